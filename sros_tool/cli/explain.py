@@ -27,6 +27,16 @@ from sros_tool.cli.common import (
     ros_domain,
     visible,
 )
+from sros_tool.cli.explain_zenoh import (
+    ZENOH,
+    ZENOH_TITLE,
+    brief_zenoh_json,
+    row,
+    zenoh_json,
+    zenoh_lines,
+    zenoh_who_json,
+    zenoh_who_lines,
+)
 from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import NEWEST, Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
@@ -46,6 +56,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.question import Part, Question
     from sros_tool.explain.reach import HopPath, Reach
     from sros_tool.explain.who import EnclaveOutcome
+    from sros_tool.explain.zenoh import ZenohAnswer
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.model import Enclave, Source
 
@@ -143,6 +154,7 @@ Example:
     protected payload ENCRYPT, submessages ENCRYPT, RTPS messages SIGN
     until     2036-11-18T09:00:00Z, when cert.pem expires
   $ sros explain keystore /talker call /add_two_ints --all-vendors
+  $ sros explain keystore /talker publish /chatter --vendor zenoh
   $ sros explain keystore --who publish /cmd_vel
   $ sros explain keystore --reach /mobile_robot/teleop
   $ ros2 run demo_nodes_cpp talker 2>&1 | \\
@@ -166,8 +178,9 @@ Example:
 )
 @click.option(
     "--vendor",
-    type=click.Choice([each.value for each in Vendor]),
-    help="The vendor whose decision counts. [default: the vendor of this machine's RMW]",
+    type=click.Choice([*(each.value for each in Vendor), ZENOH]),
+    help="The vendor whose decision counts; zenoh: what Zenoh does with the files of `sros zenoh`."
+    " [default: the vendor of this machine's RMW]",
 )
 @click.option("--all-vendors", is_flag=True, help="Compare the decisions of all vendors.")
 @click.option(
@@ -224,7 +237,7 @@ def explain(
     log: str | None,
     as_json: bool,
 ) -> int:
-    """Show whether DDS lets an enclave do something, by which rule, and how to change that.
+    """Show whether DDS or Zenoh lets an enclave do something, by which rule, and how to change it.
 
     call and serve apply to services, execute to actions; call and serve apply to an action if the
     rights have an action NAME and no service NAME; --type decides it. ROOT is a keystore, here or
@@ -244,8 +257,14 @@ def explain(
     context = _ContextOptions(moment, domain, time_zone)
     if log is not None:
         return _show_log(log, root, rest, context, as_json)
+    zenoh = "" if all_vendors else _why_zenoh(vendor, root)
+    if who and zenoh:
+        return _show_zenoh_who(root, rest, kind, zenoh, context, patterns, as_json)
     if who:
         return _show_who(root, rest, kind, vendor, context, patterns, as_json)
+    if zenoh:
+        return _show_zenoh_answer(root, rest, kind, policy, zenoh, context, as_json)
+    vendor = None if vendor == ZENOH else vendor
     return _show_answer(root, rest, kind, policy, vendor, all_vendors, context, as_json)
 
 
@@ -301,6 +320,20 @@ def _vendor_of(name: str | None) -> tuple[Vendor, str]:
     return (Vendor(name), "as asked") if name else vendor_here(os.environ)
 
 
+def _why_zenoh(vendor: str | None, root: Path | None) -> str:
+    """Return the reason to ask Zenoh and not a vendor of DDS, or ""."""
+    from sros_tool.keystore.layout import has_zenoh_files, is_keystore
+    from sros_tool.runtime.rmw import RMW
+
+    if vendor == ZENOH:
+        return "as asked"
+    rmw = os.environ.get(RMW, "")
+    keystore = root or Path(os.environ.get(KEYSTORE_VARIABLE, ""))
+    if vendor or "rmw_zenoh" not in rmw or not is_keystore(keystore):
+        return ""
+    return f"{RMW} is {rmw}" if has_zenoh_files(keystore) else ""
+
+
 # ── one question ───────────────────────────────────────────────────────────────────────────
 
 
@@ -316,15 +349,8 @@ def _show_answer(
 ) -> int:
     """Print whether an enclave may do something; return 0 if the vendor allows it, else 1."""
     from sros_tool.explain.evaluator import Evaluator
-    from sros_tool.explain.question import ask
 
-    if not 2 <= len(rest) <= 3:
-        raise UsageError(
-            "explain takes an enclave, an operation and a name",
-            "",
-            "Write for example `sros explain /talker publish /chatter`.",
-        )
-    question = ask(rest[1], rest[2] if len(rest) > 2 else "", kind)
+    question = _question(rest, kind)
     enclave = _enclave(root, rest[0], policy, options)
     context = options.context(enclave.domains)
     chosen, why = _vendor_of(vendor)
@@ -334,6 +360,7 @@ def _show_answer(
         taken = _taken_for_action(question, action)
         question = action
     answer = evaluator.explain(question)
+    zenoh = _beside(enclave, question, context)
     if all_vendors:
         others = {v: Evaluator(v, enclave, context) for v in Vendor if v is not chosen}
         answers = [answer if v is chosen else others[v].explain(question) for v in Vendor]
@@ -341,17 +368,20 @@ def _show_answer(
             shown = [_answer_json(enclave, each, policy) for each in answers]
             differ = len({each["outcome"] for each in shown}) > 1
             asked = _question_json(enclave, context, question)
-            print_json({**asked, "vendors": shown, "differ": differ})
+            print_json({**asked, "vendors": shown, "differ": differ, **_beside_json(zenoh)})
         else:
             _echo(_table_lines(enclave, answers))
+            _echo(_beside_lines(zenoh))
     elif as_json:
         asked = _question_json(enclave, context, question)
-        print_json({**asked, **_answer_json(enclave, answer, policy), "vendor_why": why})
+        answered = _answer_json(enclave, answer, policy)
+        print_json({**asked, **answered, "vendor_why": why, **_beside_json(zenoh)})
     else:
         lines = _answer_lines(enclave, answer, why, policy)
         word, _, head = next(lines).partition(":")
         click.echo(f"{coloured(word)}:{visible(head)}")
         _echo(lines)
+        _echo(_beside_lines(zenoh))
     notes = [
         *taken,
         *_provenance_notes(answer, policy),
@@ -367,6 +397,19 @@ def _show_answer(
             notes.append(Note("explain.vendors-differ", f"{_differences(measured)}."))
     print_notes(notes)
     return 0 if answer.allowed else 1
+
+
+def _question(rest: tuple[str, ...], kind: str | None) -> Question:
+    """Return the question in the words after the keystore: enclave, operation and name."""
+    from sros_tool.explain.question import ask
+
+    if not 2 <= len(rest) <= 3:
+        raise UsageError(
+            "explain takes an enclave, an operation and a name",
+            "",
+            "Write for example `sros explain /talker publish /chatter`.",
+        )
+    return ask(rest[1], rest[2] if len(rest) > 2 else "", kind)
 
 
 def _echo(lines: Iterator[str]) -> None:
@@ -556,11 +599,218 @@ def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> list[
     return [Note("explain.an-action", text)]
 
 
+# ── Zenoh ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _show_zenoh_answer(
+    root: Path | None,
+    rest: tuple[str, ...],
+    kind: str | None,
+    policy: Path | None,
+    why: str,
+    options: _ContextOptions,
+    as_json: bool,
+) -> int:
+    """Print whether Zenoh lets an enclave do something; return 0 if it does, else 1."""
+    from sros_tool.explain.evaluator import Evaluator
+    from sros_tool.explain.zenoh import ZenohEvaluator
+    from sros_tool.keystore.layout import is_keystore
+
+    question = _question(rest, kind)
+    enclave = _enclave(root, rest[0], policy, options)
+    if enclave.root is None or enclave.state is None or not is_keystore(enclave.root):
+        raise UsageError(
+            "Zenoh needs a keystore with the enclave",
+            "It decides by the files of the router and of other enclaves.",
+            "Name the keystore before the enclave.",
+        )
+    context = options.context(enclave.domains)
+    # The permissions are the source of the files, so what they decide says what has to be changed.
+    stated = Evaluator(Vendor.STANDARD, enclave, context)
+    taken: list[Note] = []
+    if not kind and (action := _action_meant(stated, question, policy)):
+        taken = _taken_for_action(question, action)
+        question = action
+    with progress("reading"):
+        evaluator = ZenohEvaluator(enclave.root, at=context.at, domain=context.domain)
+        answer = evaluator.answer(enclave.name, question)
+        outdated = evaluator.out_of_date(answer)
+    by_permissions = stated.explain(question)
+    written = _zenoh_remedy(enclave.root, by_permissions.allowed, answer, outdated)
+    if as_json:
+        print_json(
+            {
+                **_question_json(enclave, context, question),
+                "vendor": ZENOH,
+                "vendor_title": ZENOH_TITLE,
+                "vendor_why": why,
+                **zenoh_json(answer),
+                "out_of_date": None if outdated is None else list(outdated),
+                "policy": _policy_json(by_permissions, policy),
+                **_zenoh_change_json(enclave, answer, by_permissions, policy, written),
+            }
+        )
+    else:
+        lines = zenoh_lines(answer, why)
+        word, _, head = next(lines).partition(":")
+        click.echo(f"{coloured(word)}:{visible(head)}")
+        _echo(lines)
+        _echo(_zenoh_change_lines(enclave, answer, by_permissions, policy, written))
+    print_notes([*taken, *_zenoh_notes(answer, by_permissions, outdated)])
+    return 0 if answer.outcome.ok else 1
+
+
+def _zenoh_remedy(
+    root: Path, permitted: bool, answer: ZenohAnswer, outdated: Sequence[str] | None
+) -> str:
+    """Return what to do if the files of Zenoh do not say what the permissions say, or ""."""
+    from shlex import quote
+
+    if answer.of_router:
+        return "Give the node an enclave of its own."
+    if answer.outcome.ok is permitted and not outdated:
+        return ""
+    text = "Write the files of Zenoh as the permissions are" if outdated else "Look at the files"
+    return f"{text}: `sros zenoh {quote(str(root))}`; then restart the processes that it names."
+
+
+def _zenoh_change_lines(
+    enclave: LoadedEnclave, answer: ZenohAnswer, stated: Answer, policy: Path | None, written: str
+) -> Iterator[str]:
+    """Yield the lines of the policy, and what to change or to do."""
+    for line in stated.lines:
+        said = f"{line.qualifier.value} {line.right} {line.name}"
+        yield row("from", f"{_shown(line.source)}: {said}")
+    if _wants_rights(answer, stated):
+        if stated.change:
+            yield from _change_lines(stated.change)
+        if stated.remedy:
+            yield row("remedy", stated.remedy)
+        for number, command in enumerate(_commands(enclave, stated, policy)):
+            yield row("run" if not number else "", command)
+    if written:
+        yield row("remedy", written)
+
+
+def _wants_rights(answer: ZenohAnswer, stated: Answer) -> bool:
+    """Return whether more rights would help: the router's enclave shall have none."""
+    return not answer.outcome.ok and not stated.allowed and not answer.of_router
+
+
+def _zenoh_change_json(
+    enclave: LoadedEnclave, answer: ZenohAnswer, stated: Answer, policy: Path | None, written: str
+) -> dict[str, Any]:
+    denied = _wants_rights(answer, stated)
+    return {
+        "permitted": stated.allowed,
+        "remedy": written or (stated.remedy if denied else "") or None,
+        "change": _change_json(stated.change) if denied and stated.change else None,
+        "commands": _commands(enclave, stated, policy) if denied else [],
+    }
+
+
+def _zenoh_notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) -> list[Note]:
+    notes = []
+    if answer.outcome.ok is not stated.allowed and not stated.problems:
+        does, other = ("allow", "Zenoh drops") if stated.allowed else ("deny", "Zenoh lets through")
+        text = f"the signed permissions {does} it and {other} it: the two are not in step."
+        notes.append(Note("explain.zenoh-differs", text))
+    if outdated:
+        text = f"out of date: {', '.join(outdated)}. The answer is by these files as they are."
+        notes.append(Note("explain.zenoh-out-of-date", text))
+    if outdated is None:
+        text = "it was not compared with what the permissions ask for, which takes the keystore's "
+        text += "settings and all its enclaves: the answer is by the files as they are."
+        notes.append(Note("explain.zenoh-not-compared", text))
+    if answer.unsigned:
+        text = f"the permissions CA has not signed {', '.join(answer.unsigned)}: whoever can write "
+        text += "it gives rights, since Zenoh verifies no signature."
+        notes.append(Note("explain.zenoh-unsigned", text))
+    return notes
+
+
+def _beside(
+    enclave: LoadedEnclave, question: Question, context: JoinContext
+) -> ZenohAnswer | SrosError | None:
+    """Return what Zenoh decides next to DDS, or why that is not known; None without its files."""
+    from sros_tool.keystore.layout import has_zenoh_files, is_keystore
+
+    root = enclave.root
+    if root is None or enclave.state is None or not is_keystore(root) or not has_zenoh_files(root):
+        return None
+    from sros_tool.explain.zenoh import ZenohEvaluator
+
+    try:
+        evaluator = ZenohEvaluator(root, at=context.at, domain=context.domain)
+        return evaluator.answer(enclave.name, question, reach=False)
+    except SrosError as error:
+        return error
+
+
+def _beside_lines(zenoh: ZenohAnswer | SrosError | None) -> Iterator[str]:
+    if isinstance(zenoh, SrosError):
+        yield row("zenoh", f"not known: {zenoh.what}")
+    elif zenoh:
+        yield row("zenoh", f"{'yes' if zenoh.outcome.ok else f'no, {zenoh.outcome}'}: {zenoh.text}")
+
+
+def _beside_json(zenoh: ZenohAnswer | SrosError | None) -> dict[str, Any]:
+    if zenoh is None:
+        return {}
+    return {"zenoh": None if isinstance(zenoh, SrosError) else brief_zenoh_json(zenoh)}
+
+
+def _show_zenoh_who(
+    root: Path | None,
+    rest: tuple[str, ...],
+    kind: str | None,
+    why: str,
+    options: _ContextOptions,
+    patterns: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Print which enclaves Zenoh lets do something; return 0 if any, else 1."""
+    from sros_tool.explain.question import about_action
+    from sros_tool.explain.zenoh import ZenohEvaluator
+    from sros_tool.keystore.layout import check_keystore, select_enclaves
+    from sros_tool.keystore.reader import governance_of
+    from sros_tool.keystore.rights import load_rights
+
+    question = _question_of_who(rest, kind)
+    keystore = root or keystore_from_environment()
+    check_keystore(keystore)
+    context = options.context(governance_of(keystore).domains().closed())
+    evaluator = ZenohEvaluator(keystore, at=context.at, domain=context.domain)
+    names = select_enclaves(keystore, (), patterns) if patterns else evaluator.names
+    taken: list[Note] = []
+    with progress("asking"):
+        found = evaluator.who(question, names)
+        if not kind and all(each.wildcards for each in found if each.outcome.ok):
+            rights = load_rights(keystore).rights if question.type == "service" else ()
+            if action := about_action(question, rights):
+                taken, question = _taken_for_action(question, action), action
+                found = evaluator.who(action, names)
+    if as_json:
+        print_json(
+            {
+                "question": str(question),
+                "vendor": ZENOH,
+                "vendor_why": why,
+                "domain": context.domain,
+                "enclaves": [zenoh_who_json(each) for each in found],
+            }
+        )
+    else:
+        _echo(zenoh_who_lines(found))
+        click.echo(f"{question}, on {ZENOH_TITLE} ({why})", err=True)
+    print_notes(taken)
+    return 0 if any(each.outcome.ok for each in found) else 1
+
+
 # ── the answer as text ─────────────────────────────────────────────────────────────────────
 
 _ADDITION = "allow.xml"
 """Name of the file with the rights to add, in the commands that are proposed."""
-_LABEL_WIDTH = 10
 
 
 def _answer_lines(
@@ -573,45 +823,41 @@ def _answer_lines(
     may = f"yes: {enclave.name} may" if answer.allowed else f"no: {enclave.name} may not"
     documented = ", as documented" if answer.as_documented else ""
     yield f"{may} {answer.question}, on {answer.vendor.title} ({why}{documented})"
-    yield _row("why", decision.clause)
-    yield from (_row("and", str(each)) for each in answer.problems[1:])
+    yield row("why", decision.clause)
+    yield from (row("and", str(each)) for each in answer.problems[1:])
     if len(answer.parts) > 1 and not answer.allowed:
         for part, decided in answer.parts:
             sign = "ok" if decided.outcome.ok else str(decided.outcome)
-            yield _row("part", f"{part}: {sign}")
+            yield row("part", f"{part}: {sign}")
     if decision.rule is not None and grant:
         what = f"{'allow' if grant.rules[decision.rule].allow else 'deny'} rule {decision.rule + 1}"
-        yield _row("rule", f"{what} of grant {grant.name}: {decision.expression}")
+        yield row("rule", f"{what} of grant {grant.name}: {decision.expression}")
     if answer.wildcard:
-        yield _row("wildcard", f"{answer.wildcard} also matches other names")
+        yield row("wildcard", f"{answer.wildcard} also matches other names")
     for line in answer.lines:
         stated = f"{line.qualifier.value} {line.right} {line.name}"
-        yield _row("from", f"{_shown(line.source)}: {stated}")
+        yield row("from", f"{_shown(line.source)}: {stated}")
     if answer.policy_sha256 and policy is None and decision.rule is not None:
         digest = answer.policy_sha256
         default = template_default(digest)
-        yield _row(
+        yield row(
             "from",
             f"the default of the keystore's template, {default}: no policy file has been signed"
             if default
             else f"a policy file with the digest {digest[:12]}; name it with --policy",
         )
     if answer.allowed:
-        yield _row("protected", ", ".join(_protection_words(answer)))
+        yield row("protected", ", ".join(_protection_words(answer)))
     elif answer.denied_by:
-        yield _row("denied by", answer.denied_by)
+        yield row("denied by", answer.denied_by)
     if answer.until and answer.allowed:
-        yield _row("until", f"{iso(answer.until)}, when {answer.until_file} expires")
+        yield row("until", f"{iso(answer.until)}, when {answer.until_file} expires")
     if answer.change:
         yield from _change_lines(answer.change)
     if answer.remedy:
-        yield _row("remedy", answer.remedy)
+        yield row("remedy", answer.remedy)
     for number, command in enumerate(_commands(enclave, answer, policy)):
-        yield _row("run" if not number else "", command)
-
-
-def _row(label: str, text: str) -> str:
-    return f"  {label:{_LABEL_WIDTH}}{text}"
+        yield row("run" if not number else "", command)
 
 
 def _shown(source: Source) -> str:
@@ -643,7 +889,7 @@ def _topic_rule(answer: Answer) -> Any:
 
 
 def _change_lines(change: PolicyChange) -> Iterator[str]:
-    yield _row("change", "the smallest change of the policy that would allow it:")
+    yield row("change", "the smallest change of the policy that would allow it:")
     for edit in change.edits:
         if edit.xml:
             group = edit.xml.partition(" ")[0].removeprefix("<")
@@ -833,11 +1079,7 @@ def _show_who(
     from sros_tool.keystore.layout import check_keystore, select_enclaves
     from sros_tool.keystore.rights import load_rights
 
-    if not 1 <= len(rest) <= 2:
-        raise UsageError(
-            "--who takes an operation and a name", "", "Write for example publish /cmd_vel."
-        )
-    question = ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
+    question = _question_of_who(rest, kind)
     chosen, why = _vendor_of(vendor)
     keystore = root or keystore_from_environment()
     check_keystore(keystore)
@@ -875,6 +1117,17 @@ def _show_who(
                 print_notes([Note("explain.an-action", text)])
     print_notes(taken)
     return 0 if allowed else 1
+
+
+def _question_of_who(rest: tuple[str, ...], kind: str | None) -> Question:
+    """Return the question in the words after the keystore: operation and name."""
+    from sros_tool.explain.question import ask
+
+    if not 1 <= len(rest) <= 2:
+        raise UsageError(
+            "--who takes an operation and a name", "", "Write for example publish /cmd_vel."
+        )
+    return ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
 
 
 def _who_lines(found: Sequence[EnclaveOutcome]) -> Iterator[str]:

@@ -249,6 +249,12 @@ def enclave_names(root: Path) -> tuple[str, ...]:
     return names
 
 
+def has_zenoh_files(root: Path) -> bool:
+    """Return whether any enclave has a configuration of Zenoh."""
+    folders = (enclave_path(root, name) for name in enclave_names(root))
+    return any((folder / file).is_file() for folder in folders for file in ZENOH_SIGNED)
+
+
 def check_readable(root: Path) -> None:
     """Raise `KeystoreError` if this user cannot read every file of every enclave.
 

@@ -75,6 +75,9 @@ def make_folder(folder: Path) -> None:
         shutil.copytree(folder / "ks", folder / copy, symlinks=True)
     sros("rotate_ca", "turned", "--next", cwd=folder).ok()
     (folder / "partial/enclaves/a/permissions.p7s").unlink()
+    shutil.copytree(folder / "zenoh", folder / "closed", symlinks=True)
+    sros("zenoh", "closed", cwd=folder).ok()
+    (folder / "closed/enclaves/b/session.json5").unlink()
     (folder / "lost/public/identity_ca.crl.pem").unlink()
     (folder / "broken/enclaves/b/cert.pem").write_text("x")
     ledger = folder / "broken/ledger.jsonl"
@@ -251,6 +254,21 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("/a publish /x --policy denied.xml --all-vendors", 1),
         Case("broken /b publish /x --all-vendors", 1),
         Case("ks --who publish /x"),
+        Case("closed /a publish /x"),
+        Case("closed /a publish /x --all-vendors"),
+        Case("closed /a publish /x --vendor zenoh --policy policy.xml"),
+        Case("closed /b publish /y --vendor zenoh", 1),
+        Case(
+            "zenoh /a publish /x --vendor zenoh --policy denied.xml",
+            1,
+            before=("create_permission zenoh /a denied.xml", "zenoh zenoh"),
+        ),
+        Case(
+            "zenoh /a publish /nope --vendor zenoh",
+            before=("create_permission zenoh /a wild.xml", "zenoh zenoh"),
+        ),
+        Case("closed --who publish /x --vendor zenoh"),
+        Case("closed --who call /nope --vendor zenoh --match /a", 1),
         Case("ks --reach /a"),
         Case("ks --reach /b"),
         Case(f"ks /a --log {EXPIRED}", 1),

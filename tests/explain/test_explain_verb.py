@@ -62,10 +62,16 @@ def test_a_question_loads_only_what_answers_it(whole: Path) -> None:
     )
     *lines, names = run([sys.executable, "-c", code]).stdout.splitlines()
     assert lines[0].startswith("yes")
-    assert len(names.split()) <= 54
+    assert len(names.split()) <= 56
     assert not set(names.split()).intersection(
         f"sros_tool.{each}"
-        for each in ("explain.change", "explain.remedy", "keystore.transaction", "runtime.stacks")
+        for each in (
+            "explain.change",
+            "explain.remedy",
+            "explain.zenoh",
+            "keystore.transaction",
+            "runtime.stacks",
+        )
     )
 
 

@@ -1,0 +1,464 @@
+"""What Zenoh decides in a keystore: by the configurations in it as they are, link by link.
+
+Zenoh refuses nothing with an error: whoever denies a message drops it.  In client mode the router
+and the session itself decide on a right, in peer mode the sessions of all other enclaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from enum import StrEnum
+from functools import cache
+from pathlib import Path
+from shlex import quote
+
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.explain.question import Question
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
+    PERMISSIONS,
+    ROUTER_FILE,
+    SESSION_FILE,
+    ZENOH_SIGNED,
+    check_keystore,
+    enclave_folder,
+    enclave_names,
+    enclave_path,
+    has_zenoh_files,
+)
+from sros_tool.keystore.missing import no_such_enclave
+from sros_tool.keystore.reader import load_ca_certificate, load_settings, open_enclave
+from sros_tool.parallel import map_slices
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import common_name_of, validity_of
+from sros_tool.policy.model import ALLOW
+from sros_tool.policy.rights import Right, parts
+from sros_tool.xml import read_bytes
+from sros_tool.zenoh.access import Message
+from sros_tool.zenoh.configuration import Mode
+from sros_tool.zenoh.delivery import (
+    Check,
+    Delivery,
+    Route,
+    ZenohProcess,
+    call,
+    publication,
+    route,
+    token,
+)
+from sros_tool.zenoh.document import ZenohEndpoint, parse_configuration
+from sros_tool.zenoh.enforcement import Enforcement
+from sros_tool.zenoh.key_expressions import includes
+
+_OF_TLS = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)
+"""The files of an enclave that a process on Zenoh needs; those of DDS do not count."""
+_ANY_TYPE = "type/hash"
+"""Type and hash at the end of a key: rules that sros writes hold for all of them."""
+_OTHER_SIDE = {
+    "publish": "subscribe",
+    "subscribe": "publish",
+    "request": "reply",
+    "reply": "request",
+}
+
+
+class ZenohOutcome(StrEnum):
+    """What happens to an enclave's messages."""
+
+    ALLOWED = "allowed"
+    DROPPED = "dropped"
+    """They vanish on a link, without an error for anybody."""
+    REFUSED = "refused"
+    """The process opens no session, or gets no link."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether data can flow."""
+        return self is ZenohOutcome.ALLOWED
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohFile:
+    """The configuration of an enclave's process as it is in the keystore.
+
+    ``process`` is None if it opens no session, and ``problem`` says why.  ``signed`` says whether
+    the permissions CA signed the file next to it, ``until`` when the certificate expires.
+    ``endpoints`` are where a session connects, or where the router listens.
+    """
+
+    enclave: str
+    file: str
+    process: ZenohProcess | None
+    problem: str
+    signed: bool
+    until: datetime | None = None
+    endpoints: tuple[ZenohEndpoint, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """Another enclave that has the right at the other end, and the deliveries to or from it.
+
+    ``problem`` says why its process opens no session, or is "".
+    """
+
+    enclave: str
+    deliveries: tuple[Delivery, ...]
+    problem: str
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohAnswer:
+    """The answer of Zenoh to a question about an enclave.
+
+    ``text`` says why, as a clause.  ``checks`` are the decisions on the right itself.  ``reached``
+    are the other enclaves with the right at the other end.  ``wildcards`` are key expressions with
+    wildcards that decide, each with the enclaves to which a message on all of it gets.  ``until``
+    is when the certificate expires.  ``unsigned`` are the files that decide without a signature.
+    """
+
+    enclave: str
+    question: Question
+    domain: int
+    mode: Mode | None
+    outcome: ZenohOutcome
+    text: str
+    checks: tuple[Check, ...] = ()
+    reached: tuple[Reached, ...] = ()
+    wildcards: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    until: datetime | None = None
+    unsigned: tuple[str, ...] = ()
+
+    @property
+    def of_router(self) -> bool:
+        """Whether the enclave is that of the router."""
+        return self.mode is Mode.ROUTER
+
+    @property
+    def dropped(self) -> Check | None:
+        """The check that drops a message, or None; that of data if there are several."""
+        return _first((each for each in self.checks if not each.decision.allowed), self.enclave)
+
+    @property
+    def deciding(self) -> Check | None:
+        """The check whose rule is the answer; None if nothing was checked."""
+        return self.dropped or _first(self.checks, self.enclave)
+
+    @property
+    def links(self) -> tuple[tuple[tuple[str, str], tuple[Check, ...]], ...]:
+        """The checks by the pair of processes whose link they are on, each pair once."""
+        found: dict[tuple[str, str], list[Check]] = {}
+        for each in self.checks:
+            ends = (self.enclave, each.remote if each.enforcer == self.enclave else each.enforcer)
+            found.setdefault(ends, []).append(each)
+        return tuple((ends, tuple(checks)) for ends, checks in found.items())
+
+
+class ZenohEvaluator:
+    """An evaluator of questions about the enclaves of one keystore, reusable for many questions.
+
+    Raises `KeystoreError` if the keystore has no configurations of Zenoh, or no router's or several
+    routers': what they enforce together cannot be known then.
+    """
+
+    def __init__(self, root: Path, *, at: datetime, domain: int) -> None:
+        check_keystore(root)
+        self.root = root
+        self.domain = domain
+        self.names = enclave_names(root)
+        self._at = at
+        self._file = cache(self._read)
+        self.router = self._router()
+
+    def _router(self) -> ZenohFile:
+        routers = [
+            name for name in self.names if (enclave_path(self.root, name) / ROUTER_FILE).exists()
+        ]
+        if len(routers) == 1:
+            return self._file(routers[0], ROUTER_FILE)
+        if routers:
+            raise KeystoreError(
+                f"keystore '{self.root}' has the files of several routers",
+                f"{ROUTER_FILE} is in {', '.join(routers[:5])}, and sessions connect to one.",
+                "Remove those that no process uses, or write all files again: "
+                f"`sros zenoh {quote(str(self.root))}`.",
+            )
+        if has_zenoh_files(self.root):
+            raise KeystoreError(
+                f"keystore '{self.root}' has no {ROUTER_FILE}",
+                "Without the router's file it is not known what the router enforces.",
+                "Ask in the keystore from which it was exported, or write the files again: "
+                f"`sros zenoh {quote(str(self.root))}`.",
+            )
+        raise KeystoreError(
+            f"keystore '{self.root}' has no configurations of Zenoh",
+            "Without them its enclaves cannot open a session, and rmw_zenoh with files of its own "
+            "runs without any access control.",
+            f"Write them: `sros zenoh {quote(str(self.root))}`.",
+        )
+
+    def answer(self, enclave: str, question: Question, *, reach: bool = True) -> ZenohAnswer:
+        """Return the answer for one enclave; ``reach`` says whether to look at all others."""
+        if enclave not in self.names:
+            raise no_such_enclave(self.root, enclave, self.names)
+        own = self._file(enclave, self._file_of(enclave))
+        found = ZenohAnswer(
+            enclave,
+            question,
+            self.domain,
+            own.process.mode if own.process else None,
+            ZenohOutcome.REFUSED,
+            own.problem,
+            until=own.until,
+            unsigned=self._unsigned(own),
+        )
+        if own.process is None:
+            return found
+        if own.process.mode is Mode.ROUTER:
+            text = "it is the router's enclave, which passes on what others say and says nothing"
+            return replace(found, outcome=ZenohOutcome.DROPPED, text=text)
+        if self.router.process is None:
+            text = f"no link to the router {self.router.enclave}: {self.router.problem}"
+            return replace(found, text=text)
+        if not _meet(own.endpoints, self.router.endpoints):
+            text = f"no link to the router: {own.file} connects to {_listed(own.endpoints)}, and "
+            text += f"{ROUTER_FILE} listens at {_listed(self.router.endpoints)}"
+            return replace(found, text=text)
+        wanted = self._rights(enclave, question)
+        checks = tuple(
+            check
+            for other in self._enforcers(own.process, self.router.process)
+            for check in self._decided(own.process, other, wanted)
+        )
+        found = replace(found, checks=checks)
+        assert found.deciding
+        by = found.deciding.enforcer
+        why = found.deciding.decision.why
+        text = f"{found.deciding}: {why}, in {self._file_of(by)} of {by}"
+        if found.dropped:
+            return replace(found, outcome=ZenohOutcome.DROPPED, text=text)
+        reached = tuple(self._reached(own, wanted)) if reach else ()
+        return replace(
+            found,
+            outcome=ZenohOutcome.ALLOWED,
+            text=text,
+            reached=reached,
+            wildcards=tuple(self._wildcards(own.process, wanted, checks, reached)),
+        )
+
+    def who(self, question: Question, names: Sequence[str]) -> tuple[ZenohAnswer, ...]:
+        """Return the answers for several enclaves, without whom they reach."""
+
+        def work(part: Sequence[str]) -> list[ZenohAnswer]:
+            return [self.answer(name, question, reach=False) for name in part]
+
+        names = [each for each in names if each != self.router.enclave]
+        found = [each for _, part in map_slices(names, work) for each in part]
+        return tuple(sorted(found, key=lambda each: each.enclave))
+
+    def out_of_date(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
+        """Return the files that decide an answer and are not what the permissions ask for.
+
+        Return None if that cannot be told, such as in an export.
+        """
+        from sros_tool.keystore.lifecycle.zenoh import set_zenoh
+
+        try:
+            network = load_settings(self.root).zenoh
+            if network is None:
+                return None
+            planned = set_zenoh(self.root, network, now=self._at, dry_run=True).changes
+        except SrosError:
+            return None
+        ours = {answer.enclave, *(each.enforcer for each in answer.checks)}
+        ours.add(self.router.enclave)
+        paths = {f"{enclave_folder(each)}/{self._file_of(each)}" for each in ours}
+        return tuple(sorted(each.path for each in planned if each.path in paths))
+
+    # ── files ──────────────────────────────────────────────────────────────────────────────
+
+    def _file_of(self, enclave: str) -> str:
+        return ROUTER_FILE if enclave == self.router.enclave else SESSION_FILE
+
+    def _read(self, enclave: str, file: str) -> ZenohFile:
+        """Return the configuration of an enclave's process, or why it opens no session."""
+        folder = enclave_path(self.root, enclave)
+        if not (folder / file).exists():
+            return _closed(enclave, file, f"it has no {file}: its processes open no session")
+        try:
+            data = read_bytes(folder / file, "Zenoh configuration")
+            document = parse_configuration(data, str(folder / file))
+        except SrosError as error:
+            return _closed(enclave, file, f"Zenoh does not accept its {file}: {error.why}".strip())
+        state = open_enclave(folder, now=self._at)
+        faults = [each for each in state.problems_at_home if each.file in _OF_TLS]
+        if faults or state.certificate is None:
+            problem = str(faults[0]) if faults else f"{CERTIFICATE_FILE} cannot be read"
+            return _closed(enclave, file, problem)
+        name = common_name_of(state.certificate.subject) or ""
+        if name != enclave:
+            problem = f"Zenoh knows its processes by the common name {name!r} of {CERTIFICATE_FILE}"
+            return _closed(enclave, file, problem)
+        return ZenohFile(
+            enclave,
+            file,
+            ZenohProcess(name, document.mode, document.access),
+            "",
+            self._is_signed(folder / file, data),
+            validity_of(state.certificate).not_after,
+            document.listen if document.mode is Mode.ROUTER else document.connect,
+        )
+
+    def _is_signed(self, path: Path, document: bytes) -> bool:
+        """Return whether the permissions CA signed the document next to the file."""
+        try:
+            data = read_bytes(path.with_name(ZENOH_SIGNED[path.name]), "signed document")
+            signed = smime.parse(data)
+            signed.verify(load_ca_certificate(self.root, PERMISSIONS))
+        except SrosError:
+            return False
+        return signed.document.replace(b"\r\n", b"\n") == document
+
+    def _unsigned(self, own: ZenohFile) -> tuple[str, ...]:
+        return tuple(
+            f"{each.enclave}/{each.file}"
+            for each in (own, self.router)
+            if each.process and not each.signed
+        )
+
+    # ── decisions ──────────────────────────────────────────────────────────────────────────
+
+    def _enforcers(self, own: ZenohProcess, router: ZenohProcess) -> tuple[ZenohProcess, ...]:
+        """Return the processes that decide on an enclave's rights."""
+        if own.mode is not Mode.PEER:
+            return (router,)
+        files = (
+            self._file(name, SESSION_FILE)
+            for name in self.names
+            if name not in (own.name, self.router.enclave)
+        )
+        peers = (each.process for each in files if each.process)
+        return tuple(each for each in peers if each.mode is Mode.PEER) or (router,)
+
+    def _rights(self, enclave: str, question: Question) -> tuple[Right, ...]:
+        """Return the rights to topics and services that the question asks for; none for joining."""
+        return parts(Right(enclave, ALLOW, question.right, question.name)) if question.right else ()
+
+    def _decided(
+        self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right]
+    ) -> Iterator[Check]:
+        """Yield the checks by which a process decides on rights of another one, or on joining.
+
+        With the router, the session itself decides too; of peers, each on the rights of the other.
+        """
+        deliveries = [self._delivery((own, other), right) for right in wanted]
+        for delivery in deliveries or self._graph(own, other):
+            for each in (*delivery.checks, *delivery.replies):
+                if other.mode is not Mode.PEER or each.enforcer == other.name:
+                    yield each
+
+    def _delivery(self, way: Route, right: Right, key: str = "") -> Delivery:
+        """Return the delivery for a right of the first process of a way, on its key or another."""
+        key = key or f"{self.domain}{right.name}/{_ANY_TYPE}"
+        match right.right:
+            case "publish":
+                return publication(way, key)
+            case "subscribe":
+                return publication(way[::-1], key)
+            case "request":
+                return call(way, key)
+            case _:
+                return call(way[::-1], key)
+
+    def _graph(self, own: ZenohProcess, other: ZenohProcess) -> tuple[Delivery, Delivery]:
+        """Return how a node is announced in the graph, and how it sees all others."""
+        everything = f"@ros2_lv/{self.domain}/**"
+        node = f"@ros2_lv/{self.domain}/zid/0/0/NN/{own.name.replace('/', '%')}/%/node"
+        return token((own, other), node, everything), token((other, own), everything, everything)
+
+    def _reached(self, own: ZenohFile, wanted: Sequence[Right]) -> Iterator[Reached]:
+        """Yield the enclaves that have the right at the other end."""
+        for name in self.names if wanted else ():
+            if name in (own.enclave, self.router.enclave):
+                continue
+            assert own.process
+            # What the others decide comes first: it needs no file of that enclave.
+            found = self._between(own.process, _unrestricted(name, own.process.mode), wanted)
+            if not all(each.arrives for each in found):
+                continue
+            other = self._file(name, SESSION_FILE)
+            if other.process:
+                found = self._between(own.process, other.process, wanted)
+            if all(each.arrives for each in found):
+                yield Reached(name, found, other.problem)
+
+    def _between(
+        self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right], key: str = ""
+    ) -> tuple[Delivery, ...]:
+        assert self.router.process
+        way = route(own, other, self.router.process)
+        return tuple(self._delivery(way, right, key) for right in wanted)
+
+    def _wildcards(
+        self,
+        own: ZenohProcess,
+        wanted: Sequence[Right],
+        checks: Sequence[Check],
+        reached: Sequence[Reached],
+    ) -> Iterator[tuple[str, tuple[str, ...]]]:
+        """Yield the wildcards that decide, with the enclaves that a message on all of it reaches.
+
+        Only a put or a query can have such a key; it arrives where every rule is as wide.
+        """
+        asked = [each for each in wanted if each.right in ("publish", "request")]
+        for wide in dict.fromkeys(filter(None, map(self._wildcard, checks))):
+            found = [
+                each.enclave
+                for each in reached
+                if (other := self._file(each.enclave, SESSION_FILE).process)
+                and any(one.arrives for one in self._between(own, other, asked, wide))
+            ]
+            yield wide, tuple(found)
+
+    def _wildcard(self, check: Check) -> str:
+        """Return the key expression that allows data, if its name has a wildcard, or ""."""
+        if check.message not in (Message.PUT, Message.QUERY) or not check.decision.rules:
+            return ""
+        file = self._file(check.enforcer, self._file_of(check.enforcer))
+        rules = file.process.access.rules if file.process else ()
+        keys = next(each.key_expressions for each in rules if each.id in check.decision.rules)
+        wide = next((each for each in keys if includes(each, check.key)), "")
+        return wide if "*" in wide.removesuffix("/*/*") else ""
+
+
+def _unrestricted(name: str, mode: Mode) -> ZenohProcess:
+    return ZenohProcess(name, mode, Enforcement())
+
+
+_DATA = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
+"""The messages that are the use of a right; the others prepare them."""
+
+
+def _first(checks: Iterable[Check], enclave: str) -> Check | None:
+    """Return the check to name: on data before others, by others before by the enclave itself."""
+    return min(
+        checks, key=lambda each: (each.message not in _DATA, each.enforcer == enclave), default=None
+    )
+
+
+def _meet(connect: Sequence[ZenohEndpoint], listen: Sequence[ZenohEndpoint]) -> bool:
+    """Return whether a process may connect to where another listens: hosts have several names."""
+    ports = {(each.protocol, each.address.rpartition(":")[2]) for each in listen}
+    return any((each.protocol, each.address.rpartition(":")[2]) in ports for each in connect)
+
+
+def _listed(endpoints: Sequence[ZenohEndpoint]) -> str:
+    return ", ".join(each.text for each in endpoints[:3]) or "nothing"
+
+
+def _closed(enclave: str, file: str, problem: str) -> ZenohFile:
+    return ZenohFile(enclave, file, None, problem, signed=False)

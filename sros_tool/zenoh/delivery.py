@@ -1,0 +1,143 @@
+"""Deliveries between Zenoh processes: which message has to pass whom on each link.
+
+On a link two processes enforce: the one that sends a message has rules for what leaves (egress),
+the one that gets it for what arrives (ingress).  Whoever denies a message drops it without a word.
+Which messages a delivery needs, and on which links, was measured with 1.10.2 by denying one after
+the other, and is compared on random rules (``tests/integration/test_zenoh_deliveries.py``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from sros_tool.zenoh.access import Flow, Message
+from sros_tool.zenoh.configuration import Mode
+from sros_tool.zenoh.enforcement import AccessDecision, Enforcement, Remote
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohProcess:
+    """A Zenoh process on TLS, by the common name of its certificate, and what it enforces."""
+
+    name: str
+    mode: Mode
+    access: Enforcement
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """The decision of process ``enforcer`` on one message on its link with ``remote``."""
+
+    enforcer: str
+    remote: str
+    flow: Flow
+    message: Message
+    key: str
+    decision: AccessDecision
+
+    def __str__(self) -> str:
+        """Return text like ``put 0/chatter/*/* from /talker``."""
+        end = "from" if self.flow is Flow.INGRESS else "to"
+        return f"{self.message} {self.key} {end} {self.remote}"
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """The checks that a delivery has to pass, in the order of the messages.
+
+    ``replies`` are those of the reply to a call: the request is executed without them.
+    """
+
+    checks: tuple[Check, ...]
+    replies: tuple[Check, ...] = ()
+
+    @property
+    def arrives(self) -> bool:
+        """Whether the message is heard, the request executed, or the token seen."""
+        return all(each.decision.allowed for each in self.checks)
+
+    @property
+    def answered(self) -> bool:
+        """Whether also the reply gets back."""
+        return self.arrives and all(each.decision.allowed for each in self.replies)
+
+
+Route = tuple[ZenohProcess, ...]
+"""The processes that a message passes, with those at both ends; two or three.
+
+A session and the router alone are the part of a way that the rights of one enclave decide.
+"""
+
+
+def route(source: ZenohProcess, target: ZenohProcess, router: ZenohProcess) -> Route:
+    """Return the way from one process to another.
+
+    Peers connect to each other, and a router passes nothing on between peers; from or to a client
+    everything goes through the router.
+    """
+    if source.mode is Mode.PEER and target.mode is Mode.PEER:
+        return source, target
+    return source, router, target
+
+
+def publication(way: Route, key: str, subscribed: str = "") -> Delivery:
+    """Return the delivery of a sample, along ``way`` from the publisher to the subscription.
+
+    The key may have wildcards.  ``subscribed`` is the key of the subscription, if it differs.
+    """
+    back = way[::-1]
+    # Nothing is sent that nobody wants to hear, but what has wildcards goes to the router anyway.
+    wanted = back[:-1] if "*" in key and way[1].mode is Mode.ROUTER else back
+    return Delivery(
+        (
+            *_crossing(wanted, Message.DECLARE_SUBSCRIBER, subscribed or key),
+            *_crossing(way, Message.PUT, key),
+        )
+    )
+
+
+def call(way: Route, key: str, served: str = "", replied: str = "") -> Delivery:
+    """Return the delivery of a query, along ``way`` from who asks to who replies.
+
+    ``served`` is the key of the queryable and ``replied`` that of the reply, if they differ.
+    """
+    back = way[::-1]
+    # Queries go to the router in any case, and to another peer only if it offers to reply.
+    offered = back[:-1] if way[1].mode is Mode.ROUTER else back
+    return Delivery(
+        (
+            *_crossing(offered, Message.DECLARE_QUERYABLE, served or key),
+            *_crossing(way, Message.QUERY, key),
+        ),
+        tuple(_crossing(back, Message.REPLY, replied or key)),
+    )
+
+
+def token(
+    way: Route, key: str, asked: str, message: Message = Message.DECLARE_LIVELINESS_SUBSCRIBER
+) -> Delivery:
+    """Return the delivery of a liveliness token, along ``way`` from who announces to who watches.
+
+    ``asked`` is the key that the watching process asks for, with ``message``.  The router answers;
+    peers tell each other all tokens unasked.
+    """
+    asking = way[:-3:-1] if way[-2].mode is Mode.ROUTER else ()
+    return Delivery(
+        (
+            *_crossing(asking, message, asked),
+            *_crossing(way, Message.LIVELINESS_TOKEN, key),
+        )
+    )
+
+
+def _crossing(way: Sequence[ZenohProcess], message: Message, key: str) -> Iterator[Check]:
+    """Yield the checks on a message that passes the links of ``way``."""
+    for sender, receiver in pairwise(way):
+        for enforcer, remote, flow in (
+            (sender, receiver.name, Flow.EGRESS),
+            (receiver, sender.name, Flow.INGRESS),
+        ):
+            decision = enforcer.access.decide(Remote(remote), flow, message, key)
+            yield Check(enforcer.name, remote, flow, message, key, decision)

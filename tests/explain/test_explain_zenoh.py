@@ -1,0 +1,228 @@
+"""``sros explain --vendor zenoh``: by the files as they are, link by link."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.harness import Ended, policy_text, publish, sros
+
+HERE = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", "TZ": "UTC"}
+POLICY = policy_text(
+    {
+        "/talker": publish("/chatter"),
+        "/listener": publish("/chatter").replace("publish", "subscribe"),
+        "/wide": publish("/cam*") + '<services request="ALLOW"><service>/add</service></services>',
+        "/recorder": publish("/*").replace("publish", "subscribe"),
+        "/server": '<services reply="ALLOW"><service>/add</service></services>'
+        '<actions execute="ALLOW"><action>/go</action></actions>',
+        "/client": '<actions call="ALLOW"><action>/go</action></actions>',
+    }
+)
+MODES = ("client", "peer")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keystores named after the modes of their sessions; and the policy."""
+    folder = tmp_path_factory.mktemp("zenoh")
+    (folder / "policy.xml").write_text(POLICY)
+    for mode in MODES:
+        sros("create_keystore", folder / mode, "--template", "production").ok()
+        sros("generate_artifacts", "-k", folder / mode, "-p", folder / "policy.xml").ok()
+        sros("zenoh", folder / mode, "--mode", mode).ok()
+    return folder
+
+
+@pytest.fixture
+def keystore(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made / "client", tmp_path / "ks", symlinks=True))
+
+
+def explain(*words: object, env: dict[str, str | None] | None = None) -> Ended:
+    return sros("explain", *words, env={**HERE, **(env or {})})
+
+
+def zenoh(*words: object) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(explain(*words, "--vendor", "zenoh", "--json").out)
+    return found
+
+
+ALLOWED = [
+    ("/talker publish /chatter", ["/listener", "/recorder"]),
+    ("/listener subscribe /chatter", ["/talker"]),
+    ("/recorder subscribe /chatter", ["/talker"]),
+    ("/wide publish /camera", ["/recorder"]),
+    ("/wide call /add", ["/server"]),
+    ("/server serve /add", ["/wide"]),
+    ("/client call /go", ["/server"]),
+    ("/server execute /go", ["/client"]),
+    ("/talker join", []),
+]
+DENIED = [
+    "/listener publish /chatter",
+    "/talker subscribe /chatter",
+    "/client call /add",
+    "/server call /add",
+    "/client execute /go",
+    "/talker publish /camera",
+]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(("words", "reached"), ALLOWED)
+def test_what_is_allowed_and_whom_it_reaches(
+    made: Path, mode: str, words: str, reached: list[str]
+) -> None:
+    found = zenoh(made / mode, *words.split())
+    assert (found["outcome"], found["mode"]) == ("allowed", mode)
+    assert [each["enclave"] for each in found["reached"]] == reached
+    assert all(check["rules"] for link in found["links"] for check in link["checks"])
+    assert (found["out_of_date"], found["unsigned"], found["permitted"]) == ([], [], True)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("words", DENIED)
+def test_what_is_denied_is_dropped_without_an_error(made: Path, mode: str, words: str) -> None:
+    shown = explain(made / mode, *words.split(), "--vendor", "zenoh")
+    assert shown.status == 1
+    assert "silently dropped" in shown.out
+    found = zenoh(made / mode, *words.split())
+    assert found["outcome"] == "dropped"
+    assert found["change"], found
+    for link in found["links"]:
+        enforcers = {each["enforcer"] for each in link["checks"] if not each["allowed"]}
+        # In client mode also the session itself, in peer mode the other session alone.
+        assert enforcers == set(link["enclaves"][:2] if mode == "client" else link["enclaves"][1:])
+
+
+def test_each_link_is_shown_with_who_enforces_it_by_which_rule(made: Path) -> None:
+    shown = explain(made / "client", "/talker", "publish", "/chatter", "--vendor", "zenoh").ok()
+    assert shown.out.startswith(
+        "yes: /talker may publish topic /chatter, on Zenoh in client mode (as asked)\n"
+    )
+    assert "put 0/chatter/type/hash: leaving /talker by rule /router#" in shown.out
+    assert ", entering /router by rule /talker#" in shown.out
+    assert "heard by  /listener, /recorder" in shown.out
+
+
+def test_the_line_of_the_policy_is_shown(made: Path) -> None:
+    policy = made / "policy.xml"
+    asked = (made / "client", "/talker", "publish", "/chatter", "--policy", policy)
+    shown = explain(*asked, "--vendor", "zenoh").ok()
+    assert f"from      {policy}:1: ALLOW publish /chatter" in shown.out
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_a_wildcard_reaches(made: Path, mode: str) -> None:
+    """A put on all of /cam* gets to whom may subscribe to as much, and to nobody else."""
+    found = zenoh(made / mode, "/wide", "publish", "/camera")
+    assert found["wildcards"] == [{"expression": "0/cam$*/*/*/**", "reaches": ["/recorder"]}]
+    exact = zenoh(made / mode, "/talker", "publish", "/chatter")
+    assert exact["wildcards"] == []
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_who_may(made: Path, mode: str) -> None:
+    found = zenoh(made / mode, "--who", "subscribe", "/chatter")
+    able = {each["enclave"]: each["wildcard"] for each in found["enclaves"] if each["allowed"]}
+    assert able == {"/listener": None, "/recorder": "0/*/*/*/**"}
+    shown = explain(made / mode, "--who", "subscribe", "/chatter", "--vendor", "zenoh").ok()
+    assert "/recorder  by the wildcard 0/*/*/*/**\n2 of 6 enclaves may\n" in shown.out
+    assert explain(made / mode, "--who", "call", "/nope", "--vendor", "zenoh").status == 1
+
+
+# ── files that are not as they should be ───────────────────────────────────────────────────
+
+
+def test_without_its_file_an_enclave_opens_no_session(keystore: Path) -> None:
+    (keystore / "enclaves/listener/session.json5").unlink()
+    found = zenoh(keystore, "/listener", "subscribe", "/chatter")
+    assert found["outcome"] == "refused"
+    assert "it has no session.json5" in found["text"]
+    assert found["out_of_date"] == ["enclaves/listener/session.json5"]
+    assert "sros zenoh" in found["remedy"]
+    talker = zenoh(keystore, "/talker", "publish", "/chatter")
+    assert talker["allowed"]
+    assert [each["enclave"] for each in talker["reached"] if each["problem"]] == ["/listener"]
+
+
+def test_the_answer_is_by_the_file_as_it_is(keystore: Path) -> None:
+    """Whoever changes the router's file gives rights: the answer says so, and the notes why."""
+    router = keystore / "enclaves/router/router.json5"
+    session = keystore / "enclaves/talker/session.json5"
+    for file in (router, session):
+        file.write_text(file.read_text().replace("0/chatter/", "0/other/"))
+    found = zenoh(keystore, "/talker", "publish", "/other")
+    assert (found["allowed"], found["permitted"]) == (True, False)
+    assert found["unsigned"] == ["/talker/session.json5", "/router/router.json5"]
+    assert found["out_of_date"] == [
+        "enclaves/router/router.json5",
+        "enclaves/talker/session.json5",
+    ]
+    shown = explain(keystore, "/talker", "publish", "/other", "--vendor", "zenoh")
+    for note in ("explain.zenoh-differs", "explain.zenoh-out-of-date", "explain.zenoh-unsigned"):
+        assert f"note [{note}]" in shown.err
+    assert zenoh(keystore, "/talker", "publish", "/chatter")["outcome"] == "dropped"
+
+
+def test_a_file_that_zenoh_does_not_accept(keystore: Path) -> None:
+    (keystore / "enclaves/router/router.json5").write_text('{"mode": "router\x1b"}')
+    shown = explain(keystore, "/talker", "publish", "/chatter", "--vendor", "zenoh")
+    assert shown.status == 1
+    assert "no link to the router /router: Zenoh does not accept its router.json5" in shown.out
+    assert "\x1b" not in shown.out
+
+
+def test_sessions_that_connect_elsewhere_have_no_link(keystore: Path) -> None:
+    file = keystore / "enclaves/talker/session.json5"
+    file.write_text(file.read_text().replace("localhost:7447", "localhost:7448"))
+    found = zenoh(keystore, "/talker", "publish", "/chatter")
+    assert found["outcome"] == "refused"
+    assert "connects to tls/localhost:7448" in found["text"]
+
+
+def test_an_expired_certificate_gets_no_link(made: Path) -> None:
+    found = zenoh(made / "client", "/talker", "publish", "/chatter", "--at", "3y")
+    assert found["outcome"] == "refused"
+    assert "expired" in found["text"]
+
+
+def test_the_router_says_nothing(made: Path) -> None:
+    found = zenoh(made / "client", "/router", "publish", "/chatter")
+    assert (found["outcome"], found["change"]) == ("dropped", None)
+
+
+def test_a_keystore_without_these_files(tmp_path: Path) -> None:
+    sros("create_keystore", tmp_path / "ks").ok()
+    sros("create_enclave", tmp_path / "ks", "/a").ok()
+    asked = (tmp_path / "ks", "/a", "publish", "/x")
+    shown = explain(*asked, "--vendor", "zenoh")
+    assert shown.status == 2
+    assert "has no configurations of Zenoh" in shown.err
+    assert "zenoh" not in explain(*asked).out
+    assert "zenoh" not in json.loads(explain(*asked, "--json").out)
+
+
+# ── next to DDS ────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_answer_for_dds_has_that_of_zenoh_next_to_it(made: Path) -> None:
+    shown = explain(made / "client", "/talker", "publish", "/chatter").ok()
+    assert "\n  zenoh     yes: put 0/chatter/type/hash from /talker: rule " in shown.out
+    denied = explain(made / "client", "/talker", "publish", "/nope")
+    assert "\n  zenoh     no, dropped: " in denied.out
+    compared = explain(made / "client", "/talker", "publish", "/chatter", "--all-vendors").ok()
+    assert "\n  zenoh     yes: " in compared.out
+
+
+def test_zenoh_is_asked_where_ros_uses_it(made: Path) -> None:
+    asked = (made / "client", "/talker", "publish", "/chatter")
+    shown = explain(*asked, env={"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}).ok()
+    assert "on Zenoh in client mode (RMW_IMPLEMENTATION is rmw_zenoh_cpp)" in shown.out
+    dds = explain(*asked, "--vendor", "fastdds", env={"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}).ok()
+    assert "on Fast DDS 2.14 (as asked)" in dds.out
