@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 
-from sros_tool.zenoh.key_expressions import includes
+from sros_tool.zenoh.key_expressions import KeyExpressions
 
 
 class Message(StrEnum):
@@ -81,11 +82,16 @@ class AccessControl:
         return any(
             rule.flow is flow
             and message in rule.messages
-            and any(includes(each, key) for each in rule.key_expressions)
+            and _search(rule.key_expressions).include(key)
             for remote in self.remotes
             if remote.common_name == common_name
             for rule in remote.rules
         )
+
+
+@lru_cache(maxsize=4096)
+def _search(expressions: tuple[str, ...]) -> KeyExpressions:
+    return KeyExpressions(expressions)
 
 
 def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
@@ -99,19 +105,9 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
         found.setdefault((rule.flow, rule.messages), set()).update(rule.key_expressions)
     order = {message: number for number, message in enumerate(Message)}
     return tuple(
-        AccessRule(flow, messages, _needed(keys))
+        AccessRule(flow, messages, tuple(KeyExpressions(keys).needed()))
         for (flow, messages), keys in sorted(
             found.items(),
             key=lambda each: (each[0][0] is Flow.EGRESS, [*map(order.get, each[0][1])]),
-        )
-    )
-
-
-def _needed(keys: set[str]) -> tuple[str, ...]:
-    return tuple(
-        sorted(
-            each
-            for each in keys
-            if not any(other != each and includes(other, each) for other in keys)
         )
     )

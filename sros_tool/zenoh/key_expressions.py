@@ -7,12 +7,14 @@ Source: zenoh.io "Key Expressions"; measured with the wheel 1.10.2.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 
 ANY_PART, ANY_CHUNKS = "$*", "**"
 _ANY_CHUNK = "*"
 _MANY = 65536
+_MOST_COMPARED = 100_000
+"""Most comparisons to leave out what is not needed: parts of a second."""
 
 
 def canonical(chunks: Iterable[str]) -> str:
@@ -37,16 +39,82 @@ def canonical(chunks: Iterable[str]) -> str:
     return "/".join(found)
 
 
-@lru_cache(maxsize=_MANY)
 def includes(wide: str, narrow: str) -> bool:
     """Return whether ``wide`` includes every key that ``narrow`` stands for, as Zenoh decides."""
     if wide == narrow:
         return True
-    # Most expressions differ before their first wildcard; "/**" may stand for nothing.
-    begin, wildcard, _ = wide.partition("*")
-    if not wildcard or not narrow.startswith(begin.rstrip("$/")):
-        return False
-    return _chunks_include(tuple(wide.split("/")), tuple(narrow.split("/")))
+    begin = _fixed_begin(wide)
+    return begin != wide and narrow.startswith(begin) and _includes(wide, narrow)
+
+
+class KeyExpressions:
+    """Key expressions, with a fast search for those that include another one."""
+
+    def __init__(self, expressions: Iterable[str]) -> None:
+        self._all = frozenset(expressions)
+        self._by_begin: dict[str, list[str]] = {}
+        for each in self._all:
+            if (begin := _fixed_begin(each)) != each:
+                self._by_begin.setdefault(begin, []).append(each)
+        self._sizes = sorted({len(each) for each in self._by_begin})
+
+    def include(self, narrow: str) -> bool:
+        """Return whether one of the expressions includes all of ``narrow``."""
+        return narrow in self._all or any(
+            _includes(wide, narrow) for some in self._wider(narrow) for wide in some
+        )
+
+    def needed(self) -> list[str]:
+        """Return the expressions that no other one includes, sorted; all if they are too alike."""
+        compared = sum(len(some) for each in self._all for some in self._wider(each))
+        if compared > _MOST_COMPARED:
+            return sorted(self._all)
+        return sorted(
+            each
+            for each in self._all
+            if not any(
+                wide != each and _includes(wide, each)
+                for some in self._wider(each)
+                for wide in some
+            )
+        )
+
+    def _wider(self, narrow: str) -> Iterator[list[str]]:
+        """Yield the expressions with wildcards that begin as ``narrow`` does."""
+        for size in self._sizes:
+            if size > len(narrow):
+                return
+            if some := self._by_begin.get(narrow[:size]):
+                yield some
+
+
+def _fixed_begin(expression: str) -> str:
+    """Return what every included key begins with; "/**" may stand for nothing."""
+    begin, wildcard, _ = expression.partition("*")
+    return begin.rstrip("$/") if wildcard else expression
+
+
+@lru_cache(maxsize=_MANY)
+def _chunks(expression: str) -> tuple[str, ...]:
+    return tuple(expression.split("/"))
+
+
+def _includes(wide: str, narrow: str) -> bool:
+    some, others = _chunks(wide), _chunks(narrow)
+    anywhere = some.count(ANY_CHUNKS)
+    if anywhere > 1:
+        return _chunks_include(some, others)
+    if not anywhere:
+        return len(some) == len(others) and all(map(_chunk_includes, some, others))
+    before = some.index(ANY_CHUNKS)
+    after = len(some) - before - 1
+    between = len(others) - after
+    return (
+        before <= between
+        and all(map(_chunk_includes, some[:before], others))
+        and all(map(_chunk_includes, some[before + 1 :], others[between:]))
+        and not any(each.startswith("@") for each in others[before:between])
+    )
 
 
 def _chunks_include(wide: Sequence[str], narrow: Sequence[str]) -> bool:

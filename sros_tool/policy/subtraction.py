@@ -1,0 +1,194 @@
+"""Names that an expression matches and others do not, as a union of expressions without exceptions.
+
+For access control that only allows, such as that of Zenoh.  The result is exact on ROS names, whose
+characters are few: "/*" without "/ab" is every name that begins with another letter than a, "/a",
+the names "/a" with another letter than b after it, and the names that go on after "/ab".
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from math import prod
+from string import ascii_letters, digits
+from typing import NamedTuple
+
+from sros_tool.policy.patterns import covers, overlap
+
+IN_PART = "#"
+"""In a result: any characters but "/"; ``*`` stands for any characters, as in policies."""
+
+_LETTERS = "_" + digits + ascii_letters
+_PIECE = re.compile(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
+_RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
+_STARS = re.compile(r"\*\*+")
+_MOST_CHARACTERS = 5_000_000
+"""Most characters that one search compares: about a second."""
+
+
+class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it
+    """The difference is no union of expressions, or of too many; ``denied`` is why, if not ""."""
+
+    def __init__(self, denied: str = "") -> None:
+        """Record the expression that cannot be taken away."""
+        super().__init__(denied)
+        self.denied = denied
+
+
+def listed(expression: str, most: int) -> list[str]:
+    """Return expressions with ``*`` alone that match the same ROS names: one for each choice.
+
+    A ``?`` is any character of ROS names.
+
+    Raises:
+        CannotSubtract: there are more than ``most``.
+    """
+    if "?" not in expression and "[" not in expression:
+        return [_STARS.sub("*", expression)]
+    pieces = [_choices(*each.groups()) for each in _PIECE.finditer(expression)]
+    if prod(map(len, pieces)) > most:
+        raise CannotSubtract
+    names = ("".join(each) for each in product(*pieces))
+    # "/" next to another one or at the end is in no name.
+    found = (_STARS.sub("*", each) for each in names if "//" not in each and each[-1:] != "/")
+    return list(dict.fromkeys(found))
+
+
+def _choices(negated: str, members: str, one: str, text: str) -> Sequence[str]:
+    if text:
+        return [text]
+    if one:
+        return _LETTERS + "/"
+    chosen: set[str] = set()
+    for low, high, single in _RANGE.findall(members):
+        chosen.update([single] if single else map(chr, range(ord(low), ord(high) + 1)))
+    return [each for each in _LETTERS + "/" if (each in chosen) is not bool(negated)]
+
+
+def subtract(wide: str, denied: Iterable[str], most: int) -> list[str]:
+    """Return expressions that match the names that ``wide`` and none of ``denied`` matches.
+
+    All are absolute, with ``*`` as the only wildcard; the results may also have `IN_PART`.
+
+    Raises:
+        CannotSubtract: there are more than ``most``, or a denied expression has text between two
+            stars where ``wide`` has a star, too.
+    """
+    without = tuple(dict.fromkeys(denied))
+    search = _Difference(most, _MOST_CHARACTERS)
+    begins = [wide.removeprefix("*"), f"/{wide}"] if wide.startswith("*") else [wide]
+    try:
+        search.run(
+            [_Place("", begin, without, _LETTERS) for begin in begins if begin.startswith("/")]
+        )
+    except CannotSubtract as error:
+        if error.denied:  # what is left of it after some letters
+            error.denied = next(each for each in without if error.denied in each)
+        raise
+    return list(search.found)
+
+
+class _Place(NamedTuple):
+    """The names that begin with ``read``, and go on as ``wide`` and none of ``denied`` matches.
+
+    ``letters`` are those that the rest of this part of a name may have: names with others have been
+    found already.
+    """
+
+    read: str
+    wide: str
+    denied: tuple[str, ...]
+    letters: str
+
+
+@dataclass
+class _Difference:
+    """The search: names are read from their start, until nothing denied can follow any more.
+
+    Where all that is denied begins with a star, a second search reads backwards from their end.
+    """
+
+    most: int
+    left: int  # characters that may still be compared
+    backwards: bool = False
+    found: dict[str, None] = field(default_factory=dict)
+
+    def run(self, places: list[_Place]) -> None:
+        """Find the names of all places."""
+        seen = set()
+        while places:
+            place = places.pop()
+            if place[:2] not in seen:
+                seen.add(place[:2])
+                places += self._following(place)
+
+    def _following(self, place: _Place) -> Iterable[_Place]:
+        """Keep the names of a place, if one expression matches them; else return its parts."""
+        read, wide, denied, _ = place
+        self.left -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
+        if self.left < 0:
+            raise CannotSubtract
+        denied = tuple(each for each in denied if overlap(each, wide))
+        if not denied:
+            self._keep(read + wide)
+            return ()
+        if any(covers(each, wide) for each in denied):
+            return ()
+        if not wide.startswith("*"):
+            return (_Place(read + wide[0], wide[1:], _after(wide[0], denied), _LETTERS),)
+        starred = [each for each in denied if each.startswith("*")]
+        if starred and all(each in starred or "*" not in each for each in denied):
+            self._keep_backwards(read, wide, denied)
+            return ()
+        return self._by_next_letter(place._replace(denied=denied))
+
+    def _by_next_letter(self, place: _Place) -> Iterator[_Place]:
+        """Divide the names of a place; ``wide`` begins with a star."""
+        read, wide, denied, letters = place
+        rest = wide[1:]
+        parts = [each.partition("/")[0] for each in denied]
+        if rest[:1] in ("", "/") and not any("*" in each for each in parts):
+            # A part with a letter that no denied part has is allowed, whatever its other letters.
+            needed = {letter for each in parts for letter in each}
+            for letter in letters:
+                if letter not in needed:
+                    self._keep(f"{read}{IN_PART}{letter}{wide}")
+            letters = "".join(each for each in letters if each in needed)
+        yield _Place(read, rest, denied, letters)
+        begins = not self.backwards and read.endswith("/")
+        for letter in letters:
+            if not (begins and letter in digits):
+                yield _Place(read + letter, wide, _after(letter, denied), letters)
+        if read and not read.endswith("/"):
+            yield _Place(f"{read}/", wide, _after("/", denied), _LETTERS)
+
+    def _keep_backwards(self, read: str, wide: str, denied: tuple[str, ...]) -> None:
+        if self.backwards:
+            raise CannotSubtract(next(each for each in denied if each.startswith("*"))[::-1])
+        ends = _Difference(self.most, self.left, backwards=True)
+        ends.run([_Place("", wide[::-1], tuple(each[::-1] for each in denied), _LETTERS)])
+        self.left = ends.left
+        for each in ends.found:
+            self._keep(read + each[::-1])
+
+    def _keep(self, expression: str) -> None:
+        """Keep an expression unless it matches no name: with an empty part."""
+        if self.backwards or not ("//" in expression or expression.endswith("/")):
+            self.found[expression] = None
+        if len(self.found) > self.most:
+            raise CannotSubtract
+
+
+def _after(letter: str, expressions: Iterable[str]) -> tuple[str, ...]:
+    """Return what has to follow for the expressions to match, after a letter was read."""
+    found = []
+    for each in expressions:
+        if each.startswith("*"):
+            found.append(each)
+            if each[1:2] == letter:
+                found.append(each[2:])
+        elif each.startswith(letter):
+            found.append(each[1:])
+    return tuple(dict.fromkeys(found))
