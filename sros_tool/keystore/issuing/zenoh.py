@@ -55,6 +55,7 @@ from sros_tool.zenoh.network import ZenohNetwork
 
 _ANY_PORT_HERE = "tls/localhost:0"
 """Where sessions listen for direct connections, as those of rmw_zenoh do: on their own host."""
+_MOST_BYTES = 512 << 20
 _MOST_DOMAINS = 16
 """Most ROS domains of a network: every right is stated once for each."""
 
@@ -199,15 +200,23 @@ def _drifted(
 
     Those of enclaves that are ``gone`` do not count.
     """
-    found: list[Drifted] = []
-    for path, document in wanted.files.items():
-        present = _present(root / path)
-        if present is None:
-            found.append(Drifted(wanted.enclaves[path], path, Drift.MISSING))
-        elif present != document:
-            found.append(Drifted(wanted.enclaves[path], path, Drift.DIFFERS))
-        elif not _is_signed(root / path, document, authority):
-            found.append(Drifted(wanted.enclaves[path], path, Drift.UNSIGNED))
+
+    def compare(paths: Sequence[str]) -> list[Drifted]:
+        found = []
+        for path in paths:
+            document, present = wanted.files[path], _present(root / path)
+            kind = None
+            if present is None:
+                kind = Drift.MISSING
+            elif present != document:
+                kind = Drift.DIFFERS
+            elif not _is_signed(root / path, document, authority):
+                kind = Drift.UNSIGNED
+            if kind:
+                found.append(Drifted(wanted.enclaves[path], path, kind))
+        return found
+
+    found = [each for _, part in map_slices(list(wanted.files), compare) for each in part]
     found += (each for each in _stale(root, wanted.files) if each.enclave not in gone)
     return tuple(found)
 
@@ -251,23 +260,36 @@ def _zenoh_documents(
         )
     names.remove(network.router)
     reader = _RightsReader(root, authority, of_network, change)
-    found: dict[str, RemoteRights | str] = {}
-    for _, part in map_slices(names, reader.read):
-        found |= part
-    remotes = {name: each for name, each in found.items() if isinstance(each, RemoteRights)}
-    left_out = {name: each for name, each in found.items() if isinstance(each, str)}
+    read: dict[str, RemoteRights | str] = {}
+    for _, each in map_slices(names, reader.read):
+        read |= each
+    remotes = {name: each for name, each in read.items() if isinstance(each, RemoteRights)}
+    left_out = {name: each for name, each in read.items() if isinstance(each, str)}
     endpoints = tuple(f"tls/{each}" for each in network.endpoints)
     listening = tuple(f"tls/{each}" for each in network.listening())
     router = Configuration(Mode.ROUTER, listening, (), control_of_router(remotes))
     files = {_router_path(network.router): router.render()}
     enclaves = {_router_path(network.router): network.router}
     direct = network.mode is Mode.PEER
-    for name in remotes:
-        control = control_of_session(name, network.router, remotes, direct=direct)
-        listen = (_ANY_PORT_HERE,) if direct else ()
-        session = Configuration(network.mode, listen, endpoints, control)
-        files[_session_path(name)] = session.render()
-        enclaves[_session_path(name)] = name
+    if direct and len(files[_router_path(network.router)]) * len(remotes) > _MOST_BYTES:
+        raise UsageError(
+            f"the files of {len(remotes)} enclaves would be larger than {_MOST_BYTES >> 20} MB",
+            "In peer mode each has the rights of all enclaves.",
+            f"Take client mode: `sros zenoh {quote(str(root))} --mode client`.",
+        )
+
+    def render(names: Sequence[str]) -> dict[str, bytes]:
+        found = {}
+        for name in names:
+            control = control_of_session(name, network.router, remotes, direct=direct)
+            listen = (_ANY_PORT_HERE,) if direct else ()
+            session = Configuration(network.mode, listen, endpoints, control)
+            found[_session_path(name)] = session.render()
+        return found
+
+    for part, rendered in map_slices(list(remotes), render):
+        files |= rendered
+        enclaves |= zip(rendered, part, strict=True)
     return ZenohDocuments(files, enclaves, left_out)
 
 
