@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from sros_tool.errors import Note
     from sros_tool.keystore.authorities.keyring import Keyring
+    from sros_tool.keystore.issuing.zenoh import KeptZenoh
     from sros_tool.keystore.transaction.stage import Change
 
 
@@ -305,19 +306,26 @@ def print_remarks(remarks: Iterable[Note]) -> None:
         click.echo(visible(remark.text), err=True)
 
 
-def print_restart(names: Sequence[str], *, exported: bool = True) -> None:
+def print_restart(
+    names: Sequence[str], zenoh: KeptZenoh | None = None, *, exported: bool = True
+) -> None:
     """Print on stderr that the processes of the enclaves ``names`` have to be restarted.
 
-    With ``exported`` also that exports of them are out of date.
+    ``zenoh`` says which of them on Zenoh.  With ``exported`` also that exports are out of date.
     """
     if not names:
         return
-    more = len(names) - _MAX_NAMES
-    shown = ", ".join(names[:_MAX_NAMES]) + (f" and {more} more, see --json" if more > 0 else "")
     number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
-    text = f"restart the processes of {number} for it to take effect: {shown}"
+    text = f"restart the processes of {number} for it to take effect: {_some(names)}"
+    if zenoh and zenoh.files and set(zenoh.restart) != set(names):
+        text += f"; of those on Zenoh: {_some(zenoh.restart) or 'none'}"
     again = "; where they run from an export, export them again first" if exported else ""
     click.echo(visible(text + again), err=True)
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - _MAX_NAMES
+    return ", ".join(names[:_MAX_NAMES]) + (f" and {more} more, see --json" if more > 0 else "")
 
 
 def check_output(output: Path, *, force: bool) -> None:

@@ -257,8 +257,7 @@ def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
     for each in result.replaced:
         if text := lasting_text(result.root, each):
             click.echo(visible(text), err=True)
-    if result.restart:
-        print_restart(result.restart)
+    print_restart(result.restart, result.zenoh)
     print_remarks(result.remarks)
     print_notes(result.notes)
 
@@ -278,6 +277,7 @@ def _creation_json(result: Creation, dry_run: bool) -> dict[str, Any]:
         ],
         "rights": as_plain(result.replaced),
         "restart": list(result.restart),
+        "restart_zenoh": list(result.zenoh.restart),
         "changes": changes_json(result.root, result.changes),
         "notes": notes_json((*result.notes, *result.remarks)),
     }
@@ -861,6 +861,7 @@ def _show_update(
                 "replaced_work_until": as_plain(update.works_until),
                 "revoked": update.revoked,
                 "restart": list(update.restart),
+                "restart_zenoh": list(update.zenoh.restart),
                 "changes": changes_json(update.root, update.changes),
                 "notes": notes_json(
                     (
@@ -904,7 +905,7 @@ def _show_update(
             err=True,
         )
     if not dry_run:
-        print_restart(update.restart, exported=False)
+        print_restart(update.restart, update.zenoh, exported=False)
     print_remarks(update.remarks)
     if update.left:
         click.echo(

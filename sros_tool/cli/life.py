@@ -132,6 +132,7 @@ def _renewal_json(result: Renewal, dry_run: bool) -> dict[str, Any]:
         "replaced_work_until": iso(result.works_until) if result.works_until else None,
         "revoked": result.revoked,
         "restart": list(result.restart),
+        "restart_zenoh": list(result.zenoh.restart),
         "changes": changes_json(result.root, result.changes),
         "notes": notes_json((*result.notes, *result.remarks)),
     }
@@ -148,8 +149,7 @@ def _print_replaced(result: Renewal) -> None:
             else f"the replaced certificates work until {end} at the latest"
         )
         click.echo(f"{what}, unless revoked: see --revoke-old", err=True)
-    elif result.restart:
-        print_restart(result.restart)
+    print_restart(result.restart, result.zenoh)
     print_remarks(result.remarks)
 
 
@@ -234,7 +234,7 @@ def revoke(
             click.echo(f"revoked enclave {name}")
     if not dry_run:
         print_closed(root, result.changes)
-    print_restart(result.restart)
+    print_restart(result.restart, result.zenoh)
     print_remarks(result.remarks)
 
 
@@ -248,6 +248,7 @@ def _revocation_json(result: Revocation, reason: str, dry_run: bool) -> dict[str
         "reason": reason,
         "next_update": iso(result.next_update),
         "restart": list(result.restart),
+        "restart_zenoh": list(result.zenoh.restart),
         "changes": changes_json(result.root, result.changes),
         "notes": notes_json(result.remarks),
     }

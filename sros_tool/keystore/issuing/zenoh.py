@@ -87,17 +87,23 @@ class KeptZenoh:
     restart: tuple[str, ...] = ()
     notes: tuple[Note, ...] = ()
 
+    def without(self, names: Collection[str]) -> KeptZenoh:
+        """Return the same without restarting the enclaves ``names``."""
+        return replace(self, restart=tuple(each for each in self.restart if each not in names))
+
 
 @dataclass(frozen=True, slots=True)
 class ZenohChange:
     """What a transaction changes in the enclaves of a keystore, as far as Zenoh depends on it.
 
     ``issued`` are the grants of enclaves with new permissions, ``gone`` the enclaves that are
-    revoked.  ``stated`` are the policies of the enclaves, by whose lines errors are told.
+    revoked, ``replaced`` those whose earlier certificates are.  ``stated`` are the policies of the
+    enclaves, by whose lines errors are told.
     """
 
     issued: Mapping[str, Grant] = field(default_factory=dict)
     gone: Collection[str] = ()
+    replaced: Collection[str] = ()
     stated: Mapping[str, Enclave | None] = field(default_factory=dict)
 
 
@@ -152,7 +158,7 @@ def keep_zenoh(
         {name: path for path, name in wanted.enclaves.items()},
         written,
         tuple(sorted({each.enclave for each in drifts if each.kind is not Drift.UNSIGNED})),
-        (*_left_out_notes(wanted.left_out), *_revoked_names(root, names, now)),
+        (*_left_out_notes(wanted.left_out), *_revoked_names(root, names, now, change.replaced)),
     )
 
 
@@ -490,7 +496,9 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
         )
 
 
-def _revoked_names(root: Path, names: Sequence[str], now: datetime) -> Iterable[Note]:
+def _revoked_names(
+    root: Path, names: Sequence[str], now: datetime, replaced: Collection[str]
+) -> Iterable[Note]:
     """Yield a note on names that revoked certificates have, too, until they expire."""
     entries = read_ledger(root).entries
     revoked = {each.serial for each in entries if each.what == "revocation"}
@@ -503,6 +511,7 @@ def _revoked_names(root: Path, names: Sequence[str], now: datetime) -> Iterable[
             and each.enclave in names
             and each.not_after >= iso(now)
         }
+        | {*replaced}
     )
     if again:
         yield Note(

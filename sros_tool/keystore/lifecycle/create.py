@@ -527,8 +527,9 @@ def write_enclaves(
         permissions.certificate,
         lambda: permissions,
         now,
-        ZenohChange(writer.grants, stated=wanted),
+        ZenohChange(writer.grants, replaced=[e.name for e in superseded], stated=wanted),
     )
+    kept = kept.without(created)  # no process of theirs runs yet
     append(transaction, entries, keystore.authorities.identity, now)
     transaction.commit()
     return Creation(
@@ -549,7 +550,7 @@ def write_enclaves(
             *kept.notes,
         ),
         tuple(each.replaced for each in done.values() if each.replaced),
-        keystore.names if revoked else tuple(e for e in kept.restart if e not in created),
+        keystore.names if revoked else kept.restart,
         revoked.remarks if revoked else (),
         kept,
     )

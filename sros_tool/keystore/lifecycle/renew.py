@@ -60,7 +60,7 @@ class Renewal:
     ``works_until`` is the latest expiry of the replaced certificates, or None if they have expired
     or were revoked.  ``revoked`` is the number of revoked certificates.  ``restart`` are the
     enclaves whose processes trust the revoked certificates until they are restarted.  ``remarks``
-    are notes about open tasks.
+    are notes about open tasks, ``zenoh`` are the configurations for Zenoh.
     """
 
     root: Path
@@ -71,6 +71,7 @@ class Renewal:
     revoked: int = 0
     restart: tuple[str, ...] = ()
     remarks: tuple[Note, ...] = ()
+    zenoh: KeptZenoh = KeptZenoh()  # noqa: RUF009 - frozen
 
 
 def renew(
@@ -159,7 +160,7 @@ def renew(
                 permissions.certificate,
                 lambda: permissions,
                 now,
-                ZenohChange(writer.grants),
+                ZenohChange(writer.grants, replaced=renewed if revoked else ()),
             )
             notes += kept.notes
         append(transaction, entries, authorities.identity, now)
@@ -173,6 +174,7 @@ def renew(
         revoked.count if revoked else 0,
         existing if revoked else kept.restart,
         revoked.remarks if revoked else (),
+        kept,
     )
 
 

@@ -54,7 +54,8 @@ class Revocation:
 
     ``revoked`` are the revoked enclaves.  ``restart`` are the enclaves whose processes trust the
     revoked certificates until they are restarted.  ``next_update`` is the expiry of the revocation
-    list, in UTC.  ``remarks`` are notes about open tasks.
+    list, in UTC.  ``remarks`` are notes about open tasks, ``zenoh`` are the configurations for
+    Zenoh.
     """
 
     root: Path
@@ -63,6 +64,7 @@ class Revocation:
     next_update: datetime
     changes: tuple[Change, ...]
     remarks: tuple[Note, ...] = ()
+    zenoh: KeptZenoh = KeptZenoh()  # noqa: RUF009 - frozen
 
 
 def revoke(
@@ -141,6 +143,7 @@ def revoke(
         next_update,
         tuple(transaction.changes),
         (*lists.remarks, *_remarks_on_lack(root, ledger, present), *kept.notes),
+        kept,
     )
 
 

@@ -165,7 +165,7 @@ class KeystoreUpdate:
     ``rights`` has what enclaves gain and lose.  ``works_until`` is the latest expiry of replaced
     certificates with their permissions, or None if none works.  ``revoked`` is the number of
     revoked certificates.  ``restart`` are the enclaves whose processes have to be restarted,
-    ``remarks`` notes about that and other open tasks.
+    ``remarks`` notes about that and other open tasks; ``zenoh`` are the configurations for Zenoh.
     """
 
     root: Path
@@ -183,6 +183,7 @@ class KeystoreUpdate:
     remarks: tuple[Note, ...]
     changes: tuple[Change, ...]
     notes: tuple[Note, ...] = ()
+    zenoh: KeptZenoh = KeptZenoh()  # noqa: RUF009 - frozen
 
     def looser(self) -> tuple[str, ...]:
         """Return a clause for each thing that becomes possible."""
@@ -563,7 +564,9 @@ class _Updater:
                 self._now,
             )
             entries += revoked.entries
-        kept = self._keep_zenoh() if done else KeptZenoh()
+        kept = KeptZenoh()
+        if done:
+            kept = self._keep_zenoh([each.name for each in superseded] if revoked else ())
         append(self._transaction, entries, self._authorities.identity, self._now)
         rights = tuple(each.rights.revoked() if revoked else each.rights for each in reissued)
         settings = (
@@ -597,9 +600,10 @@ class _Updater:
             tuple(remarks),
             tuple(self._transaction.changes),
             (*(self._writer.notes if reissued else ()), *kept.notes),
+            kept,
         )
 
-    def _keep_zenoh(self) -> KeptZenoh:
+    def _keep_zenoh(self, replaced: Sequence[str]) -> KeptZenoh:
         permissions = self._authorities.permissions
         return keep_zenoh(
             self._transaction,
@@ -608,7 +612,7 @@ class _Updater:
             permissions.certificate,
             lambda: permissions,
             self._now,
-            ZenohChange(self._writer.grants),
+            ZenohChange(self._writer.grants, replaced=replaced),
         )
 
     # ── enclaves ───────────────────────────────────────────────────────────────────────────

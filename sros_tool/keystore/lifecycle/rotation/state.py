@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
@@ -25,7 +26,12 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     list_enclaves,
 )
-from sros_tool.keystore.reader import authority_files, certificates_of, read_certificate
+from sros_tool.keystore.reader import (
+    authority_files,
+    certificates_of,
+    load_settings,
+    read_certificate,
+)
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     digest,
@@ -267,6 +273,12 @@ def _restart_remarks(root: Path, rotation: Rotation) -> list[str]:
         "Cyclone DDS: it trusts one CA at a time, so restart all processes together; processes "
         "before and after the restart do not communicate.",
     ]
+    with suppress(SrosError):  # `check` finds settings that cannot be read
+        if load_settings(root).zenoh:
+            remarks.append(
+                "Zenoh: restart the processes one by one, at any time; processes before and after "
+                "the restart communicate. Continue when all have been restarted."
+            )
     if any(file != "permissions_ca" for file in files):
         remarks.append(
             "Revocations at this stage are signed by both CAs, if the key of the old CA is "
