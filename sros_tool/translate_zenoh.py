@@ -146,6 +146,30 @@ def domains_of(control: AccessControl) -> set[int]:
     return {int(key[1]) for key in asked if len(key) == 3 and key[1].isdecimal()}
 
 
+def stated_names(rules: Iterable[AccessRule]) -> list[tuple[str, str]]:
+    """Return the rights that rules of `remote_of` state, each with its name, sorted.
+
+    A name with wildcards is shown as Zenoh writes it.
+    """
+    marks = {of[0][:2]: right for right, of in _MESSAGES.items()}
+    return sorted(
+        {
+            (marks[rule.flow, rule.messages], _name_in(key))
+            for rule in rules
+            if (rule.flow, rule.messages) in marks
+            for key in rule.key_expressions
+        }
+    )
+
+
+def _name_in(key: str) -> str:
+    """Return the name in the key expression of a right, without domain, type and hash."""
+    chunks = key.split("/")[1:]
+    last = chunks[-1:] if chunks[-1] == ANY_CHUNKS else []  # canonical: behind type and hash
+    name = chunks[: len(chunks) - len(last) - len(_ANY_TYPE)]
+    return "/".join(["", *name, *last])
+
+
 def control_of_router(remotes: Mapping[str, RemoteRights]) -> AccessControl:
     """Return what the router enforces: the rights of every enclave, by the enclave's name."""
     return AccessControl(tuple(remotes[each] for each in sorted(remotes)))

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from sros_tool.cli.common import PATH, json_option, now, print_json, visible
+from sros_tool.cli.common import PATH, json_option, now, print_json, visible, visible_line
 from sros_tool.values import as_plain
 
 _INDENT = "  "
@@ -47,9 +47,10 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
     """Show the contents of PATH.
 
     PATH is a keystore, an enclave's folder, a file of certificates, a revocation list, a private
-    key or a signed document (.p7s). The exit status is 1 if an enclave cannot run, a signature
-    does not verify or is missing (in a .p7s file, or with --ca), a certificate or signed document
-    is missing from the keystore's ledger, or lines of the ledger are missing or were changed.
+    key, a Zenoh configuration or a signed document (.p7s). The exit status is 1 if an enclave
+    cannot run, a signature does not verify or is missing (in a .p7s file, or with --ca), a Zenoh
+    configuration does not fit its signature or its enclave, a certificate or signed document is
+    missing from the keystore's ledger, or lines of the ledger are missing or were changed.
     """
     from sros_tool.errors import DocumentError, UsageError
     from sros_tool.keystore.describe import describe
@@ -63,13 +64,16 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
         raise UsageError(
             f"--ca verifies a signed document, and '{path}' is of the kind {described['kind']}",
             "",
-            "Leave --ca out, or name a governance.p7s or permissions.p7s.",
+            "Leave --ca out, or name a governance.p7s, permissions.p7s or session.p7s.",
         )
     if as_json:
         print_json(described)
     else:
         for line in _TEXT[described["kind"]](described):
-            click.echo(visible(line))
+            click.echo(visible_line(line))
+    zenoh = described.get("zenoh") or described
+    if zenoh.get("problems"):
+        return 1
     if described.get("signed") is False:  # documents in clear, such as governance.xml, exist
         return 1 if authority or path.suffix == ".p7s" else 0
     return 1 if described.get("problems") or described.get("signature_verified") is False else 0
@@ -166,6 +170,10 @@ def _enclave(d: dict[str, Any]) -> Iterator[str]:
     yield f"  domains {d['domains']}"
     for grant in d["permissions"] or ():
         yield from _indented(_grant(grant))
+    if zenoh := d["zenoh"]:
+        yield f"  Zenoh: {', '.join(each['file'] for each in zenoh['files']) or 'NOT USABLE'}"
+        for problem in zenoh["problems"]:
+            yield f"    {problem}"
 
 
 def _certificate(d: dict[str, Any]) -> Iterator[str]:
@@ -220,6 +228,50 @@ def _governance_file(d: dict[str, Any]) -> Iterator[str]:
     yield f"governance {d['path']}"
     yield from _indented(_signature(d))
     yield from _indented(_governance(d))
+
+
+def _zenoh_configuration(d: dict[str, Any]) -> Iterator[str]:
+    yield f"Zenoh configuration {d['path']}"
+    yield from _indented(_signature(d))
+    for problem in d["problems"]:
+        yield f"  {problem}"
+    if not d["made_by_sros"]:
+        yield "  not as sros writes it: see `sros check` of the file"
+    places = [
+        f"{word} {', '.join(d[key])}"
+        for word, key in (("listens at", "listen"), ("connects to", "connect"))
+        if d[key]
+    ]
+    yield f"  {d['mode']}, {', '.join(places) or 'without an endpoint'}"
+    access = d["access_control"]
+    state = "" if access["enabled"] else "OFF: "
+    yield (
+        f"  access control: {state}{_counted(access['rules'], 'rule')} for "
+        f"{_counted(access['subjects'], 'subject')}, everything else: {access['default'].upper()}"
+    )
+    if d["domains"]:
+        yield f"  domain {', '.join(map(str, d['domains']))}"
+    for each in d["rights"]:
+        yield from _indented(_remote(each))
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _remote(d: dict[str, Any]) -> Iterator[str]:
+    if d["own_rights_by_router"]:
+        yield f"through the router {d['enclave']} this enclave may"
+        for kind, rights in sorted(d["may"].items()):
+            for right, names in rights.items():
+                yield f"  {right} {kind}: {', '.join(names)}"
+        return
+    counts = [
+        f"{right} {_counted(len(names), kind.removesuffix('s'))}"
+        for kind, rights in sorted(d["may"].items())
+        for right, names in rights.items()
+    ]
+    yield f"processes of {d['enclave']} may {', '.join(counts) or 'only see the graph'}"
 
 
 def _signature(d: dict[str, Any]) -> Iterator[str]:
@@ -282,4 +334,5 @@ _TEXT = {
     "revocation list": _revocation_list,
     "permissions": _permissions,
     "governance": _governance_file,
+    "Zenoh configuration": _zenoh_configuration,
 }

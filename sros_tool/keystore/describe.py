@@ -12,9 +12,15 @@ from cryptography import x509
 from sros_tool.dds.governance import Governance, parse_governance, values_of
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, SrosError
+from sros_tool.keystore.describe_zenoh import (
+    content_problems,
+    describe_configuration,
+    opened_at,
+)
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     ROLES,
+    ZENOH_SIGNED,
     ca_certificate,
     ca_key,
     is_keystore,
@@ -38,12 +44,14 @@ from sros_tool.validity import iso
 from sros_tool.xml import parse, read_bytes
 
 Description = dict[str, Any]
+_JSON = (".json5", ".json")
 
 
 def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Description:
     """Describe the content of ``path`` as a JSON value; ``kind`` selects the other fields.
 
-    Kinds: keystore, enclave, certificate, revocation list, private key, permissions, governance.
+    Kinds: keystore, enclave, certificate, revocation list, private key, permissions, governance,
+    Zenoh configuration.
 
     Args:
         path: a keystore, the folder of an enclave, or a file of one.
@@ -62,6 +70,7 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
                 "kind": "enclave",
                 "path": str(path),
                 **_describe_enclave(open_enclave(path, now=now)),
+                **_zenoh(path, now),
             }
         refuse_earlier(path)
         raise DocumentError(
@@ -89,9 +98,26 @@ def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Des
         return _signed(path, data, now, authority)
     if data.lstrip()[:1] == b"<":
         return {**_document(data, now), "signed": False, "signature_verified": False}
+    if path.suffix in _JSON or data.lstrip()[:1] == b"{":
+        return _configuration(path, data, now, authority)
     raise DocumentError(
-        "it is neither a PEM certificate, revocation list or key, nor a signed document, nor XML",
+        "it is neither a PEM certificate, revocation list or key, nor a signed document, nor XML, "
+        "nor a Zenoh configuration",
     )
+
+
+def _configuration(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
+    """Describe a Zenoh configuration, with the signature of the same document next to it."""
+    described = describe_configuration(data)
+    signature: Description = {"signed": False, "signature_verified": False}
+    signed = path.with_name(ZENOH_SIGNED.get(path.name, path.name))
+    if signed != path and signed.exists():
+        message = read_bytes(signed, "signed document")
+        signature = _signature(signed, message, now, authority)
+        if smime.parse(message).document.replace(b"\r\n", b"\n") != data:
+            problem = f"it is not the document that was signed in {signed.name}"
+            signature |= {"signature_verified": False, "signature_problem": problem}
+    return {**described, "problems": content_problems(path, now), **signature}
 
 
 def _keystore(root: Path, now: datetime) -> Description:
@@ -140,6 +166,23 @@ def _keystore(root: Path, now: datetime) -> Description:
         "enclaves": enclaves,
         "unreadable": unreadable,
         "problems": problems,
+    }
+
+
+def _zenoh(folder: Path, now: datetime) -> Description:
+    """Describe the Zenoh configurations of an enclave: the files, and what is wrong with them."""
+    opened = opened_at(folder, now)
+    if opened is None or not opened.files:
+        return {"zenoh": None}
+    return {
+        "zenoh": {
+            "files": [
+                {"file": file, "mode": opened.configurations[file].mode.value}
+                for file in opened.files
+                if file in opened.configurations
+            ],
+            "problems": [str(each) for each in opened.problems],
+        }
     }
 
 
@@ -220,6 +263,16 @@ def _revocation_list(crl: RevocationList, now: datetime) -> Description:
 
 
 def _signed(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
+    document = smime.parse(data).document
+    signature = _signature(path, data, now, authority)
+    if document.lstrip()[:1] == b"<":
+        return {**_document(document, now), **signature}
+    described = describe_configuration(document.replace(b"\r\n", b"\n"))
+    return {**described, "problems": content_problems(path, now), **signature}
+
+
+def _signature(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
+    """Describe the signature of the signed document ``data`` at ``path``."""
     signed = smime.parse(data)
     signer = signed.signer()
     found = authority or permissions_ca_for(path)
@@ -234,7 +287,6 @@ def _signed(path: Path, data: bytes, now: datetime, authority: Path | None) -> D
             reason = str(error)
         verified = not reason
     return {
-        **_document(signed.document, now),
         "signed": True,
         **_authority("signer", signer),
         "digest": signed.digest,
