@@ -1337,6 +1337,7 @@ def _finding_lines(finding: LogFinding) -> Iterator[str]:
     yield f"line {finding.line}{by}: {finding.text[:160]}{times}"
     of = f" [{finding.enclave}]" if finding.enclave else ""
     source = finding.vendor.title.split()[0] + " DDS" if finding.vendor else "ROS 2"
+    source = ZENOH_TITLE if finding.zenoh else source
     yield f"  means     {source}{of}: {finding.cause}"
     yield from (f"  found     {each}" for each in finding.found)
     yield f"  remedy    {finding.remedy}"
@@ -1345,7 +1346,7 @@ def _finding_lines(finding: LogFinding) -> Iterator[str]:
 def _finding_json(finding: LogFinding) -> dict[str, Any]:
     return {
         "id": finding.id,
-        "vendor": finding.vendor.value if finding.vendor else None,
+        "vendor": ZENOH if finding.zenoh else finding.vendor.value if finding.vendor else None,
         "line": finding.line,
         "count": finding.count,
         "text": finding.text,

@@ -38,7 +38,15 @@ from sros_tool.runtime.vendor_log import (
     plain_text,
     style_of,
 )
+from sros_tool.runtime.zenoh_log import (
+    ZENOH_IDS,
+    ZENOH_LINE,
+    DroppedMessage,
+    dropped_messages,
+    zenoh_text,
+)
 from sros_tool.translate import SERVICE_ENDS, grant_rights
+from sros_tool.translate_from_zenoh import name_of_key
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """The forms of a topic in a line: without punctuation, or with punctuation of its name."""
@@ -52,9 +60,9 @@ class LogFinding:
     """A message with its cause and remedy, and the causes found in the enclave.
 
     ``line`` is the line number (from 1) of the first of ``count`` messages; ``vendor`` is None for
-    messages of rcl.  ``process`` is the label of the process that printed them, "" without a label.
-    ``enclave`` is "" if the log does not name it.  ``checked`` says whether an
-    enclave was examined, and ``found`` are the true causes found in it.
+    messages of rcl and of Zenoh, which ``zenoh`` tells apart.  ``process`` is the label of the
+    process that printed them, "" without a label.  ``enclave`` is "" if the log does not name it.
+    ``checked`` says whether an enclave was examined, and ``found`` are the true causes found in it.
     """
 
     id: str
@@ -68,6 +76,7 @@ class LogFinding:
     remedy: str
     found: tuple[str, ...] = ()
     checked: bool = False
+    zenoh: bool = False
 
 
 FindEnclave = Callable[[str], LoadedEnclave | None]
@@ -94,6 +103,7 @@ def explain_log(
     hits = _strongest(_hits(_joined(lines)), reported)
     found = [examiner.message(group) for group in _grouped(hits)]
     found += [examiner.denial(each, named) for each, named in denials]
+    found += _dropped(lines, root)
     return tuple(sorted(found, key=lambda each: each.line))
 
 
@@ -181,6 +191,10 @@ def _broken(process: str, line: str, rest: str, following: str) -> str:
 
 def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
     """Return the meaning of a line (``rest`` without its label), and the match, if any."""
+    if found := zenoh_text(line):
+        return found
+    if ZENOH_LINE.search(rest):  # what is not in the table is no trouble of security
+        return UNKNOWN, None
     if found := log_text(line):
         return found
     return UNKNOWN, None if denied_topic(line) else UNKNOWN.pattern.search(rest)
@@ -219,6 +233,75 @@ def _lines_naming(
     return found
 
 
+# ── what Zenoh drops ───────────────────────────────────────────────────────────────────────
+
+_DROPPED: Mapping[tuple[str, bool], str] = {
+    ("Put", True): "publish",
+    ("Delete", True): "publish",
+    ("Declare Subscriber", True): "subscribe",
+    ("Query", True): "call",
+    ("Reply", True): "serve",
+    ("Declare Queryable", True): "serve",
+    ("Put", False): "subscribe",
+    ("Delete", False): "subscribe",
+    ("Declare Subscriber", False): "publish",
+    ("Query", False): "serve",
+    ("Reply", False): "call",
+    ("Declare Queryable", False): "call",
+}
+"""What a remote process may not do whose message is dropped, by its kind, and if it sent it."""
+_GRAPH: Mapping[tuple[str, bool], str] = {
+    ("Liveliness Token", True): "announce this node, topic or service in the graph",
+    ("Liveliness Token", False): "see this node, topic or service in the graph",
+    ("Liveliness Query", True): "ask for the graph",
+    ("Declare Liveliness Subscriber", True): "ask for the graph",
+}
+
+
+def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
+    """Yield what access control of Zenoh dropped: one finding for each right that is missing."""
+    numbered = ((n, *labelled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
+    groups: dict[tuple[str, str, str], list[DroppedMessage]] = {}
+    for each in dropped_messages(numbered):
+        _, name = name_of_key(each.key)
+        right = _DROPPED.get((each.message, each.ingress), "") if name else ""
+        what = f"{right} {name}" if right else _GRAPH.get((each.message, each.ingress), "")
+        what = what or f"pass {each.message} of {each.key}"
+        groups.setdefault((each.process, each.name or each.zid, what), []).append(each)
+    for (process, who, what), found in groups.items():
+        first = found[0]
+        yield LogFinding(
+            "zenoh-dropped",
+            None,
+            first.line,
+            len(found),
+            f"{first.message} ({'ingress' if first.ingress else 'egress'}) on {first.key}",
+            process,
+            first.name,
+            f"{'' if first.name else 'the process with the zid '}{who} may not {what}, by the "
+            "rules of the process that logged it: it drops the message, and nobody else learns it",
+            _of_dropped(first, what, root),
+            zenoh=True,
+        )
+
+
+def _of_dropped(dropped: DroppedMessage, what: str, root: str) -> str:
+    if not dropped.name:
+        return (
+            "The line that says `on Interface(...)+CertCommonName(...)` of this zid has its name; "
+            "without one, no rule is for it."
+        )
+    asked = what if name_of_key(dropped.key)[1] else ""
+    if not asked:
+        return (
+            "If it is an enclave of the keystore, `sros zenoh KEYSTORE --check` shows whether the "
+            "files are up to date."
+        ).replace("KEYSTORE", quote(root) if root else "KEYSTORE")
+    verb, _, name = asked.partition(" ")
+    command = f"sros explain {quote(root) if root else 'KEYSTORE'} {quote(dropped.name)}"
+    return f"`{command} {verb} {quote(name)} --vendor zenoh` shows what is missing in the policy."
+
+
 # ── examining ──────────────────────────────────────────────────────────────────────────────
 
 
@@ -250,6 +333,7 @@ class _Examiner:
             first.enclave,
             first.cause,
             remedy_of,
+            zenoh=meaning.id.startswith(ZENOH_IDS),
         )
         examined = meaning.faults or meaning.id == "service"
         enclave = named if examined else None
