@@ -38,6 +38,9 @@ VERBS = (
     "create_request /s robot",
     "sign_request ks robot/enclaves/r/request.pem -o second.tar.gz --renew",
     "import answer.tar.gz robot",
+    "zenoh ks",
+    "create_permission zenoh /b policy.xml",
+    "revoke zenoh /a",
     "policies --copy copied",
 )
 
@@ -48,11 +51,13 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("full")
     (folder / "policy.xml").write_text(POLICY)
     (folder / "new.xml").write_text(NEW_ENCLAVES)
-    for name in ("ks", "rotated"):
+    for name in ("ks", "rotated", "zenoh"):
         shutil.copytree(made_keystore, folder / name, symlinks=True)
     for verb in (
         "create_enclave ks /b",
+        "create_enclave zenoh /b",
         "rotate_ca rotated --next",
+        "zenoh zenoh --mode peer",
         "create_request /r robot",
         "sign_request ks robot/enclaves/r/request.pem -o answer.tar.gz",
     ):

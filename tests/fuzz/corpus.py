@@ -47,6 +47,22 @@ listener = "viewer"
 talker = "camera"
 expected = "heard"
 """
+_ZENOH = """\
+// as people write it
+{
+  mode: 'peer', connect: { endpoints: { router: [], peer: ["tls/localhost:7447#iface=lo"] } },
+  transport: { link: { tls: { enable_mtls: true, root_ca_certificate: "ca.pem", }, }, },
+  access_control: {
+    enabled: true, default_permission: 'allow',
+    rules: [
+      { id: "r", permission: "deny", flows: ["ingress"], messages: ["put"], key_exprs: ["0/a/**"] },
+      { id: "s", permission: "allow", messages: ["put", "query"], key_exprs: ["0/*/@adv/**"] },
+    ],
+    subjects: [{ id: "all" }, { id: "b", cert_common_names: ["/b"], link_protocols: ["tls"] }],
+    policies: [{ rules: ["r", "s"], subjects: ["all", "b"] }],
+  },
+}
+"""
 _LOG = """\
 [INFO] [launch]: process started with pid [4242]
 [talker-1] 2026-11-22 08:00:00.000 [SECURITY Error] Error creating \
@@ -69,7 +85,7 @@ class Corpus:
 
     @property
     def keystore(self) -> Path:
-        """A keystore in the first stage of a rotation, with a revoked enclave and a policy."""
+        """A keystore in the first stage of a rotation, with a revoked enclave, and with Zenoh."""
         return self.root / "ks"
 
     @property
@@ -99,8 +115,10 @@ def make_corpus(root: Path) -> Corpus:
     policy.write_text(_POLICY)
     (root / "scenario.toml").write_text(_SCENARIO)
     (root / "log").write_text(_LOG)
+    (root / "by_hand.json5").write_text(_ZENOH)
     sros("create_keystore", keystore, "--template", "production").ok()
     sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
+    sros("zenoh", keystore).ok()
     sros("create_enclave", keystore, "/gone").ok()
     sros("revoke", keystore, "/gone").ok()
     sros("create_request", "/r", robot).ok()

@@ -52,6 +52,12 @@ READING = (
     "verify {ks}",
     "env {ks} /a",
     "crl {ks}",
+    "zenoh {ks} --check",
+    "env {ks} /a --rmw rmw_zenoh_cpp",
+    "env {ks} /router --rmw rmw_zenoh_cpp --json",
+    "inspect {ks}/enclaves/a/session.p7s",
+    "explain {ks} /a publish /chatter --vendor zenoh",
+    "check {ks}/enclaves/router/router.json5 --json",
     "crl {ks} --json",
     "rotate_ca {ks}",
     "rotate_ca {ks} --status --json",
@@ -81,6 +87,9 @@ WRITING = (
     "create_keystore {out}/ks --identity-ca {ks}/public/identity_ca.cert.pem "
     "--identity-key file:{ks}/private/identity_ca.key.pem",
     "create_keystore {out}/ks --encrypt-ca-keys",
+    "zenoh {ks}",
+    "zenoh {ks} --mode peer --listen 0.0.0.0:7447",
+    "zenoh {ks} --off",
     "merge_policy {root}/policy.xml {root}/shipped.xml",
 )
 NEIGHBOURS = {

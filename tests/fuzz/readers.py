@@ -12,6 +12,7 @@ from pathlib import Path
 
 from cryptography import x509
 
+from sros_tool.checks.zenoh import document_findings
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
@@ -52,6 +53,7 @@ from sros_tool.policy.rights import policy_rights
 from sros_tool.report.sources import read_source
 from sros_tool.translate import ros_rights
 from sros_tool.validity import Window, iso
+from sros_tool.zenoh.document import parse_configuration
 from tests.fuzz.corpus import PASSPHRASE, Corpus
 
 NOW = datetime(2026, 12, 1, tzinfo=UTC)
@@ -228,6 +230,12 @@ def _ledger(data: bytes, place: Place) -> None:
     history(place.keystore, now=NOW)
 
 
+def _zenoh(data: bytes, place: Place) -> None:
+    document = parse_configuration(data, "drawn")
+    for each in document_findings(document):
+        str(each)
+
+
 def _rotation(data: bytes, place: Place) -> None:
     place.replace("rotation.json", data)
     read_rotation(place.keystore)
@@ -281,6 +289,11 @@ READERS: dict[str, Reader] = {
     "template": Reader(_template, ("ks/sros.toml",), 2),
     "scenario": Reader(_scenario, ("scenario.toml",), 2),
     "ledger": Reader(_ledger, ("ks/ledger.jsonl",)),
+    "Zenoh": Reader(
+        _zenoh,
+        ("ks/enclaves/a/session.json5", "ks/enclaves/router/router.json5", "by_hand.json5"),
+        3,
+    ),
     "rotation": Reader(_rotation, ("ks/rotation.json",)),
     "answer": Reader(_answer, ("answer.tar.gz",)),
     "log": Reader(_log, ("log",), 2),
