@@ -30,8 +30,11 @@ def _complete_scenario(
     _context: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[str]:
     from sros_tool.demo.scenarios import ALL, SCENARIOS
+    from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
 
-    names = [ALL, *(scenario.name for scenario in SCENARIOS)]
+    on_zenoh = _context.params.get("backend") == "zenoh"
+    chosen = ZENOH_SCENARIOS if on_zenoh else SCENARIOS
+    names = [ALL, *(scenario.name for scenario in chosen)]
     return [name for name in names if name.startswith(incomplete)]
 
 
@@ -51,6 +54,7 @@ Example:
   $ sros demo --scenario attacks --keystore ~/robot --summary attacks.md
   $ sros demo --scenario governance --plot cost.svg
   $ sros demo --scenario all
+  $ sros demo --backend zenoh --summary zenoh.md
 
 Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1.
 A row marked "open" shows an attack that is known to succeed, and counts as expected. OPEN
@@ -59,10 +63,10 @@ the template production: the exit status is 1 unless --accept-open names the row
 )
 @click.option(
     "--backend",
-    type=click.Choice(["auto", "rclpy", "cyclone"]),
+    type=click.Choice(["auto", "rclpy", "cyclone", "zenoh"]),
     default="auto",
     show_default=True,
-    help="What the nodes run on; auto uses rclpy if its RMW enforces security.",
+    help="What the nodes run on; auto uses rclpy if its RMW enforces security, else Cyclone DDS.",
 )
 @click.option(
     "--scenario",
@@ -156,24 +160,25 @@ def demo(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Show on a real DDS that nodes without permission cannot communicate with secured nodes.
+    """Show on a real DDS or Zenoh that nodes without permission cannot talk to secured nodes.
 
     Creates keystores, starts nodes with and without them, and compares expected and observed
     results. The scenario `isolation` takes about 10 s on Cyclone DDS and 20 s on rclpy. The
     scenario `attacks` tries all attacks that sros knows, also without the defences that stop them;
-    it takes about 30 s on Cyclone DDS and 60 s on rclpy.
+    it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), all scenarios
+    run, in about 20 s.
     """
     from sros_tool.demo.program import DemoOptions, run_demo
-    from sros_tool.demo.scenarios import SCENARIOS, choose_scenarios
+    from sros_tool.demo.scenarios import choose_scenarios
     from sros_tool.demo.show import demo_table
     from sros_tool.files import replace_file
     from sros_tool.keystore.template import load_template
 
     if list_them:
-        _list(SCENARIOS, as_json)
+        _list(backend, as_json)
         return
     options = DemoOptions(
-        scenarios=choose_scenarios(scenarios),
+        scenarios=choose_scenarios(scenarios, on_zenoh=backend == "zenoh"),
         only=only,
         keystore=keystore,
         accept_open=accept_open,
@@ -215,12 +220,29 @@ def demo(
         sys.exit(1)
 
 
-def _list(scenarios: Sequence[Scenario], as_json: bool) -> None:
+def _list(backend: str, as_json: bool) -> None:
+    """Print the scenarios of a backend, or of all."""
+    from sros_tool.demo.scenarios import SCENARIOS
+    from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
+
+    on_dds = () if backend == "zenoh" else SCENARIOS
+    on_zenoh = ZENOH_SCENARIOS if backend in ("auto", "zenoh") else ()
     if as_json:
-        listed = [{"name": s.name, "title": s.title, "rows": len(s.rows)} for s in scenarios]
+        listed = [
+            {"name": each.name, "title": each.title, "rows": len(each.rows), "zenoh": zenoh}
+            for scenarios, zenoh in ((on_dds, False), (on_zenoh, True))
+            for each in scenarios
+        ]
         print_json({"scenarios": listed})
         return
-    width = max(len(scenario.name) for scenario in scenarios)
+    _echo_scenarios(on_dds)
+    if on_dds and on_zenoh:
+        click.echo("\nwith --backend zenoh:")
+    _echo_scenarios(on_zenoh)
+
+
+def _echo_scenarios(scenarios: Sequence[Scenario]) -> None:
+    width = max((len(scenario.name) for scenario in scenarios), default=0)
     for scenario in scenarios:
         click.echo(f"{scenario.name:<{width}}  {len(scenario.rows):>3} rows  {scenario.title}")
 

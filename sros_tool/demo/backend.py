@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import metadata
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import ProtectionKind
@@ -31,7 +32,7 @@ from sros_tool.runtime.stacks import (
 )
 from sros_tool.translate import governance_for
 
-AUTO, RCLPY, CYCLONE = "auto", "rclpy", "cyclone"
+AUTO, RCLPY, CYCLONE, ZENOH = "auto", "rclpy", "cyclone", "zenoh"
 
 _ASKED = "chosen with --backend"
 _NO_RCLPY = (
@@ -59,7 +60,16 @@ class Backend:
     @property
     def rows_at_once(self) -> int:
         """The number of rows to run in parallel; an rclpy node needs some 0.6 s of CPU to start."""
-        return 4 if self.name == RCLPY else 16
+        return {RCLPY: 4, ZENOH: 8}.get(self.name, 16)
+
+    @property
+    def on_zenoh(self) -> bool:
+        """Whether the nodes run on Zenoh, and not on a DDS."""
+        return self.name == ZENOH
+
+    def wire_name(self, topic: str, domain: int) -> str:
+        """Return the name of a ROS topic in packets."""
+        return f"{domain}{topic}/" if self.on_zenoh else f"rt{topic}"
 
     @property
     def vendor(self) -> Condition | None:
@@ -87,6 +97,12 @@ class Backend:
             return [*program, *options, *naming_arguments(role, names)]
         return [sys.executable, "-P", "-m", "sros_tool.demo.nodes.cyclone", role.value, *options]
 
+    def zenoh_command(self, role: Role, options: Sequence[str], enclave: str) -> list[str]:
+        """Return the command line of a process on Zenoh, and the enclave that it announces."""
+        named = ["--ros-args", "--enclave", enclave, "--"] if enclave else []
+        program = [sys.executable, "-P", "-m", "sros_tool.demo.nodes.zenoh", role.value]
+        return [*program, *options, *named]
+
     def environment(
         self, role: Role, *, wire: bool = False, denied: bool = False, secured: bool = False
     ) -> Mapping[str, str]:
@@ -94,6 +110,8 @@ class Backend:
 
         ``wire`` keeps its messages out of shared memory; ``denied`` makes it log why it is denied.
         """
+        if self.on_zenoh:
+            return {}
         on_ros = self.library(role, secured=secured) == RCLPY
         variables = {RMW: self.rmw} if on_ros and self.rmw else {}
         if on_ros and wire:
@@ -125,6 +143,25 @@ def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:
     if wish == RCLPY:
         raise UnavailableError("no RMW under rclpy enforces security here", reason, _NO_RCLPY)
     return _cyclone(cyclone_stack(probe), reason)
+
+
+def zenoh_backend() -> Backend:
+    """Return the backend that runs the nodes on Zenoh.
+
+    Raises:
+        UnavailableError: the package eclipse-zenoh is not installed.
+    """
+    try:
+        version = metadata.version("eclipse-zenoh")
+    except metadata.PackageNotFoundError:
+        version = ""
+    if not version or importlib.util.find_spec("zenoh") is None:
+        raise UnavailableError(
+            "the demo on Zenoh needs the package eclipse-zenoh",
+            "It is not installed in this Python.",
+            "Install it with `pip install 'sros_tool[zenoh]'`.",
+        )
+    return Backend(ZENOH, f"Zenoh {version}", _ASKED)
 
 
 def _cyclone(stack: Stack, why: str) -> Backend:
@@ -163,7 +200,12 @@ _ENCRYPTING = (ProtectionKind.ENCRYPT, ProtectionKind.ENCRYPT_WITH_ORIGIN_AUTHEN
 
 
 def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Condition]:
-    """Return the conditions that hold for a DDS topic with this backend and template."""
+    """Return the conditions that hold for a DDS topic with this backend and template.
+
+    On Zenoh nothing depends on the template.
+    """
+    if backend.on_zenoh:
+        return frozenset()
     (domain,) = governance_for(template.protection, DomainSet.of((0, 0))).domain_access_rules
     rule = next(each for each in domain.topic_access_rules if matches(each.topic_expression, topic))
     kinds = (

@@ -70,7 +70,8 @@ class KeystoreCopy:
     """A keystore to forge; ``foreign`` is another keystore with the same enclaves.
 
     ``cast`` has the enclave of each part; ``topic`` is the attacked ROS topic, ``domain`` a domain
-    of the keystore; ``keyring`` says where the keys of its CAs are.
+    of the keystore; ``keyring`` says where the keys of its CAs are.  ``router`` is the enclave of
+    the Zenoh router ("": none), which listens at ``endpoint``.
     """
 
     root: Path
@@ -80,6 +81,8 @@ class KeystoreCopy:
     domain: int
     now: datetime
     keyring: Keyring = IN_KEYSTORE
+    router: str = ""
+    endpoint: str = ""
 
     @property
     def dds_topic(self) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
@@ -29,6 +29,7 @@ from sros_tool.demo.scenarios.model import (
     SoundKeystore,
 )
 from sros_tool.demo.scenarios.policies import DENIED_TOPIC, SERVICE
+from sros_tool.demo.zenoh_files import start_network, zenoh_variables
 from sros_tool.errors import SrosError
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
@@ -36,6 +37,8 @@ from sros_tool.keystore.template import Template
 from sros_tool.runtime.environment import DOMAIN, secured_environment
 from sros_tool.runtime.stacks import ProbeEnclave
 from sros_tool.translate import dds_names
+from sros_tool.validity import Window
+from sros_tool.zenoh.configuration import Mode
 
 _RIGHTS = {
     Role.TALKER: "publish",
@@ -47,12 +50,16 @@ _RIGHTS = {
 
 @dataclass(frozen=True)
 class KeystoreSpec:
-    """The input for creating keystores: an absolute ROS topic, domains, a template, the time."""
+    """The input for creating keystores: an absolute ROS topic, domains, a template, the time.
+
+    ``endpoint`` is where a Zenoh router listens.
+    """
 
     topic: str
     domains: DomainSet
     template: Template
     now: datetime
+    endpoint: str = "localhost:7447"
 
 
 @dataclass(frozen=True)
@@ -61,13 +68,16 @@ class KeystoreSet:
 
     ``missing`` has the reason for each keystore that could not be made.  The scenario's own
     keystore is a copy of the ``user`` keystore, if given: that copy and its forgeries have the
-    cast of ``user``, the other keystores have ``cast``.
+    cast of ``user``, the other keystores have ``cast``.  With a ``router``, the name of an
+    enclave, the processes run on Zenoh.  ``copies`` has the forged keystores.
     """
 
     keystores: Mapping[KeystoreChoice, Path]
     cast: Mapping[str, str] = field(default_factory=dict)
     missing: Mapping[KeystoreChoice, str] = field(default_factory=dict)
     user: UserKeystore | None = None
+    router: str = ""
+    copies: Mapping[KeystoreChoice, KeystoreCopy] = field(default_factory=dict)
 
     def topic(self, party: Party, topic: str) -> str:
         """Return the ROS topic, service or action of a party; ``topic`` is the demo's topic."""
@@ -91,8 +101,35 @@ class KeystoreSet:
         if identity.keystore is None:
             return {DOMAIN: str(domain)}
         root = self.keystores[identity.keystore]
-        secured = secured_environment(root, self.enclave(identity), domain)
-        return secured | dict(identity.variables)
+        name = self.enclave(identity)
+        if self.router:
+            router = name == self.router
+            return zenoh_variables(root, name, domain, router=router, lawless=identity.lawless)
+        return secured_environment(root, name, domain) | dict(identity.variables)
+
+    def announced(self, party: Party) -> str:
+        """Return the enclave that a party names to others, or ""."""
+        if party.announced:
+            return self.enclave(Identity(OWN, party.announced))
+        return self.enclave(party.identity) if party.identity.keystore is not None else ""
+
+    def shorten(self, identity: Identity, lifetime: int, elapsed: float) -> float:
+        """Give the enclave of an identity a certificate that expires in ``lifetime`` seconds.
+
+        ``elapsed`` is the time since the keystores were made.  Returns in how many seconds the
+        certificate expires: a certificate has whole seconds.
+        """
+        assert identity.keystore is not None
+        copy = self.copies[identity.keystore]
+        now = copy.now + timedelta(seconds=elapsed)
+        expiry = (now + timedelta(seconds=lifetime)).replace(microsecond=0)
+        copy.reissue(identity.enclave, Window(now - timedelta(days=1), expiry))
+        return (expiry - now).total_seconds()
+
+    def change(self, identity: Identity, forge: Forge) -> None:
+        """Change the keystore of an identity."""
+        assert identity.keystore is not None
+        forge(self.copies[identity.keystore])
 
     def node_names(self, party: Party) -> tuple[str, ...]:
         """Return absolute names for a party's ROS nodes, chosen so that its enclave allows them."""
@@ -193,13 +230,14 @@ def create_keystores(
     else:
         user.copy(keystores[OWN])
     missing: dict[KeystoreChoice, str] = {}
+    copies: dict[KeystoreChoice, KeystoreCopy] = {}
     for choice in _forgeries_of(scenario):
         root = keystores[choice] = folder / "forged" / name_of(choice)
         try:
-            _forge(choice, root, keystores, scenario, spec, user)
+            copies[choice] = _forge(choice, root, keystores, scenario, spec, user)
         except SrosError as error:
             missing[choice] = str(error)
-    return KeystoreSet(keystores, scenario.cast, missing, user)
+    return KeystoreSet(keystores, scenario.cast, missing, user, scenario.router, copies)
 
 
 def create_scenario_keystore(root: Path, scenario: Scenario, spec: KeystoreSpec) -> None:
@@ -209,6 +247,8 @@ def create_scenario_keystore(root: Path, scenario: Scenario, spec: KeystoreSpec)
         generate_artifacts(root, policies=[scenario.policy(spec.topic)], now=spec.now)
     if scenario.unpermitted:
         create_enclaves(root, scenario.unpermitted, now=spec.now)
+    if scenario.router:
+        start_network(root, scenario.router, spec.endpoint, Mode.PEER, spec.now)
 
 
 def _forgeries_of(scenario: Scenario) -> list[Forge | Undefended]:
@@ -227,8 +267,8 @@ def _forge(
     scenario: Scenario,
     spec: KeystoreSpec,
     user: UserKeystore | None,
-) -> None:
-    """Make one forged keystore in ``root``."""
+) -> KeystoreCopy:
+    """Make one forged keystore in ``root``, and return it."""
     cast, keyring = scenario.cast, IN_KEYSTORE
     if isinstance(choice, Undefended):
         weakened = replace(spec, template=choice.template(spec.template))
@@ -241,4 +281,9 @@ def _forge(
         if user is not None:
             cast, keyring = user.cast, user.keyring()
     domain = next(iter(spec.domains))
-    forge(KeystoreCopy(root, keystores[FOREIGN], cast, spec.topic, domain, spec.now, keyring))
+    foreign = keystores[FOREIGN]
+    copy = KeystoreCopy(
+        root, foreign, cast, spec.topic, domain, spec.now, keyring, scenario.router, spec.endpoint
+    )
+    forge(copy)
+    return copy

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 import signal
+import socket
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -16,7 +19,15 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
-from sros_tool.demo.backend import AUTO, RCLPY, Backend, choose_backend, conditions
+from sros_tool.demo.backend import (
+    AUTO,
+    RCLPY,
+    ZENOH,
+    Backend,
+    choose_backend,
+    conditions,
+    zenoh_backend,
+)
 from sros_tool.demo.casting import UserKeystore, open_user_keystore
 from sros_tool.demo.cost import Effort, measure_cost
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
@@ -24,8 +35,9 @@ from sros_tool.demo.network import Progress, run_isolated
 from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.isolation import ISOLATION
-from sros_tool.demo.scenarios.model import Row, Scenario
+from sros_tool.demo.scenarios.model import Row, Scenario, joined
 from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, check_topic
+from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.runtime.netns import Isolation, try_isolation
@@ -36,6 +48,12 @@ _DEFAULT_DOMAIN = 80
 """The first domain of the rows: below 102, where Linux assigns no ports by itself."""
 
 _DEFAULT_TEMPLATE = "production"
+
+_ENDPOINT = "localhost:7447"
+"""Where Zenoh routers listen, each in a network of its own."""
+
+_ZENOH_WINDOW = 2.0
+"""Seconds in which a row on Zenoh observes silence."""
 
 _HOST = "host"
 """The value of --network for the network of this machine."""
@@ -74,23 +92,34 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
         SrosError: a keystore could not be made.
     """
     _check_accepted(options)
+    zenoh = zenoh_backend() if options.backend == ZENOH else None
+    if zenoh and options.keystore is not None:
+        raise UsageError(
+            "--keystore cannot be used with --backend zenoh",
+            "The demo on Zenoh attacks keystores of its own.",
+            "Leave out one of them.",
+        )
     user = _user_keystore(options)
     template = options.template or (user.template if user else load_template(_DEFAULT_TEMPLATE))
     topic = options.topic
     topic = check_topic((user.topic if user else DEFAULT_TOPIC) if topic is None else topic)
     scenarios = _with_chosen_rows(options)
     isolation = _isolation(options.network)
-    domains = [_domains(scenario, options, user, isolation) for scenario in scenarios]
+    groups = [joined(scenarios)] if zenoh else list(scenarios)
+    domains = [_domains(scenario, options, user, isolation) for scenario in groups]
+    started = time.monotonic()
     results: list[ScenarioResult] = []
     with _ended_by_signals(), _folder(options.keep) as folder:
-        progress("looking for a DDS that enforces security")
-        backend = _find_backend(options.backend, folder, topic, now)
-        for scenario, row_domains in zip(scenarios, domains, strict=True):
-            scenario_folder = folder if len(scenarios) == 1 else folder / scenario.name
+        if zenoh is None:
+            progress("looking for a DDS that enforces security")
+        backend = zenoh or _find_backend(options.backend, folder, topic, now)
+        for scenario, row_domains in zip(groups, domains, strict=True):
+            scenario_folder = folder if len(groups) == 1 else folder / scenario.name
             keystore_domains = (
                 user.domains if user else DomainSet.of((row_domains[0], row_domains[-1]))
             )
-            spec = KeystoreSpec(topic, keystore_domains, template, now)
+            endpoint = _ENDPOINT if isolation.isolated else f"localhost:{_free_port()}"
+            spec = KeystoreSpec(topic, keystore_domains, template, now, endpoint)
             rows = tuple(_expected(row, backend, template, topic) for row in scenario.rows)
             if user:
                 strong = load_template(_DEFAULT_TEMPLATE)
@@ -111,8 +140,9 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 keystores=keystores,
                 topic=topic,
                 folder=scenario_folder / "rows",
-                limits=options.limits,
+                limits=replace(options.limits, window=_ZENOH_WINDOW) if zenoh else options.limits,
                 own_networks=isolation.isolated,
+                started=started,
             )
             row_results = run_isolated(partial(run_rows, plan), isolation, progress)
             cost = None
@@ -121,6 +151,9 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                     measure_cost, plan, scenario.measured, scenario_folder / "cost", options.effort
                 )
                 cost = run_isolated(measuring, isolation, progress)
+            if zenoh:
+                results += _parted(scenarios, row_results)
+                continue
             cast = keystores.members(scenario.rows, on_ros=backend.name == RCLPY) if user else ()
             results.append(
                 ScenarioResult(scenario.name, scenario.title, tuple(row_results), cost, cast)
@@ -130,6 +163,14 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             text = json.dumps(versioned(result.as_json()), indent=2) + "\n"
             (folder / "result.json").write_text(text, encoding="utf-8")
     return result
+
+
+def _parted(scenarios: Sequence[Scenario], rows: Sequence[RowResult]) -> Iterator[ScenarioResult]:
+    """Yield the results of scenarios whose rows ran together, in order."""
+    left = iter(rows)
+    for scenario in scenarios:
+        own = tuple(itertools.islice(left, len(scenario.rows)))
+        yield ScenarioResult(scenario.name, scenario.title, own)
 
 
 def _expected(row: Row, backend: Backend, template: Template, topic: str) -> Row:
@@ -237,6 +278,14 @@ def _domains(
                 "Run it as root, or where unprivileged user namespaces are allowed.",
             )
         return (next(iter(user.domains)),) * len(scenario.rows)
+    if scenario.router:  # every row has a router of its own
+        if not 0 <= options.domain <= MAX_DOMAIN:
+            raise UsageError(
+                f"the demo cannot run in domain {options.domain}",
+                f"The highest domain is {MAX_DOMAIN}.",
+                f"Choose a domain from 0 to {MAX_DOMAIN}.",
+            )
+        return (options.domain,) * len(scenario.rows)
     last = MAX_DOMAIN - len(scenario.rows) + 1
     if not 0 <= options.domain <= last:
         raise UsageError(
@@ -291,6 +340,14 @@ def _ended_by_signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _free_port() -> int:
+    """Return a TCP port of this host that nobody uses now."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port: int = free.getsockname()[1]
+        return port
 
 
 def _isolation(network: str) -> Isolation:

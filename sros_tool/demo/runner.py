@@ -12,19 +12,21 @@ import logging
 import math
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import time
 import uuid
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.keystores import KeystoreSet
 from sros_tool.demo.network import ENDING_SIGNALS, Progress, RowNetwork, end_with_starter
 from sros_tool.demo.scenarios.model import (
+    CALLING,
     DENIALS,
     SPEAKING,
     Claim,
@@ -33,9 +35,24 @@ from sros_tool.demo.scenarios.model import (
     Role,
     Row,
     Wire,
+    together,
 )
-from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, judge_row
-from sros_tool.demo.wire import Injection, Wiretap, forged_text, udp_ports, with_replaced_text
+from sros_tool.demo.verdict import (
+    PartyRecord,
+    RowRecord,
+    RowResult,
+    expired_too_early,
+    judge_row,
+)
+from sros_tool.demo.wire import (
+    Injection,
+    Wiretap,
+    bound_ports,
+    clean_shared_memory,
+    forged_text,
+    shared_memory,
+    with_replaced_text,
+)
 from sros_tool.runtime.events import Event, EventKind, EventReader
 from sros_tool.runtime.vendor_log import plain_text
 
@@ -46,6 +63,13 @@ _TICK = 0.05
 
 _GRACE = 0.3
 """Seconds for messages that are on their way when a window closes."""
+
+_LIFETIMES = (8, 20, 60)
+"""Seconds of a short-lived certificate; the next one if it expired before it was used."""
+
+_AFTER_EXPIRY = 2.0
+_SECONDS_TO_CONNECT = 2.0
+"""Seconds that a process tries to connect which is expected to be refused."""
 
 _ENOUGH_MESSAGES = 3
 _AFTER_ENOUGH = 2.0
@@ -85,6 +109,13 @@ class RunPlan:
     limits: Limits = field(default_factory=Limits)
     period: float = 0.1
     own_networks: bool = False
+    started: float = field(default_factory=time.monotonic)
+
+    @property
+    def rows_at_once(self) -> int:
+        """The number of worlds to run in parallel."""
+        # Routers of one machine listen at the same port.
+        return 1 if self.backend.on_zenoh and not self.own_networks else self.backend.rows_at_once
 
 
 def run_rows(plan: RunPlan, progress: Progress) -> list[RowResult]:
@@ -99,61 +130,83 @@ class _Runner:
         self._plan = plan
         self._progress = progress
         self._mark = uuid.uuid4().hex[:8]
-        self._slots = asyncio.Semaphore(plan.backend.rows_at_once)
+        self._slots = asyncio.Semaphore(plan.rows_at_once)
         self._end = 0.0
         self._finished = 0
 
     async def run(self) -> list[RowResult]:
         plan = self._plan
-        waves = math.ceil(len(plan.rows) / plan.backend.rows_at_once)
+        groups = worlds(plan.rows)
+        waves = math.ceil(len(groups) / plan.rows_at_once)
         self._end = time.monotonic() + max(plan.limits.total, waves * plan.limits.wave)
         loop, task = asyncio.get_running_loop(), asyncio.current_task()
         assert task is not None
         for number in ENDING_SIGNALS:
             loop.add_signal_handler(number, task.cancel)
-        return await asyncio.gather(*map(self._run_row, range(len(self._plan.rows))))
+        results = [each for done in await asyncio.gather(*map(self._run, groups)) for each in done]
+        order = [index for group in groups for index in group]
+        return [result for _, result in sorted(zip(order, results, strict=True), key=_first)]
 
     def _text(self, index: int, party: Party) -> str:
         """Return the text of a talker, which is unique among all rows."""
         return f"Hello World from the {party.name} {self._mark}-{index}"
 
-    async def _run_row(self, index: int) -> RowResult:
-        row, domain = self._plan.rows[index], self._plan.domains[index]
-        skipped = self._why_skipped(row)
-        if skipped:
-            record = RowRecord(row, domain, skipped=skipped)
-        else:
+    async def _run(self, group: Sequence[int]) -> list[RowResult]:
+        """Run rows that share their processes; return their results in order."""
+        rows, domain = [self._plan.rows[index] for index in group], self._plan.domains[group[0]]
+        skipped = {row.name: why for row in rows if (why := self._why_skipped(row))}
+        tried = [row for row in rows if row.name not in skipped]
+        played = RowRecord(rows[0], domain)
+        if tried:
             async with self._slots:
-                record = await self._play(index)
-        result = judge_row(record)
-        self._finished += 1
-        self._progress(
-            f"[{self._finished}/{len(self._plan.rows)}] {row.name}: {result.observed.value}"
-        )
-        return result
+                for lifetime in _LIFETIMES:
+                    played = await self._play(group[0], together(tried), lifetime)
+                    if not (tried[0].short_lived and expired_too_early(played)):
+                        break
+        results = []
+        for row in rows:
+            record = replace(played, row=row, skipped=skipped.get(row.name, played.skipped))
+            results.append(judge_row(record))
+            self._finished += 1
+            self._progress(
+                f"[{self._finished}/{len(self._plan.rows)}] {row.name}: {results[-1].observed}"
+            )
+        return results
 
     def _why_skipped(self, row: Row) -> str:
-        handshake = any(claim.wire is not Wire.TEXT for claim in row.claims)
+        handshake = any(claim.wire in (Wire.TOPIC, Wire.CERTIFICATE) for claim in row.claims)
         if (handshake or row.replay or row.impersonate) and not self._plan.own_networks:
             return "the row needs a separate network namespace"
         return self._plan.keystores.problem(row, self._plan.topic)
 
-    async def _play(self, index: int) -> RowRecord:
-        row, domain = self._plan.rows[index], self._plan.domains[index]
-        folder = self._plan.folder / f"row_{index + 1:02}"
+    async def _play(self, index: int, row: Row, lifetime: int) -> RowRecord:
+        plan, domain = self._plan, self._plan.domains[index]
+        folder = plan.folder / f"row_{index + 1:02}"
+        shutil.rmtree(folder, ignore_errors=True)  # of a run with a shorter lifetime
         folder.mkdir(parents=True)
+        expiry = None
+        if row.short_lived:
+            seconds = plan.keystores.shorten(row.talking.identity, lifetime, self._elapsed())
+            expiry = time.monotonic() + seconds
         processes: dict[str, _PartyProcess] = {}
         tap: Wiretap | None = None
         network = RowNetwork(own=self._plan.own_networks)
         try:
             with network.entered():
                 if row.tapped:
-                    tap = self._listen_in(index)
+                    tap = self._listen_in(index, row)
                     if tap.problem:
                         return RowRecord(row, domain, skipped=tap.problem)
-                for party in row.parties:
-                    processes[party.name] = self._start(index, party, domain, folder)
-            window = await self._watch(row, processes)
+            for turn in sorted({party.turn for party in row.parties}):
+                await self._settled(processes.values())
+                with network.entered():
+                    for party in row.parties:
+                        if party.turn == turn:
+                            started = self._start(index, row, party, folder)
+                            processes[party.name] = started
+            window = await self._watch(row, processes, expiry)
+            texts = {name: process.text for name, process in processes.items()}
+            memory = shared_memory(texts) if _in_memory(row) else {}
             ports = frozenset[int]().union(*(each.ports() for each in processes.values()))
             wire = tap.count(ports) if tap and row.wire else {}
             injected = None
@@ -167,32 +220,49 @@ class _Runner:
             finally:
                 for process in processes.values():
                     process.end()
+                if _in_memory(row):
+                    clean_shared_memory(process.text for process in processes.values())
                 if tap is not None:
                     tap.close()
                 network.close()
         records = {name: process.record() for name, process in processes.items()}
-        return RowRecord(row, domain, records, window, wire, injected)
+        return RowRecord(row, domain, records, window, wire, injected, expiry, memory)
 
-    def _listen_in(self, index: int) -> Wiretap:
-        row = self._plan.rows[index]
+    def _elapsed(self) -> float:
+        """Return the seconds since the plan was made."""
+        return time.monotonic() - self._plan.started
+
+    async def _settled(self, processes: Collection[_PartyProcess]) -> bool:
+        """Wait until all processes are settled; return False if that takes too long."""
+        deadline = min(time.monotonic() + self._plan.limits.start, self._end)
+        while not all(process.settled for process in processes):
+            if time.monotonic() > deadline:
+                return False
+            await asyncio.sleep(_TICK)
+        return True
+
+    def _listen_in(self, index: int, row: Row) -> Wiretap:
         texts = {party.name: self._text(index, party) for party in row.parties}
-        topic = f"rt{self._plan.topic}"
+        topic = self._plan.backend.wire_name(self._plan.topic, self._plan.domains[index])
         return Wiretap(texts, topic, replayed=bool(row.replay or row.impersonate))
 
-    def _start(self, index: int, party: Party, domain: int, folder: Path) -> _PartyProcess:
-        plan, row = self._plan, self._plan.rows[index]
+    def _start(self, index: int, row: Row, party: Party, folder: Path) -> _PartyProcess:
+        plan, domain = self._plan, self._plan.domains[index]
         topic = plan.keystores.topic(party, plan.topic)
         options = ["--topic", topic, "--period", str(plan.period)]
         text = self._text(index, party)
-        if party.role in SPEAKING:
+        if party.role in SPEAKING or (plan.backend.on_zenoh and party.role in CALLING):
             options += ["--text", text]
         if party.role is Role.ACTION_CLIENT:
             servers = [each for each in row.parties if each.role is Role.ACTION_SERVER]
             options += ["--server", self._text(index, servers[0])] if len(servers) == 1 else []
         if party.role is Role.OBSERVER:
             for other in row.parties:
-                if other.role is Role.TALKER and other.other_topic:
+                if other.role is Role.TALKER and (other.other_topic or other.topic):
                     options += ["--also", plan.keystores.topic(other, plan.topic)]
+        if plan.backend.on_zenoh:
+            options += ["--size", str(party.size)] if party.size else []
+            options += ["--patience", str(_SECONDS_TO_CONNECT)] if _is_refused(party, row) else []
         environment = base_environment(os.environ)
         secured = party.identity.keystore is not None
         denied = any(
@@ -208,8 +278,11 @@ class _Runner:
             secured=secured,
         )
         environment |= plan.keystores.environment(party.identity, domain)
-        names = plan.keystores.node_names(party)
-        command = backend.command(party.role, options, names, secured=secured)
+        if backend.on_zenoh:
+            command = backend.zenoh_command(party.role, options, plan.keystores.announced(party))
+        else:
+            names = plan.keystores.node_names(party)
+            command = backend.command(party.role, options, names, secured=secured)
         return _PartyProcess(
             party.name,
             command,
@@ -221,26 +294,27 @@ class _Runner:
         )
 
     async def _watch(
-        self, row: Row, processes: Mapping[str, _PartyProcess]
+        self, row: Row, processes: Mapping[str, _PartyProcess], expiry: float | None
     ) -> tuple[float, float] | None:
         limits = self._plan.limits
-        deadline = min(time.monotonic() + limits.start, self._end)
-        while not all(process.settled for process in processes.values()):
-            if time.monotonic() > deadline:
-                return None
-            await asyncio.sleep(_TICK)
+        if not await self._settled(processes.values()):
+            return None
         if _is_decided_by_start(row):
             now = time.monotonic()
             return now, now
         needed = [processes[party.name] for party in row.parties if not party.intruder]
         if not all(process.running for process in needed):
             return None
+        if row.meanwhile is not None:
+            self._plan.keystores.change(row.party(row.claims[0].subject).identity, row.meanwhile)
         start = time.monotonic()
-        shortest = min(start + limits.window, self._end)
-        longest = min(start + limits.longest_window, self._end)
+        shortest = max(start + limits.window, (expiry or 0.0) + _AFTER_EXPIRY)
+        shortest = min(shortest, self._end)
+        longest = min(max(start + limits.longest_window, shortest), self._end)
         claims = (*row.claims, *row.controls)
         positive = [claim for claim in claims if claim.holds]
-        silence = not row.brief or any(_awaits_silence(claim, row, processes) for claim in claims)
+        silence = not row.brief or expiry is not None
+        silence = silence or any(_awaits_silence(claim, row, processes) for claim in claims)
         enough_at = None
         while True:
             now = time.monotonic()
@@ -260,7 +334,7 @@ class _Runner:
     def _is_met(self, claim: Claim, processes: Mapping[str, _PartyProcess]) -> bool:
         """Return whether a claim that something happens was observed often enough."""
         events = processes[claim.subject].look()
-        if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED):
+        if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED, Relation.EXECUTES):
             mark = f"{processes[claim.talker].text}: "
             heard = [e for e in events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
             return len(heard) >= _ENOUGH_MESSAGES
@@ -276,6 +350,30 @@ def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProces
         return False
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
     return claim.denied not in DENIALS or all(processes[name].running for name in names)
+
+
+def _first(pair: tuple[int, RowResult]) -> int:
+    return pair[0]
+
+
+def worlds(rows: Sequence[Row]) -> list[list[int]]:
+    """Return the places of the rows, those that share a world together."""
+    groups: dict[object, list[int]] = {}
+    for index, row in enumerate(rows):
+        groups.setdefault(row.world or index, []).append(index)
+    return list(groups.values())
+
+
+def _in_memory(row: Row) -> bool:
+    return any(claim.wire is Wire.MEMORY for claim in row.claims)
+
+
+def _is_refused(party: Party, row: Row) -> bool:
+    """Return whether a row expects that a party gets no connection."""
+    return any(
+        claim.denied and party.intruder and party.name in (claim.subject, claim.talker)
+        for claim in row.claims
+    )
 
 
 def _is_decided_by_start(row: Row) -> bool:
@@ -336,6 +434,10 @@ _PREFIXES_LEFT_OUT = ("ROS_SECURITY_",)
 _VARIABLES_LEFT_OUT = frozenset(
     {
         "CYCLONEDDS_URI",
+        "RUST_LOG",
+        "ZENOH_CONFIG_OVERRIDE",
+        "ZENOH_ROUTER_CONFIG_URI",
+        "ZENOH_SESSION_CONFIG_URI",
         "FASTDDS_BUILTIN_TRANSPORTS",
         "FASTDDS_DEFAULT_PROFILES_FILE",
         "FASTRTPS_DEFAULT_PROFILES_FILE",
@@ -426,8 +528,8 @@ class _PartyProcess:
         return self._own_status is not None
 
     def ports(self) -> frozenset[int]:
-        """Return the UDP ports that the process has bound, or had bound at the last call."""
-        self._ports = udp_ports(self._process.pid) or self._ports
+        """Return the ports that the process has bound, or had bound at the last call."""
+        self._ports = bound_ports(self._process.pid) or self._ports
         return self._ports
 
     def ask_to_end(self) -> None:

@@ -56,7 +56,9 @@ class RowRecord:
 
     ``window`` has start and end of the observation (CLOCK_MONOTONIC, s), or None if a party was not
     ready in time.  ``injected`` counts the packets that were sent again or changed; ``skipped`` is
-    why the row was not run, or "".
+    why the row was not run, or "".  ``expiry`` is when the certificate of a short-lived talker
+    expires (CLOCK_MONOTONIC, s); ``memory`` counts the segments of shared memory with the text of
+    each party.
     """
 
     row: Row
@@ -65,6 +67,8 @@ class RowRecord:
     window: tuple[float, float] | None = None
     wire: Mapping[str, WireCount] = field(default_factory=dict)
     injected: Injection | None = None
+    expiry: float | None = None
+    memory: Mapping[str, int] = field(default_factory=dict)
     skipped: str = ""
 
 
@@ -197,10 +201,10 @@ def _lost_import(party: Party, record: PartyRecord) -> str:
 def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
     subject = record.parties[claim.subject]
     if claim.relation is Relation.IS_REFUSED:
-        return _judge_refusal(claim.subject, subject)
+        return _with_evidence(_judge_refusal(claim.subject, subject), claim, record)
     for name in filter(None, (claim.subject, claim.talker)):
         if problem := _why_not_running(name, record.parties[name]):
-            return problem
+            return _with_evidence(problem, claim, record)
     if claim.relation is Relation.STARTS:
         return _Finding(RowStatus.STARTED, f"{claim.subject} started")
     if record.window is None:
@@ -214,6 +218,10 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
         return _judge_forgery(claim, record, subject, talker)
     if claim.relation is Relation.IS_ANSWERED:
         return _judge_answers(claim, record, subject, talker)
+    if claim.relation is Relation.EXECUTES:
+        return _judge_execution(claim, record, subject, talker)
+    if claim.relation is Relation.HEARS_EXPIRED:
+        return _judge_expiry(claim, record, subject, talker)
     sent = {e.text for e in talker.events if e.kind is EventKind.SENT and _in_window(e, record)}
     if not sent:
         return _Finding(RowStatus.UNDECIDED, f"{claim.talker} sent nothing in the window")
@@ -221,6 +229,8 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
         return _judge_view(claim, record, subject, talker)
     mark = f"{talker.text}: "
     heard = [e for e in subject.events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
+    if record.row.meanwhile is not None:  # what was heard before the change proves nothing
+        heard = [e for e in heard if _in_window(e, record)]
     status = STATUS_OF[Relation.HEARS, bool(heard)]
     seconds = record.window[1] - record.window[0]
     arrived = len(sent & {event.text for event in heard})
@@ -239,6 +249,83 @@ def _judge_answers(
     within = sum(1 for event in answers if _in_window(event, record))
     counted = f"{min(within, len(asked))} right answers from the {claim.talker}"
     return _Finding(status, f"{claim.subject} asked {len(asked)} times and got {counted}")
+
+
+def _judge_execution(
+    claim: Claim, record: RowRecord, server: PartyRecord, client: PartyRecord
+) -> _Finding:
+    """Judge by the requests that reached the server: a reply may be lost after that."""
+    asked = [e for e in client.events if e.kind is EventKind.SENT and _in_window(e, record)]
+    if not asked:
+        return _Finding(RowStatus.UNDECIDED, f"{claim.talker} sent no request in the window")
+    reached = [e for e in server.events if e.kind is EventKind.HEARD and _is_of(e, client)]
+    status = STATUS_OF[Relation.EXECUTES, bool(reached)]
+    counted = f"{min(len(reached), len(asked))} of {len(asked)} requests of the {claim.talker}"
+    return _Finding(status, f"{claim.subject} executed {counted}")
+
+
+_ON_ITS_WAY = 1.0
+"""Seconds after an expiry in which a message may still arrive: certificates have whole seconds."""
+
+
+def expired_too_early(record: RowRecord) -> bool:
+    """Return whether a short-lived talker was not heard before its certificate expired."""
+    claim = record.row.claims[0]
+    if record.expiry is None or not record.parties:
+        return False
+    talker = record.parties[claim.talker]
+    heard = record.parties[claim.subject].events
+    return not any(
+        e.kind is EventKind.HEARD and _is_of(e, talker) and e.time < record.expiry for e in heard
+    )
+
+
+def _judge_expiry(
+    claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
+) -> _Finding:
+    if record.expiry is None or expired_too_early(record):
+        return _Finding(
+            RowStatus.UNDECIDED, f"{claim.talker} was not heard before its certificate expired"
+        )
+    after = record.expiry + _ON_ITS_WAY
+    sent = [e for e in talker.events if e.kind is EventKind.SENT and e.time > after]
+    if not sent:
+        return _Finding(
+            RowStatus.UNDECIDED, f"{claim.talker} sent nothing after its certificate had expired"
+        )
+    heard = [e for e in listener.events if e.kind is EventKind.HEARD and _is_of(e, talker)]
+    late = [e for e in heard if e.time > after]
+    counted = f"{len(heard) - len(late)} messages of the {claim.talker} until its certificate"
+    return _Finding(
+        STATUS_OF[Relation.HEARS_EXPIRED, bool(late)],
+        f"{claim.subject} heard {counted} expired, and {len(late)} of {len(sent)} after that",
+    )
+
+
+def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Finding:
+    """Return a refusal with the logged line that is its evidence, if the claim names one.
+
+    A process that merely gets no connection may be slow.
+    """
+    if not claim.evidence or finding.status is not RowStatus.NOT_LET_IN:
+        return finding
+    if claim.evidence in finding.detail:
+        return finding
+    outputs = [(each.name, record.parties[each.name].output) for each in record.row.parties]
+    lines = ((name, line) for name, output in outputs for line in output.splitlines())
+    found = next(((name, line) for name, line in lines if claim.evidence in line), None)
+    if found is None:
+        return _Finding(
+            RowStatus.UNDECIDED, f"{finding.detail}, but nobody logged {claim.evidence!r}"
+        )
+    name, line = found
+    return _Finding(finding.status, f"{finding.detail}; {name}: {_message_of(line)}")
+
+
+def _message_of(line: str) -> str:
+    """Return the message of a line of Zenoh's log, without time, level, module and hint."""
+    message = line.partition(": ")[2].partition(" Hint: ")[0]
+    return " ".join(message.split()).rstrip(".") or line.strip()
 
 
 def _judge_replay(
@@ -296,7 +383,17 @@ def _judge_view(
     return _Finding(STATUS_OF[Relation.SEES, most > 0], f"{counted} in {len(looks)} polls")
 
 
+def _judge_memory(claim: Claim, record: RowRecord) -> _Finding:
+    segments = record.memory.get(claim.subject, 0)
+    return _Finding(
+        STATUS_OF[Relation.READABLE, segments > 0],
+        f"{segments} segments of shared memory show the text",
+    )
+
+
 def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> _Finding:
+    if claim.wire is Wire.MEMORY:
+        return _judge_memory(claim, record)
     count = record.wire.get(claim.subject)
     if count is None:
         return _Finding(RowStatus.UNDECIDED, "no packets were captured")

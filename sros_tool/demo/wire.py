@@ -1,5 +1,7 @@
 """Capture packets, count readable and protected ones, and send packets again or changed.
 
+Packets of DDS are UDP, those of Zenoh TCP or TLS over TCP; Zenoh can also use shared memory.
+
 The packet and raw sockets need CAP_NET_RAW in their network: root has it, and also a process in a
 network namespace that it created (`sros_tool.runtime.netns`).
 """
@@ -7,23 +9,29 @@ network namespace that it created (`sros_tool.runtime.netns`).
 from __future__ import annotations
 
 import asyncio
+import mmap
+import os
 import socket
 import time
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-_ETH_P_IP = 0x0800
+_ETH_P_ALL = 0x0003
 _PACKET_OUTGOING = 4
-_UDP = 17
+_UDP, _TCP = 17, 6
 _BUFFER_BYTES = 16 * 1024 * 1024
 _SO_RCVBUFFORCE = 33
 
 _RTPS_HEADER = 20
 _PROTECTED_SUBMESSAGES = range(0x30, 0x35)
 """SEC_BODY, SEC_PREFIX, SEC_POSTFIX, SRTPS_PREFIX, SRTPS_POSTFIX (DDS-Security 1.1 §7.3.6)."""
+
+
+_TLS_DATA = b"\x17\x03\x03"
+"""The begin of a record with application data (RFC 8446 §5.1)."""
 
 
 class _CapturedPacket(NamedTuple):
@@ -35,9 +43,9 @@ class _CapturedPacket(NamedTuple):
 
 
 class PacketCounter:
-    """A counter of IPv4 packets that show one of ``marks``, and of protected packets.
+    """A counter of packets that show one of ``marks``, and of protected packets.
 
-    ``plain`` counts by mark, ``protected`` by UDP port, for both ports of a packet.  With
+    ``plain`` counts by mark, ``protected`` by port, for both ports of a packet.  With
     ``keep``, the RTPS packets themselves are in ``kept``, in order.
     """
 
@@ -49,19 +57,24 @@ class PacketCounter:
         self.kept: list[_CapturedPacket] = []
 
     def count(self, packet: bytes) -> None:
-        """Count one packet; ignore it if it is not UDP."""
-        start = (packet[0] & 0x0F) * 4 if packet else 0
-        if len(packet) < max(20, start) + 8 or packet[9] != _UDP:
+        """Count one packet; ignore it if it is neither UDP over IPv4, nor TCP."""
+        transport, start = _transport(packet)
+        if len(packet) < start + 8 or transport not in (_UDP, _TCP):
             return
         source = int.from_bytes(packet[start : start + 2], "big")
         target = int.from_bytes(packet[start + 2 : start + 4], "big")
-        payload = packet[start + 8 :]
+        if transport == _TCP:
+            header = (packet[start + 12] >> 4) * 4 if len(packet) > start + 12 else 20
+            payload = packet[start + header :]
+        else:
+            payload = packet[start + 8 :]
         if self._keep and payload[:4] == b"RTPS":
             self.kept.append(_CapturedPacket(time.monotonic(), source, packet))
         for mark, raw in self._marks.items():
             if raw in payload:
                 self.plain[mark] += 1
-        if _is_protected(payload):
+        is_tls = transport == _TCP and payload.startswith(_TLS_DATA)
+        if is_tls or _is_protected(payload):
             self.protected.update({source, target})
 
 
@@ -74,7 +87,7 @@ class Capture(PacketCounter):
 
     def __init__(self, marks: Sequence[str], *, keep: bool = False) -> None:
         super().__init__(marks, keep=keep)
-        self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(_ETH_P_IP))
+        self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(_ETH_P_ALL))
         self._socket.setblocking(False)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER_BYTES)
@@ -100,6 +113,22 @@ class Capture(PacketCounter):
         self._socket.close()
 
 
+_IPV6_HEADER = 40
+
+
+def _transport(packet: bytes) -> tuple[int, int]:
+    """Return the transport protocol of an IP packet, and where it begins; (0, 0) if there is none.
+
+    UDP counts only over IPv4, and TCP over IPv6 only without extension headers.
+    """
+    version = packet[0] >> 4 if len(packet) >= 20 else 0
+    if version == 4:
+        return packet[9], max(20, (packet[0] & 0x0F) * 4)
+    if version == 6 and len(packet) > _IPV6_HEADER and packet[6] == _TCP:
+        return _TCP, _IPV6_HEADER
+    return 0, 0
+
+
 def _is_protected(payload: bytes) -> bool:
     """Return whether a UDP payload is RTPS with a protected submessage (RTPS 2.3 §9.4)."""
     if payload[:4] != b"RTPS":
@@ -117,12 +146,17 @@ def _is_protected(payload: bytes) -> bool:
     return False
 
 
-def udp_ports(process: int) -> frozenset[int]:
-    """Return the UDP ports that a process has bound (from /proc); none if it has ended."""
+def bound_ports(process: int) -> frozenset[int]:
+    """Return the UDP and TCP ports that a process has (from /proc); none if it has ended."""
     folder = Path(f"/proc/{process}")
     try:
         links = list((folder / "fd").iterdir())
-        lines = (folder / "net" / "udp").read_text(encoding="ascii").splitlines()[1:]
+        lines = [
+            line
+            for table in ("udp", "tcp", "tcp6")
+            if (folder / "net" / table).exists()
+            for line in (folder / "net" / table).read_text(encoding="ascii").splitlines()[1:]
+        ]
     except OSError:
         return frozenset()
     inodes = {_socket_inode(link) for link in links}
@@ -136,6 +170,51 @@ def _socket_inode(link: Path) -> str:
     except OSError:
         return ""  # closed since it was listed
     return target.removeprefix("socket:[").removesuffix("]") if target[:8] == "socket:[" else ""
+
+
+_SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - read, and what the demo's own processes left
+_LARGEST_SEGMENT = 1 << 28
+
+
+def shared_memory(texts: Mapping[str, str]) -> dict[str, int]:
+    """Return how many segments of shared memory show the text of each party."""
+    found = _segments()
+    return {
+        name: sum(_shows(path, text) for path in found) if text else 0
+        for name, text in texts.items()
+    }
+
+
+def clean_shared_memory(texts: Iterable[str]) -> None:
+    """Remove the segments with one of these texts: processes that were ended leave them."""
+    marks = [text for text in texts if text]
+    for path in _segments():
+        if any(_shows(path, text) for text in marks):
+            path.unlink(missing_ok=True)
+
+
+def _segments() -> list[Path]:
+    """Return the segments of shared memory that belong to this user."""
+    try:
+        return [
+            path
+            for path in _SHARED_MEMORY.iterdir()
+            if path.is_file() and not path.is_symlink() and path.stat().st_uid == os.geteuid()
+        ]
+    except OSError:
+        return []
+
+
+def _shows(path: Path, text: str) -> bool:
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if not 0 < size <= _LARGEST_SEGMENT:
+                return False
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as segment:
+                return segment.find(text.encode()) >= 0
+    except (OSError, ValueError):
+        return False
 
 
 _DATA = 0x15
@@ -207,8 +286,8 @@ _CERTIFICATE = "-----BEGIN CERTIFICATE-----"
 class Wiretap:
     """A capture of a row's packets; ``problem`` says why capturing is not permitted, or "".
 
-    ``texts`` has the text of each party, by name; ``topic`` is a DDS topic name.  The capture
-    starts at once: create it in the network of the row, and inside a running asyncio loop.
+    ``texts`` has the text of each party, by name; ``topic`` is the topic as packets name it.  The
+    capture starts at once: create it in the network of the row, and inside a running asyncio loop.
     """
 
     def __init__(self, texts: Mapping[str, str], topic: str, *, replayed: bool) -> None:

@@ -8,7 +8,7 @@ import struct
 
 import pytest
 
-from sros_tool.demo.wire import PacketCounter, udp_ports
+from sros_tool.demo.wire import PacketCounter, bound_ports
 
 
 def packet(payload: bytes, source: int = 7000, target: int = 7410, protocol: int = 17) -> bytes:
@@ -61,5 +61,5 @@ def test_ports_of_a_process() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
         bound.bind(("127.0.0.1", 0))
         port = bound.getsockname()[1]
-        assert port in udp_ports(os.getpid())
-    assert port not in udp_ports(os.getpid())
+        assert port in bound_ports(os.getpid())
+    assert port not in bound_ports(os.getpid())

@@ -214,8 +214,12 @@ def test_wrong_usage_is_told_before_anything_runs(
 
 def test_the_list_of_scenarios() -> None:
     text = sros("demo", "--list").ok().out
-    assert [line.split()[0] for line in text.splitlines()] == [
+    on_dds, _, on_zenoh = text.partition("\nwith --backend zenoh:\n")
+    assert [line.split()[0] for line in on_dds.splitlines()] == [
         *("isolation", "services", "actions", "composition", "attacks", "governance")
+    ]
+    assert [line.split()[0] for line in on_zenoh.splitlines()] == [
+        *("isolation", "services", "attacks")
     ]
     shown = json.loads(sros("demo", "--list", "--json").ok().out)["scenarios"]
     assert shown[0]["rows"] == 11

@@ -6,11 +6,21 @@ import pytest
 
 from sros_tool.demo.scenarios import SCENARIOS, choose_scenarios
 from sros_tool.demo.scenarios.isolation import ROWS
-from sros_tool.demo.scenarios.model import SPEAKING, STATUS_OF, Relation, Row, Scenario
+from sros_tool.demo.scenarios.model import (
+    CALLING,
+    SPEAKING,
+    STATUS_OF,
+    Relation,
+    Row,
+    Scenario,
+)
+from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
 from sros_tool.errors import UsageError
 
 EVERY_ROW = pytest.mark.parametrize(
-    "row", [row for scenario in SCENARIOS for row in scenario.rows], ids=lambda row: row.name
+    "row",
+    [row for scenario in (*SCENARIOS, *ZENOH_SCENARIOS) for row in scenario.rows],
+    ids=lambda row: row.name,
 )
 
 
@@ -21,7 +31,8 @@ def test_claims_name_parties_of_the_row(row: Row) -> None:
     for claim in (*row.claims, *row.controls):
         row.party(claim.subject)
         if claim.talker:
-            assert row.party(claim.talker).role in SPEAKING
+            calls = claim.relation is Relation.EXECUTES
+            assert row.party(claim.talker).role in (CALLING if calls else SPEAKING)
 
 
 @EVERY_ROW
@@ -51,7 +62,9 @@ def test_whoever_is_not_to_succeed_is_tried_beside_somebody_who_does(row: Row) -
         assert any(claim.holds for claim in (*row.claims, *row.controls))
 
 
-@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda scenario: scenario.name)
+@pytest.mark.parametrize(
+    "scenario", (*SCENARIOS, *ZENOH_SCENARIOS), ids=lambda scenario: scenario.name
+)
 def test_names_are_distinct_and_can_be_printed_anywhere(scenario: Scenario) -> None:
     names = [row.name for row in scenario.rows]
     assert len(names) == len(set(names)) >= 3

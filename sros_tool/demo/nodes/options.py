@@ -21,6 +21,8 @@ class NodeOptions:
     ``topic`` is the ROS name of the role's topic, service or action.  ``period`` is in seconds.
     ``text`` is sent in messages, and identifies a server.  ``server`` is the text of the action
     server that an action client uses ("": unknown).  ``also`` are further topics for an observer.
+    On Zenoh, messages of a talker have ``size`` bytes or more, and ``patience`` is how long a
+    process waits for its connection, in seconds.
     """
 
     role: str
@@ -30,6 +32,8 @@ class NodeOptions:
     report: Path | None = None
     server: str = ""
     also: tuple[str, ...] = ()
+    size: int = 0
+    patience: float = 60.0
 
     @property
     def service(self) -> str:
@@ -71,6 +75,16 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
         action="append",
         default=[],
         help="another topic whose publishers an observer counts",
+    )
+    parser.add_argument(
+        "--size", type=int, default=NodeOptions.size, help="bytes of a message on Zenoh, at least"
+    )
+    parser.add_argument(
+        "--patience",
+        type=_positive,
+        default=NodeOptions.patience,
+        metavar="SECONDS",
+        help="time to wait for a connection on Zenoh (default: %(default)s)",
     )
     parser.add_argument(
         "--report", type=Path, metavar="FILE", help="append the events to FILE as JSON lines"

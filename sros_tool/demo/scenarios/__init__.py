@@ -12,6 +12,7 @@ from sros_tool.demo.scenarios.governance import GOVERNANCE
 from sros_tool.demo.scenarios.isolation import ISOLATION
 from sros_tool.demo.scenarios.model import Scenario
 from sros_tool.demo.scenarios.services import ACTIONS, SERVICES
+from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
 from sros_tool.errors import UsageError
 
 SCENARIOS: tuple[Scenario, ...] = (
@@ -26,25 +27,34 @@ _DEFAULT_SCENARIO = ISOLATION.name
 ALL = "all"
 
 
-def choose_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
-    """Return the scenarios with these names or TOML files, in order; without names, the default.
+def choose_scenarios(names: Sequence[str], *, on_zenoh: bool = False) -> tuple[Scenario, ...]:
+    """Return the scenarios with these names or TOML files, in order.
+
+    Without names, it is the default scenario on DDS, and all of them ``on_zenoh``.
 
     Raises:
         UsageError: no scenario has a given name.
         DocumentError: a file is not a valid scenario.
     """
-    if ALL in names:
-        return SCENARIOS
-    known = {scenario.name: scenario for scenario in SCENARIOS}
+    scenarios = ZENOH_SCENARIOS if on_zenoh else SCENARIOS
+    if ALL in names or (on_zenoh and not names):
+        return scenarios
+    known = {scenario.name: scenario for scenario in scenarios}
     chosen = []
     for name in dict.fromkeys(names or (_DEFAULT_SCENARIO,)):
         if name.endswith(".toml"):
+            if on_zenoh:
+                raise UsageError(
+                    f"the scenario {name} cannot run on Zenoh",
+                    "Scenarios of your own run on a DDS.",
+                    f"Leave out --backend zenoh, or name {', '.join(known)}.",
+                )
             chosen.append(read_scenario(Path(name)))
             continue
         if name not in known:
             raise UsageError(
                 f"there is no scenario {name!r}",
-                f"sros has {', '.join(known)}.",
+                f"sros has {', '.join(known)}{' on Zenoh' if on_zenoh else ''}.",
                 "Name one of them, `all`, or a TOML file.",
             )
         chosen.append(known[name])

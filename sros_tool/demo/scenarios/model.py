@@ -6,7 +6,7 @@ which prove that a silence is not a crash.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -26,10 +26,19 @@ class Role(StrEnum):
     ACTION_CLIENT = "action_client"
     COMPOSED = "composed"
     """Several nodes in one process and one enclave: a talker, a listener and a server."""
+    ROUTER = "router"
+    """The router of a Zenoh network."""
+    RELAY = "relay"
+    """A talker and a listener in one node."""
+    FLOODER = "flooder"
+    """A program that makes useless connections to the router."""
 
 
-SPEAKING = frozenset({Role.TALKER, Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED})
+SPEAKING = frozenset({Role.TALKER, Role.RELAY, Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED})
 """The roles that send a text that identifies them."""
+
+CALLING = frozenset({Role.CLIENT, Role.ACTION_CLIENT})
+"""The roles whose requests have a text that identifies them, on Zenoh."""
 
 
 class RowStatus(StrEnum):
@@ -43,6 +52,10 @@ class RowStatus(StrEnum):
     NOT_DECEIVED = "not deceived"
     ANSWERED = "answered"
     NOT_ANSWERED = "not answered"
+    EXECUTED = "executed"
+    NOT_EXECUTED = "not executed"
+    STILL_HEARD = "still heard"
+    CUT_OFF = "cut off"
     REFUSED = "refused"
     NOT_LET_IN = "not let in"
     STARTED = "started"
@@ -68,11 +81,13 @@ class Relation(StrEnum):
     HEARS = "hears"
     HEARS_AGAIN = "hears replayed packets of"
     BELIEVES = "believes changed packets of"
+    HEARS_EXPIRED = "hears after its certificate expired the"
     IS_ANSWERED = "is answered by"
+    EXECUTES = "executes a call of"
     IS_REFUSED = "is refused"
     STARTS = "starts"
     SEES = "sees"
-    READABLE = "is readable on the wire"
+    READABLE = "is readable"
 
 
 STATUS_OF: dict[tuple[Relation, bool], RowStatus] = {
@@ -82,6 +97,10 @@ STATUS_OF: dict[tuple[Relation, bool], RowStatus] = {
     (Relation.HEARS_AGAIN, False): RowStatus.NOT_HEARD_AGAIN,
     (Relation.BELIEVES, True): RowStatus.DECEIVED,
     (Relation.BELIEVES, False): RowStatus.NOT_DECEIVED,
+    (Relation.HEARS_EXPIRED, True): RowStatus.STILL_HEARD,
+    (Relation.HEARS_EXPIRED, False): RowStatus.CUT_OFF,
+    (Relation.EXECUTES, True): RowStatus.EXECUTED,
+    (Relation.EXECUTES, False): RowStatus.NOT_EXECUTED,
     (Relation.IS_ANSWERED, True): RowStatus.ANSWERED,
     (Relation.IS_ANSWERED, False): RowStatus.NOT_ANSWERED,
     (Relation.IS_REFUSED, True): RowStatus.REFUSED,
@@ -104,11 +123,12 @@ SUCCESSES = frozenset(
 
 
 class Wire(StrEnum):
-    """A text to look for in the packets of a party."""
+    """A text to look for in the packets of a party, or in shared memory."""
 
     TEXT = "text"
     TOPIC = "topic name"
     CERTIFICATE = "certificate"
+    MEMORY = "shared memory"
 
 
 class SoundKeystore(StrEnum):
@@ -133,12 +153,14 @@ class Identity:
     """The keystore and enclave a process runs with (without a keystore: unsecured).
 
     ``enclave`` is a part of the scenario's cast ("talker") or the name of an enclave
-    ("/arm/camera").  ``variables`` replace environment variables of a secured process.
+    ("/arm/camera").  ``variables`` replace environment variables of a secured process.  On Zenoh, a
+    ``lawless`` process switches its own access control off.
     """
 
     keystore: KeystoreChoice | None = None
     enclave: str = ""
     variables: tuple[tuple[str, str], ...] = ()
+    lawless: bool = False
 
 
 UNSECURED = Identity()
@@ -150,7 +172,9 @@ class Party:
 
     ``topic`` is the ROS name of its topic, service or action ("": the topic of the demo).
     ``other_topic`` puts a talker on a topic that nobody else uses.  If an ``intruder`` is refused,
-    the row goes on.
+    the row goes on.  A party of a later ``turn`` starts when all of the earlier ones are ready.
+    ``announced`` is the enclave that it names to others ("": its own), as a part or a name; its
+    messages have ``size`` bytes or more.
     """
 
     name: str
@@ -159,6 +183,9 @@ class Party:
     topic: str = ""
     other_topic: bool = False
     intruder: bool = False
+    turn: int = 0
+    announced: str = ""
+    size: int = 0
 
 
 @dataclass(frozen=True)
@@ -166,6 +193,8 @@ class Claim:
     """A claim that ``relation`` holds between ``subject`` and ``talker``, or does not (``holds``).
 
     ``denied`` is the denial that must be the reason, a status in `DENIALS`; None: any reason.
+    ``evidence`` is a text that a party of the row must have logged about a process that was not let
+    in ("": none).
     """
 
     relation: Relation
@@ -173,6 +202,7 @@ class Claim:
     talker: str = ""
     holds: bool = True
     denied: RowStatus | None = None
+    evidence: str = ""
     wire: Wire = Wire.TEXT
 
     @property
@@ -234,7 +264,10 @@ class Row:
     ``mechanism`` is the reason for the expected status, as a clause; ``wire`` requests a capture of
     the packets; ``replay`` names the party whose packets are sent again after it has left,
     ``impersonate`` the party whose packets are sent again with changed text.  A ``brief`` row ends
-    as soon as it is decided.  The first of ``variants`` whose conditions hold replaces the expected
+    as soon as it is decided.  ``meanwhile`` changes the keystore of the first claim's subject when
+    all processes run; with ``short_lived``, the talker of the first claim gets a certificate that
+    expires while the row runs.  Rows of the same ``world`` share their processes: a party of two
+    rows is the same process.  The first of ``variants`` whose conditions hold replaces the expected
     status.  ``attack`` names the attack to which the row belongs; with ``removed`` it shows that
     attack without the defence that ``removed`` names.  ``open_because`` and ``remedy`` are as in
     `Variant`.  ``accepted`` says that the user accepts that the attack succeeds, ``unaccepted``
@@ -251,6 +284,9 @@ class Row:
     replay: str = ""
     impersonate: str = ""
     brief: bool = False
+    meanwhile: Forge | None = None
+    short_lived: bool = False
+    world: str = ""
     variants: tuple[Variant, ...] = ()
     attack: str = ""
     removed: str = ""
@@ -277,6 +313,11 @@ class Row:
         """The topic, service or action of the first claim ("": the topic of the demo)."""
         return self.party(self.claims[0].subject).topic
 
+    @property
+    def talking(self) -> Party:
+        """The talker of the first claim."""
+        return self.party(self.claims[0].talker)
+
     def under(self, conditions: frozenset[Condition]) -> Row:
         """Return the row with the status that is expected under these conditions."""
         for variant in self.variants:
@@ -299,12 +340,33 @@ class Row:
         return self
 
 
+def together(rows: Sequence[Row]) -> Row:
+    """Return one row with the parties, claims and controls of all rows, which share a world.
+
+    Raises:
+        ValueError: two parties of one name differ.
+    """
+    parties: dict[str, Party] = {}
+    for party in (each for row in rows for each in row.parties):
+        if parties.setdefault(party.name, party) != party:
+            raise ValueError(f"world {rows[0].world!r} has two parties {party.name!r}")
+    return replace(
+        rows[0],
+        parties=tuple(parties.values()),
+        claims=tuple(claim for row in rows for claim in row.claims),
+        controls=tuple(claim for row in rows for claim in row.controls),
+        wire=any(row.wire for row in rows),
+        brief=all(row.brief for row in rows),
+    )
+
+
 @dataclass(frozen=True)
 class Scenario:
     """Rows that belong together, and the policy of their enclaves.
 
     ``cast`` has the enclave of each part.  ``policy`` returns the policy for the topic of the demo;
-    the enclaves ``unpermitted`` have no policy.  ``measured`` has the keystore of each protection
+    the enclaves ``unpermitted`` have no policy.  With a ``router``, the name of an enclave, its
+    keystores also have the files for Zenoh.  ``measured`` has the keystore of each protection
     kind whose cost is measured.  A scenario with ``any_keystore`` can also run in a user's
     keystore.
     """
@@ -315,5 +377,18 @@ class Scenario:
     cast: Mapping[str, str] = field(default_factory=dict)
     policy: Callable[[str], Policy] | None = None
     unpermitted: tuple[str, ...] = ()
+    router: str = ""
     measured: Mapping[str, Undefended] = field(default_factory=dict)
     any_keystore: bool = False
+
+
+def joined(scenarios: Sequence[Scenario]) -> Scenario:
+    """Return one scenario with the rows of several, which have the same enclaves and policy.
+
+    Raises:
+        ValueError: their enclaves or policies differ.
+    """
+    first = scenarios[0]
+    if any((each.cast, each.policy) != (first.cast, first.policy) for each in scenarios):
+        raise ValueError("scenarios with other enclaves cannot run together")
+    return replace(first, rows=tuple(row for each in scenarios for row in each.rows))

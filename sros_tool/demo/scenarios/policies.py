@@ -89,6 +89,21 @@ def attacked_policy(topic: str) -> Policy:
     return replace(talking, enclaves=(*allowed, *guests, *service))
 
 
+def zenoh_policy(topic: str, *, guest_talks: bool = False, silent: str = "") -> Policy:
+    """Return the policy of the demo on Zenoh: `attacked_policy` and an action.
+
+    With ``guest_talks``, the guest may use the topic as talker and as listener; the enclave
+    ``silent`` may not use it.
+    """
+    attacked = attacked_policy(topic)
+    of = {each.path: each for each in attacked.enclaves}
+    if guest_talks:
+        of[GUEST] = replace(of[GUEST], profiles=(*of[_TALKER].profiles, *of[_LISTENER].profiles))
+    if silent:
+        of[silent] = _with_topic(of[silent], None, topic)
+    return replace(attacked, enclaves=(*of.values(), *shipped_action_policy(topic).enclaves))
+
+
 def shipped_service_policy(_topic: str) -> Policy:
     """Return the shipped policy of a service; the topic does not matter."""
     return _shipped_policy("add_two_ints.xml")
@@ -120,11 +135,11 @@ def measured_policy(topic: str) -> Policy:
     return replace(talking, enclaves=(*talking.enclaves, *ends))
 
 
-def _with_topic(enclave: Enclave, topic: str | None) -> Enclave:
-    """Return the enclave with ``topic`` instead of the shipped topic (None: with neither)."""
+def _with_topic(enclave: Enclave, topic: str | None, before: str = _POLICY_TOPIC) -> Enclave:
+    """Return the enclave with ``topic`` instead of ``before`` (None: with neither)."""
 
     def of_group(group: Group) -> Group | None:
-        if group.kind != "topics" or _POLICY_TOPIC not in group.names:
+        if group.kind != "topics" or before not in group.names:
             return group
         return None if topic is None else replace(group, names=(topic,))
 

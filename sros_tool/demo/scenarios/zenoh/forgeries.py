@@ -1,0 +1,390 @@
+"""Forgeries of Zenoh files: as an attacker would change them, or without a defence.
+
+Rows of scenarios refer to these functions; each changes a copy of the keystore (see `forger`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from sros_tool.demo.forger import STOLEN, KeystoreCopy
+from sros_tool.demo.scenarios.policies import zenoh_policy
+from sros_tool.demo.zenoh_files import start_network
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
+    ROUTER_FILE,
+    SESSION_FILE,
+    enclave_names,
+    enclave_path,
+)
+from sros_tool.keystore.lifecycle.create import generate_artifacts
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.policy.model import Policy
+from sros_tool.validity import Window
+from sros_tool.zenoh.access import Message
+from sros_tool.zenoh.configuration import Mode
+
+_Document = dict[str, Any]
+_Change = Callable[[_Document], None]
+
+_EVERYBODY = "everybody"
+_FLOWS = ("ingress", "egress")
+
+
+def _files(copy: KeystoreCopy) -> dict[str, Path]:
+    """Return the Zenoh files of a keystore by enclave."""
+    folders = {name: enclave_path(copy.root, name) for name in enclave_names(copy.root)}
+    places = {
+        name: folder / (ROUTER_FILE if name == copy.router else SESSION_FILE)
+        for name, folder in folders.items()
+    }
+    return {name: path for name, path in places.items() if path.is_file()}
+
+
+def _edit(path: Path, change: _Change) -> None:
+    document = json.loads(path.read_bytes())
+    change(document)
+    path.write_text(json.dumps(document), encoding="utf-8")
+
+
+def _edit_all(copy: KeystoreCopy, change: _Change, *, router: bool = True) -> None:
+    for name, path in _files(copy).items():
+        if router or name != copy.router:
+            _edit(path, change)
+
+
+def _edit_part(copy: KeystoreCopy, part: str, change: _Change) -> None:
+    _edit(copy.folder(part) / SESSION_FILE, change)
+
+
+def _without_rules(document: _Document) -> None:
+    document.pop("access_control", None)
+
+
+def _tls(document: _Document) -> _Document:
+    tls: _Document = document["transport"]["link"]["tls"]
+    return tls
+
+
+# ── who enforces ───────────────────────────────────────────────────────────────────────────
+
+
+def through_the_router(copy: KeystoreCopy) -> None:
+    """Let the sessions connect to the router alone."""
+    start_network(copy.root, copy.router, copy.endpoint, Mode.CLIENT, copy.now)
+
+
+def rules_at_the_router_only(copy: KeystoreCopy) -> None:
+    """Take the rules out of all sessions, which connect to each other directly."""
+    _edit_all(copy, _without_rules, router=False)
+
+
+def sessions_that_limit_themselves(copy: KeystoreCopy) -> None:
+    """Let every session enforce only its own rights, towards everybody, and the router nothing."""
+    through_the_router(copy)
+    for name, path in _files(copy).items():
+        _edit(path, _without_rules if name == copy.router else _for_everybody(copy.router))
+
+
+def _for_everybody(router: str) -> _Change:
+    """Return a change: what a file lets the router do, it lets everybody do."""
+
+    def change(document: _Document) -> None:
+        control = document["access_control"]
+        for subject in control["subjects"]:
+            if subject["id"] == router:
+                del subject["cert_common_names"]
+
+    return change
+
+
+def subject_for_everybody(copy: KeystoreCopy) -> None:
+    """Let another enclave play the router, and believe everybody who does."""
+    another_router(copy)
+    for name, path in _files(copy).items():
+        if name not in (copy.router, copy.enclave("guest")):
+            _edit(path, _for_everybody(copy.router))
+
+
+def another_router(copy: KeystoreCopy) -> None:
+    """Let the guest listen in place of the router."""
+    router = json.loads((enclave_path(copy.root, copy.router) / ROUTER_FILE).read_bytes())
+    _without_rules(router)
+    (copy.folder("guest") / SESSION_FILE).write_text(json.dumps(router), encoding="utf-8")
+
+
+def talkative_router(copy: KeystoreCopy) -> None:
+    """Let whoever has the router's key also publish and subscribe."""
+    through_the_router(copy)
+    folder = enclave_path(copy.root, copy.router)
+    router = json.loads((folder / ROUTER_FILE).read_bytes())
+    _without_rules(router)
+    (folder / ROUTER_FILE).write_text(json.dumps(router), encoding="utf-8")
+
+
+# ── rules ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _rule(name: str, keys: Iterable[str], permission: str = "allow", flow: str = "") -> _Document:
+    return {
+        "id": name,
+        "permission": permission,
+        "flows": [flow] if flow else list(_FLOWS),
+        "messages": [each.value for each in Message],
+        "key_exprs": list(keys),
+    }
+
+
+def _everything(document: _Document) -> None:
+    """Let everybody do everything."""
+    control = document["access_control"]
+    control["rules"].append(_rule(_EVERYBODY, ("**", "@ros2_lv/**")))
+    control["subjects"].append({"id": _EVERYBODY})
+    control["policies"].append({"rules": [_EVERYBODY], "subjects": [_EVERYBODY]})
+
+
+def denial_in_a_wildcard(copy: KeystoreCopy) -> None:
+    """Allow everybody everything, but deny the guest the topic and the service by their names."""
+    names = [f"{copy.domain}{name}/**" for name in (copy.topic, "/add_two_ints")]
+    guest = copy.enclave("guest")
+
+    def change(document: _Document) -> None:
+        control = document["access_control"] = {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": [],
+            "subjects": [],
+            "policies": [],
+        }
+        for name in enclave_names(copy.root):
+            control["subjects"].append({"id": name, "cert_common_names": [name]})
+        others = [each["id"] for each in control["subjects"]]
+        control["rules"] += [
+            _rule(_EVERYBODY, ("**", "@ros2_lv/**")),
+            _rule("denied", names, "deny", "ingress"),
+        ]
+        control["policies"] += [
+            {"rules": [_EVERYBODY], "subjects": others},
+            {"rules": ["denied"], "subjects": [guest]},
+        ]
+
+    through_the_router(copy)
+    _edit_all(copy, change)
+
+
+def guest_may_use_the_topic(copy: KeystoreCopy) -> None:
+    """Give the guest the rights of talker and listener, by another policy."""
+    _change_rights(copy, zenoh_policy(copy.topic, guest_talks=True))
+
+
+def tokens_of_any_enclave(copy: KeystoreCopy) -> None:
+    """Let every enclave announce nodes under any enclave's name."""
+
+    def change(document: _Document) -> None:
+        for rule in document["access_control"]["rules"]:
+            if "liveliness_token" in rule["messages"]:
+                rule["key_exprs"] = [
+                    f"@ros2_lv/{copy.domain}/**" if each.startswith("@ros2_lv") else each
+                    for each in rule["key_exprs"]
+                ]
+
+    _edit_all(copy, change)
+
+
+def earlier_session_file(copy: KeystoreCopy) -> None:
+    """Put back the guest's session file of an earlier policy, which gave it the topic."""
+    path = copy.folder("guest") / SESSION_FILE
+    path.write_bytes(_of_earlier_policy(copy))
+
+
+def earlier_session_file_of_one_that_limits_itself(copy: KeystoreCopy) -> None:
+    """Put back the guest's earlier file where every session enforces only its own rights."""
+    earlier = json.loads(_of_earlier_policy(copy))
+    sessions_that_limit_themselves(copy)
+    _for_everybody(copy.router)(earlier)
+    (copy.folder("guest") / SESSION_FILE).write_text(json.dumps(earlier), encoding="utf-8")
+
+
+def _of_earlier_policy(copy: KeystoreCopy) -> bytes:
+    """Return the guest's session file of a policy that gave it the topic, and then change that."""
+    through_the_router(copy)
+    _change_rights(copy, zenoh_policy(copy.topic, guest_talks=True))
+    earlier = (copy.folder("guest") / SESSION_FILE).read_bytes()
+    _change_rights(copy, zenoh_policy(copy.topic))
+    return earlier
+
+
+def _change_rights(copy: KeystoreCopy, policy: Policy) -> None:
+    generate_artifacts(copy.root, policies=[policy], now=copy.now)
+
+
+# ── identities and links ───────────────────────────────────────────────────────────────────
+
+
+def identity_of_another_ca(copy: KeystoreCopy) -> None:
+    """Give the talker the key and certificate of the talker of another CA."""
+    other = enclave_path(copy.foreign, copy.enclave("talker"))
+    for name in (KEY_FILE, CERTIFICATE_FILE):
+        copy.put("talker", name, (other / name).read_bytes())
+
+
+def both_cas_trusted(copy: KeystoreCopy) -> None:
+    """Make everybody trust the other CA, too."""
+    identity_of_another_ca(copy)
+    other = (enclave_path(copy.foreign, copy.enclave("talker")) / IDENTITY_CA_FILE).read_bytes()
+    for name in enclave_names(copy.root):
+        file = enclave_path(copy.root, name) / IDENTITY_CA_FILE
+        both = file.read_bytes() + other
+        file.unlink()
+        file.write_bytes(both)
+
+
+def without_certificate(copy: KeystoreCopy) -> None:
+    """Let the talker show no certificate."""
+    for name in (KEY_FILE, CERTIFICATE_FILE):
+        (copy.folder("talker") / name).unlink()
+
+    def change(document: _Document) -> None:
+        _tls(document)["enable_mtls"] = False
+        document["listen"]["endpoints"] = []
+
+    _edit_part(copy, "talker", change)
+
+
+def certificates_not_asked_for(copy: KeystoreCopy) -> None:
+    """Let nobody ask for certificates, and everybody do everything; the talker shows none."""
+
+    def change(document: _Document) -> None:
+        _tls(document)["enable_mtls"] = False
+        _everything(document)
+
+    _edit_all(copy, change)
+    without_certificate(copy)
+
+
+def plain_tcp(copy: KeystoreCopy) -> None:
+    """Let the talker speak TCP to the port of the router."""
+    _edit_part(copy, "talker", _plain(f"tcp/{copy.endpoint}"))
+
+
+def _plain(endpoint: str) -> _Change:
+    def change(document: _Document) -> None:
+        document["mode"] = Mode.CLIENT.value
+        document["connect"]["endpoints"] = [endpoint]
+        document["listen"]["endpoints"] = []
+        del document["transport"]["link"]
+
+    return change
+
+
+def tcp_next_to_tls(copy: KeystoreCopy) -> None:
+    """Let the router also listen without TLS, and everybody do everything there."""
+    host, _, port = copy.endpoint.rpartition(":")
+    endpoint = f"tcp/{host}:{int(port) + 1}"
+
+    def change(document: _Document) -> None:
+        document["listen"]["endpoints"].append(endpoint)
+        del document["transport"]["link"]["protocols"]
+        _everything(document)
+
+    through_the_router(copy)
+    _edit(enclave_path(copy.root, copy.router) / ROUTER_FILE, change)
+    _edit_part(copy, "talker", _plain(endpoint))
+
+
+def in_the_clear(copy: KeystoreCopy) -> None:
+    """Let everybody speak TCP, without access control."""
+
+    def change(document: _Document) -> None:
+        _without_rules(document)
+        del document["transport"]["link"]
+        for side in ("listen", "connect"):
+            endpoints = document[side]["endpoints"]
+            document[side]["endpoints"] = [each.replace("tls/", "tcp/") for each in endpoints]
+
+    _edit_all(copy, change)
+
+
+def short_lived(_copy: KeystoreCopy) -> None:
+    """Leave the keystore as it is: the runner gives its talker a certificate that expires."""
+
+
+def links_that_outlive_certificates(copy: KeystoreCopy) -> None:
+    """Leave links open when a certificate expires."""
+
+    def change(document: _Document) -> None:
+        _tls(document)["close_link_on_expiration"] = False
+
+    _edit_all(copy, change)
+
+
+def in_shared_memory(copy: KeystoreCopy) -> None:
+    """Let processes of the host exchange large messages in shared memory."""
+
+    def change(document: _Document) -> None:
+        document["transport"]["shared_memory"]["enabled"] = True
+
+    _edit_all(copy, change)
+
+
+# ── revocation ─────────────────────────────────────────────────────────────────────────────
+
+
+def revoked_talker(copy: KeystoreCopy) -> None:
+    """Revoke the talker; a thief has a copy of its enclave."""
+    _keep_stolen(copy, _revoke_talker(copy))
+
+
+def revoked_talker_in_the_rules(copy: KeystoreCopy) -> None:
+    """Revoke the talker, but leave the files of all others as they were."""
+    before = {path: path.read_bytes() for path in _files(copy).values()}
+    stolen = _revoke_talker(copy)
+    for path, data in before.items():
+        if path.parent.is_dir():
+            path.write_bytes(data)
+    _keep_stolen(copy, stolen)
+
+
+def revoked_name_in_use_again(copy: KeystoreCopy) -> None:
+    """Revoke the talker, and make it again under the same name."""
+    stolen = _revoke_talker(copy)
+    talker, policy = copy.enclave("talker"), zenoh_policy(copy.topic)
+    generate_artifacts(copy.root, enclaves=[talker], policies=[policy], now=copy.now)
+    _keep_stolen(copy, stolen)
+
+
+def rights_taken_away(copy: KeystoreCopy) -> None:
+    """Take the topic from the talker in the keystore, while all processes run."""
+    _change_rights(copy, zenoh_policy(copy.topic, silent=copy.enclave("talker")))
+
+
+def rights_to_take_away(_copy: KeystoreCopy) -> None:
+    """Leave the keystore as it is: `rights_taken_away` changes it while the row runs."""
+
+
+def _revoke_talker(copy: KeystoreCopy) -> dict[str, bytes]:
+    """Revoke the talker; return the files that its enclave had."""
+    stolen = {file.name: file.read_bytes() for file in copy.folder("talker").iterdir()}
+    revoke(copy.root, [copy.enclave("talker")], now=copy.now, keyring=copy.keyring)
+    return stolen
+
+
+def _keep_stolen(copy: KeystoreCopy, files: Mapping[str, bytes]) -> None:
+    """Put a copy of an enclave, which a thief made, under another name."""
+    folder = enclave_path(copy.root, STOLEN)
+    folder.mkdir(mode=0o700)
+    for name, data in files.items():
+        (folder / name).touch(0o600)
+        (folder / name).write_bytes(data)
+
+
+def in_date(copy: KeystoreCopy) -> None:
+    """Issue the talker's certificate again, valid from yesterday to tomorrow."""
+    day = timedelta(days=1)
+    copy.reissue("talker", Window(copy.now - day, copy.now + day))

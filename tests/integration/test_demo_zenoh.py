@@ -1,0 +1,89 @@
+"""The whole demo on Zenoh as a user runs it; and that a missing defence makes it fail."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sros_tool.demo.program import DemoOptions, run_demo
+from sros_tool.demo.scenarios.model import Scenario
+from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
+from sros_tool.demo.scenarios.zenoh.attacks import ATTACKS
+from tests.support.children import PATIENCE
+
+pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
+pytestmark = pytest.mark.zenoh
+
+SROS = [sys.executable, "-c", "from sros_tool.cli import main; main()"]
+ROWS = [row for scenario in ZENOH_SCENARIOS for row in scenario.rows]
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], int, Path]:
+    folder = tmp_path_factory.mktemp("zenoh_demo")
+    done = subprocess.run(
+        [*SROS, "demo", "--backend", "zenoh", "--json", "--keep", folder / "kept"],
+        env={**os.environ, "TMPDIR": str(folder), "ZENOH_CONFIG_OVERRIDE": "mode=wrong"},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert not done.stderr
+    return json.loads(done.stdout), done.returncode, folder / "kept"
+
+
+def test_every_row_is_as_expected(shown: tuple[dict[str, Any], int, Path]) -> None:
+    result, status, _ = shown
+    assert [row for row in result["rows"] if not row["as_expected"]] == []
+    assert status == 0
+    assert result["backend"] == "zenoh"
+    assert result["dds"].startswith("Zenoh 1.")
+    assert [each["name"] for each in result["scenarios"]] == ["isolation", "services", "attacks"]
+    assert [row["name"] for row in result["rows"]] == [row.name for row in ROWS]
+    skipped = {row["name"] for row in result["rows"] if row["observed"] == "skipped"}
+    assert not skipped or not result["own_network"]
+
+
+def test_what_is_kept(shown: tuple[dict[str, Any], int, Path]) -> None:
+    result, _, keep = shown
+    assert json.loads((keep / "result.json").read_text()) == result
+    assert (keep / "keystore/enclaves/router/router.p7s").is_file()
+    for key in keep.glob("**/key.pem"):
+        assert key.stat().st_mode & 0o077 == 0
+
+
+def test_no_large_message_stays_in_shared_memory(
+    shown: tuple[dict[str, Any], int, Path],
+) -> None:
+    assert shown
+    ours = [each for each in Path("/dev/shm").iterdir() if each.is_file()]
+    assert not [each for each in ours if b"Hello World from the talker" in each.read_bytes()]
+
+
+def without_defences(name: str) -> Scenario:
+    """The scenario of an attack as if it were closed, in a keystore where it is not."""
+    attacks = {row.name: row for row in ATTACKS.rows}
+    closed = attacks[name]
+    opened = next(row for row in ATTACKS.rows if row.attack == closed.attack and row.removed)
+    row = replace(opened, name=name, expected=closed.expected, claims=closed.claims, world="")
+    return replace(ATTACKS, rows=(row,))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["another enclave publishes through the router", "another enclave plays the router and reads"],
+)
+def test_the_demo_fails_where_the_defence_is_missing(name: str) -> None:
+    options = DemoOptions(backend="zenoh", scenarios=(without_defences(name),))
+    result = run_demo(options, datetime.now(UTC), lambda _line: None)
+    assert not result.as_expected
+    assert [row.observed.value for row in result.rows] == ["heard"]
