@@ -124,7 +124,7 @@ def _complete_enclave(
 _IGNORED = {
     "": ("infrastructure", "patterns"),
     "--who": ("infrastructure", "policy", "all_vendors"),
-    "--reach": ("patterns", "kind", "vendor", "all_vendors", "moment", "domain", "time_zone"),
+    "--reach": ("patterns", "kind", "all_vendors", "moment", "domain", "time_zone"),
     "--log": ("infrastructure", "patterns", "kind", "policy", "vendor", "all_vendors"),
 }
 """The parameters that have no effect, for each of the options that choose a mode."""
@@ -253,7 +253,11 @@ def explain(
     _refuse_ignored(mode)
     root, rest = _split(words, keystore, verb=0 if who else 1)
     if reach:
-        return _show_reach(reach, root, rest, policy, infrastructure, as_json)
+        if vendor not in (None, ZENOH):
+            text = "It follows the rights, which are the same for all vendors of DDS."
+            raise UsageError("--reach takes no --vendor but zenoh", text, "Leave it out.")
+        of_zenoh = bool(_why_zenoh(vendor, root))
+        return _show_reach(reach, root, rest, policy, infrastructure, as_json, zenoh=of_zenoh)
     context = _ContextOptions(moment, domain, time_zone)
     if log is not None:
         return _show_log(log, root, rest, context, as_json)
@@ -742,7 +746,7 @@ def _beside(
 
     try:
         evaluator = ZenohEvaluator(root, at=context.at, domain=context.domain)
-        return evaluator.answer(enclave.name, question, reach=False)
+        return evaluator.answer(enclave.name, question, reach=False, brief=True)
     except SrosError as error:
         return error
 
@@ -1162,20 +1166,27 @@ def _show_reach(
     policy: Path | None,
     infrastructure: bool,
     as_json: bool,
+    *,
+    zenoh: bool,
 ) -> int:
     """Print which enclaves one enclave can influence and learn from; return 0."""
     from sros_tool.explain.reach import OF_EVERY_NODE, QUESTIONS, Network
     from sros_tool.keystore.missing import likely_names
-    from sros_tool.keystore.rights import load_rights
+    from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 
     if root is None and len(rest) == 1:
         root, rest = Path(rest[0]), ()
     if rest:
         raise UsageError("--reach takes one enclave, and no question")
-    source = load_rights(root or policy or keystore_from_environment())
+    if zenoh:
+        if policy:
+            raise UsageError("--reach on Zenoh takes no --policy", "It reads the files of Zenoh.")
+        source = load_zenoh_rights(root or keystore_from_environment())
+    else:
+        source = load_rights(root or policy or keystore_from_environment())
     without, questions = ((), ()) if infrastructure else (OF_EVERY_NODE, QUESTIONS)
     network = Network(source.rights, without=without, questions=questions, **_uncontrolled(source))
-    if source.kind == "keystore":
+    if source.kind == "keystore" or zenoh:
         _check_there(source.path, enclave)
     if enclave not in network.enclaves:
         meant = likely_names(enclave, network.enclaves)

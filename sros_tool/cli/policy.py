@@ -160,7 +160,8 @@ Example:
   - /talker ALLOW request service /*
   + /talker ALLOW request service /add_two_ints  (A has it by request ...
   3 rights differ
-  $ sros diff_policy robot.xml keystore/enclaves/talker/permissions.p7s""",
+  $ sros diff_policy robot.xml keystore/enclaves/talker/permissions.p7s
+  $ sros diff_policy keystore keystore/enclaves/router/router.json5""",
 )
 @click.argument("a", metavar="A", type=PATH)
 @click.argument("b", metavar="B", type=PATH)
@@ -168,9 +169,10 @@ Example:
 def diff_policy(a: Path, b: Path, as_json: bool) -> int:
     """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
-    A and B are policy files, permissions (.p7s or .xml), folders of enclaves, or keystores.
-    Permissions are shown in ROS terms; their signature is verified if the permissions CA is next
-    to them. If A or B is for a single enclave, only this enclave is compared.
+    A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or
+    configurations of Zenoh such as router.json5. Permissions and rules of Zenoh are shown in ROS
+    terms; the signature of permissions is verified if the permissions CA is next to them. If A or
+    B is only for some enclaves, these are compared.
 
     The exit status is 1 if the rights differ, or if DDS would refuse A or B.
     """

@@ -52,7 +52,8 @@ Examples:
   $ sros view policies/mobile_robot.xml --format svg -o mobile_robot.svg
   $ sros view robot.xml --observed learned.xml -o use.html
   $ sros view old.xml new.xml -o change.html
-  $ sros view robot.xml keystore -o drift.html""",
+  $ sros view robot.xml keystore -o drift.html
+  $ sros view keystore keystore/enclaves/router/router.json5 -o zenoh.html""",
 )
 @click.argument("sources", metavar="SOURCE...", type=PATH, nargs=-1, required=True)
 @click.option(
@@ -107,8 +108,9 @@ def view(
     """Draw who may do what in SOURCE, or compare two sources in one drawing.
 
     A SOURCE is a policy file, a keystore (its signed permissions), the folder of an enclave, its
-    permissions, or the output of `sros generate_policy --json`. Two policies are compared as
-    before and after, a policy and a keystore for drift. --observed compares the rights in SOURCE
+    permissions, a Zenoh configuration (router.json5), or the output of `sros generate_policy
+    --json`. Two policies are compared as before and after, a policy and a keystore for drift, and
+    a Zenoh configuration with what it should allow. --observed compares the rights in SOURCE
     with those that are used.
 
     The page is one file that needs no network. No format contains keys or paths of this machine.
@@ -183,6 +185,9 @@ def _picture(
         return overlay(read[0], read[1], "use", context)
     if kinds[0] == kinds[1]:
         return overlay(read[0], read[1], "change", context)
+    if "zenoh" in kinds:
+        first, second = sorted(read, key=lambda each: each.origin.kind == "zenoh")
+        return overlay(first, second, "worlds", context)
     # Drift is shown from the side of the policy, whichever was named first.
     first, second = sorted(read, key=lambda each: each.origin.kind != "policy")
     return overlay(first, second, "drift", context)

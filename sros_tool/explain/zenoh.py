@@ -201,8 +201,13 @@ class ZenohEvaluator:
             f"Write them: `sros zenoh {quote(str(self.root))}`.",
         )
 
-    def answer(self, enclave: str, question: Question, *, reach: bool = True) -> ZenohAnswer:
-        """Return the answer for one enclave; ``reach`` says whether to look at all others."""
+    def answer(
+        self, enclave: str, question: Question, *, reach: bool = True, brief: bool = False
+    ) -> ZenohAnswer:
+        """Return the answer for one enclave; ``reach`` says whether to look at all others.
+
+        A ``brief`` answer for a peer is by the router's file, which has the same rights.
+        """
         if enclave not in self.names:
             raise no_such_enclave(self.root, enclave, self.names)
         own = self._file(enclave, self._file_of(enclave))
@@ -231,7 +236,7 @@ class ZenohEvaluator:
         wanted = self._rights(enclave, question)
         checks = tuple(
             check
-            for other in self._enforcers(own.process, self.router.process)
+            for other in self._enforcers(own.process, self.router.process, brief=brief)
             for check in self._decided(own.process, other, wanted)
         )
         found = replace(found, checks=checks)
@@ -332,9 +337,11 @@ class ZenohEvaluator:
 
     # ── decisions ──────────────────────────────────────────────────────────────────────────
 
-    def _enforcers(self, own: ZenohProcess, router: ZenohProcess) -> tuple[ZenohProcess, ...]:
+    def _enforcers(
+        self, own: ZenohProcess, router: ZenohProcess, *, brief: bool
+    ) -> tuple[ZenohProcess, ...]:
         """Return the processes that decide on an enclave's rights."""
-        if own.mode is not Mode.PEER:
+        if brief or own.mode is not Mode.PEER:
             return (router,)
         files = (
             self._file(name, SESSION_FILE)

@@ -1,7 +1,8 @@
-"""The rights that a policy, a permissions document, an enclave or a keystore gives.
+"""The rights that a policy, permissions, an enclave, a keystore or a Zenoh configuration gives.
 
 The rights of enclaves and keystores are read from ``permissions.p7s``, which is the file that DDS
-loads.  Its signature is verified with the permissions CA next to it.
+loads.  Its signature is verified with the permissions CA next to it.  A configuration of Zenoh
+gives what its access control lets other enclaves do.
 """
 
 from __future__ import annotations
@@ -10,14 +11,17 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 
 from cryptography import x509
 
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
-from sros_tool.errors import DocumentError, Note, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
+    ROUTER_FILE,
+    SESSION_FILE,
     enclave_names,
     enclave_path,
     is_keystore,
@@ -29,7 +33,10 @@ from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.translate import grant_rights
+from sros_tool.translate_zenoh_back import rights_in_rules
 from sros_tool.xml import parse, read_bytes
+from sros_tool.zenoh.configuration import Mode
+from sros_tool.zenoh.document import parse_configuration
 
 _COMMON_NAME = re.compile(r"(?:^|[,/])\s*CN\s*=\s*(/[^,]*?)\s*(?:,|$)")
 
@@ -38,9 +45,9 @@ _COMMON_NAME = re.compile(r"(?:^|[,/])\s*CN\s*=\s*(/[^,]*?)\s*(?:,|$)")
 class RightsSource:
     """The rights that a file or folder gives.
 
-    ``kind`` is "policy", "permissions", "enclave" or "keystore".  ``scope`` are the enclaves that
-    it can give rights to; None for all.  ``sound`` is False if DDS would refuse a part of it: a
-    signature that does not verify, or permissions that are missing or malformed.
+    ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh".  ``scope`` are the
+    enclaves that it can give rights to; None for all.  ``sound`` is False if DDS would refuse a
+    part of it: a signature that does not verify, or permissions that are missing or malformed.
     """
 
     path: Path
@@ -54,8 +61,8 @@ class RightsSource:
 def load_rights(path: Path) -> RightsSource:
     """Return the rights that ``path`` gives.
 
-    ``path`` is a policy file, ``permissions.p7s`` or ``permissions.xml``, an enclave folder, or a
-    keystore.
+    ``path`` is a policy file, ``permissions.p7s`` or ``permissions.xml``, an enclave folder, a
+    keystore, or a configuration of Zenoh such as ``router.json5``.
 
     Raises:
         DocumentError: ``path`` is anything else, or malformed.
@@ -71,12 +78,74 @@ def load_rights(path: Path) -> RightsSource:
             f"It has no enclaves folder, and no {PERMISSIONS_FILE}.",
         )
     data = read_bytes(path, "file")
+    if is_zenoh(data):
+        return _zenoh_rights(path, data)
     signed = b"multipart/signed" in data[:1000].lower()
     # read_policy says how a policy of an earlier format, with <profiles> at the top, is converted.
     if not signed and parse(data, f"'{path}'").tag in ("policy", "profiles"):
         policy = read_policy(path)
         return RightsSource(path, "policy", policy_rights(policy), None, True, ())
     return _document_rights(path, "permissions", path)
+
+
+def load_zenoh_rights(root: Path) -> RightsSource:
+    """Return the rights that the Zenoh configurations of a keystore give its enclaves together.
+
+    Those are of the router, and of peers, which are connected without it.
+
+    Raises:
+        KeystoreError: there is no configuration of a router.
+        DocumentError: Zenoh would not accept a configuration.
+    """
+    files = {name: enclave_path(root, name) for name in enclave_names(root)}
+    routers = [name for name, folder in files.items() if (folder / ROUTER_FILE).is_file()]
+    if not routers:
+        raise KeystoreError(
+            f"keystore '{root}' has no {ROUTER_FILE}",
+            "Without it, it is not known what Zenoh enforces.",
+            f"Write it: `sros zenoh {quote(str(root))}`.",
+        )
+    found = [load_rights(files[name] / ROUTER_FILE) for name in routers]
+    for name, folder in files.items():
+        file = folder / SESSION_FILE
+        if name not in routers and file.is_file():
+            data = read_bytes(file, "Zenoh configuration")
+            document = parse_configuration(data, str(file))
+            if document.mode is not Mode.PEER:
+                break  # those of a keystore have one mode, and clients are filtered by the router
+            found.append(_zenoh_rights(file, data))
+    return RightsSource(
+        root,
+        "zenoh",
+        frozenset(each for one in found for each in one.rights if each.enclave not in routers),
+        None,
+        True,
+        tuple(dict.fromkeys(note for one in found for note in one.notes)),
+    )
+
+
+def is_zenoh(data: bytes) -> bool:
+    """Return whether a file looks like a configuration of Zenoh: JSON5 with access control."""
+    return data.lstrip()[:1] in (b"{", b"/") and b"access_control" in data
+
+
+def _zenoh_rights(path: Path, data: bytes) -> RightsSource:
+    access = parse_configuration(data, str(path)).access
+    found = rights_in_rules(access)
+    notes = []
+    if not access.enabled or access.allows_by_default:
+        text = "its access control is off, so it denies nothing."
+        if access.enabled:
+            text = "it allows everything that no rule denies, to everybody."
+        notes.append(Note("rights.zenoh-open", f"{path}: {text}"))
+    if any(each.cert_common_names is None for each in access.subjects):
+        text = "it has rules for processes without a name, which are no enclaves: they are left out"
+        notes.append(Note("rights.zenoh-nameless", f"{path}: {text}; `sros check` shows them."))
+    if found.left_out:
+        text = f"{path}: {len(found.left_out)} key expressions are no names of ROS, and left out, "
+        text += f"such as {found.left_out[0][:80]}."
+        notes.append(Note("rights.zenoh-no-name", text))
+    return RightsSource(path, "zenoh", found.rights, found.enclaves, True, tuple(notes))
 
 
 def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:

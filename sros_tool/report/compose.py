@@ -48,6 +48,7 @@ _OVERLAYS = {
     "use": Overlay("use", "allowed, never observed", "observed, not allowed"),
     "change": Overlay("change", "removed", "added"),
     "drift": Overlay("drift", "only in the policy", "only in what was signed"),
+    "worlds": Overlay("worlds", "not in the rules of Zenoh", "only in the rules of Zenoh"),
 }
 """Every kind of overlay."""
 
@@ -93,7 +94,7 @@ def compose(first: PictureSource, context: Context = Context()) -> Picture:
 def overlay(
     first: PictureSource, second: PictureSource, kind: str, context: Context = Context()
 ) -> Picture:
-    """Return the overlay of two sources; ``kind`` is "use", "change" or "drift"."""
+    """Return the overlay of two sources; ``kind`` is a key of `_OVERLAYS`."""
     scope = first.scope if second.scope is None else second.scope
     rights = [
         frozenset(each for each in side.rights if scope is None or each.enclave in scope)

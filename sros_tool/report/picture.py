@@ -177,8 +177,9 @@ class SourceTitle:
 class Overlay:
     """The kind of an overlay of two sources.
 
-    ``kind`` is use (allowed and observed), change (before and after) or drift (policy and
-    keystore); ``first`` and ``second`` label a right that only the first or second side has.
+    ``kind`` is use (allowed and observed), change (before and after), drift (policy and keystore)
+    or worlds (rights and rules of Zenoh); ``first`` and ``second`` label a right that only the
+    first or second side has.
     """
 
     kind: str

@@ -29,7 +29,7 @@ from sros_tool.keystore.reader import (
     open_enclave,
     read_lists,
 )
-from sros_tool.keystore.rights import load_rights
+from sros_tool.keystore.rights import is_zenoh, load_rights
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import (
     authority_text,
@@ -62,7 +62,8 @@ def read_source(path: Path, *, now: datetime) -> PictureSource:
     Raises:
         DocumentError: ``path`` is none of these.
     """
-    if path.is_file() and read_bytes(path, "file").lstrip()[:1] == b"{":
+    data = read_bytes(path, "file") if path.is_file() else b""
+    if data.lstrip()[:1] == b"{" and not is_zenoh(data):
         return _observation(path)
     read = load_rights(path)
     findings = tuple(PicturedFinding(note.id, "warning", note.text) for note in read.notes)

@@ -136,6 +136,52 @@ def test_who_may(made: Path, mode: str) -> None:
     assert explain(made / mode, "--who", "call", "/nope", "--vendor", "zenoh").status == 1
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_reach_follows_the_rules_of_zenoh(made: Path, tmp_path: Path, mode: str) -> None:
+    asked = ("--reach", "/client", "--vendor", "zenoh", "--json")
+    found = json.loads(explain(made / mode, *asked).ok().out)
+    dds = json.loads(explain(made / mode, *asked[:2], "--json").ok().out)
+    assert found == dds
+    assert [each["enclave"] for each in found["influences"]] == ["/recorder", "/server", "/wide"]
+    if mode == "client":
+        changed = Path(shutil.copytree(made / mode, tmp_path / "ks", symlinks=True))
+        router = changed / "enclaves/router/router.json5"
+        router.write_text(router.read_text().replace("/go/_action/", "/went/_action/", 1))
+        assert json.loads(explain(changed, *asked).ok().out) != found
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_rules_of_zenoh_are_the_rights_of_the_keystore(made: Path, mode: str) -> None:
+    router = made / mode / "enclaves/router/router.json5"
+    sros("diff_policy", made / mode, router).ok()
+    sros("diff_policy", made / "policy.xml", router).ok()
+
+
+def test_diff_and_view_show_where_the_worlds_differ(keystore: Path, tmp_path: Path) -> None:
+    router = keystore / "enclaves/router/router.json5"
+    router.write_text(router.read_text().replace("0/chatter/*/*", "0/other/*/*"))
+    shown = sros("diff_policy", keystore, router)
+    assert shown.status == 1
+    assert "- /talker ALLOW publish topic /chatter\n" in shown.out
+    assert "+ /talker ALLOW publish topic /other\n" in shown.out
+    picture = json.loads(sros("view", keystore, router, "--format", "json").ok().out)
+    assert picture["overlay"]["kind"] == "worlds"
+    marks = {each["text"]: each["mark"] for each in picture["differences"]}
+    assert marks["/talker ALLOW publish topic /other"] == "second"
+    alone = json.loads(sros("view", router, "--format", "json").ok().out)
+    assert [each["path"] for each in alone["enclaves"]] == sorted(
+        ["/client", "/listener", "/recorder", "/server", "/talker", "/wide"]
+    )
+
+
+def test_rules_that_enforce_nothing_are_noted(keystore: Path) -> None:
+    router = keystore / "enclaves/router/router.json5"
+    document = json.loads(router.read_text())
+    document["access_control"]["enabled"] = False
+    router.write_text(json.dumps(document))
+    assert "note [rights.zenoh-open]" in sros("diff_policy", keystore, router).err
+
+
 # ── files that are not as they should be ───────────────────────────────────────────────────
 
 
