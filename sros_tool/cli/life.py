@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -305,7 +306,7 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     if soon:
         click.echo(
             "the list expires soon, and DDS then refuses every participant: "
-            f"run `sros crl {root} --refresh`.",
+            f"run `sros crl {quote(str(root))} --refresh`.",
             err=True,
         )
     return 1 if soon else 0

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
+from shlex import quote
 
 from cryptography import x509
 
@@ -148,13 +149,13 @@ def read_credentials(root: Path, name: str) -> Credentials:
         raise KeystoreError(
             f"enclave {name} cannot be read: {error.what}",
             error.why,
-            error.remedy or f"See `sros inspect {folder}`.",
+            error.remedy or f"See `sros inspect {quote(str(folder))}`.",
         ) from error
     if granted.grant is None:
         raise KeystoreError(
             f"the permissions of enclave {name} have no grant for {subject}",
             "They belong to another certificate.",
-            f"Sign them again with `sros create_permission {root} {name} POLICY_FILE`.",
+            f"Sign them again with `sros create_permission {quote(str(root))} {name} POLICY_FILE`.",
         )
     return Credentials(name, certificate, granted.signed, granted.digest, granted.grant)
 

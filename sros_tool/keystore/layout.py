@@ -334,7 +334,7 @@ def select_enclaves(
             raise KeystoreError(
                 f"no enclave of keystore '{root}' matches {pattern!r}",
                 "",
-                f"See `sros list_enclaves {root}`.",
+                f"See `sros list_enclaves {quote(str(root))}`.",
             )
         chosen |= dict.fromkeys(fitting)
     return tuple(chosen)
@@ -426,7 +426,7 @@ def check_keystore(root: Path) -> None:
             "It does not exist."
             if not root.exists()
             else f"It has no {ENCLAVES} folder, or has neither a CA, a governance nor an enclave.",
-            f"Make one with `sros create_keystore {root}`.",
+            f"Make one with `sros create_keystore {quote(str(root))}`.",
         )
 
 

@@ -23,6 +23,7 @@ from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
+from shlex import quote
 from sys import intern
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -309,8 +310,10 @@ def _too_large(path: Path, limit: str) -> KeystoreError:
         f"the ledger '{path}' is too large",
         f"It has more than {limit}.",
         f"If all of it is of this keystore, move {LEDGER} and {LEDGER_HEAD} to an archive, state "
-        f"all rights again with `sros generate_artifacts -k {root} -p POLICY_FILE`, and replace "
-        f"the CAs with `sros rotate_ca {root} --next`, so that nothing that the new ledger lacks "
+        f"all rights again with `sros generate_artifacts -k {quote(str(root))} -p POLICY_FILE`, "
+        "and replace "
+        f"the CAs with `sros rotate_ca {quote(str(root))} --next`, so that nothing that the new "
+        "ledger lacks "
         "is valid. Otherwise restore it from a backup.",
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.errors import InvalidNameError, KeystoreError, SrosError
 from sros_tool.keystore.layout import REVOKED
@@ -34,7 +35,7 @@ def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
     names = sorted(there)
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     why = f"The keystore has {', '.join(names[:_SHOWN]) or 'no enclave'}{more}."
-    create = f"`sros create_enclave {root} {name}`"
+    create = f"`sros create_enclave {quote(str(root))} {name}`"
     return KeystoreError(what, why, f"If it is not a typo, create it with {create}.")
 
 
@@ -60,7 +61,8 @@ def _was_revoked(root: Path, entry: Entry) -> SrosError:
     return KeystoreError(
         f"enclave {entry.enclave} of keystore '{root}' was revoked at {entry.time}{reason}",
         f"Its files are in '{folder}'." if folder.is_dir() else "",
-        f"To use it again, with another key: `sros generate_artifacts -k {root} -e {entry.enclave} "
+        f"To use it again, with another key: `sros generate_artifacts -k {quote(str(root))} -e "
+        f"{entry.enclave} "
         "-p POLICY_FILE`.",
     )
 

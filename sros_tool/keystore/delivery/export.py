@@ -167,7 +167,7 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
             raise KeystoreError(
                 f"enclave {name} would not run on a robot",
                 "; ".join(map(str, state.problems)) + ".",
-                f"See `sros inspect {folder}`.",
+                f"See `sros inspect {quote(str(folder))}`.",
             )
         authorities = (state.identity_ca, state.permissions_ca)
         if any(

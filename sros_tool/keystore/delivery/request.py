@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.delivery.trust import refuse_ca_keystore
@@ -42,7 +43,9 @@ def create_request(
     check_enclave_name(name)
     if not dry_run and folder.is_dir():
         tidy(folder)
-    refuse_ca_keystore(folder, f"Make the enclave with `sros create_enclave {folder} {name}`.")
+    refuse_ca_keystore(
+        folder, f"Make the enclave with `sros create_enclave {quote(str(folder))} {name}`."
+    )
     place = enclave_folder(name)
     with Transaction(folder, fresh=True, dry_run=dry_run) as transaction:
         path = folder / place / "key.pem"

@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from shlex import quote
 
 from cryptography import x509
 
@@ -249,7 +250,7 @@ def _check_key(root: Path, request: SigningRequest, known: KnownKeys, renew: boo
             raise KeystoreError(
                 f"enclave {request.name} has another key in keystore '{root}'",
                 "Its key.pem would not fit a certificate for the key in the request.",
-                f"Revoke the enclave first, with `sros revoke {root} {request.name}`.",
+                f"Revoke the enclave first, with `sros revoke {quote(str(root))} {request.name}`.",
             )
 
 

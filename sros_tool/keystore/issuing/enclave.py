@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
+from shlex import quote
 from typing import TypeVar
 
 from cryptography import x509
@@ -315,7 +316,8 @@ def _early_expiry(
     return Note(
         "keystore.ends-with-ca",
         f"New {what} expire with their CA at {iso(end)}, {lost.days} days earlier than the "
-        f"keystore's settings choose. Rotate the CA with `sros rotate_ca {root} --next`.",
+        f"keystore's settings choose. Rotate the CA with `sros rotate_ca {quote(str(root))} "
+        "--next`.",
     )
 
 
@@ -400,7 +402,8 @@ class RecordedRights:
         raise KeystoreError(
             f"it is not certain that the permissions of enclave {name} are its latest",
             why,
-            f"State its rights with `sros create_permission {self._root} {name} POLICY_FILE`, and "
+            f"State its rights with `sros create_permission {quote(str(self._root))} {name} "
+            "POLICY_FILE`, and "
             "try again.",
         )
 

@@ -456,7 +456,8 @@ def _check_typo(root: Path) -> None:
             raise UsageError(
                 f"'{root}' does not exist, and '{name}' next to it is a keystore",
                 "The name may be a typo, so no second keystore is created.",
-                f"Name '{root.with_name(name)}', or run `sros create_keystore {root}` first.",
+                f"Name '{root.with_name(name)}', or run `sros create_keystore "
+                f"{quote(str(root))}` first.",
             )
 
 
@@ -592,7 +593,7 @@ def _write_enclave(
         if revoke_old and isinstance(identity, x509.Certificate):
             old = identity
             public: PublicKey = old.public_key()  # type: ignore[assignment]
-            remedy = f"Give it another key with `sros renew {root} {name} --new-key`."
+            remedy = f"Give it another key with `sros renew {quote(str(root))} {name} --new-key`."
             keystore.known.refuse_revoked(public, f"enclave {name}", remedy, old)
             identity = NewIdentity(enclave_subject(name, unique=True), public)
     rights = None
@@ -689,7 +690,7 @@ def _usable_certificate(
         raise KeystoreError(
             f"the certificate of enclave {name} is not valid now",
             f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}.",
-            f"Renew it with `sros renew {root} {name}`.",
+            f"Renew it with `sros renew {quote(str(root))} {name}`.",
         )
     return certificate
 

@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.keystore.authorities.authority import Authorities, load_authorities
@@ -229,7 +230,9 @@ class _Renewer:
             identity = NewIdentity(subject, key.public_key(), key)
         else:
             public: PublicKey = state.certificate.public_key()  # type: ignore[assignment]
-            remedy = f"Give it another key with `sros renew {self._root} {name} --new-key`."
+            remedy = (
+                f"Give it another key with `sros renew {quote(str(self._root))} {name} --new-key`."
+            )
             self._known.refuse_revoked(public, f"enclave {name}", remedy, state.certificate)
             identity = NewIdentity(subject, public)
         return Issuance(name, identity, rights)

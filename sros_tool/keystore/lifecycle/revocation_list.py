@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from shlex import quote
 
 from cryptography import x509
 
@@ -311,7 +312,8 @@ class RevocationListSigner:
                 f"the key of the old identity CA {name} is not available",
                 f"Until that CA is retired, Fast DDS accepts its certificates, so it also has to "
                 f"sign a revocation list: {error.what}.",
-                f"Restart all processes and run `sros rotate_ca {self._root} --to retire` first; "
+                f"Restart all processes and run `sros rotate_ca {quote(str(self._root))} --to "
+                "retire` first; "
                 "or add --until-retired, and retire it soon.",
             )
         text = f"The list of the old identity CA {name} was not signed again"
@@ -322,5 +324,5 @@ class RevocationListSigner:
         elif old:
             text += f"; it expires at {iso(old.next_update)}, and Fast DDS then refuses "
             text += "the enclaves of that CA"
-        text += f": run `sros rotate_ca {self._root} --to retire`."
+        text += f": run `sros rotate_ca {quote(str(self._root))} --to retire`."
         self.remarks.append(Note("crl.old-ca-not-signed", text))

@@ -388,7 +388,8 @@ def update_keystore(
             raise UsageError(
                 "nothing changes in the keystore, so no certificate is replaced",
                 "",
-                f"To replace and revoke certificates, run `sros renew {root} NAME --revoke-old`.",
+                f"To replace and revoke certificates, run `sros renew {quote(str(root))} NAME "
+                "--revoke-old`.",
             )
         update = updater.update(done, pending, keyring, progress)
         lost = _signed_payloads(present.settings.protection, goal.settings.protection)
@@ -677,7 +678,7 @@ class _Updater:
     def _new_identity(self, state: Credentials) -> NewIdentity:
         name, settings = state.name, self._goal.settings
         public: PublicKey = state.certificate.public_key()  # type: ignore[assignment]
-        remedy = f"Give it another key with `sros renew {self._root} {name} --new-key`."
+        remedy = f"Give it another key with `sros renew {quote(str(self._root))} {name} --new-key`."
         self._known.refuse_revoked(public, f"enclave {name}", remedy, state.certificate)
         kept = settings.unique_subject == self._present.settings.unique_subject
         unique = (
@@ -717,7 +718,8 @@ class _Updater:
             raise KeystoreError(
                 f"the permissions of enclave {name} are not for domain {self._present.domains}",
                 "So it is not certain which rights it shall have in other domains.",
-                f"State them with `sros create_permission {self._root} {name} POLICY_FILE`.",
+                f"State them with `sros create_permission {quote(str(self._root))} {name} "
+                "POLICY_FILE`.",
             )
         rules = tuple(replace(each, domains=self._goal.domains) for each in grant.rules)
         return replace(grant, rules=rules)
@@ -733,7 +735,7 @@ class _Updater:
             raise KeystoreError(
                 f"a rotation of the CA of keystore '{self._root}' is under way",
                 "It replaces the CA in both roles.",
-                f"Finish it first with `sros rotate_ca {self._root} --next`.",
+                f"Finish it first with `sros rotate_ca {quote(str(self._root))} --next`.",
             )
         (file,) = files
         for one, private, path_of in (

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from shlex import quote
 
 from cryptography import x509
 
@@ -207,7 +208,7 @@ def _target_stage(root: Path, rotation: Rotation, to: RotationStage | None) -> R
             raise UsageError(
                 f"no CA of keystore '{root}' is being replaced",
                 "There is no old CA to retire.",
-                f"Begin with `sros rotate_ca {root} --next`.",
+                f"Begin with `sros rotate_ca {quote(str(root))} --next`.",
             )
         return RotationStage.NONE  # an earlier rotation is complete
     order = list(RotationStage)
@@ -216,13 +217,14 @@ def _target_stage(root: Path, rotation: Rotation, to: RotationStage | None) -> R
         raise UsageError(
             f"the stage {to} is not the next one",
             f"The next stage is {rotation.next_stage()}; after it, restart the processes.",
-            f"Run `sros rotate_ca {root} --next`, or `--finish` to do all stages at once.",
+            f"Run `sros rotate_ca {quote(str(root))} --next`, or `--finish` to do all stages at "
+            "once.",
         )
     if ahead < 0:
         raise UsageError(
             f"the stage {to} is over",
             f"The keystore is at {rotation.stage}, and a rotation cannot go back.",
-            f"Run `sros rotate_ca {root} --next`.",
+            f"Run `sros rotate_ca {quote(str(root))} --next`.",
         )
     return to
 
@@ -262,7 +264,7 @@ def renew_identity_ca(
             raise KeystoreError(
                 f"a rotation of the CAs of keystore '{root}' is under way",
                 "",
-                f"Finish it first with `sros rotate_ca {root} --next`.",
+                f"Finish it first with `sros rotate_ca {quote(str(root))} --next`.",
             )
         template = load_settings(root)
         key = keyring.open(root, IDENTITY, template)
@@ -481,7 +483,8 @@ class _Rotator:
                 raise KeystoreError(
                     f"enclave {name} cannot be moved to the new CA: {error.what}",
                     error.why,
-                    error.remedy or f"Run `sros inspect {folder}`. Nothing was changed.",
+                    error.remedy
+                    or f"Run `sros inspect {quote(str(folder))}`. Nothing was changed.",
                 ) from error
 
         writer.for_each(self._names, reissue, progress)
@@ -610,7 +613,7 @@ def _issuance(
                 "identity CA of this keystore"
             )
         key: PublicKey = kept.public_key()  # type: ignore[assignment]
-        remedy = f"Renew it with `sros renew {root} {name} --new-key`, or revoke it."
+        remedy = f"Renew it with `sros renew {quote(str(root))} {name} --new-key`, or revoke it."
         known.refuse_revoked(key, f"enclave {name}", remedy, kept)
         certificate = NewIdentity(kept.subject, key)
     rights = None
@@ -628,7 +631,7 @@ def _verified_rights(
         raise KeystoreError(
             f"its permissions have no grant for {subject}",
             "They belong to another certificate.",
-            f"Sign them again with `sros create_permission {root} {name} POLICY_FILE`.",
+            f"Sign them again with `sros create_permission {quote(str(root))} {name} POLICY_FILE`.",
         )
     return recorded.of(name, old.digest, old.grant)
 
