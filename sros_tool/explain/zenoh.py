@@ -296,7 +296,7 @@ class ZenohEvaluator:
             return _closed(enclave, file, f"it has no {file}: its processes open no session")
         try:
             data = read_bytes(folder / file, "Zenoh configuration")
-            document = parse_configuration(data, str(folder / file))
+            document = parse_configuration(data, str(folder / file), lines=False)
         except SrosError as error:
             return _closed(enclave, file, f"Zenoh does not accept its {file}: {error.why}".strip())
         state = open_enclave(folder, now=self._at)

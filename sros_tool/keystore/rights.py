@@ -110,7 +110,7 @@ def load_zenoh_rights(root: Path) -> RightsSource:
         file = folder / SESSION_FILE
         if name not in routers and file.is_file():
             data = read_bytes(file, "Zenoh configuration")
-            document = parse_configuration(data, str(file))
+            document = parse_configuration(data, str(file), lines=False)
             if document.mode is not Mode.PEER:
                 break  # those of a keystore have one mode, and clients are filtered by the router
             found.append(_zenoh_rights(file, data))
@@ -130,7 +130,7 @@ def is_zenoh(data: bytes) -> bool:
 
 
 def _zenoh_rights(path: Path, data: bytes) -> RightsSource:
-    access = parse_configuration(data, str(path)).access
+    access = parse_configuration(data, str(path), lines=False).access
     found = rights_in_rules(access)
     notes = []
     if not access.enabled or access.allows_by_default:

@@ -7,8 +7,10 @@ Source: spec.json5.org 1.0; compared with what the wheel 1.10.2 accepts.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 MOST_BYTES = 16 * 1024 * 1024
@@ -59,14 +61,39 @@ class _Token(NamedTuple):
     line: int
 
 
-def parse_json5(text: str) -> Any:
+def parse_json5(text: str, *, lines: bool = True) -> Any:
     """Return the value of a JSON5 text; each object is a `Json5Object`.
+
+    Without ``lines``, which are then 1 everywhere, JSON is read some twenty times as fast.
 
     Raises:
         Json5Error: the text is not JSON5, has more than 100 levels, or an object that names a
             member twice.
     """
+    # JSON may state half a character by an escape.
+    if not lines and "\\u" not in text:
+        with suppress(ValueError, RecursionError):  # then the reader of JSON5 says what is wrong
+            value = json.loads(text, object_pairs_hook=_without_lines)
+            if not _is_deep(value):
+                return value
     return _Reader(text).whole()
+
+
+def _without_lines(members: list[tuple[str, Any]]) -> Json5Object:
+    found = Json5Object(1)
+    found.update(members)
+    if len(found) != len(members):
+        raise ValueError("a member is named twice")
+    return found
+
+
+def _is_deep(value: Any) -> bool:
+    level = [value]
+    for _ in range(_MOST_DEPTH):
+        inner = [each.values() if isinstance(each, dict) else each for each in level
+                 if isinstance(each, dict | list)]  # fmt: skip
+        level = [each for of in inner for each in of]
+    return any(isinstance(each, dict | list) for each in level)
 
 
 def _tokens(text: str) -> Iterator[_Token]:

@@ -41,14 +41,27 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("text", "value"), ACCEPTED.items())
-def test_accepted(text: str, value: object) -> None:
-    assert parse_json5(text) == value
+@pytest.mark.parametrize("lines", [True, False])
+def test_accepted(text: str, value: object, lines: bool) -> None:
+    assert parse_json5(text, lines=lines) == value
 
 
 @pytest.mark.parametrize(("text", "problem"), REFUSED.items())
-def test_refused(text: str, problem: str) -> None:
+@pytest.mark.parametrize("lines", [True, False])
+def test_refused(text: str, problem: str, lines: bool) -> None:
     with pytest.raises(Json5Error, match=problem.replace("[", r"\[")):
-        parse_json5(text)
+        parse_json5(text, lines=lines)
+
+
+@pytest.mark.parametrize(
+    "text", ['{"a":1,"a":2}', '{"a":"\\ud800"}', "[" * 101 + "]" * 101, "[" * 5000]
+)
+def test_json_is_refused_alike_without_its_lines(text: str) -> None:
+    for lines in (True, False):
+        with pytest.raises(Json5Error):
+            parse_json5(text, lines=lines)
+    assert parse_json5("[" * 100 + "]" * 100, lines=False) == parse_json5("[" * 100 + "]" * 100)
+    assert parse_json5('{"a":[1,{}]}', lines=False)["a"][1].line == 1
 
 
 def test_lines() -> None:
