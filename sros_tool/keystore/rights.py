@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
 
 from cryptography import x509
 
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
-from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, Note, PolicyError, SrosError
 from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
@@ -31,8 +31,10 @@ from sros_tool.keystore.layout import (
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.policy.model import ALLOW, RIGHTS, Source
+from sros_tool.policy.rights import Right, order, parts, policy_rights
 from sros_tool.translate import grant_rights
+from sros_tool.translate_zenoh import StatedRight
 from sros_tool.translate_zenoh_back import rights_in_rules
 from sros_tool.xml import parse, read_bytes
 from sros_tool.zenoh.configuration import Mode
@@ -275,3 +277,30 @@ def _left_out(grants: Iterable[Grant]) -> Iterator[Note]:
         if False in kinds[kinds.index(True) if True in kinds else len(kinds) :]:
             text = "a deny_rule after an allow_rule may have no effect: the first match decides."
             yield Note("rights.rule-order", text)
+
+
+def recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRight, ...]:
+    """Return the ROS rights that signed permissions give an enclave in a ROS domain.
+
+    A topic ``*`` without a ROS name, as ros2/sros2 grants it, stands for all topics and services if
+    it may be published and subscribed; other topics without a ROS name are not on Zenoh.
+
+    Raises:
+        PolicyError: it is uncertain which ROS names a denial is about.
+    """
+    source = Source(f"the permissions of {enclave}", 0)
+    rules = tuple(each for each in grant.rules if domain in each.domains.closed())
+    rights = grant_rights(enclave, replace(grant, rules=rules))
+    raw = {each for each in rights if each.kind == "dds"}
+    if unclear := sorted(each.describe() for each in raw if each.qualifier is not ALLOW):
+        raise PolicyError(
+            f"{source}: DENY {unclear[0]} cannot be said to Zenoh",
+            "It is a name of DDS, and not certainly one of ROS.",
+            "State the rights of the enclave in a policy, with `sros create_permission`.",
+        )
+    if {each.right for each in raw if each.name == "*"} == {"publish", "subscribe"}:
+        rights |= {
+            Right(enclave, ALLOW, right, "/*") for right in (*RIGHTS["topics"], *RIGHTS["services"])
+        }
+    parted = (part for each in rights - raw for part in parts(each))
+    return tuple(StatedRight(each, source) for each in sorted(set(parted), key=order))

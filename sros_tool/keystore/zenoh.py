@@ -14,7 +14,6 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.zenoh import recorded_rights
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     PERMISSIONS_FILE,
@@ -22,6 +21,7 @@ from sros_tool.keystore.layout import (
     ZENOH_SIGNED,
 )
 from sros_tool.keystore.reader import OpenedEnclave
+from sros_tool.keystore.rights import recorded_rights
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of
 from sros_tool.translate_zenoh import domains_of, remote_of

@@ -32,14 +32,14 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.reader import read_certificate, read_lists, read_signed_grant
+from sros_tool.keystore.rights import recorded_rights
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, subject_text
-from sros_tool.policy.model import ALLOW, Enclave, Source
-from sros_tool.policy.rights import KIND_OF, Right, Rules, order, parts
-from sros_tool.translate import grant_rights
+from sros_tool.policy.model import Enclave
+from sros_tool.policy.rights import KIND_OF, Rules
 from sros_tool.translate_zenoh import (
     StatedRight,
     control_of_router,
@@ -413,31 +413,6 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
                         rules.allow(enclave, right, name),
                         f"the right of {enclave} to {right} {name}",
                     )
-
-
-def recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRight, ...]:
-    """Return the ROS rights that signed permissions give an enclave in a ROS domain.
-
-    A topic ``*`` without a ROS name, as ros2/sros2 grants it, stands for all topics and services if
-    it may be published and subscribed; other topics without a ROS name are not on Zenoh.
-
-    Raises:
-        PolicyError: it is uncertain which ROS names a denial is about.
-    """
-    source = Source(f"the permissions of {enclave}", 0)
-    rules = tuple(each for each in grant.rules if domain in each.domains.closed())
-    rights = grant_rights(enclave, replace(grant, rules=rules))
-    raw = {each for each in rights if each.kind == "dds"}
-    if unclear := sorted(each.describe() for each in raw if each.qualifier is not ALLOW):
-        raise PolicyError(
-            f"{source}: DENY {unclear[0]} cannot be said to Zenoh",
-            "It is a name of DDS, and not certainly one of ROS.",
-            "State the rights of the enclave in a policy, with `sros create_permission`.",
-        )
-    if {each.right for each in raw if each.name == "*"} == {"publish", "subscribe"}:
-        rights |= {Right(enclave, ALLOW, right, "/*") for right in _PROOF}
-    parted = (part for each in rights - raw for part in parts(each))
-    return tuple(StatedRight(each, source) for each in sorted(set(parted), key=order))
 
 
 # ── files ──────────────────────────────────────────────────────────────────────────────────
