@@ -21,6 +21,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.keystores import KeystoreSet
@@ -34,6 +35,7 @@ from sros_tool.demo.scenarios.model import (
     Relation,
     Role,
     Row,
+    RowStatus,
     Wire,
     together,
 )
@@ -41,7 +43,6 @@ from sros_tool.demo.verdict import (
     PartyRecord,
     RowRecord,
     RowResult,
-    expired_too_early,
     judge_row,
 )
 from sros_tool.demo.wire import (
@@ -64,12 +65,21 @@ _TICK = 0.05
 _GRACE = 0.3
 """Seconds for messages that are on their way when a window closes."""
 
-_LIFETIMES = (8, 20, 60)
-"""Seconds of a short-lived certificate; the next one if it expired before it was used."""
+
+class _Patience(NamedTuple):
+    """Seconds that a slow machine may need; a row that stays undecided is tried with more.
+
+    ``lifetime`` is that of a short-lived certificate, ``connect`` how long a process tries to
+    connect that is expected to be refused.
+    """
+
+    lifetime: int
+    connect: float
+
+
+_PATIENCE = (_Patience(8, 2.0), _Patience(20, 8.0), _Patience(60, 30.0))
 
 _AFTER_EXPIRY = 2.0
-_SECONDS_TO_CONNECT = 2.0
-"""Seconds that a process tries to connect which is expected to be refused."""
 
 _ENOUGH_MESSAGES = 3
 _AFTER_ENOUGH = 2.0
@@ -159,9 +169,10 @@ class _Runner:
         played = RowRecord(rows[0], domain)
         if tried:
             async with self._slots:
-                for lifetime in _LIFETIMES:
-                    played = await self._play(group[0], together(tried), lifetime)
-                    if not (tried[0].short_lived and expired_too_early(played)):
+                for patience in _PATIENCE if self._plan.backend.on_zenoh else _PATIENCE[:1]:
+                    played = await self._play(group[0], together(tried), patience)
+                    found = (judge_row(replace(played, row=row)).observed for row in tried)
+                    if RowStatus.UNDECIDED not in found:
                         break
         results = []
         for row in rows:
@@ -179,14 +190,15 @@ class _Runner:
             return "the row needs a separate network namespace"
         return self._plan.keystores.problem(row, self._plan.topic)
 
-    async def _play(self, index: int, row: Row, lifetime: int) -> RowRecord:
+    async def _play(self, index: int, row: Row, patience: _Patience) -> RowRecord:
         plan, domain = self._plan, self._plan.domains[index]
         folder = plan.folder / f"row_{index + 1:02}"
-        shutil.rmtree(folder, ignore_errors=True)  # of a run with a shorter lifetime
+        shutil.rmtree(folder, ignore_errors=True)  # of an attempt with less patience
         folder.mkdir(parents=True)
         expiry = None
         if row.short_lived:
-            seconds = plan.keystores.shorten(row.talking.identity, lifetime, self._elapsed())
+            identity, lifetime = row.talking.identity, patience.lifetime
+            seconds = plan.keystores.shorten(identity, lifetime, self._elapsed())
             expiry = time.monotonic() + seconds
         processes: dict[str, _PartyProcess] = {}
         tap: Wiretap | None = None
@@ -202,7 +214,7 @@ class _Runner:
                 with network.entered():
                     for party in row.parties:
                         if party.turn == turn:
-                            started = self._start(index, row, party, folder)
+                            started = self._start(index, row, party, folder, patience)
                             processes[party.name] = started
             window = await self._watch(row, processes, expiry)
             texts = {name: process.text for name, process in processes.items()}
@@ -246,7 +258,9 @@ class _Runner:
         topic = self._plan.backend.wire_name(self._plan.topic, self._plan.domains[index])
         return Wiretap(texts, topic, replayed=bool(row.replay or row.impersonate))
 
-    def _start(self, index: int, row: Row, party: Party, folder: Path) -> _PartyProcess:
+    def _start(
+        self, index: int, row: Row, party: Party, folder: Path, patience: _Patience
+    ) -> _PartyProcess:
         plan, domain = self._plan, self._plan.domains[index]
         topic = plan.keystores.topic(party, plan.topic)
         options = ["--topic", topic, "--period", str(plan.period)]
@@ -262,7 +276,7 @@ class _Runner:
                     options += ["--also", plan.keystores.topic(other, plan.topic)]
         if plan.backend.on_zenoh:
             options += ["--size", str(party.size)] if party.size else []
-            options += ["--patience", str(_SECONDS_TO_CONNECT)] if _is_refused(party, row) else []
+            options += ["--patience", str(patience.connect)] if _is_refused(party, row) else []
         environment = base_environment(os.environ)
         secured = party.identity.keystore is not None
         denied = any(

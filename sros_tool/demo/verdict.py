@@ -268,7 +268,7 @@ _ON_ITS_WAY = 1.0
 """Seconds after an expiry in which a message may still arrive: certificates have whole seconds."""
 
 
-def expired_too_early(record: RowRecord) -> bool:
+def _expired_too_early(record: RowRecord) -> bool:
     """Return whether a short-lived talker was not heard before its certificate expired."""
     claim = record.row.claims[0]
     if record.expiry is None or not record.parties:
@@ -283,7 +283,7 @@ def expired_too_early(record: RowRecord) -> bool:
 def _judge_expiry(
     claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
 ) -> _Finding:
-    if record.expiry is None or expired_too_early(record):
+    if record.expiry is None or _expired_too_early(record):
         return _Finding(
             RowStatus.UNDECIDED, f"{claim.talker} was not heard before its certificate expired"
         )

@@ -23,6 +23,8 @@ from sros_tool.demo.scenarios.policies import zenoh_policy
 from sros_tool.demo.scenarios.zenoh import forgeries
 from sros_tool.demo.scenarios.zenoh.parties import (
     CAST,
+    CLIENTS,
+    PEERS,
     ROUTER,
     answered,
     attacker,
@@ -36,7 +38,7 @@ from sros_tool.demo.scenarios.zenoh.parties import (
 
 _CHATTER = (hears("listener", "talker"),)
 _CALLS = (answered("client", "server"),)
-_WORLD = "attacked"
+_WORLD = PEERS
 
 
 # ── on the wire ────────────────────────────────────────────────────────────────────────────
@@ -54,7 +56,7 @@ def _tapped(name: str, keystore: KeystoreChoice, wire: Wire, *, readable: bool) 
         wire=True,
         brief=True,
         world="tapped, open" if readable else "tapped",
-        attack=f"{name} on the wire",
+        attack=name,
         removed="TLS" if readable else "",
     )
 
@@ -62,7 +64,10 @@ def _tapped(name: str, keystore: KeystoreChoice, wire: Wire, *, readable: bool) 
 _WIRE_ROWS = tuple(
     _tapped(name, forgeries.in_the_clear if readable else OWN, wire, readable=readable)
     for readable in (False, True)
-    for name, wire in (("payload", Wire.TEXT), ("topic names", Wire.TOPIC))
+    for name, wire in (
+        ("payload read on the wire", Wire.TEXT),
+        ("topic names read on the wire", Wire.TOPIC),
+    )
 )
 
 _LARGE = 64 * 1024
@@ -81,7 +86,7 @@ def _shared(name: str, keystore: KeystoreChoice, *, readable: bool) -> Row:
         _CHATTER,
         brief=True,
         attack="large messages in shared memory",
-        removed="that switch" if readable else "",
+        removed="`shared_memory` off" if readable else "",
     )
 
 
@@ -157,7 +162,7 @@ _CONNECTION_ROWS = (
         "no certificate, and none is asked for",
         forgeries.certificates_not_asked_for,
         "no certificate",
-        "mutual TLS, and rules for names alone",
+        "mutual TLS and named subjects",
     ),
     _outsider(
         "a certificate of another CA",
@@ -181,7 +186,7 @@ _CONNECTION_ROWS = (
         "TCP instead of TLS, which the router also accepts",
         forgeries.tcp_next_to_tls,
         "TCP instead of TLS",
-        "the list of protocols, and rules for names alone",
+        "the list of protocols and named subjects",
     ),
     _outsider(
         "an expired certificate",
@@ -319,9 +324,9 @@ def _trespasses() -> tuple[Row, ...]:
                 attack,
                 who,
                 denied,
-                "the router enforces the rights of everybody; no rules of its own are needed",
+                "the router enforces everybody's rights, whatever the attacker's own session does",
                 forgeries.through_the_router,
-                "attacked clients",
+                CLIENTS,
                 attack,
             ),
             _trespass(
@@ -332,7 +337,7 @@ def _trespasses() -> tuple[Row, ...]:
                 forgeries.sessions_that_limit_themselves,
                 "limited by themselves",
                 attack,
-                "rules for others (each session limits only itself)",
+                "rules that others enforce",
             ),
         ]
     rows += [
@@ -378,7 +383,7 @@ def _rogue(
         _CHATTER if direct else (),
         world=world,
         attack=f"another enclave plays the router and {'reads' if reads else 'injects'}",
-        removed="rules for the router's name alone" if succeeds else "",
+        removed="a named subject for the router" if succeeds else "",
     )
 
 
@@ -539,7 +544,7 @@ _EARLIER_ROWS = (
         "session file of an earlier policy, sessions that limit themselves",
         forgeries.earlier_session_file_of_one_that_limits_itself,
         RowStatus.HEARD,
-        "rules for others (each session limits only itself)",
+        "rules that others enforce",
     ),
     _thief(
         "revoked identity",

@@ -18,6 +18,8 @@ from sros_tool.demo.scenarios.policies import zenoh_policy
 from sros_tool.demo.scenarios.zenoh.forgeries import through_the_router
 from sros_tool.demo.scenarios.zenoh.parties import (
     CAST,
+    CLIENTS,
+    PEERS,
     ROUTER,
     action_pair,
     answered,
@@ -31,7 +33,6 @@ from sros_tool.demo.scenarios.zenoh.parties import (
     topic_pair,
 )
 
-_PEERS, _CLIENTS = "peers", "clients"
 _CHATTER = (hears("listener", "talker"),)
 _DENIED = "no rule allows it, and what no rule allows is dropped"
 _OPEN_PAIR = (
@@ -77,8 +78,8 @@ def _topic_rows(how: str, keystore: KeystoreChoice, world: str) -> tuple[Row, ..
 
 
 _ROWS: tuple[Row, ...] = (
-    *_topic_rows("directly", OWN, _PEERS),
-    *_topic_rows("through the router", through_the_router, _CLIENTS),
+    *_topic_rows("directly", OWN, PEERS),
+    *_topic_rows("through the router", through_the_router, CLIENTS),
     attempt(
         "unsecured talker to unsecured listener",
         RowStatus.HEARD,
@@ -92,7 +93,7 @@ _ROWS: tuple[Row, ...] = (
         "every node needs the graph, and its token names the enclave of its certificate",
         Claim(Relation.SEES, "observer", "talker"),
         (*topic_pair(), rightful("observer", Role.OBSERVER, OWN, "client")),
-        world=_PEERS,
+        world=PEERS,
     ),
 )
 
@@ -121,7 +122,7 @@ _SERVICE_ROWS: tuple[Row, ...] = (
         "the client may send requests and receive replies, the server the reverse",
         answered("client", "server"),
         service_pair(),
-        world=_PEERS,
+        world=PEERS,
     ),
     attempt(
         "client without permission",
@@ -130,7 +131,7 @@ _SERVICE_ROWS: tuple[Row, ...] = (
         executes("server", _UNASKED_CLIENT.name),
         (*service_pair(), _UNASKED_CLIENT),
         _CALLS,
-        world=_PEERS,
+        world=PEERS,
     ),
     attempt(
         "enclave that poses as the server",
@@ -139,7 +140,7 @@ _SERVICE_ROWS: tuple[Row, ...] = (
         answered("client", _POSING_SERVER.name),
         (*service_pair(), _POSING_SERVER),
         _CALLS,
-        world=_PEERS,
+        world=PEERS,
     ),
     attempt(
         "client of an action",
@@ -147,7 +148,7 @@ _SERVICE_ROWS: tuple[Row, ...] = (
         "goal, feedback, status and result arrive: three services and two topics",
         answered("action client", "action server"),
         action_pair(),
-        world=_PEERS,
+        world=PEERS,
     ),
     attempt(
         "action client without permission",
@@ -156,7 +157,7 @@ _SERVICE_ROWS: tuple[Row, ...] = (
         executes("action server", _UNASKED_ACTION_CLIENT.name),
         (*action_pair(), _UNASKED_ACTION_CLIENT),
         _GOALS,
-        world=_PEERS,
+        world=PEERS,
     ),
     attempt(
         "enclave that poses as the action server",
@@ -165,7 +166,7 @@ _SERVICE_ROWS: tuple[Row, ...] = (
         answered("action client", _POSING_ACTION_SERVER.name),
         (*action_pair(), _POSING_ACTION_SERVER),
         _GOALS,
-        world=_PEERS,
+        world=PEERS,
     ),
 )
 

@@ -23,6 +23,8 @@ from sros_tool.demo.scenarios.model import (
 from sros_tool.demo.scenarios.policies import ACTION, SERVICE
 
 ROUTER = "/router"
+PEERS, CLIENTS = "peers", "clients"
+"""The worlds with all defences: sessions connect to each other, or to the router alone."""
 CAST = {
     "talker": "/talker_listener/talker",
     "listener": "/talker_listener/listener",
