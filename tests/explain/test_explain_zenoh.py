@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import json
+import random
 import shutil
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from sros_tool.cli.common import now
+from sros_tool.explain.question import ask
+from sros_tool.explain.zenoh import ZenohEvaluator
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.rights import KIND_OF, Rules, policy_rights, unfolded
+from tests.support.children import LONG
 from tests.support.harness import Ended, policy_text, publish, sros
 
 HERE = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", "TZ": "UTC"}
@@ -272,3 +280,56 @@ def test_zenoh_is_asked_where_ros_uses_it(made: Path) -> None:
     assert "on Zenoh in client mode (RMW_IMPLEMENTATION is rmw_zenoh_cpp)" in shown.out
     dds = explain(*asked, "--vendor", "fastdds", env={"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}).ok()
     assert "on Fast DDS 2.14 (as asked)" in dds.out
+
+
+# ── random policies ────────────────────────────────────────────────────────────────────────
+
+NAMES = ("/a", "/ab", "/a/b", "/b", "/b/a/c")
+PATTERNS = (*NAMES, "/*", "/a*", "/a/*", "/*b", "/b/*/c")
+OTHER_END = {"publish": "subscribe", "subscribe": "publish", "request": "reply", "reply": "request"}
+WORD = {"publish": "publish", "subscribe": "subscribe", "request": "call", "reply": "serve"}
+
+
+def drawn_policy(draw: random.Random) -> str:
+    """Return a policy of five enclaves with random rights, some of them denied."""
+
+    def group(right: str) -> str:
+        kind = KIND_OF[right]
+        names = draw.sample(PATTERNS, draw.randint(1, 2))
+        qualifier = "DENY" if draw.random() < 0.15 else "ALLOW"
+        inner = "".join(f"<{kind[:-1]}>{each}</{kind[:-1]}>" for each in names)
+        return f'<{kind} {right}="{qualifier}">{inner}</{kind}>'
+
+    return policy_text(
+        {
+            f"/e{number}": "".join(group(right) for right in OTHER_END if draw.random() < 0.8)
+            or publish("/a")
+            for number in range(5)
+        }
+    )
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("seed", range(12 if LONG else 2))
+def test_random_policies_are_answered_as_their_permissions_say(
+    tmp_path: Path, mode: str, seed: int
+) -> None:
+    draw = random.Random(f"{mode} {seed}")
+    policy = tmp_path / "policy.xml"
+    policy.write_text(drawn_policy(draw))
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("generate_artifacts", "-k", root, "-p", policy).ok()
+    sros("zenoh", root, "--mode", mode).ok()
+    rules = Rules(unfolded(policy_rights(read_policy(policy))))
+    evaluator = ZenohEvaluator(root, at=now(), domain=0)
+    enclaves = [each for each in evaluator.names if each != "/router"]
+    allowed = denied = 0
+    for enclave, (right, other), name in product(enclaves, OTHER_END.items(), NAMES):
+        answer = evaluator.answer(enclave, ask(WORD[right], name))
+        assert answer.outcome.ok is rules.allow(enclave, right, name), (enclave, right, name)
+        able = [each for each in enclaves if each != enclave and rules.allow(each, other, name)]
+        expected = able if answer.outcome.ok else []
+        assert [each.enclave for each in answer.reached] == expected, (enclave, right, name)
+        allowed, denied = allowed + answer.outcome.ok, denied + (not answer.outcome.ok)
+    assert min(allowed, denied) > 5
