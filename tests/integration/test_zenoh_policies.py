@@ -1,0 +1,126 @@
+"""The shipped policies on real Zenoh: each allowed pair of enclaves communicates, and no other one.
+
+Each pair of (enclave, name, direction) of a policy is tried between all of its enclaves, and with
+an enclave that may do everything, in client and in peer mode, and after `sros distribute_key`.
+Besides the names of a policy, its wildcards stand for some names that they match, or nearly match.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import sys
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sros_tool.names import is_expression
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import RIGHTS
+from sros_tool.policy.rights import KIND_OF, Rules, policy_rights, unfolded
+from sros_tool.resources import policies_dir
+from tests.support.children import LONG, run
+from tests.support.harness import policy_text, publish, sros
+
+pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
+
+pytestmark = pytest.mark.zenoh
+MATRIX = Path(__file__).with_name("zenoh_matrix.py")
+KINDS = ("topics", "services")
+ROBOT = "mobile_robot.xml"
+SHIPPED = sorted(each.name for each in policies_dir().glob("*.xml"))
+WITNESS = policy_text(
+    {
+        "/witness": publish("/*")
+        + publish("/*").replace("publish", "subscribe")
+        + '<services request="ALLOW" reply="ALLOW"><service>/*</service></services>'
+    }
+)
+
+
+def matrix_of(policies: list[Path]) -> dict[str, Any]:
+    """Return the names of policies, and the rights of their enclaves to each of them."""
+    rights = unfolded(right for each in policies for right in policy_rights(read_policy(each)))
+    names: dict[str, set[str]] = {kind: {"/elsewhere", "/else/where"} for kind in KINDS}
+    for each in rights:
+        names[KIND_OF[each.right]].update(examples(each.name))
+    rules = Rules(rights)
+    if not LONG:
+        names["services"] = set(sorted(names["services"])[::6])
+    return {
+        **{kind: sorted(names[kind]) for kind in KINDS},
+        "rights": {
+            enclave: {
+                right: [name for name in sorted(names[kind]) if rules.allow(enclave, right, name)]
+                for kind in KINDS
+                for right in RIGHTS[kind]
+            }
+            for enclave in sorted({each.enclave for each in rights})
+        },
+    }
+
+
+def examples(name: str) -> list[str]:
+    """Return names that an expression matches, or nearly matches; or the name itself."""
+    if not is_expression(name):
+        return [name]
+    filled = {name.replace("*", each) for each in ("x", "a/b", "_9")}
+    return sorted(each.replace("//", "/") for each in filled | {name.split("*")[0].rstrip("/")}
+                  if each)  # fmt: skip
+
+
+def keystore_of(folder: Path, policies: list[Path], *, mode: str) -> Path:
+    """Make a keystore with Zenoh files for policies, and a port of its own."""
+    with socket.socket() as free:  # where no network of its own is allowed
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"localhost:{free.getsockname()[1]}"
+    root = folder / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    options = [word for each in policies for word in ("-p", each)]
+    sros("generate_artifacts", "-k", root, *options).ok()
+    sros("zenoh", root, "--mode", mode, "--endpoint", endpoint).ok()
+    return root
+
+
+def tried(keystore: Path, policies: list[Path], folder: Path, *more: str) -> Any:
+    """Return what was observed on sessions with the files of a keystore."""
+    (folder / "matrix.json").write_text(json.dumps(matrix_of(policies)))
+    done = run(
+        [sys.executable, "-P", MATRIX, keystore, folder / "matrix.json", *more],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        patience=3600,
+    )
+    return json.loads(done.stdout)
+
+
+CASES = [*product(SHIPPED if LONG else [ROBOT], ("client", "peer"), (False,))]
+CASES += [(each, "client", True) for each in (SHIPPED if LONG else ["talker_listener.xml"])]
+CASES += [(each, "peer", True) for each in (SHIPPED if LONG else [])]
+
+
+@pytest.mark.parametrize(("file", "mode", "exported"), CASES)
+def test_every_allowed_pair_communicates_and_no_other_one(
+    file: str, mode: str, exported: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "witness.xml").write_text(WITNESS)
+    policies = [policies_dir() / file, tmp_path / "witness.xml"]
+    keystore = keystore_of(tmp_path, policies, mode=mode)
+    if exported:
+        sros("distribute_key", keystore, "--all", tmp_path / "elsewhere").ok()
+        keystore.rename(tmp_path / "gone")
+        keystore = tmp_path / "elsewhere"
+    observed = tried(keystore, policies, tmp_path)
+    print(file, mode, "exported" if exported else "", observed["allowed"], "of", observed["tried"])
+    assert observed["up"]
+    assert observed["different"] == {}
+    assert min(observed["allowed"].values()) > 0
+
+
+def test_without_rules_others_communicate_too(tmp_path: Path) -> None:
+    (tmp_path / "witness.xml").write_text(WITNESS)
+    policies = [policies_dir() / "talker_listener.xml", tmp_path / "witness.xml"]
+    observed = tried(keystore_of(tmp_path, policies, mode="client"), policies, tmp_path, "open")
+    assert all(observed["different"][what]["too much"] for what in ("heard", "executed", "replied"))
