@@ -25,6 +25,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
+    print_restart,
     several_enclaves,
     split_root,
 )
@@ -126,8 +127,8 @@ def distribute_key(
             for name in selection.names:
                 click.echo(f"enclave {name} in '{target}' is already up to date", err=True)
         for change in export.changes if done else ():
-            if change.action == "replace":
-                click.echo(f"replaced {change.path}", err=True)
+            if word := {"replace": "replaced", "remove": "removed"}.get(change.action):
+                click.echo(f"{word} {change.path}", err=True)
     for name in selection.names if done and not as_json else ():
         click.echo(f"exported enclave {name} to {where}", err=target == _STREAM)
     if as_json:
@@ -549,6 +550,8 @@ def import_verb(
             "  compare both with the output of sign_request, or use --ca: otherwise they are "
             "not verified"
         )
+    if done.restart_zenoh:
+        print_restart((done.name,), exported=False)
 
 
 def _imported_json(
@@ -562,6 +565,7 @@ def _imported_json(
         "enclaves": [enclave_json(folder, done.name, outcome, written=known)],
         "authorities": _authorities_json(done.identity_ca, done.permissions_ca),
         "authorities_verified": pinned or not done.first,
+        "restart_zenoh": [done.name] if done.restart_zenoh else [],
         "changes": changes_json(folder, done.changes),
         "notes": [],
     }

@@ -16,6 +16,7 @@ READERS = (
     "sros_tool.keystore.expiry",
     "sros_tool.keystore.missing",
     "sros_tool.keystore.ledger",
+    "sros_tool.keystore.zenoh",
 )
 WRITERS = ("transaction", "issuing", "lifecycle", "delivery", "authorities")
 

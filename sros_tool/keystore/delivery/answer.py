@@ -19,11 +19,13 @@ from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.trust import check_same_authority, refuse_ca_keystore, trusted_in
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
     ENCLAVES,
     OPTIONAL_FILES,
     REQUIRED_FILES,
     SEAL,
     ZENOH_FILES,
+    ZENOH_SIGNED,
     enclave_folder,
 )
 from sros_tool.keystore.reader import (
@@ -35,6 +37,7 @@ from sros_tool.keystore.reader import (
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.zenoh import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
@@ -78,7 +81,8 @@ class ImportedEnclave:
     """An enclave that was imported; without ``changes``, the same answer was installed already.
 
     ``first`` says whether the folder trusted no CA before, so that nothing vouched for the new
-    ones.  ``until`` is the first expiry of certificate and permissions.
+    ones.  ``until`` is the first expiry of certificate and permissions.  ``restart_zenoh`` says
+    whether processes on Zenoh that run have other rules until they are restarted.
     """
 
     name: str
@@ -87,6 +91,7 @@ class ImportedEnclave:
     first: bool
     until: datetime
     changes: tuple[Change, ...]
+    restart_zenoh: bool = False
 
 
 def seal(files: dict[str, bytes], number: int, authority: Authority) -> bytes:
@@ -146,6 +151,8 @@ def _read_answer(data: bytes) -> RequestAnswer:
 def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> OpenedEnclave:
     """Return the enclave of an answer, after checking that DDS would load it with its key.
 
+    Its Zenoh configurations have to be signed, and to fit its permissions.
+
     ``key`` is the public key of the enclave.
 
     Raises:
@@ -157,7 +164,10 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
         for path, data in answer.files.items():
             write_new_file(Path(folder, path.rpartition("/")[2]), data)
         state = open_enclave(Path(folder), now=now)
+        zenoh = open_zenoh(Path(folder), answer.name, state)
     problems = [str(each) for each in state.problems if each.file != _KEY]
+    if zenoh.files:
+        problems += [str(each) for each in zenoh.problems if each.file != CERTIFICATE_FILE]
     certificate = state.certificate
     if certificate and certificate.public_key() != key:
         problems.insert(0, "cert.pem: it does not belong to the enclave's key.pem")
@@ -233,6 +243,7 @@ def import_answer(
             f"Name that folder, or make a new key and request with `sros create_request {name} "
             f"{folder}`, and have the request signed.",
         )
+    ran = any((place / file).exists() for file in ZENOH_SIGNED)
     with Transaction(folder, dry_run=dry_run) as transaction:
         key = load_key(read_bytes(place / _KEY, "private key"), f"'{place / _KEY}'")
         state = check_answer(answer, key.public_key(), now=now)
@@ -261,6 +272,7 @@ def import_answer(
         not known,
         until,
         tuple(transaction.changes),
+        ran and any(Path(each.path).name in ZENOH_SIGNED for each in transaction.changes),
     )
 
 

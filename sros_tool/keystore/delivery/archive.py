@@ -13,10 +13,13 @@ from sros_tool.errors import DocumentError
 from sros_tool.keystore.layout import folder_mode
 
 SUFFIXES = (".tar.gz", ".tgz")
-MAX_PACKED = 4 * 1024 * 1024
-MAX_UNPACKED = 8 * 1024 * 1024
-MAX_MEMBER = 1024 * 1024
-"""Largest size in bytes: of a packed archive, of its unpacked content, and of a file in it."""
+MAX_PACKED = 16 * 1024 * 1024
+MAX_UNPACKED = 40 * 1024 * 1024
+MAX_MEMBER = 17 * 1024 * 1024
+"""Largest size in bytes: of a packed archive, of its unpacked content, and of a file in it.
+
+There is room for a Zenoh configuration of the largest size that is read, and its signed document.
+"""
 _MOST_MEMBERS = 200
 _GZIP = 16 + zlib.MAX_WBITS
 

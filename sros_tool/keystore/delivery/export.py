@@ -29,9 +29,10 @@ from sros_tool.keystore.layout import (
     select_enclaves,
 )
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import OpenedEnclave, open_enclave
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.zenoh import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.xml import read_bytes
@@ -169,6 +170,7 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
                 "; ".join(map(str, state.problems)) + ".",
                 f"See `sros inspect {quote(str(folder))}`.",
             )
+        _check_zenoh(root, folder, name, state)
         authorities = (state.identity_ca, state.permissions_ca)
         if any(
             each and state.certificate and each.public_key() == state.certificate.public_key()
@@ -183,6 +185,17 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
                     if file != KEY_FILE and holds_private_key(files[path]):
                         raise _holds_ca_key(folder / file)
     return dict(sorted(files.items()))
+
+
+def _check_zenoh(root: Path, folder: Path, name: str, state: OpenedEnclave) -> None:
+    """Refuse an enclave with Zenoh configurations that `sros run` would refuse on the robot."""
+    found = open_zenoh(folder, name, state)
+    if found.files and found.problems:
+        raise KeystoreError(
+            f"the Zenoh configuration of enclave {name} could not be used on a robot",
+            "; ".join(map(str, found.problems)) + ".",
+            f"Write it again: `sros zenoh {quote(str(root))}`.",
+        )
 
 
 def _holds_ca_key(path: Path) -> KeystoreError:
@@ -216,12 +229,13 @@ def _write_folder(
             "Choose another folder.",
         )
     check_same_authority(target, files)
+    stale = _stale_zenoh(target, files)
     different = {
         path: data
         for path, data in files.items()
         if not (target / path).is_file() or read_bytes(target / path, "file") != data
     }
-    replaced = [path for path in different if os.path.lexists(target / path)]
+    replaced = [path for path in (*different, *stale) if os.path.lexists(target / path)]
     if replaced and not force:
         raise KeystoreError(
             f"'{target}' already holds different versions of {', '.join(replaced)}",
@@ -231,8 +245,21 @@ def _write_folder(
     with Transaction(target, fresh=True, dry_run=dry_run) as transaction:
         for path, data in different.items():
             transaction.write(path, data, private=file_mode(path) == 0o600)
+        for path in stale:
+            transaction.remove(path)
         transaction.commit()
     return tuple(transaction.changes)
+
+
+def _stale_zenoh(target: Path, files: dict[str, bytes]) -> list[str]:
+    """Return the Zenoh files of earlier exports of the enclaves that have none of them now."""
+    folders = {path.rpartition("/")[0] for path in files}
+    return sorted(
+        path
+        for folder in folders
+        for path in (f"{folder}/{file}" for file in ZENOH_FILES)
+        if path not in files and os.path.lexists(target / path)
+    )
 
 
 def _write_archive(
