@@ -11,6 +11,7 @@ import pytest
 import sros_tool
 from sros_tool.cli.program import FAMILIES
 from sros_tool.demo.scenarios.attacks import ATTACKS
+from sros_tool.demo.scenarios.zenoh.attacks import ATTACKS as ZENOH_ATTACKS
 
 PROJECT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
@@ -60,6 +61,7 @@ def test_every_attack_is_in_the_table_of_attacks() -> None:
     text = read("docs/attacks.md")
     rows = [row.name for row in ATTACKS.rows if not row.removed]
     assert len(rows) > 30
+    rows += [row.name for row in ZENOH_ATTACKS.rows if not row.removed]
     assert [name for name in rows if f"| {name} |" not in text] == []
 
 

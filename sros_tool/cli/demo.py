@@ -166,7 +166,7 @@ def demo(
     results. The scenario `isolation` takes about 10 s on Cyclone DDS and 20 s on rclpy. The
     scenario `attacks` tries all attacks that sros knows, also without the defences that stop them;
     it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), all scenarios
-    run, in about 20 s.
+    run, in about 25 s.
     """
     from sros_tool.demo.program import DemoOptions, run_demo
     from sros_tool.demo.scenarios import choose_scenarios

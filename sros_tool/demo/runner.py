@@ -49,8 +49,8 @@ from sros_tool.demo.wire import (
     Injection,
     Wiretap,
     bound_ports,
-    clean_shared_memory,
     forged_text,
+    mapped_segments,
     shared_memory,
     with_replaced_text,
 )
@@ -202,6 +202,8 @@ class _Runner:
             expiry = time.monotonic() + seconds
         processes: dict[str, _PartyProcess] = {}
         tap: Wiretap | None = None
+        segments: frozenset[Path] = frozenset()
+        memory: Mapping[str, int] = {}
         network = RowNetwork(own=self._plan.own_networks)
         try:
             with network.entered():
@@ -217,8 +219,10 @@ class _Runner:
                             started = self._start(index, row, party, folder, patience)
                             processes[party.name] = started
             window = await self._watch(row, processes, expiry)
-            texts = {name: process.text for name, process in processes.items()}
-            memory = shared_memory(texts) if _in_memory(row) else {}
+            if _in_memory(row):
+                texts = {name: process.text for name, process in processes.items()}
+                segments = frozenset().union(*(each.segments() for each in processes.values()))
+                memory = shared_memory(texts, segments)
             ports = frozenset[int]().union(*(each.ports() for each in processes.values()))
             wire = tap.count(ports) if tap and row.wire else {}
             injected = None
@@ -232,8 +236,8 @@ class _Runner:
             finally:
                 for process in processes.values():
                     process.end()
-                if _in_memory(row):
-                    clean_shared_memory(process.text for process in processes.values())
+                for path in segments:  # processes of Zenoh leave them
+                    path.unlink(missing_ok=True)
                 if tap is not None:
                     tap.close()
                 network.close()
@@ -545,6 +549,10 @@ class _PartyProcess:
         """Return the ports that the process has bound, or had bound at the last call."""
         self._ports = bound_ports(self._process.pid) or self._ports
         return self._ports
+
+    def segments(self) -> frozenset[Path]:
+        """Return the segments of shared memory that the process maps."""
+        return mapped_segments(self._process.pid)
 
     def ask_to_end(self) -> None:
         """Send SIGTERM; if the process ends after that, it does not count as ended by itself."""

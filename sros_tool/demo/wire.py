@@ -14,7 +14,7 @@ import os
 import socket
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -172,37 +172,26 @@ def _socket_inode(link: Path) -> str:
     return target.removeprefix("socket:[").removesuffix("]") if target[:8] == "socket:[" else ""
 
 
-_SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - read, and what the demo's own processes left
+_SHARED_MEMORY = "/dev/shm/"  # noqa: S108 - the segments of the demo's own processes
 _LARGEST_SEGMENT = 1 << 28
 
 
-def shared_memory(texts: Mapping[str, str]) -> dict[str, int]:
-    """Return how many segments of shared memory show the text of each party."""
-    found = _segments()
+def mapped_segments(process: int) -> frozenset[Path]:
+    """Return the segments of shared memory that a process maps; none if it has ended."""
+    try:
+        lines = Path(f"/proc/{process}/maps").read_text("utf-8", "surrogateescape").splitlines()
+    except OSError:
+        return frozenset()
+    names = (line.split(maxsplit=5)[5:] for line in lines)
+    return frozenset(Path(each[0]) for each in names if each and each[0].startswith(_SHARED_MEMORY))
+
+
+def shared_memory(texts: Mapping[str, str], segments: Collection[Path]) -> dict[str, int]:
+    """Return how many of the segments show the text of each party."""
     return {
-        name: sum(_shows(path, text) for path in found) if text else 0
+        name: sum(_shows(path, text) for path in segments) if text else 0
         for name, text in texts.items()
     }
-
-
-def clean_shared_memory(texts: Iterable[str]) -> None:
-    """Remove the segments with one of these texts: processes that were ended leave them."""
-    marks = [text for text in texts if text]
-    for path in _segments():
-        if any(_shows(path, text) for text in marks):
-            path.unlink(missing_ok=True)
-
-
-def _segments() -> list[Path]:
-    """Return the segments of shared memory that belong to this user."""
-    try:
-        return [
-            path
-            for path in _SHARED_MEMORY.iterdir()
-            if path.is_file() and not path.is_symlink() and path.stat().st_uid == os.geteuid()
-        ]
-    except OSError:
-        return []
 
 
 def _shows(path: Path, text: str) -> bool:

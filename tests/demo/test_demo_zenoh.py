@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib import metadata
+from multiprocessing import shared_memory as shared_memory_of_python
 from pathlib import Path
 
 import pytest
@@ -21,7 +23,7 @@ from sros_tool.demo.verdict import (
     RowResult,
     judge_row,
 )
-from sros_tool.demo.wire import PacketCounter, clean_shared_memory, shared_memory
+from sros_tool.demo.wire import PacketCounter, mapped_segments, shared_memory
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.runtime.events import Event, EventKind, ProcessStage
 from tests.support.harness import sros
@@ -226,17 +228,25 @@ def test_short_packets_are_ignored(length: int) -> None:
     assert not counter.protected
 
 
-def test_text_in_shared_memory_is_found_and_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sros_tool.demo.wire._SHARED_MEMORY", tmp_path)
+def test_text_in_shared_memory_is_found(tmp_path: Path) -> None:
     (tmp_path / "one").write_bytes(b"\0" * 5000 + b"the talker: 1")
     (tmp_path / "empty").touch()
     (tmp_path / "other").write_bytes(b"somebody's")
-    (tmp_path / "link").symlink_to(tmp_path / "one")
-    assert shared_memory({"talker": "the talker", "listener": ""}) == {"talker": 1, "listener": 0}
-    clean_shared_memory(["the talker", ""])
-    assert {each.name for each in tmp_path.iterdir()} == {"empty", "other", "link"}
+    segments = [*tmp_path.iterdir(), tmp_path / "gone"]
+    texts = {"talker": "the talker", "listener": ""}
+    assert shared_memory(texts, segments) == {"talker": 1, "listener": 0}
+
+
+def test_the_segments_of_a_process_are_those_that_it_maps() -> None:
+    segment = shared_memory_of_python.SharedMemory(create=True, size=5000)
+    path = Path("/dev/shm") / segment.name.lstrip("/")
+    try:
+        assert path in mapped_segments(os.getpid())
+    finally:
+        segment.close()
+        segment.unlink()
+    assert path not in mapped_segments(os.getpid())
+    assert mapped_segments(2**22) == frozenset()
 
 
 # ── what it needs ──────────────────────────────────────────────────────────────────────────
