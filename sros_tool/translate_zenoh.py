@@ -114,7 +114,7 @@ def remote_of(enclave: str, stated: Mapping[int, Iterable[StatedRight]]) -> Remo
             below = tuple(f"{each}/{_ADVANCED}" for each in keys)
             rules += [
                 AccessRule(flow, messages, below if history else keys)
-                for flow, messages, history in _MESSAGES[right]
+                for flow, messages, history in (_MESSAGES[right] if keys else ())
             ]
     return RemoteRights(enclave, joined(rules))
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import DocumentError
 from sros_tool.policy.patterns import ComparisonLimit
+from sros_tool.translate_from_zenoh import is_self_limiting
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import Message
 from sros_tool.zenoh.configuration import Mode
@@ -348,8 +349,7 @@ def _of_everybody(document: ConfigurationDocument) -> list[AclSubject]:
     return [
         each
         for each in access.subjects
-        if each.cert_common_names is None
-        and each.usernames is None
+        if not each.is_named()
         and (access.allows_by_default or any(rule.allows for rule in access.rules_of(each.id)))
     ]
 
@@ -357,11 +357,7 @@ def _of_everybody(document: ConfigurationDocument) -> list[AclSubject]:
 def _subjects(document: ConfigurationDocument) -> Iterator[Finding]:
     access = document.access
     open_to_all = _of_everybody(document)
-    if (
-        document.mode is not Mode.ROUTER
-        and open_to_all
-        and len(open_to_all) == len([each for each in access.subjects if access.rules_of(each.id)])
-    ):
+    if open_to_all and is_self_limiting(document):
         text = f"no subject has a name: {_ids(open_to_all)}"
         yield SELF_LIMITING.found(document.mode.value, text, document.name, open_to_all[0].line)
     else:

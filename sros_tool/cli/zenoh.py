@@ -11,10 +11,12 @@ import click
 from sros_tool.cli.common import (
     PATH,
     dry_run_option,
+    force_option,
     json_option,
     keyring,
     keystore_from_environment,
     now,
+    output_option,
     print_closed,
     print_json,
     print_notes,
@@ -24,6 +26,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import changes_json, notes_json
+from sros_tool.cli.zenoh_from import show_from
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -44,10 +47,11 @@ Example:
   wrote keystore/enclaves/talker/session.json5
   $ sros zenoh keystore --mode peer --endpoint robot:7447 --listen [::]:7447
   $ sros zenoh keystore --check
+  $ sros zenoh --from session.json5 -o policy.xml
 
 Exit status: 0 written, or up to date; with --check 1 if a file is missing or
-out of date; 2 if it could not be done, such as for rights that Zenoh cannot
-enforce.""",
+out of date; with --from 1 if the file is open or does not work; 2 if it could
+not be done, such as for rights that Zenoh cannot enforce.""",
 )
 @click.argument("root", type=PATH, required=False)
 @click.option("--router", metavar="NAME", help="Enclave of the router; usually /router.")
@@ -72,6 +76,15 @@ enforce.""",
 @click.option("--domain", metavar="IDS", help="ROS domains; usually those of the keystore.")
 @click.option("--off", is_flag=True, help="Remove the files, and keep none in step any more.")
 @click.option("--check", "only_check", is_flag=True, help="Write nothing; say what is out of date.")
+@click.option(
+    "--from",
+    "existing",
+    type=PATH,
+    metavar="FILE",
+    help="Say what an existing configuration of Zenoh allows whom, and where it is open.",
+)
+@output_option("With --from: write what it allows as a policy to FILE.")
+@force_option
 @dry_run_option
 @json_option
 def zenoh(
@@ -83,6 +96,9 @@ def zenoh(
     domain: str | None,
     off: bool,
     only_check: bool,
+    existing: Path | None,
+    output: Path | None,
+    force: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -97,6 +113,11 @@ def zenoh(
     from sros_tool.keystore.lifecycle.zenoh import set_zenoh
     from sros_tool.keystore.reader import load_settings
 
+    if existing:
+        _refuse_with_from(root, router, *endpoints, *listen, mode, domain, off, only_check)
+        raise SystemExit(show_from(existing, output, force=force, dry_run=dry_run, as_json=as_json))
+    if output or force:
+        raise UsageError("--output and --force are for --from only", "", "Leave them out.")
     root = root or keystore_from_environment()
     check_keystore(root)
     settings = load_settings(root)
@@ -140,6 +161,15 @@ def zenoh(
     print_notes(result.notes)
     if only_check and result.changes:
         raise SystemExit(1)
+
+
+def _refuse_with_from(*given: object) -> None:
+    if any(given):
+        raise UsageError(
+            "--from takes no keystore and no choice of the network",
+            "It reads one configuration, and changes nothing.",
+            "Leave them out.",
+        )
 
 
 def _network(settings: Template, given: dict[str, str]) -> ZenohNetwork:

@@ -57,6 +57,10 @@ class AclSubject:
     zids: tuple[str, ...] | None = None
     line: int = field(default=0, compare=False)
 
+    def is_named(self) -> bool:
+        """Return whether it states who the process is, and not only how it connects."""
+        return self.cert_common_names is not None or self.usernames is not None
+
     def overlaps(self, other: AclSubject) -> bool:
         """Return whether a process can match both as two subjects: with the rights of either.
 

@@ -1,0 +1,172 @@
+"""Reading an existing configuration of Zenoh: who may do what, and where it is open."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sros_tool.cli.check import echo_finding
+from sros_tool.cli.common import check_output, print_json, print_notes, save, visible, visible_line
+from sros_tool.cli.written import file_change, notes_json
+from sros_tool.errors import Note, PolicyError
+
+if TYPE_CHECKING:
+    from sros_tool.checks.kind import Finding
+    from sros_tool.translate_from_zenoh import RightsBehindRules
+    from sros_tool.zenoh.document import ConfigurationDocument
+
+_VERBS = {"publish": "publish", "subscribe": "subscribe", "request": "call", "reply": "serve"}
+_MOST_KEYS = 5
+
+
+def show_from(file: Path, output: Path | None, *, force: bool, dry_run: bool, as_json: bool) -> int:
+    """Say what the configuration ``file`` allows, and write it as a policy to ``output``.
+
+    Returns 1 if the configuration is open or does not work (a finding that is an error), else 0.
+    """
+    from sros_tool.checks.kind import ERROR, WARNING
+    from sros_tool.checks.zenoh import document_findings
+    from sros_tool.policy.document import write_policy
+    from sros_tool.translate_from_zenoh import policy_of, rights_behind
+    from sros_tool.xml import read_bytes
+    from sros_tool.zenoh.document import parse_configuration
+
+    if output:
+        check_output(output, force=force)
+    document = parse_configuration(read_bytes(file, "Zenoh configuration"), str(file))
+    rights = rights_behind(document)
+    findings = sorted(
+        document_findings(document), key=lambda each: (-each.severity, each.line or 0)
+    )
+    shown = [each for each in findings if each.severity >= WARNING]
+    notes: tuple[Note, ...] = ()
+    saved = ""
+    changes: list[dict[str, str]] = []
+    if output:
+        policy = policy_of(rights)
+        if not policy.enclaves:
+            raise PolicyError(
+                f"the rules of '{file}' make no policy",
+                "They name no enclave that may publish, subscribe, call or serve anything.",
+                "`sros generate_policy` makes a policy from a running robot.",
+            )
+        notes = tuple(_left_out(rights))
+        changes = file_change(output, existed=output.exists())
+        saved = "" if dry_run else save(output, write_policy(policy))
+    if as_json:
+        print_json(
+            {
+                **_json(document, rights, shown),
+                "output": str(output) if saved else None,
+                "dry_run": dry_run,
+                "changes": changes,
+                "notes": notes_json(notes),
+            }
+        )
+    else:
+        for line in _lines(document, rights):
+            click.echo(visible(line))
+        for each in shown:
+            echo_finding(each)
+        if output and dry_run:
+            click.echo(visible(f"would {changes[0]['action']} {output}"))
+    print_notes(notes)
+    if saved:
+        click.echo(saved, err=True)
+    return 1 if any(each.severity >= ERROR for each in findings) else 0
+
+
+def _lines(document: ConfigurationDocument, found: Sequence[RightsBehindRules]) -> Iterator[str]:
+    yield visible_line(f"{document.name}: the configuration of a {_kind(document)}")
+    for each in found:
+        if not (each.rights or each.unsaid or each.denied):
+            continue
+        obeys = ", by rules that bind only itself" if each.own else ""
+        yield visible_line(f"{_who(each)}{obeys}")
+        for right in _VERBS:
+            stated = [one for one in each.rights if one.right == right]
+            for one in stated:
+                domain = "" if one.domain == "0" else f" (domain {one.domain})"
+                lacks = f" (of no use without {', '.join(one.lacks)})" if one.lacks else ""
+                yield visible_line(f"  may {_VERBS[right]} {one.name}{domain}{lacks}")
+        yield from _keys("may also", each.unsaid)
+        yield from _keys("is denied, if no wildcard is used,", each.denied)
+
+
+def _keys(what: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
+    for right, verb in _VERBS.items():
+        keys = [key for of, key in pairs if of == right]
+        more = f" and {len(keys) - _MOST_KEYS} more" if len(keys) > _MOST_KEYS else ""
+        if keys:
+            yield visible_line(f"  {what} {verb} the keys {', '.join(keys[:_MOST_KEYS])}{more}")
+
+
+def _kind(document: ConfigurationDocument) -> str:
+    mode = document.mode.value
+    return mode if mode == "router" else f"session (mode {mode})"
+
+
+def _who(found: RightsBehindRules) -> str:
+    if found.own:
+        return f"the process itself ({found.subject})"
+    if found.names is None:
+        return f"everybody who gets a connection{f' ({found.subject})' if found.subject else ''}"
+    return ", ".join(found.names[:_MOST_KEYS]) + (
+        f" and {len(found.names) - _MOST_KEYS} more" if len(found.names) > _MOST_KEYS else ""
+    )
+
+
+def _left_out(found: Sequence[RightsBehindRules]) -> Iterator[Note]:
+    """Yield notes about what the rules allow or deny, and the policy does not state."""
+    from sros_tool.translate_from_zenoh import enclave_of
+
+    for each in found:
+        if (each.rights or each.unsaid) and not enclave_of(each):
+            yield Note("zenoh.no-enclave", f"{_who(each)}: no enclave, so not in the policy")
+        elif each.unsaid:
+            keys = ", ".join(key for _, key in each.unsaid[:_MOST_KEYS])
+            yield Note(
+                "zenoh.unsaid",
+                f"{_who(each)}: the policy lacks {len(each.unsaid)} rights that no ROS name "
+                f"states exactly: {keys}",
+            )
+    yield Note(
+        "zenoh.node-names",
+        "the rules name no nodes: each profile has the last part of its enclave's name, and "
+        "absolute names",
+    )
+
+
+def _json(
+    document: ConfigurationDocument,
+    found: Sequence[RightsBehindRules],
+    findings: Sequence[Finding],
+) -> dict[str, Any]:
+    return {
+        "file": document.name,
+        "mode": document.mode.value,
+        "enforced": document.access.enabled,
+        "subjects": [
+            {
+                "id": each.subject or None,
+                "names": None if each.names is None else list(each.names),
+                "own": each.own,
+                "rights": [
+                    {
+                        "right": _VERBS[one.right],
+                        "name": one.name,
+                        "domain": one.domain,
+                        "lacks": list(one.lacks),
+                    }
+                    for one in each.rights
+                ],
+                "unsaid": [{"right": _VERBS[right], "key": key} for right, key in each.unsaid],
+                "denied": [{"right": _VERBS[right], "key": key} for right, key in each.denied],
+            }
+            for each in found
+        ],
+        "findings": [each.as_json() for each in findings],
+    }
