@@ -6,8 +6,9 @@ more rights: a name is given only if the rules allow every key that it stands fo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from sros_tool.errors import InvalidNameError
 from sros_tool.names import check_enclave_name, expression_problem
@@ -24,6 +25,7 @@ from sros_tool.zenoh.key_expressions import ANY_CHUNKS, canonical, includes, int
 _HISTORY = "@adv"
 _OF_TYPE = ("*", "*")
 """The type and its hash, with which the keys of topics and services end."""
+_MANY = 65536
 _EVERY_NAME = ("*", *_OF_TYPE, ANY_CHUNKS)
 
 
@@ -145,13 +147,13 @@ def _rights(
     for right, place in _PLACES.items():
         allowed = keys(place.flow, place.message)
         taken = keys(place.flow, place.message, allows=False)
-        needed = [(message, keys(flow, message)) for flow, message in place.needs]
+        needed = [(message, _ByPrefix(keys(flow, message), limit)) for flow, message in place.needs]
         names_of = _Names(allowed, taken, limit)
         for domain, name in names_of.stated():
             lacks = tuple(
                 message.value
                 for message, others in needed
-                if not all(_any_includes(others, key, limit) for key in _keys_of(domain, name))
+                if not all(others.any(key, includes) for key in _keys_of(domain, name))
             )
             found.append(StatedName(right, name, domain, lacks))
         unsaid += [(right, key) for key in names_of.unsaid()]
@@ -160,16 +162,29 @@ def _rights(
     return RightsBehindRules(subject, names, own, tuple(order), tuple(unsaid), tuple(denied))
 
 
-def _keys_of(domain: str, name: str) -> list[str]:
-    return [canonical((domain, *chunks, *_OF_TYPE)) for chunks in chunks_of(name)]
+@lru_cache(maxsize=_MANY)
+def _keys_of(domain: str, name: str) -> tuple[str, ...]:
+    return tuple(canonical((domain, *chunks, *_OF_TYPE)) for chunks in chunks_of(name))
 
 
-def _any_includes(wide: Iterable[str], narrow: str, limit: ComparisonLimit) -> bool:
-    for each in wide:
-        if includes(each, narrow):
-            return True
-        limit.spend(len(each) + len(narrow))
-    return False
+class _ByPrefix:
+    """Expressions by their text before the first wildcard, with which what they match begins."""
+
+    def __init__(self, expressions: Iterable[str], limit: ComparisonLimit) -> None:
+        self._limit = limit
+        self._found: dict[str, list[str]] = {}
+        for each in expressions:
+            # "/**" and "/*" may stand for nothing, or for a part without the slash.
+            self._found.setdefault(each.partition("*")[0].rstrip("$/"), []).append(each)
+
+    def any(self, text: str, holds: Callable[[str, str], bool]) -> bool:
+        """Return whether ``holds`` of an expression and ``text``, for one that may match it."""
+        for end in range(len(text) + 1):
+            for each in self._found.get(text[:end], ()):
+                if holds(each, text):
+                    return True
+                self._limit.spend(len(each) + len(text))
+        return False
 
 
 class _Names:
@@ -181,7 +196,7 @@ class _Names:
         self._allowed = allowed
         self._denied = denied
         self._limit = limit
-        self._exactly = set(allowed)
+        self._including = _ByPrefix(allowed, limit)
         self._said: list[str] = []
 
     def stated(self) -> list[tuple[str, str]]:
@@ -192,34 +207,31 @@ class _Names:
             for domain, name in _candidates(key)
             if not expression_problem(name) and self._is_sound(domain, name)
         )
-        wild = [each for each in sound if "*" in each[1]]
-        found = [
+        self._said = [key for domain, name in sound for key in _keys_of(domain, name)]
+        names: dict[str, list[str]] = {}
+        for domain, name in sound:
+            names.setdefault(domain, []).extend([name] if "*" in name else [])
+        wild = {domain: _ByPrefix(of, self._limit) for domain, of in names.items()}
+        return [
             (domain, name)
             for domain, name in sound
-            if not any(
-                other != name and place == domain and covers(other, name) for place, other in wild
-            )
+            if not wild[domain].any(name, lambda one, of: one != of and covers(one, of))
         ]
-        self._said = [key for domain, name in sound for key in _keys_of(domain, name)]
-        return found
 
     def _is_sound(self, domain: str, name: str) -> bool:
         return all(
-            (key in self._exactly or _any_includes(self._allowed, key, self._limit))
+            self._including.any(key, includes)
             and not any(intersects(each, key) for each in self._denied)
             for key in _keys_of(domain, name)
         )
 
     def unsaid(self) -> list[str]:
         """Return the key expressions that the names leave out a part of."""
-        said = set(self._said)
+        said = _ByPrefix(dict.fromkeys(self._said), self._limit)
         return [
             key
             for key in self._allowed
-            if not all(
-                piece in said or _any_includes(self._said, piece, self._limit)
-                for piece in _pieces(key)
-            )
+            if not all(said.any(piece, includes) for piece in _pieces(key))
         ]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.support.harness import policy_text, publish, sros
 from tests.support.made_by_eloquent import EVERYTHING, make_eloquent
-from tests.support.zenoh_configurations import self_limiting
+from tests.support.zenoh_configurations import denying, self_limiting
 
 WITHOUT_JSON = {
     "run": "it becomes the command that it runs, whose output is the result",
@@ -81,6 +81,7 @@ def make_folder(folder: Path) -> None:
     (folder / "closed/enclaves/b/session.json5").unlink()
     (folder / "open.json5").write_text("{mode: 'router'}")
     (folder / "self_limiting.json5").write_text(self_limiting())
+    (folder / "denying.json5").write_text(denying())
     (folder / "lost/public/identity_ca.crl.pem").unlink()
     (folder / "broken/enclaves/b/cert.pem").write_text("x")
     ledger = folder / "broken/ledger.jsonl"
@@ -177,6 +178,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("--from closed/enclaves/a/session.json5 -o found.xml --dry-run"),
         Case("--from self_limiting.json5", 1),
         Case("--from open.json5", 1),
+        Case("--from denying.json5", 1),
     ),
     "rotate_ca": (
         Case("ks"),

@@ -95,3 +95,23 @@ def self_limiting(
         },
     }
     return json.dumps(document, indent=2)
+
+
+def denying() -> str:
+    """A router that denies something inside of what it allows, in part by no name of ROS."""
+    rule = {"messages": ["put"], "flows": ["ingress"]}
+    return json.dumps(
+        {
+            "mode": "router",
+            "access_control": {
+                "enabled": True,
+                "default_permission": "deny",
+                "rules": [
+                    {**rule, "id": "yes", "permission": "allow", "key_exprs": ["0/*/*/*"]},
+                    {**rule, "id": "no", "permission": "deny", "key_exprs": ["0/a/*/*"]},
+                ],
+                "subjects": [{"id": "s", "cert_common_names": ["/talker"]}],
+                "policies": [{"rules": ["yes", "no"], "subjects": ["s"]}],
+            },
+        }
+    )
