@@ -1,9 +1,13 @@
-"""Processes that read the variables of `sros run` as rmw_zenoh_cpp does open, and only those."""
+"""Processes of an export that read the variables of `sros run` as rmw_zenoh_cpp does open.
+
+Only those do.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import sys
 from pathlib import Path
@@ -25,7 +29,7 @@ PROCESS = Path(__file__).with_name("zenoh_process.py")
 def test_a_session_opens_with_the_environment_and_not_without(
     mode: str, name: str, tmp_path: Path
 ) -> None:
-    root, policy = tmp_path / name, tmp_path / "policy.xml"
+    root, policy, robot = tmp_path / "home", tmp_path / "policy.xml", tmp_path / name
     subscribe = publish("/chatter").replace("publish", "subscribe")
     policy.write_text(policy_text({"/talker": publish("/chatter"), "/listener": subscribe}))
     sros("create_keystore", root).ok()
@@ -34,8 +38,10 @@ def test_a_session_opens_with_the_environment_and_not_without(
         free.bind(("127.0.0.1", 0))
         endpoint = f"localhost:{free.getsockname()[1]}"
     sros("zenoh", root, "--mode", mode, "--endpoint", endpoint).ok()
+    sros("distribute_key", root, "--all", robot).ok()
+    shutil.rmtree(root)
     done = run(
-        [sys.executable, "-P", PROCESS, "world", root],
+        [sys.executable, "-P", PROCESS, "world", robot],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
     )
     assert json.loads(done.stdout) == {
