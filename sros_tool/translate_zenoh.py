@@ -21,6 +21,7 @@ from sros_tool.zenoh.access import (
     Flow,
     Message,
     RemoteRights,
+    in_order,
     joined,
 )
 from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical
@@ -183,9 +184,9 @@ def control_of_session(
     The enclave ``router`` may send and get what the enclave itself may get and send: it passes on
     what others said.  With ``direct`` connections, every other enclave has its own rights, too.
     """
-    own = tuple(each.mirrored() for each in remotes[enclave].rules)
+    own = in_order(each.mirrored() for each in remotes[enclave].rules)
     known = dict(remotes) if direct else {}
-    known[router] = RemoteRights(router, joined(own))
+    known[router] = RemoteRights(router, own)
     return AccessControl(tuple(known[each] for each in sorted(known)))
 
 

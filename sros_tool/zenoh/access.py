@@ -7,12 +7,12 @@ Sources: zenoh.io "Access Control"; zenoh 1.9, access_control.rs and authorizati
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
 
-from sros_tool.zenoh.key_expressions import KeyExpressions
+from sros_tool.zenoh.key_expressions import KeyExpressions, includes
 
 
 class Message(StrEnum):
@@ -80,13 +80,30 @@ class AccessControl:
         as a whole, so that a wider subscription, query or put is dropped and not cut down.
         """
         return any(
-            rule.flow is flow
-            and message in rule.messages
-            and _search(rule.key_expressions).include(key)
-            for remote in self.remotes
-            if remote.common_name == common_name
-            for rule in remote.rules
+            _include(each.key_expressions, key) for each in self._rules(common_name, flow, message)
         )
+
+    def passing(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
+        """Return the key expressions of all rules for a message, to ask about many keys."""
+        rules = self._rules(common_name, flow, message)
+        return KeyExpressions(each for rule in rules for each in rule.key_expressions)
+
+    def _rules(self, common_name: str, flow: Flow, message: Message) -> Iterator[AccessRule]:
+        for remote in self.remotes:
+            if remote.common_name == common_name:
+                for rule in remote.rules:
+                    if rule.flow is flow and message in rule.messages:
+                        yield rule
+
+
+_FEW = 16
+"""So many key expressions are compared one by one, without an index."""
+
+
+def _include(expressions: tuple[str, ...], key: str) -> bool:
+    if len(expressions) <= _FEW:
+        return any(includes(each, key) for each in expressions)
+    return _search(expressions).include(key)
 
 
 @lru_cache(maxsize=4096)
@@ -103,11 +120,20 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     found: dict[tuple[Flow, tuple[Message, ...]], set[str]] = {}
     for rule in rules:
         found.setdefault((rule.flow, rule.messages), set()).update(rule.key_expressions)
-    order = {message: number for number, message in enumerate(Message)}
-    return tuple(
+    return in_order(
         AccessRule(flow, messages, tuple(KeyExpressions(keys).needed()))
-        for (flow, messages), keys in sorted(
-            found.items(),
-            key=lambda each: (each[0][0] is Flow.EGRESS, [*map(order.get, each[0][1])]),
+        for (flow, messages), keys in found.items()
+    )
+
+
+_ORDER = {message: number for number, message in enumerate(Message)}
+
+
+def in_order(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
+    """Return rules of different directions and messages in the order of `joined`."""
+    return tuple(
+        sorted(
+            rules,
+            key=lambda each: (each.flow is Flow.EGRESS, [_ORDER[one] for one in each.messages]),
         )
     )

@@ -7,12 +7,15 @@ Source: zenoh.io "Key Expressions"; measured with the wheel 1.10.2.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import lru_cache
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cached_property, lru_cache
 
 ANY_PART, ANY_CHUNKS = "$*", "**"
 _ANY_CHUNK = "*"
 _MANY = 65536
+_SAME_DEPTH = re.compile(r"(?:/\*)*(?:/@[^*]*(?:/\*\*)?)?")
+"""The wildcards at the end of expressions, by which none includes one with another beginning."""
 _MOST_COMPARED = 100_000
 """Most comparisons to leave out what is not needed: parts of a second."""
 
@@ -52,11 +55,18 @@ class KeyExpressions:
 
     def __init__(self, expressions: Iterable[str]) -> None:
         self._all = frozenset(expressions)
-        self._by_begin: dict[str, list[str]] = {}
+
+    @cached_property
+    def _by_begin(self) -> Mapping[str, list[str]]:
+        found: dict[str, list[str]] = {}
         for each in self._all:
             if (begin := _fixed_begin(each)) != each:
-                self._by_begin.setdefault(begin, []).append(each)
-        self._sizes = sorted({len(each) for each in self._by_begin})
+                found.setdefault(begin, []).append(each)
+        return found
+
+    @cached_property
+    def _sizes(self) -> list[int]:
+        return sorted({len(each) for each in self._by_begin})
 
     def include(self, narrow: str) -> bool:
         """Return whether one of the expressions includes all of ``narrow``."""
@@ -66,6 +76,9 @@ class KeyExpressions:
 
     def needed(self) -> list[str]:
         """Return the expressions that no other one includes, sorted; all if they are too alike."""
+        ends = {each[len(_fixed_begin(each)) :] for each in self._all}
+        if len(ends) == 1 and _SAME_DEPTH.fullmatch(ends.pop()):
+            return sorted(self._all)
         compared = sum(len(some) for each in self._all for some in self._wider(each))
         if compared > _MOST_COMPARED:
             return sorted(self._all)
@@ -88,6 +101,7 @@ class KeyExpressions:
                 yield some
 
 
+@lru_cache(maxsize=_MANY)
 def _fixed_begin(expression: str) -> str:
     """Return what every included key begins with; "/**" may stand for nothing."""
     begin, wildcard, _ = expression.partition("*")

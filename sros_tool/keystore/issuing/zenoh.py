@@ -38,8 +38,8 @@ from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, subject_text
-from sros_tool.policy.model import Enclave
-from sros_tool.policy.rights import KIND_OF, Rules
+from sros_tool.policy.model import RIGHTS, Enclave
+from sros_tool.policy.rights import Rules
 from sros_tool.translate_zenoh import (
     StatedRight,
     control_of_router,
@@ -397,22 +397,30 @@ _PROOF = {
 
 
 def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[StatedRight]]) -> None:
-    """Raise `PkiError` if rules decide otherwise than the rights about a name that these have."""
+    """Raise `PkiError` if rules decide otherwise than the rights about a name that these have.
+
+    For names with wildcards, some are asked that they match.
+    """
     control = AccessControl((remote,))
+    passing = {right: control.passing(enclave, *use) for right, use in _PROOF.items()}
     for domain, rights in stated.items():
         rules = Rules([each.right for each in rights])
-        names = {(each.right.kind, each.right.name) for each in rights}
+        names = {(e.right.kind, name) for e in rights for name in _examples(e.right.name)}
         for kind, name in names:
-            if is_expression(name):
-                continue
-            for right, (flow, message) in _PROOF.items():
-                if KIND_OF[right] == kind:
-                    key = f"{domain}{name}/type/hash"
-                    check_meaning(
-                        control.allows(enclave, flow, message, key),
-                        rules.allow(enclave, right, name),
-                        f"the right of {enclave} to {right} {name}",
-                    )
+            for right in RIGHTS[kind]:
+                check_meaning(
+                    passing[right].include(f"{domain}{name}/type/hash"),
+                    rules.allow(enclave, right, name),
+                    f"the right of {enclave} to {right} {name}",
+                )
+
+
+def _examples(name: str) -> Iterable[str]:
+    if not is_expression(name):
+        return (name,)
+    if not name.startswith("/") or "?" in name or "[" in name:
+        return ()
+    return (name.replace("*", "a"), name.replace("*", "a/b"))
 
 
 # ── files ──────────────────────────────────────────────────────────────────────────────────
