@@ -145,11 +145,15 @@ def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:
     return _cyclone(cyclone_stack(probe), reason)
 
 
+_OLDEST_ZENOH = (1, 10)
+"""The oldest version whose logs were seen: rows take them as evidence."""
+
+
 def zenoh_backend() -> Backend:
     """Return the backend that runs the nodes on Zenoh.
 
     Raises:
-        UnavailableError: the package eclipse-zenoh is not installed.
+        UnavailableError: the package eclipse-zenoh is not installed, or too old.
     """
     try:
         version = metadata.version("eclipse-zenoh")
@@ -160,6 +164,13 @@ def zenoh_backend() -> Backend:
             "the demo on Zenoh needs the package eclipse-zenoh",
             "It is not installed in this Python.",
             "Install it with `pip install 'sros_tool[zenoh]'`.",
+        )
+    found = tuple(int(part) for part in version.split(".")[:2] if part.isdigit())
+    if found < _OLDEST_ZENOH:
+        raise UnavailableError(
+            f"the demo on Zenoh needs eclipse-zenoh {'.'.join(map(str, _OLDEST_ZENOH))} or newer",
+            f"Version {version} is installed in this Python.",
+            "Upgrade it with `pip install --upgrade 'sros_tool[zenoh]'`.",
         )
     return Backend(ZENOH, f"Zenoh {version}", _ASKED)
 

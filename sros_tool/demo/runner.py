@@ -80,6 +80,7 @@ class _Patience(NamedTuple):
 _PATIENCE = (_Patience(8, 2.0), _Patience(20, 8.0), _Patience(60, 30.0))
 
 _AFTER_EXPIRY = 2.0
+"""Seconds for which a row goes on after a certificate expired."""
 
 _ENOUGH_MESSAGES = 3
 _AFTER_ENOUGH = 2.0
@@ -153,16 +154,17 @@ class _Runner:
         assert task is not None
         for number in ENDING_SIGNALS:
             loop.add_signal_handler(number, task.cancel)
-        results = [each for done in await asyncio.gather(*map(self._run, groups)) for each in done]
-        order = [index for group in groups for index in group]
-        return [result for _, result in sorted(zip(order, results, strict=True), key=_first)]
+        results: dict[int, RowResult] = {}
+        for found in await asyncio.gather(*map(self._run, groups)):
+            results |= found
+        return [results[index] for index in range(len(plan.rows))]
 
     def _text(self, index: int, party: Party) -> str:
         """Return the text of a talker, which is unique among all rows."""
         return f"Hello World from the {party.name} {self._mark}-{index}"
 
-    async def _run(self, group: Sequence[int]) -> list[RowResult]:
-        """Run rows that share their processes; return their results in order."""
+    async def _run(self, group: Sequence[int]) -> dict[int, RowResult]:
+        """Run rows that share their processes; return their results by their places."""
         rows, domain = [self._plan.rows[index] for index in group], self._plan.domains[group[0]]
         skipped = {row.name: why for row in rows if (why := self._why_skipped(row))}
         tried = [row for row in rows if row.name not in skipped]
@@ -174,13 +176,13 @@ class _Runner:
                     found = (judge_row(replace(played, row=row)).observed for row in tried)
                     if RowStatus.UNDECIDED not in found:
                         break
-        results = []
-        for row in rows:
+        results = {}
+        for index, row in zip(group, rows, strict=True):
             record = replace(played, row=row, skipped=skipped.get(row.name, played.skipped))
-            results.append(judge_row(record))
+            result = results[index] = judge_row(record)
             self._finished += 1
             self._progress(
-                f"[{self._finished}/{len(self._plan.rows)}] {row.name}: {results[-1].observed}"
+                f"[{self._finished}/{len(self._plan.rows)}] {row.name}: {result.observed}"
             )
         return results
 
@@ -368,10 +370,6 @@ def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProces
         return False
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
     return claim.denied not in DENIALS or all(processes[name].running for name in names)
-
-
-def _first(pair: tuple[int, RowResult]) -> int:
-    return pair[0]
 
 
 def worlds(rows: Sequence[Row]) -> list[list[int]]:

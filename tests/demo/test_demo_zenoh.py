@@ -267,6 +267,19 @@ def test_without_the_package_it_says_what_to_install(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(("version", "fits"), [("1.9.0", False), ("1.10.0", True), ("2.0", True)])
+def test_an_old_package_is_refused(
+    version: str, fits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(metadata, "version", lambda _name: version)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: object())
+    if fits:
+        assert backend.zenoh_backend().dds == f"Zenoh {version}"
+    else:
+        with pytest.raises(UnavailableError, match=r"needs eclipse-zenoh 1\.10 or newer.*1\.9\.0"):
+            backend.zenoh_backend()
+
+
 def test_a_keystore_of_the_user_is_refused(tmp_path: Path) -> None:
     ended = sros("demo", "--backend", "zenoh", "--keystore", tmp_path, cwd=tmp_path)
     assert ended.status == 2
