@@ -807,6 +807,12 @@ def _show_zenoh_who(
     else:
         _echo(zenoh_who_lines(found))
         click.echo(f"{question}, on {ZENOH_TITLE} ({why})", err=True)
+    if any(each.mode == "peer" for each in found):
+        text = "peers decide by their own files, and this is by that of the router, which has the "
+        text += (
+            "same rights if `sros zenoh --check` says so; a question about one enclave reads all."
+        )
+        taken.append(Note("explain.zenoh-by-router", text))
     print_notes(taken)
     return 0 if any(each.outcome.ok for each in found) else 1
 

@@ -85,16 +85,14 @@ class ZenohOutcome(StrEnum):
 class ZenohFile:
     """The configuration of an enclave's process as it is in the keystore.
 
-    ``process`` is None if it opens no session, and ``problem`` says why.  ``signed`` says whether
-    the permissions CA signed the file next to it, ``until`` when the certificate expires.
-    ``endpoints`` are where a session connects, or where the router listens.
+    ``process`` is None if it opens no session, and ``problem`` says why.  ``until`` is when the
+    certificate expires.  ``endpoints`` are where a session connects, or where the router listens.
     """
 
     enclave: str
     file: str
     process: ZenohProcess | None
     problem: str
-    signed: bool
     until: datetime | None = None
     endpoints: tuple[ZenohEndpoint, ...] = ()
 
@@ -256,10 +254,10 @@ class ZenohEvaluator:
         )
 
     def who(self, question: Question, names: Sequence[str]) -> tuple[ZenohAnswer, ...]:
-        """Return the answers for several enclaves, without whom they reach."""
+        """Return the answers for several enclaves, without whom they reach; brief for peers."""
 
         def work(part: Sequence[str]) -> list[ZenohAnswer]:
-            return [self.answer(name, question, reach=False) for name in part]
+            return [self.answer(name, question, reach=False, brief=True) for name in part]
 
         names = [each for each in names if each != self.router.enclave]
         found = [each for _, part in map_slices(names, work) for each in part]
@@ -279,9 +277,11 @@ class ZenohEvaluator:
             planned = set_zenoh(self.root, network, now=self._at, dry_run=True).changes
         except SrosError:
             return None
-        ours = {answer.enclave, *(each.enforcer for each in answer.checks)}
-        ours.add(self.router.enclave)
-        paths = {f"{enclave_folder(each)}/{self._file_of(each)}" for each in ours}
+        ours = {answer.enclave, self.router.enclave}
+        others = {each.enforcer for each in answer.checks} - ours
+        paths = {f"{enclave_folder(each)}/{self._file_of(each)}" for each in ours | others}
+        # Whether the first two are signed is told apart.
+        paths |= {f"{enclave_folder(each)}/{ZENOH_SIGNED[SESSION_FILE]}" for each in others}
         return tuple(sorted(each.path for each in planned if each.path in paths))
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
@@ -313,14 +313,14 @@ class ZenohEvaluator:
             file,
             ZenohProcess(name, document.mode, document.access),
             "",
-            self._is_signed(folder / file, data),
             validity_of(state.certificate).not_after,
             document.listen if document.mode is Mode.ROUTER else document.connect,
         )
 
-    def _is_signed(self, path: Path, document: bytes) -> bool:
-        """Return whether the permissions CA signed the document next to the file."""
+    def _is_signed(self, path: Path) -> bool:
+        """Return whether the permissions CA signed the document of a file next to it."""
         try:
+            document = read_bytes(path, "Zenoh configuration")
             data = read_bytes(path.with_name(ZENOH_SIGNED[path.name]), "signed document")
             signed = smime.parse(data)
             signed.verify(load_ca_certificate(self.root, PERMISSIONS))
@@ -332,7 +332,8 @@ class ZenohEvaluator:
         return tuple(
             f"{each.enclave}/{each.file}"
             for each in (own, self.router)
-            if each.process and not each.signed
+            if each.process
+            and not self._is_signed(enclave_path(self.root, each.enclave) / each.file)
         )
 
     # ── decisions ──────────────────────────────────────────────────────────────────────────
@@ -468,4 +469,4 @@ def _listed(endpoints: Sequence[ZenohEndpoint]) -> str:
 
 
 def _closed(enclave: str, file: str, problem: str) -> ZenohFile:
-    return ZenohFile(enclave, file, None, problem, signed=False)
+    return ZenohFile(enclave, file, None, problem)

@@ -90,6 +90,8 @@ def _without_lines(members: list[tuple[str, Any]]) -> Json5Object:
 def _is_deep(value: Any) -> bool:
     level = [value]
     for _ in range(_MOST_DEPTH):
+        if not level:
+            return False
         inner = [each.values() if isinstance(each, dict) else each for each in level
                  if isinstance(each, dict | list)]  # fmt: skip
         level = [each for of in inner for each in of]

@@ -236,6 +236,7 @@ def _sequences_intersect(
     return len(other) in reached
 
 
+@lru_cache(maxsize=_MANY)
 def expression_problem(text: str) -> str:
     """Return why Zenoh does not accept a key expression, or "" if it does.
 

@@ -224,6 +224,24 @@ def test_the_answer_is_by_the_file_as_it_is(keystore: Path) -> None:
     assert zenoh(keystore, "/talker", "publish", "/chatter")["outcome"] == "dropped"
 
 
+def test_a_peer_whose_file_is_not_signed_is_named(made: Path, tmp_path: Path) -> None:
+    changed = Path(shutil.copytree(made / "peer", tmp_path / "ks", symlinks=True))
+    (changed / "enclaves/listener/session.p7s").unlink()
+    found = zenoh(changed, "/talker", "publish", "/chatter")
+    assert found["out_of_date"] == ["enclaves/listener/session.p7s"]
+
+
+def test_a_peer_with_other_rules_is_named(made: Path, tmp_path: Path) -> None:
+    """Each peer decides by its own file: one that differs drops what the others let through."""
+    changed = Path(shutil.copytree(made / "peer", tmp_path / "ks", symlinks=True))
+    file = changed / "enclaves/client/session.json5"
+    file.write_text(file.read_text().replace("0/chatter/", "0/other/"))
+    found = zenoh(changed, "/talker", "publish", "/chatter")
+    assert found["outcome"] == "dropped"
+    assert [each["enclaves"][1] for each in found["links"] if not each["passes"]] == ["/client"]
+    assert found["out_of_date"] == ["enclaves/client/session.json5"]
+
+
 def test_a_file_that_zenoh_does_not_accept(keystore: Path) -> None:
     (keystore / "enclaves/router/router.json5").write_text('{"mode": "router\x1b"}')
     shown = explain(keystore, "/talker", "publish", "/chatter", "--vendor", "zenoh")
