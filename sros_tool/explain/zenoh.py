@@ -279,10 +279,15 @@ class ZenohEvaluator:
             return None
         ours = {answer.enclave, self.router.enclave}
         others = {each.enforcer for each in answer.checks} - ours
-        paths = {f"{enclave_folder(each)}/{self._file_of(each)}" for each in ours | others}
-        # Whether the first two are signed is told apart.
-        paths |= {f"{enclave_folder(each)}/{ZENOH_SIGNED[SESSION_FILE]}" for each in others}
-        return tuple(sorted(each.path for each in planned if each.path in paths))
+        changed = {each.path for each in planned}
+        found = {f"{enclave_folder(each)}/{self._file_of(each)}" for each in ours | others}
+        found &= changed
+        # Whether the files of the first two are signed is told apart.
+        for each in others:
+            folder = enclave_folder(each)
+            if f"{folder}/{SESSION_FILE}" not in changed:
+                found |= {f"{folder}/{ZENOH_SIGNED[SESSION_FILE]}"} & changed
+        return tuple(sorted(found))
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
