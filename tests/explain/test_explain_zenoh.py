@@ -15,7 +15,8 @@ from sros_tool.cli.common import now
 from sros_tool.explain.question import ask
 from sros_tool.explain.zenoh import ZenohEvaluator
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.rights import KIND_OF, Rules, policy_rights, unfolded
+from sros_tool.policy.rights import Rules, policy_rights, unfolded
+from tests.explain.zenoh_policies import NAMES, OTHER_END, WORD, drawn_policy
 from tests.support.children import LONG
 from tests.support.harness import Ended, policy_text, publish, sros
 
@@ -301,30 +302,6 @@ def test_zenoh_is_asked_where_ros_uses_it(made: Path) -> None:
 
 
 # ── random policies ────────────────────────────────────────────────────────────────────────
-
-NAMES = ("/a", "/ab", "/a/b", "/b", "/b/a/c")
-PATTERNS = (*NAMES, "/*", "/a*", "/a/*", "/*b", "/b/*/c")
-OTHER_END = {"publish": "subscribe", "subscribe": "publish", "request": "reply", "reply": "request"}
-WORD = {"publish": "publish", "subscribe": "subscribe", "request": "call", "reply": "serve"}
-
-
-def drawn_policy(draw: random.Random) -> str:
-    """Return a policy of five enclaves with random rights, some of them denied."""
-
-    def group(right: str) -> str:
-        kind = KIND_OF[right]
-        names = draw.sample(PATTERNS, draw.randint(1, 2))
-        qualifier = "DENY" if draw.random() < 0.15 else "ALLOW"
-        inner = "".join(f"<{kind[:-1]}>{each}</{kind[:-1]}>" for each in names)
-        return f'<{kind} {right}="{qualifier}">{inner}</{kind}>'
-
-    return policy_text(
-        {
-            f"/e{number}": "".join(group(right) for right in OTHER_END if draw.random() < 0.8)
-            or publish("/a")
-            for number in range(5)
-        }
-    )
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -1,9 +1,10 @@
-"""What arrives on real Zenoh is what `zenoh.delivery` says, for random rules and links."""
+"""What arrives on real Zenoh is what sros says: for random rules and links, and random policies."""
 
 from __future__ import annotations
 
 import json
 import os
+import random
 import socket
 import sys
 from pathlib import Path
@@ -11,6 +12,10 @@ from typing import Any
 
 import pytest
 
+from sros_tool.cli.common import now
+from sros_tool.explain.question import ask
+from sros_tool.explain.zenoh import ZenohEvaluator
+from tests.explain.zenoh_policies import NAMES, OTHER_END, WORD, drawn_policy
 from tests.support.children import LONG, run
 from tests.support.harness import policy_text, publish, sros
 
@@ -18,29 +23,34 @@ pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
 
 pytestmark = pytest.mark.zenoh
 DELIVERIES = Path(__file__).with_name("zenoh_deliveries.py")
+MATRIX = Path(__file__).with_name("zenoh_matrix.py")
 POLICY = policy_text({"/talker": publish("/chatter"), "/listener": publish("/chatter")})
+
+
+def make_keystore(folder: Path, policy: str, mode: str) -> Path:
+    """Make a keystore with Zenoh files for a policy, and for a port of its own."""
+    (folder / "policy.xml").write_text(policy)
+    sros("create_keystore", folder / "ks", "--template", "production").ok()
+    sros("generate_artifacts", "-k", folder / "ks", "-p", folder / "policy.xml").ok()
+    with socket.socket() as free:  # where no network of its own is allowed
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"localhost:{free.getsockname()[1]}"
+    sros("zenoh", folder / "ks", "--mode", mode, "--endpoint", endpoint).ok()
+    return folder / "ks"
 
 
 @pytest.fixture(scope="module")
 def keystore(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A keystore with Zenoh files, whose access control the worlds replace."""
-    folder = tmp_path_factory.mktemp("zenoh")
-    (folder / "policy.xml").write_text(POLICY)
-    sros("create_keystore", folder / "ks", "--template", "production").ok()
-    sros("create_enclave", folder / "ks", "/router").ok()
-    sros("generate_artifacts", "-k", folder / "ks", "-p", folder / "policy.xml").ok()
-    with socket.socket() as free:  # where no network of its own is allowed
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"localhost:{free.getsockname()[1]}"
-    sros("zenoh", folder / "ks", folder / "policy.xml", "--endpoint", endpoint).ok()
-    return folder / "ks"
+    return make_keystore(tmp_path_factory.mktemp("zenoh"), POLICY, "peer")
 
 
-def deliveries(keystore: Path, talker: str, listener: str, seed: int, count: int) -> Any:
-    """Return what a world of real sessions observed, in modes and with rules of a seed."""
+def play(script: Path, *words: object) -> Any:
+    """Return what a process with a world of real sessions observed."""
     done = run(
-        [sys.executable, "-P", DELIVERIES, keystore, talker, listener, seed, count],
+        [sys.executable, "-P", script, *words],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        patience=3600,
     )
     return json.loads(done.stdout)
 
@@ -55,8 +65,35 @@ MIXED = [("client", "peer"), ("peer", "client")]
 def test_what_arrives_is_what_the_engine_says(
     keystore: Path, talker: str, listener: str, seed: int
 ) -> None:
-    observed = deliveries(keystore, talker, listener, seed, 250 if LONG else 80)
+    observed = play(DELIVERIES, keystore, talker, listener, seed, 250 if LONG else 80)
     assert not any(observed["different"].values()), observed["different"]
     # Both sides were up, and each kind of delivery was both allowed and dropped.
     assert min(observed["arrived"].values()) >= 5, observed["arrived"]
     assert min(observed["dropped"].values()) >= 5, observed["dropped"]
+
+
+@pytest.mark.parametrize("mode", ["client", "peer"])
+@pytest.mark.parametrize("seed", range(8 if LONG else 1))
+def test_what_explain_answers_is_what_happens(tmp_path: Path, mode: str, seed: int) -> None:
+    """Each enclave of a random policy tries every name in every direction, also with no rules."""
+    policy = drawn_policy(random.Random(f"live {seed}"))
+    keystore = make_keystore(tmp_path, policy, mode)
+    evaluator = ZenohEvaluator(keystore, at=now(), domain=0)
+    answers = {
+        enclave: {
+            right: [
+                name
+                for name in NAMES
+                if evaluator.answer(enclave, ask(WORD[right], name), reach=False).outcome.ok
+            ]
+            for right in OTHER_END
+        }
+        for enclave in evaluator.names
+        if enclave != "/router"
+    }
+    matrix = {"topics": NAMES, "services": NAMES, "rights": answers}
+    (tmp_path / "matrix.json").write_text(json.dumps(matrix))
+    observed = play(MATRIX, keystore, tmp_path / "matrix.json")
+    assert observed["up"]
+    assert observed["different"] == {}
+    assert observed["allowed"]["heard"] > 0
