@@ -107,7 +107,7 @@ def publish_all(matrix: Matrix, sessions: dict[Voice, Any], direct: bool) -> set
             tried = (speaker, str(listener), name)
             last[tried] = max(last.get(tried, 0), int(number))
 
-        return sessions[listener].declare_subscriber(key(name), hear)
+        return sessions[listener].declare_subscriber(key(name), directly(hear))
 
     kept = [subscribe(each, name) for each in sessions for name in matrix.used(each, "subscribe")]
     wanted = matrix.wanted(direct, "publish", "subscribe")
@@ -147,7 +147,7 @@ def call_all(
                 executed.add((bytes(query.payload or b"").decode(), str(server), name))
                 query.reply(key(name), str(server))
 
-        return sessions[server].declare_queryable(key(name), answer, complete=True)
+        return sessions[server].declare_queryable(key(name), directly(answer), complete=True)
 
     def call(client: Voice, name: str) -> None:
         def reply(got: Any) -> None:
@@ -158,7 +158,7 @@ def call_all(
         pending.add(one)
         sessions[client].get(
             key(name),
-            zenoh.handlers.Callback(reply, lambda: pending.discard(one)),
+            directly(reply, lambda: pending.discard(one)),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             payload=str(client),
@@ -176,6 +176,11 @@ def call_all(
         time.sleep(0.05)
     del kept
     return counted(executed, direct), counted(replied, direct)
+
+
+def directly(callback: Any, ended: Any = None) -> Any:
+    """Return a handler in the threads of Zenoh; usually each handler has a thread of its own."""
+    return zenoh.handlers.Callback(callback, ended, indirect=False)
 
 
 def counted(seen: set[Tried], direct: bool) -> set[Tried]:
