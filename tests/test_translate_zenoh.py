@@ -25,6 +25,7 @@ from sros_tool.translate_zenoh import (
     chunks_of,
     control_of_router,
     control_of_session,
+    remote_of,
     remote_rights,
     stated_rights,
 )
@@ -287,26 +288,29 @@ USES = {
 def test_random_policies_give_the_same_rights_as_on_dds_or_an_error() -> None:
     """DDS is asked by its own engine, from the permissions of the same enclave."""
     draw, translated = random.Random(15), 0
-    for _ in range(3000 if LONG else 300):
+    for _ in range(3000 if LONG else 60):
         enclave = drawn_enclave(draw)
         try:
-            control = AccessControl((remote_rights(enclave, 0),))
+            stated = dict.fromkeys((0, 7), stated_rights(enclave))
+            control = AccessControl((remote_of("/e", stated),))
         except PolicyError:
             continue
         translated += 1
         document = permissions_for(
             enclave, subject="CN=/e", validity=VALIDITY, domains=DomainSet.of((0, 0))
         )
-        for name, (right, use) in product(NAMES, USES.items()):
+        parts = [f"/{a}/_action/{part}" for a in ("a", "ab/a") for part in ("send_goal", "status")]
+        for name, (right, use) in product([*draw.sample(NAMES, 40), *parts], USES.items()):
             names = dds_names(right, name)
             on_dds = all(
                 rule_allows(document, topic, publish=written)
                 for topics, written in ((names.publish, True), (names.subscribe, False))
                 for topic in topics
             )
-            told = control.allows("/e", *use, f"0{name}/{TYPE}")
-            assert told == on_dds, (enclave, right, name)
-    assert translated > 100
+            for domain, here in ((0, on_dds), (7, on_dds), (1, False)):
+                told = control.allows("/e", *use, f"{domain}{name}/{TYPE}")
+                assert told == here, (enclave, right, name)
+    assert translated > (500 if LONG else 15)
 
 
 def rule_allows(permissions: Permissions, topic: str, *, publish: bool) -> bool:
@@ -318,16 +322,24 @@ def rule_allows(permissions: Permissions, topic: str, *, publish: bool) -> bool:
     return False
 
 
+DRAWN = [
+    "/a", "/b", "/ab", "/a/b", "/ab/a", "/a/b/aab", "/a*", "/*b", "/a/*", "/*", "/[ab]", "/a?",
+    "/[!b]b", "/a*b", "a", "a/b", "~/b", "*", "b*", "~/*",
+]  # fmt: skip
+
+
 def drawn_enclave(draw: random.Random) -> Enclave:
-    """An enclave with some rights and denials, on names of which some have wildcards."""
-    names = ["/a", "/b", "/ab", "/a/b", "/ab/a", "/a/b/aab", "/a*", "/*b", "/a/*", "/*", "/[ab]"]
-    groups = []
-    for _ in range(draw.randint(1, 5)):
-        kind = draw.choice(("topics", "services"))
-        right = draw.choice(RIGHTS_OF[kind])
-        qualifier = DENY_ if draw.random() < 0.3 else ALLOW
-        groups.append(Group(kind, ((right, qualifier),), tuple(draw.sample(names, 2))))
-    return Enclave("/e", (Profiles((Profile("/", "n", tuple(groups)),)),))
+    """An enclave of some nodes with rights and denials, on names of which some have wildcards."""
+    profiles = []
+    for ns in draw.sample(("/", "/a", "/ab/a"), draw.randint(1, 2)):
+        groups = []
+        for _ in range(draw.randint(1, 4)):
+            kind = draw.choice(("topics", "services", "actions"))
+            right = draw.choice(RIGHTS_OF[kind])
+            qualifier = DENY_ if draw.random() < 0.3 else ALLOW
+            groups.append(Group(kind, ((right, qualifier),), tuple(draw.sample(DRAWN, 2))))
+        profiles.append(Profile(ns, draw.choice("ab"), tuple(groups)))
+    return Enclave("/e", (Profiles(tuple(profiles)),))
 
 
 def test_a_session_trusts_its_router_with_its_own_rights_alone(tmp_path: Path) -> None:
