@@ -52,6 +52,7 @@ from sros_tool.policy.document import convert_policy, read_policy, write_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.sources import read_source
 from sros_tool.translate import ros_rights
+from sros_tool.translate_from_zenoh import policy_of, rights_behind
 from sros_tool.validity import Window, iso
 from sros_tool.zenoh.document import parse_configuration
 from tests.fuzz.corpus import PASSPHRASE, Corpus
@@ -231,9 +232,10 @@ def _ledger(data: bytes, place: Place) -> None:
 
 
 def _zenoh(data: bytes, place: Place) -> None:
-    document = parse_configuration(data, "drawn")
+    document = parse_configuration(data, "drawn", [("scouting/multicast", "{enabled:true}")])
     for each in document_findings(document):
         str(each)
+    write_policy(policy_of(rights_behind(document)))
 
 
 def _rotation(data: bytes, place: Place) -> None:
