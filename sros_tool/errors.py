@@ -65,3 +65,13 @@ class Note:
 
     id: str
     text: str
+
+
+def check_meaning(read: object, meant: object, what: str) -> None:
+    """Raise `PkiError` unless ``read``, parsed from the new document, equals ``meant``."""
+    if read != meant:
+        raise PkiError(
+            f"{what} would not have the intended content",
+            "Nothing was written.",
+            "This is a defect of sros: please report it with the policy.",
+        )

@@ -15,7 +15,7 @@ from sros_tool.errors import KeystoreError, Note, UsageError
 if TYPE_CHECKING:
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.reader import OpenedEnclave
-    from sros_tool.keystore.zenoh import OpenedZenoh
+    from sros_tool.keystore.zenoh.opened import OpenedZenoh
 
 RMWS = (
     "rmw_connextdds",
@@ -160,7 +160,7 @@ def _opened_zenoh(root: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
             does not state the rights of its permissions.
     """
     from sros_tool.keystore.layout import PUBLIC, enclave_path
-    from sros_tool.keystore.zenoh import ZenohFault, open_zenoh
+    from sros_tool.keystore.zenoh.opened import ZenohFault, open_zenoh
 
     found = open_zenoh(enclave_path(root, name), name, state)
     if not found.problems:

@@ -11,7 +11,7 @@ from typing import Any
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import CERTIFICATE_FILE, PERMISSIONS_FILE, ZENOH_SIGNED
 from sros_tool.keystore.reader import open_enclave
-from sros_tool.keystore.zenoh import OpenedZenoh, ZenohFault, open_zenoh
+from sros_tool.keystore.zenoh.opened import OpenedZenoh, ZenohFault, open_zenoh
 from sros_tool.pki.certificates import common_name_of
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.translate_zenoh import domains_of, stated_names

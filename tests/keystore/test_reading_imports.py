@@ -16,7 +16,9 @@ READERS = (
     "sros_tool.keystore.expiry",
     "sros_tool.keystore.missing",
     "sros_tool.keystore.ledger",
-    "sros_tool.keystore.zenoh",
+    "sros_tool.keystore.recorded",
+    "sros_tool.keystore.zenoh.opened",
+    "sros_tool.keystore.zenoh.wanted",
 )
 WRITERS = ("transaction", "issuing", "lifecycle", "delivery", "authorities")
 

@@ -11,10 +11,10 @@ from collections.abc import Collection, Iterator
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.zenoh import Drift, Drifted, zenoh_drift
 from sros_tool.keystore.layout import PERMISSIONS, SETTINGS, enclave_path
 from sros_tool.keystore.reader import open_enclave, open_keystore
-from sros_tool.keystore.zenoh import OpenedZenoh, ZenohFault, open_zenoh
+from sros_tool.keystore.zenoh.opened import OpenedZenoh, ZenohFault, open_zenoh
+from sros_tool.keystore.zenoh.wanted import Drift, Drifted, zenoh_drift
 
 _AGAIN = "Run `sros zenoh ROOT`, and restart the processes that it names."
 _SOURCE = "sros (docs/zenoh.md); Zenoh 1.10 verifies no signature of its configuration."

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.errors import KeystoreError, Note, PkiError
+from sros_tool.errors import KeystoreError, Note, check_meaning
 from sros_tool.keystore.authorities.imported import check_imported
 from sros_tool.keystore.authorities.keyring import Keyring, check_imported_keys, check_places
 from sros_tool.keystore.layout import (
@@ -70,16 +70,6 @@ class Authority:
             (signed.digest_matches(), _with_lf(signed.document)), (True, _with_lf(document)), what
         )
         return message
-
-
-def check_meaning(read: object, meant: object, what: str) -> None:
-    """Raise `PkiError` unless ``read``, parsed from the new document, equals ``meant``."""
-    if read != meant:
-        raise PkiError(
-            f"{what} would not have the intended content",
-            "Nothing was written.",
-            "This is a defect of sros: please report it with the policy.",
-        )
 
 
 def _with_lf(document: bytes) -> bytes:

@@ -32,7 +32,7 @@ from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.keystore.zenoh import open_zenoh
+from sros_tool.keystore.zenoh.opened import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.xml import read_bytes

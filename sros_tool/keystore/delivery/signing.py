@@ -19,12 +19,10 @@ from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack
 from sros_tool.keystore.issuing.enclave import (
-    EarlierRights,
     EnclaveWriter,
     Issuance,
     Issued,
     NewIdentity,
-    RecordedRights,
     StatedRights,
     default_rights,
     link_shared_files,
@@ -32,7 +30,7 @@ from sros_tool.keystore.issuing.enclave import (
     shared_files,
     stated_enclave,
 )
-from sros_tool.keystore.issuing.zenoh import KeptZenoh, ZenohChange, keep_zenoh
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -62,10 +60,12 @@ from sros_tool.keystore.reader import (
     read_certificate,
     read_signed_grant,
 )
+from sros_tool.keystore.recorded import EarlierRights, RecordedRights
 from sros_tool.keystore.settings import edit_notes
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.zenoh.wanted import ZenohChange
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import enclave_subject, has_unique_part, pem, validity_of
 from sros_tool.pki.certificates import subject_text as text_of

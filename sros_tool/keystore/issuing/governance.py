@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from datetime import datetime
 
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
-from sros_tool.keystore.authorities.authority import Authority, check_meaning, write_copies
+from sros_tool.errors import check_meaning
+from sros_tool.keystore.authorities.authority import Authority, write_copies
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_P7S, GOVERNANCE_XML
 from sros_tool.keystore.ledger import Entry, document_entry
 from sros_tool.keystore.transaction.transaction import Transaction

@@ -9,68 +9,26 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from enum import StrEnum
 from pathlib import Path
-from shlex import quote
 
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Grant
-from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageError
-from sros_tool.keystore.authorities.authority import Authority, check_meaning
-from sros_tool.keystore.issuing.enclave import RecordedRights
-from sros_tool.keystore.layout import (
-    CERTIFICATE_FILE,
-    PERMISSIONS_FILE,
-    ROUTER_FILE,
-    SESSION_FILE,
-    ZENOH_SIGNED,
-    enclave_folder,
-    enclave_names,
-    enclave_path,
-)
+from sros_tool.errors import Note
+from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.reader import read_certificate, read_lists, read_signed_grant
-from sros_tool.keystore.rights import recorded_rights
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.names import is_expression
-from sros_tool.parallel import map_slices
-from sros_tool.pki import smime
-from sros_tool.pki.certificates import common_name_of, subject_text
-from sros_tool.policy.model import RIGHTS, Enclave
-from sros_tool.policy.rights import Rules
-from sros_tool.translate_zenoh import (
-    StatedRight,
-    control_of_router,
-    control_of_session,
-    remote_of,
-    remote_rights,
+from sros_tool.keystore.zenoh.wanted import (
+    NO_CHANGE,
+    Drift,
+    ZenohChange,
+    drifted,
+    signed_path,
+    stale_files,
+    zenoh_documents,
 )
 from sros_tool.validity import iso
-from sros_tool.xml import read_bytes
-from sros_tool.zenoh.access import AccessControl, Flow, Message, RemoteRights
-from sros_tool.zenoh.configuration import Configuration, Mode
 from sros_tool.zenoh.network import ZenohNetwork
-
-_ANY_PORT_HERE = "tls/localhost:0"
-"""Where sessions listen for direct connections, as those of rmw_zenoh do: on their own host."""
-_MOST_BYTES = 512 << 20
-_MOST_DOMAINS = 16
-"""Most ROS domains of a network: every right is stated once for each."""
-
-
-@dataclass(frozen=True, slots=True)
-class ZenohDocuments:
-    """The configurations that a keystore shall have.
-
-    ``files`` maps their paths in the keystore to their content, ``enclaves`` to their enclaves.
-    ``left_out`` maps enclaves that get none, and no rights at the others, to the reason: a clause.
-    """
-
-    files: Mapping[str, bytes]
-    enclaves: Mapping[str, str]
-    left_out: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,24 +50,6 @@ class KeptZenoh:
         return replace(self, restart=tuple(each for each in self.restart if each not in names))
 
 
-@dataclass(frozen=True, slots=True)
-class ZenohChange:
-    """What a transaction changes in the enclaves of a keystore, as far as Zenoh depends on it.
-
-    ``issued`` are the grants of enclaves with new permissions, ``gone`` the enclaves that are
-    revoked, ``replaced`` those whose earlier certificates are.  ``stated`` are the policies of the
-    enclaves, by whose lines errors are told.
-    """
-
-    issued: Mapping[str, Grant] = field(default_factory=dict)
-    gone: Collection[str] = ()
-    replaced: Collection[str] = ()
-    stated: Mapping[str, Enclave | None] = field(default_factory=dict)
-
-
-_NOTHING = ZenohChange()
-
-
 def keep_zenoh(
     transaction: Transaction,
     network: ZenohNetwork | None,
@@ -117,7 +57,7 @@ def keep_zenoh(
     authority: x509.Certificate,
     signer: Callable[[], Authority],
     now: datetime,
-    change: ZenohChange = _NOTHING,
+    change: ZenohChange = NO_CHANGE,
 ) -> KeptZenoh:
     """Stage the configurations as the keystore will need them; nothing without a ``network``.
 
@@ -137,8 +77,8 @@ def keep_zenoh(
     if network is None:
         return KeptZenoh()
     root = transaction.root
-    wanted = _zenoh_documents(root, network, domains, authority, change)
-    drifts = _drifted(root, wanted, authority, change.gone)
+    wanted = zenoh_documents(root, network, domains, authority, change)
+    drifts = drifted(root, wanted, authority, change.gone)
     signing = None
     written: dict[str, bytes] = {}
     for each in drifts:
@@ -150,7 +90,7 @@ def keep_zenoh(
             written[each.path] = document
         signing = signing or signer()
         data = b"" if transaction.dry_run else signing.sign(document, "a Zenoh configuration")
-        written[_signed_path(each.path)] = data
+        written[signed_path(each.path)] = data
     for path, data in written.items():
         transaction.write(path, data)
     names = tuple(wanted.enclaves.values())
@@ -164,307 +104,16 @@ def keep_zenoh(
 
 def remove_zenoh(transaction: Transaction) -> tuple[str, ...]:
     """Stage the removal of all configurations of a keystore; return their enclaves."""
-    stale = list(_stale(transaction.root, ()))
+    stale = list(stale_files(transaction.root, ()))
     for each in stale:
         _remove(transaction, each.path)
     return tuple(dict.fromkeys(each.enclave for each in stale))
 
 
 def _remove(transaction: Transaction, path: str) -> None:
-    for each in (path, _signed_path(path)):
+    for each in (path, signed_path(path)):
         if (transaction.root / each).is_file():
             transaction.remove(each)
-
-
-class Drift(StrEnum):
-    """How a configuration is not what the keystore shall have."""
-
-    MISSING = "missing"
-    DIFFERS = "differs"
-    UNSIGNED = "unsigned"
-    """The permissions CA has not signed it next to it."""
-    STALE = "stale"
-    """There should be none."""
-
-
-@dataclass(frozen=True, slots=True)
-class Drifted:
-    """A configuration that is not what the keystore shall have; ``path`` is in the keystore."""
-
-    enclave: str
-    path: str
-    kind: Drift
-
-
-def _drifted(
-    root: Path,
-    wanted: ZenohDocuments,
-    authority: x509.Certificate,
-    gone: Collection[str] = (),
-) -> tuple[Drifted, ...]:
-    """Return the configurations that are not as ``wanted`` or not signed by ``authority``.
-
-    Those of enclaves that are ``gone`` do not count.
-    """
-
-    def compare(paths: Sequence[str]) -> list[Drifted]:
-        found = []
-        for path in paths:
-            document, present = wanted.files[path], _present(root / path)
-            kind = None
-            if present is None:
-                kind = Drift.MISSING
-            elif present != document:
-                kind = Drift.DIFFERS
-            elif not _is_signed(root / path, document, authority):
-                kind = Drift.UNSIGNED
-            if kind:
-                found.append(Drifted(wanted.enclaves[path], path, kind))
-        return found
-
-    found = [each for _, part in map_slices(list(wanted.files), compare) for each in part]
-    found += (each for each in _stale(root, wanted.files) if each.enclave not in gone)
-    return tuple(found)
-
-
-def zenoh_drift(
-    root: Path, network: ZenohNetwork, domains: DomainSet, authority: x509.Certificate
-) -> tuple[tuple[Drifted, ...], Mapping[str, str]]:
-    """Return the configurations that are not as they shall be, and who gets none with the reason.
-
-    Raises:
-        SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
-    """
-    wanted = _zenoh_documents(root, network, domains, authority)
-    return _drifted(root, wanted, authority), wanted.left_out
-
-
-def _zenoh_documents(
-    root: Path,
-    network: ZenohNetwork,
-    domains: DomainSet,
-    authority: x509.Certificate,
-    change: ZenohChange = _NOTHING,
-) -> ZenohDocuments:
-    """Return the configurations that the enclaves of a keystore need; arguments as `keep_zenoh`."""
-    of_network = _domains(network, domains, root)
-    names = [each for each in enclave_names(root) if each not in change.gone]
-    names = sorted({*names, *change.issued})
-    if network.router not in names:
-        raise KeystoreError(
-            f"keystore '{root}' has no enclave {network.router}, and the router of Zenoh needs it",
-            "Its certificate shows to all others that the process is the router.",
-            f"Create it with `sros create_enclave {quote(str(root))} {network.router}`, name "
-            "another one with `sros zenoh --router NAME`, or end the network with `sros zenoh "
-            f"{quote(str(root))} --off`.",
-        )
-    if change.stated.get(network.router):
-        raise UsageError(
-            f"a policy has rights for {network.router}, the enclave of the Zenoh router",
-            "The router passes on what all others say, so it would have the rights of all there.",
-            "Give the node an enclave of its own.",
-        )
-    names.remove(network.router)
-    reader = _RightsReader(root, authority, of_network, change)
-    read: dict[str, RemoteRights | str] = {}
-    for _, each in map_slices(names, reader.read):
-        read |= each
-    remotes = {name: each for name, each in read.items() if isinstance(each, RemoteRights)}
-    left_out = {name: each for name, each in read.items() if isinstance(each, str)}
-    endpoints = tuple(f"tls/{each}" for each in network.endpoints)
-    listening = tuple(f"tls/{each}" for each in network.listening())
-    router = Configuration(Mode.ROUTER, listening, (), control_of_router(remotes))
-    files = {_router_path(network.router): router.render()}
-    enclaves = {_router_path(network.router): network.router}
-    direct = network.mode is Mode.PEER
-    if direct and len(files[_router_path(network.router)]) * len(remotes) > _MOST_BYTES:
-        raise UsageError(
-            f"the files of {len(remotes)} enclaves would be larger than {_MOST_BYTES >> 20} MB",
-            "In peer mode each has the rights of all enclaves.",
-            f"Take client mode: `sros zenoh {quote(str(root))} --mode client`.",
-        )
-
-    def render(names: Sequence[str]) -> dict[str, bytes]:
-        found = {}
-        for name in names:
-            control = control_of_session(name, network.router, remotes, direct=direct)
-            listen = (_ANY_PORT_HERE,) if direct else ()
-            session = Configuration(network.mode, listen, endpoints, control)
-            found[_session_path(name)] = session.render()
-        return found
-
-    for part, rendered in map_slices(list(remotes), render):
-        files |= rendered
-        enclaves |= zip(rendered, part, strict=True)
-    return ZenohDocuments(files, enclaves, left_out)
-
-
-def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int, ...]:
-    """Return the ROS domains of the network, all of which the governance has."""
-    if others := [each for each in network.domains if each not in domains]:
-        raise UsageError(
-            f"the Zenoh network has domain {others[0]}, and keystore '{root}' only {domains}",
-            "DDS and Zenoh would enforce different rights.",
-            f"Name other domains with `sros zenoh --domain`, or add the domain with `sros "
-            f"update_keystore {quote(str(root))} --domain {domains},{others[0]} --allow-looser`.",
-        )
-    found = network.domains or tuple(domains)
-    if len(found) > _MOST_DOMAINS:
-        raise UsageError(
-            f"keystore '{root}' is for {len(found)} domains, and a Zenoh network for at most "
-            f"{_MOST_DOMAINS}",
-            "Its rules state every right once for each domain.",
-            "Name those that run on Zenoh with `sros zenoh --domain`.",
-        )
-    return found
-
-
-# ── the rights of each enclave ─────────────────────────────────────────────────────────────
-
-
-class _RightsReader:
-    """Reader of the enclaves' rights, as what other processes allow to them.
-
-    Only the last permissions that the permissions CA signed count: whoever puts older ones, or
-    others, into a folder gets no rules for them.
-    """
-
-    def __init__(
-        self,
-        root: Path,
-        authority: x509.Certificate,
-        domains: Sequence[int],
-        change: ZenohChange,
-    ) -> None:
-        self._root = root
-        self._authority = authority
-        self._domains = domains
-        self._change = change
-        self._recorded = RecordedRights(root)
-        self._revoked = {one.serial for each in read_lists(root) for one in each.revoked}
-
-    def read(self, names: Iterable[str]) -> dict[str, RemoteRights | str]:
-        """Return the rights of enclaves, or why they get none, as a clause."""
-        return {name: self._rights(name) for name in names}
-
-    def _rights(self, name: str) -> RemoteRights | str:
-        grant: Grant | str | None = self._change.issued.get(name)
-        if grant is None:
-            try:
-                grant = self._signed_grant(name)
-            except SrosError as error:
-                return error.what
-        if not isinstance(grant, Grant):
-            return grant
-        stated = {each: recorded_rights(name, grant, each) for each in self._domains}
-        try:
-            rights = remote_of(name, stated)
-        except PolicyError:
-            if policy := self._change.stated.get(name):
-                remote_rights(policy, self._domains[0])  # names the line of the policy
-            raise
-        _prove(name, rights, stated)
-        return rights
-
-    def _signed_grant(self, name: str) -> Grant | str:
-        folder = enclave_path(self._root, name)
-        if not (folder / CERTIFICATE_FILE).exists():
-            return "it has no certificate yet"
-        certificate = read_certificate(folder / CERTIFICATE_FILE)
-        if certificate.serial_number in self._revoked:
-            return "its certificate is revoked"
-        subject = certificate.subject
-        if common_name_of(subject) != name:
-            return (
-                f"its certificate has the common name {common_name_of(subject) or '(none)'!r}, by "
-                "which Zenoh knows a process"
-            )
-        if not (folder / PERMISSIONS_FILE).exists():
-            return "it has no permissions"
-        found = read_signed_grant(folder / PERMISSIONS_FILE, subject_text(subject))
-        found.signed.verify(self._authority)
-        self._recorded.policy(name, found.digest)
-        return found.grant or "its permissions are not for its certificate"
-
-
-_PROOF = {
-    "publish": (Flow.INGRESS, Message.PUT),
-    "subscribe": (Flow.EGRESS, Message.PUT),
-    "request": (Flow.INGRESS, Message.QUERY),
-    "reply": (Flow.EGRESS, Message.QUERY),
-}
-"""The message that is the use of each right; on purpose not taken from the translation."""
-
-
-def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[StatedRight]]) -> None:
-    """Raise `PkiError` if rules decide otherwise than the rights about a name that these have.
-
-    For names with wildcards, some are asked that they match.
-    """
-    control = AccessControl((remote,))
-    passing = {right: control.passing(enclave, *use) for right, use in _PROOF.items()}
-    for domain, rights in stated.items():
-        rules = Rules([each.right for each in rights])
-        names = {(e.right.kind, name) for e in rights for name in _examples(e.right.name)}
-        for kind, name in names:
-            for right in RIGHTS[kind]:
-                check_meaning(
-                    passing[right].include(f"{domain}{name}/type/hash"),
-                    rules.allow(enclave, right, name),
-                    f"the right of {enclave} to {right} {name}",
-                )
-
-
-def _examples(name: str) -> Iterable[str]:
-    if not is_expression(name):
-        return (name,)
-    if not name.startswith("/") or "?" in name or "[" in name:
-        return ()
-    return (name.replace("*", "a"), name.replace("*", "a/b"))
-
-
-# ── files ──────────────────────────────────────────────────────────────────────────────────
-
-
-def _present(path: Path) -> bytes | None:
-    try:
-        return read_bytes(path, "Zenoh configuration")
-    except SrosError:
-        return None
-
-
-def _is_signed(path: Path, document: bytes, authority: x509.Certificate) -> bool:
-    """Return whether the permissions CA signed a document next to its file ``path``."""
-    try:
-        signed = smime.parse(read_bytes(path.with_name(ZENOH_SIGNED[path.name]), "signed document"))
-        signed.verify(authority)
-    except SrosError:
-        return False
-    return signed.document.replace(b"\r\n", b"\n") == document
-
-
-def _stale(root: Path, wanted: Collection[str]) -> Iterable[Drifted]:
-    """Yield the configurations that enclaves should not have.
-
-    What nobody ever signed may be a file of somebody's own.
-    """
-    for name in enclave_names(root):
-        for path in (_router_path(name), _session_path(name)):
-            if path not in wanted and (root / _signed_path(path)).is_file():
-                yield Drifted(name, path, Drift.STALE)
-
-
-def _router_path(name: str) -> str:
-    return f"{enclave_folder(name)}/{ROUTER_FILE}"
-
-
-def _session_path(name: str) -> str:
-    return f"{enclave_folder(name)}/{SESSION_FILE}"
-
-
-def _signed_path(path: str) -> str:
-    folder, _, file = path.rpartition("/")
-    return f"{folder}/{ZENOH_SIGNED[file]}"
 
 
 # ── notes ──────────────────────────────────────────────────────────────────────────────────

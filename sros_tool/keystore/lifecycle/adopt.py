@@ -23,7 +23,6 @@ from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.authorities.imported import check_imported
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.enclave import (
-    EarlierRights,
     EnclaveWriter,
     Issuance,
     NewIdentity,
@@ -52,6 +51,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.create import Creation, check_free, place_notes
+from sros_tool.keystore.recorded import EarlierRights
 from sros_tool.keystore.settings import write_settings
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.keystore.transaction.recovery import tidy

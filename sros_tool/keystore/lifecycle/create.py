@@ -29,7 +29,6 @@ from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
     NewIdentity,
-    RecordedRights,
     StatedRights,
     default_rights,
     link_shared_files,
@@ -37,7 +36,7 @@ from sros_tool.keystore.issuing.enclave import (
     stated_enclave,
 )
 from sros_tool.keystore.issuing.governance import write_governance
-from sros_tool.keystore.issuing.zenoh import KeptZenoh, ZenohChange, keep_zenoh
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -67,6 +66,7 @@ from sros_tool.keystore.reader import (
     load_settings,
     read_certificate,
 )
+from sros_tool.keystore.recorded import RecordedRights
 from sros_tool.keystore.settings import (
     edit_notes,
     with_places,
@@ -76,6 +76,7 @@ from sros_tool.keystore.template import NODE_BASICS, Template, template_names
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.zenoh.wanted import ZenohChange
 from sros_tool.names import check_enclave_name
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.parallel import Progress

@@ -20,13 +20,11 @@ from sros_tool.keystore.expiry import (
     refuse_unreadable,
 )
 from sros_tool.keystore.issuing.enclave import (
-    EarlierRights,
     EnclaveWriter,
     Issuance,
     NewIdentity,
-    RecordedRights,
 )
-from sros_tool.keystore.issuing.zenoh import KeptZenoh, ZenohChange, keep_zenoh
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     KEY_FILE,
@@ -39,10 +37,12 @@ from sros_tool.keystore.ledger import append
 from sros_tool.keystore.lifecycle.revoke import Superseded, revoke_superseded
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import governance_of, load_settings
+from sros_tool.keystore.recorded import EarlierRights, RecordedRights
 from sros_tool.keystore.settings import edit_notes
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.zenoh.wanted import ZenohChange
 from sros_tool.names import check_enclave_name
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import (

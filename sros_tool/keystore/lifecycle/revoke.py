@@ -12,7 +12,7 @@ from cryptography import x509
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.authorities.authority import Authority, load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.issuing.zenoh import KeptZenoh, ZenohChange, keep_zenoh
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
 from sros_tool.keystore.layout import (
     CRL,
     IDENTITY,
@@ -38,6 +38,7 @@ from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.zenoh.wanted import ZenohChange
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import common_name_of, issued_by, validity_of
 from sros_tool.pki.crl import REASONS, SUPERSEDED, Revoked

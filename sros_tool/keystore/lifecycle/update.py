@@ -37,16 +37,14 @@ from sros_tool.keystore.expiry import (
     refuse_unreadable,
 )
 from sros_tool.keystore.issuing.enclave import (
-    EarlierRights,
     EnclaveWriter,
     Issuance,
     NewIdentity,
-    RecordedRights,
     StatedRights,
     default_rights,
 )
 from sros_tool.keystore.issuing.governance import write_governance
-from sros_tool.keystore.issuing.zenoh import KeptZenoh, ZenohChange, keep_zenoh
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     GOVERNANCE_XML,
@@ -73,6 +71,7 @@ from sros_tool.keystore.lifecycle.replaced import (
 from sros_tool.keystore.lifecycle.revoke import Superseded, revoke_superseded
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.reader import authority_files, governance_of, load_settings
+from sros_tool.keystore.recorded import EarlierRights, RecordedRights
 from sros_tool.keystore.settings import (
     HandEdits,
     edit_remedy,
@@ -85,6 +84,7 @@ from sros_tool.keystore.template import EVERYTHING, Template, with_values
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.zenoh.wanted import ZenohChange
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import enclave_subject, has_unique_part, same_key
 from sros_tool.pki.keys import PublicKey

@@ -13,12 +13,13 @@ from shlex import quote
 
 from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.issuing.enclave import RecordedRights, default_rights
+from sros_tool.keystore.issuing.enclave import default_rights
 from sros_tool.keystore.issuing.zenoh import remove_zenoh
 from sros_tool.keystore.layout import PERMISSIONS_FILE, SETTINGS, check_keystore, enclave_path
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.create import Creation, open_to_issue, write_enclaves
 from sros_tool.keystore.reader import governance_of, load_settings
+from sros_tool.keystore.recorded import RecordedRights
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import EVERYTHING, NODE_BASICS
 from sros_tool.keystore.transaction.recovery import tidy

@@ -23,13 +23,11 @@ from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.authorities.authority import Authority, write_bundle, write_copies
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring, check_places
 from sros_tool.keystore.issuing.enclave import (
-    EarlierRights,
     EnclaveWriter,
     Issuance,
     NewIdentity,
-    RecordedRights,
 )
-from sros_tool.keystore.issuing.zenoh import ZenohChange, keep_zenoh
+from sros_tool.keystore.issuing.zenoh import keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -79,11 +77,13 @@ from sros_tool.keystore.reader import (
     read_crl,
     read_signed_grant,
 )
+from sros_tool.keystore.recorded import EarlierRights, RecordedRights
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.zenoh.wanted import ZenohChange
 from sros_tool.parallel import Progress
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
