@@ -6,6 +6,7 @@ more rights: a name is given only if the rules allow every key that it stands fo
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,6 +28,8 @@ _OF_TYPE = ("*", "*")
 """The type and its hash, with which the keys of topics and services end."""
 _MANY = 65536
 _EVERY_NAME = ("*", *_OF_TYPE, ANY_CHUNKS)
+_DOMAIN = re.compile(r"\*|0|[1-9][0-9]{0,2}")
+"""The first part of a key of rmw_zenoh: what does not begin with a domain has no ROS name."""
 
 
 def name_of_key(key: str) -> tuple[str, str]:
@@ -240,7 +243,7 @@ def _candidates(key: str) -> Iterator[tuple[str, str]]:
     domain, *chunks = key.split("/")
     if domain == ANY_CHUNKS:
         domain, chunks = "*", [ANY_CHUNKS, *chunks]
-    if domain.startswith("@") or not chunks:
+    if not _DOMAIN.fullmatch(domain) or not chunks:
         return
     if chunks[-1] != ANY_CHUNKS:
         yield from ((domain, each) for each in _texts(chunks[: -len(_OF_TYPE)]))

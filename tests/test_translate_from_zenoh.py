@@ -67,6 +67,9 @@ def puts(*keys: str, **more: Any) -> dict[str, Any]:
         (("0/*/*/*",), [], 1),
         (("@ros2_lv/0/**", "0/chatter/*/*/@adv/**"), [], 0),
         (("some/key",), [], 1),
+        (("demo/**",), [], 1),
+        (("demo/chatter/*/*", "00/a/*/*", "0$*/a/*/*"), [], 3),
+        (("42/chatter/*/*",), ["/chatter"], 0),
         (("0/a/*/*", "0/a/*/*", "0/a/b/*/*"), ["/a", "/a/b"], 0),
         (("0/*/*/*/**", "0/a/*/*"), ["/*"], 0),
     ],
@@ -233,7 +236,8 @@ def test_the_verb_says_and_writes_what_it_can(tmp_path: Path) -> None:
     ("text", "words", "said"),
     [
         ("{", (), "Line 1: it ends too early"),
-        ("{}", ("-o", "x.xml"), "make no policy"),
+        ("{}", ("-o", "x.xml"), "everybody who gets a connection: none is the name of an enclave"),
+        (rules(puts("demo/**")), ("-o", "x.xml"), "They allow no ROS name"),
         ("{}", ("--mode", "peer"), "--from takes no keystore"),
     ],
 )
@@ -242,6 +246,16 @@ def test_the_verb_refuses(text: str, words: tuple[str, ...], said: str, tmp_path
     ended = sros("zenoh", "--from", "file.json5", *words, cwd=tmp_path)
     assert ended.status == 2
     assert said in ended.err
+
+
+def test_rights_of_other_domains_are_noted(tmp_path: Path) -> None:
+    (tmp_path / "file.json5").write_text(rules(puts("0/a/*/*", "7/b/*/*")))
+    ended = sros("zenoh", "--from", "file.json5", "-o", "x.xml", cwd=tmp_path)
+    assert "note [zenoh.domains]: a policy names no domains" in ended.err
+    (tmp_path / "file.json5").write_text(rules(puts("0/a/*/*")))
+    ended = sros("zenoh", "--from", "file.json5", "-o", "y.xml", cwd=tmp_path)
+    assert "zenoh.domains" not in ended.err
+    assert (tmp_path / "y.xml").exists()
 
 
 def test_output_is_for_from_alone(tmp_path: Path) -> None:

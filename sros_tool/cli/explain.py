@@ -1334,9 +1334,23 @@ def _show_log(
         else:
             lines = text.count("\n") + (not text.endswith("\n")) if text else 0
             number = "the log is empty" if not lines else f"of {lines} lines, none"
-            number += "" if not lines else " looks like a message of DDS Security"
+            number += (
+                ""
+                if not lines
+                else " looks like a message of DDS Security, or of a denial by Zenoh"
+            )
             click.echo(number, err=True)
+            if _ZENOH_TESTS in text:
+                click.echo(_ONLY_TESTS, err=True)
     return 1 if findings else 0
+
+
+_ZENOH_TESTS = "interceptor::access_control: ACL ("
+_ONLY_TESTS = (
+    "Zenoh's access control logged tests of declared keys: they do not tell which message was "
+    "dropped. `sros explain ROOT ENCLAVE publish|subscribe|call|serve NAME --vendor zenoh` shows "
+    "whether one is denied."
+)
 
 
 _LOG_NOTES = (

@@ -50,8 +50,9 @@ def show_from(file: Path, output: Path | None, *, force: bool, dry_run: bool, as
         if not policy.enclaves:
             raise PolicyError(
                 f"the rules of '{file}' make no policy",
-                "They name no enclave that may publish, subscribe, call or serve anything.",
-                "`sros generate_policy` makes a policy from a running robot.",
+                _why_no_policy(rights),
+                "`sros zenoh --from` without -o shows what the rules allow. `sros generate_policy` "
+                "makes a policy from a running robot.",
             )
         notes = tuple(_left_out(rights))
         changes = file_change(output, existed=output.exists())
@@ -119,6 +120,18 @@ def _who(found: RightsBehindRules) -> str:
     )
 
 
+def _why_no_policy(found: Sequence[RightsBehindRules]) -> str:
+    """Say which subjects have rights, but are no enclaves."""
+    strangers = [_who(each) for each in found if each.rights]
+    if not strangers:
+        return "They allow no ROS name that anybody may publish, subscribe, call or serve."
+    more = f" and {len(strangers) - _MOST_KEYS} more" if len(strangers) > _MOST_KEYS else ""
+    return (
+        f"They allow something to {', '.join(strangers[:_MOST_KEYS])}{more}: none is the name of "
+        "an enclave, such as /talker, in cert_common_names."
+    )
+
+
 def _left_out(found: Sequence[RightsBehindRules]) -> Iterator[Note]:
     """Yield notes about what the rules allow or deny, and the policy does not state."""
     from sros_tool.translate_from_zenoh import enclave_of
@@ -133,6 +146,14 @@ def _left_out(found: Sequence[RightsBehindRules]) -> Iterator[Note]:
                 f"{_who(each)}: the policy lacks {len(each.unsaid)} rights that no ROS name "
                 f"states exactly: {keys}",
             )
+    domains = sorted({one.domain for each in found for one in each.rights} - {"0", "*"}, key=int)
+    if domains:
+        yield Note(
+            "zenoh.domains",
+            f"a policy names no domains, and has the rights of domains {', '.join(domains)}, too: "
+            "they hold in every domain of the keystore that is made from it. Make one for each "
+            "domain if they shall differ.",
+        )
     yield Note(
         "zenoh.node-names",
         "the rules name no nodes: each profile has the last part of its enclave's name, and "

@@ -474,6 +474,21 @@ def test_a_remedy_names_the_keystore_and_the_enclave_that_the_user_named(
     assert "`sros explain KEYSTORE ENCLAVE join`" in unnamed
 
 
+def test_tests_of_declared_keys_are_not_called_nothing(tmp_path: Path) -> None:
+    # Lines of a router on Zenoh 1.10.2 that dropped a subscription: none says which message it was.
+    module = "TRACE rx-0 ThreadId(10) zenoh::net::routing::interceptor::access_control: "
+    where = "(ingress) on 0/cmd_vel/t/h"
+    (tmp_path / "router.log").write_text(
+        f"{module}ACL (ingress): caching permissions for `0/cmd_vel/t/h` ...\n"
+        f"{module}ef on Interface(lo)+CertCommonName(/listener)+Transport(Tls)+ef is unauthorized "
+        f"to Declare/Undeclare Subscriber {where}\n"
+    )
+    ended = sros("explain", "--log", tmp_path / "router.log").ok()
+    assert "they do not tell which message was dropped" in ended.err
+    (tmp_path / "other.log").write_text("one\n")
+    assert "Zenoh's access control" not in sros("explain", "--log", tmp_path / "other.log").ok().err
+
+
 def test_a_line_that_follows_an_unknown_one_is_not_swallowed() -> None:
     unknown, known = f"{FAST_LINE}Something new", f"{FAST_LINE}PKCS7 data verification failed"
     assert [each.id for each in explained(f"{unknown}\n{known}\n{unknown}")] == [
@@ -486,8 +501,14 @@ def test_a_line_that_follows_an_unknown_one_is_not_swallowed() -> None:
 def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
     for text, said in (
         ("", "the log is empty"),
-        ("one\ntwo\n", "of 2 lines, none looks like a message of DDS Security"),
-        ("one\ntwo", "of 2 lines, none looks like a message of DDS Security"),
+        (
+            "one\ntwo\n",
+            "of 2 lines, none looks like a message of DDS Security, or of a denial by Zenoh",
+        ),
+        (
+            "one\ntwo",
+            "of 2 lines, none looks like a message of DDS Security, or of a denial by Zenoh",
+        ),
     ):
         (tmp_path / "robot.log").write_text(text)
         ended = sros("explain", "--log", tmp_path / "robot.log").ok()
