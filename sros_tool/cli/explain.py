@@ -1345,7 +1345,7 @@ def _show_log(
     return 1 if findings else 0
 
 
-_ZENOH_TESTS = "interceptor::access_control: ACL ("
+_ZENOH_TESTS = "caching permissions for `"
 _ONLY_TESTS = (
     "Zenoh's access control logged tests of declared keys: they do not tell which message was "
     "dropped. `sros explain ROOT ENCLAVE publish|subscribe|call|serve NAME --vendor zenoh` shows "

@@ -476,7 +476,10 @@ def test_a_remedy_names_the_keystore_and_the_enclave_that_the_user_named(
 
 def test_tests_of_declared_keys_are_not_called_nothing(tmp_path: Path) -> None:
     # Lines of a router on Zenoh 1.10.2 that dropped a subscription: none says which message it was.
-    module = "TRACE rx-0 ThreadId(10) zenoh::net::routing::interceptor::access_control: "
+    module = (
+        "\x1b[35mTRACE\x1b[0m rx-0 ThreadId(10) "
+        "\x1b[2mzenoh::net::routing::interceptor::access_control\x1b[0m\x1b[2m:\x1b[0m "
+    )
     where = "(ingress) on 0/cmd_vel/t/h"
     (tmp_path / "router.log").write_text(
         f"{module}ACL (ingress): caching permissions for `0/cmd_vel/t/h` ...\n"
