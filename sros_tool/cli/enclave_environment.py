@@ -164,6 +164,7 @@ def _opened_zenoh(root: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
 
     found = open_zenoh(enclave_path(root, name), name, state)
     if not found.problems:
+        _refuse_outdated(root, name)
         return found
     write = f"`sros zenoh {quote(str(root))}`"
     if not (root / PUBLIC).is_dir():
@@ -180,6 +181,34 @@ def _opened_zenoh(root: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
         "; ".join(map(str, found.problems)) + ".",
         f"Write the files again: {write}.",
     )
+
+
+def _refuse_outdated(root: Path, name: str) -> None:
+    """Raise `KeystoreError` if the file of an enclave has not the rights of all others.
+
+    A router, and a session that connects to others, enforces those rights: with a file of before,
+    validly signed, it would enforce those of before.  An export does not have them.
+    """
+    from sros_tool.keystore.layout import PERMISSIONS, SETTINGS
+    from sros_tool.keystore.reader import load_ca_certificate, open_keystore
+    from sros_tool.keystore.zenoh.wanted import zenoh_drift
+    from sros_tool.zenoh.configuration import Mode
+
+    if not (root / SETTINGS).exists():
+        return
+    keystore = open_keystore(root)
+    network = keystore.settings.zenoh if keystore.settings else None
+    if network is None or (network.router != name and network.mode is Mode.CLIENT):
+        return
+    authority = load_ca_certificate(root, PERMISSIONS)
+    drifts, _ = zenoh_drift(root, network, keystore.domains, authority)
+    if any(each.enclave == name for each in drifts):
+        where = quote(str(root))
+        raise KeystoreError(
+            f"the Zenoh configuration of enclave {name} is not in step with the keystore",
+            "It states the rights of other enclaves otherwise than their permissions.",
+            f"Write it again: `sros zenoh {where}`, and restart the processes that it names.",
+        )
 
 
 def _zenoh_domain(

@@ -179,6 +179,22 @@ def test_nothing_starts_with_signed_files_of_other_rights(
     assert "session.json5: it does not state the rights of permissions.p7s" in refused.err
 
 
+@pytest.mark.parametrize(("name", "file"), [("/router", "router"), ("/b", "session")])
+def test_nothing_starts_with_a_signed_file_from_before_another_enclave_changed(
+    name: str, file: str, keystore: Path
+) -> None:
+    """A router, and a peer, enforces what the others may do: an earlier file, what they might."""
+    folder = keystore / f"enclaves{name}"
+    earlier = {each: each.read_bytes() for each in folder.glob(f"{file}.*")}
+    sros("create_permission", keystore, "/a", keystore.parent / "more.xml").ok()
+    sros("env", keystore, name, *ZENOH).ok()
+    for path, content in earlier.items():
+        path.write_bytes(content)
+    ended = sros("env", keystore, name, *ZENOH)
+    assert ended.status == 2 and "is not in step with the keystore" in ended.err
+    sros("env", keystore, "/a", *ZENOH).ok()
+
+
 @pytest.mark.parametrize(
     "words",
     [
