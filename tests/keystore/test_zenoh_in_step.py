@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
+from sros_tool.keystore.lifecycle.zenoh import set_zenoh
 from sros_tool.keystore.reader import load_ca_certificate
 from sros_tool.pki import smime
+from sros_tool.zenoh.network import ZenohNetwork
 from tests.support.harness import policy_text, publish, snapshot, sros
 
 FIRST = policy_text({"/a": publish("/x"), "/b": publish("/y")})
@@ -144,6 +147,21 @@ def test_permissions_that_were_put_back_give_no_rights(folder: Path) -> None:
     ended = sros("create_enclave", "client", "/c", cwd=folder).ok()
     assert "/a gets no configuration for Zenoh" in ended.err
     assert "/z/" not in (root / "enclaves/router/router.json5").read_text()
+    assert not (root / "enclaves/a/session.json5").exists()
+
+
+def test_expired_permissions_give_no_rights(folder: Path) -> None:
+    """As on DDS: Zenoh itself looks at the certificate alone, which is valid for longer."""
+    root = folder / "client"
+    set_zenoh(root, ZenohNetwork(), now=datetime.now(UTC) + timedelta(days=179))
+    in_step(root)
+    later = datetime.now(UTC) + timedelta(days=181)
+    due = set_zenoh(root, ZenohNetwork(), now=later, dry_run=True)
+    assert "/a gets no configuration for Zenoh" in due.notes[0].text
+    assert "its permissions expired at" in due.notes[0].text
+    set_zenoh(root, ZenohNetwork(), now=later)
+    router = json.loads((root / "enclaves/router/router.json5").read_text())
+    assert router["access_control"]["subjects"] == []
     assert not (root / "enclaves/a/session.json5").exists()
 
 

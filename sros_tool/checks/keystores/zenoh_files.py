@@ -129,7 +129,9 @@ def check_network(
     except SrosError:  # a finding of each enclave
         return
     try:
-        drifts, left_out = zenoh_drift(keystore.root, network, domains, authorities[0])
+        drifts, left_out = zenoh_drift(
+            keystore.root, network, domains, authorities[0], keystore.now
+        )
     except SrosError as error:
         yield CANNOT_BE_MADE.found("zenoh", str(error), keystore.shown(SETTINGS))
         return

@@ -77,7 +77,7 @@ def keep_zenoh(
     if network is None:
         return KeptZenoh()
     root = transaction.root
-    wanted = zenoh_documents(root, network, domains, authority, change)
+    wanted = zenoh_documents(root, network, domains, authority, now, change)
     drifts = drifted(root, wanted, authority, change.gone)
     signing = None
     written: dict[str, bytes] = {}

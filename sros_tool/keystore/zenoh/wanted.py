@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 from shlex import quote
@@ -137,14 +138,18 @@ def drifted(
 
 
 def zenoh_drift(
-    root: Path, network: ZenohNetwork, domains: DomainSet, authority: x509.Certificate
+    root: Path,
+    network: ZenohNetwork,
+    domains: DomainSet,
+    authority: x509.Certificate,
+    now: datetime,
 ) -> tuple[tuple[Drifted, ...], Mapping[str, str]]:
     """Return the configurations that are not as they shall be, and who gets none with the reason.
 
     Raises:
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
     """
-    wanted = zenoh_documents(root, network, domains, authority)
+    wanted = zenoh_documents(root, network, domains, authority, now)
     return drifted(root, wanted, authority), wanted.left_out
 
 
@@ -153,6 +158,7 @@ def zenoh_documents(
     network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,
+    now: datetime,
     change: ZenohChange = NO_CHANGE,
 ) -> ZenohDocuments:
     """Return the configurations that the enclaves of a keystore need; arguments as `keep_zenoh`."""
@@ -174,7 +180,7 @@ def zenoh_documents(
             "Give the node an enclave of its own.",
         )
     names.remove(network.router)
-    reader = _RightsReader(root, authority, of_network, change)
+    reader = _RightsReader(root, authority, of_network, now, change)
     read: dict[str, RemoteRights | str] = {}
     for _, each in map_slices(names, reader.read):
         read |= each
@@ -234,8 +240,8 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
 class _RightsReader:
     """Reader of the enclaves' rights, as what other processes allow to them.
 
-    Only the last permissions that the permissions CA signed count: whoever puts older ones, or
-    others, into a folder gets no rules for them.
+    Only the last permissions that the permissions CA signed count, until they expire: whoever puts
+    older ones, or others, into a folder gets no rules for them.
     """
 
     def __init__(
@@ -243,11 +249,13 @@ class _RightsReader:
         root: Path,
         authority: x509.Certificate,
         domains: Sequence[int],
+        now: datetime,
         change: ZenohChange,
     ) -> None:
         self._root = root
         self._authority = authority
         self._domains = domains
+        self._now = now
         self._change = change
         self._recorded = RecordedRights(root)
         self._revoked = {one.serial for each in read_lists(root) for one in each.revoked}
@@ -293,7 +301,11 @@ class _RightsReader:
         found = read_signed_grant(folder / PERMISSIONS_FILE, subject_text(subject))
         found.signed.verify(self._authority)
         self._recorded.policy(name, found.digest)
-        return found.grant or "its permissions are not for its certificate"
+        if found.grant is None:
+            return "its permissions are not for its certificate"
+        if found.grant.validity.not_after < self._now:
+            return f"its permissions expired at {found.grant.not_after}"
+        return found.grant
 
 
 _PROOF = {
