@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import combinations, product
+from itertools import combinations, islice, product
 from pathlib import Path
 
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
@@ -216,6 +216,8 @@ _LINK, _TLS, _ACCESS = "transport/link", "transport/link/tls", "access_control"
 _WITH_WILDCARDS = frozenset(Message) - {Message.REPLY, Message.LIVELINESS_TOKEN}
 """The messages that can name a key with wildcards."""
 _FEW = 3
+_MOST_PAIRS = 1000
+"""So many pairs of subjects are counted at most."""
 _COMPARISON = 20
 """What comparing two subjects counts, in characters."""
 
@@ -364,10 +366,11 @@ def _subjects(document: ConfigurationDocument) -> Iterator[Finding]:
         for each in open_to_all:
             text = f"subject {each.id} has {_described(each)}, and rules that allow"
             yield EVERYBODY.found(f"subject {each.id}", text, document.name, each.line)
-    pairs = list(_overlapping(access.subjects))
+    pairs = list(islice(_overlapping(access.subjects), _MOST_PAIRS + 1))
     if pairs:
         first, second = pairs[0]
-        more = f", and {len(pairs) - 1} more pairs" if len(pairs) > 1 else ""
+        least = "at least " if len(pairs) > _MOST_PAIRS else ""
+        more = f", and {least}{len(pairs) - 1} more pairs" if len(pairs) > 1 else ""
         text = f"subjects {first.id} and {second.id} can match the same process{more}"
         yield OVERLAPPING.found(f"subject {second.id}", text, document.name, second.line)
 
@@ -401,10 +404,12 @@ def _denials(document: ConfigurationDocument) -> Iterator[Finding]:
     access, limit = document.access, ComparisonLimit()
     reported: set[tuple[str, str]] = set()
     for subject in access.subjects:
+        denials = [each for each in access.rules_of(subject.id) if not each.allows]
+        if not denials:
+            continue
+        limit.spend(_COMPARISON * len(access.subjects))
         others = [each for each in access.subjects if each.overlaps(subject)]
-        for rule in access.rules_of(subject.id):
-            if rule.allows:
-                continue
+        for rule in denials:
             for kind, text in (
                 (DENY_IN_WILDCARD, _wildcard_past(rule, subject, access, limit)),
                 (DENY_OVERRULED, _overruled(rule, others, access, limit)),

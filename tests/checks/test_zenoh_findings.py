@@ -80,3 +80,18 @@ def test_check_takes_a_configuration(tmp_path: Path) -> None:
     assert "session.json5:1: error: a session without access control" in ended.out
     file.write_text("{mode: 'client'")
     assert "Line 1: it ends too early" in sros("check", file).out
+
+
+def test_subjects_that_overlap_by_the_million_are_not_all_counted(tmp_path: Path) -> None:
+    """A small file with 4,000,000 such pairs: they are counted up to a limit."""
+    document = sound()
+    access = document["access_control"]
+    for number in range(2000):
+        access["subjects"] += [
+            {"id": f"name {number}", "cert_common_names": ["/a"]},
+            {"id": f"place {number}", "interfaces": ["eth0"]},
+        ]
+    file = tmp_path / "session.json5"
+    file.write_text(json.dumps(document))
+    texts = [each.text for each in configuration_findings(file)]
+    assert any(each.endswith("and at least 1000 more pairs") for each in texts)
