@@ -201,7 +201,7 @@ def _refuse_outdated(root: Path, name: str) -> None:
     if network is None or (network.router != name and network.mode is Mode.CLIENT):
         return
     authority = load_ca_certificate(root, PERMISSIONS)
-    drifts, _ = zenoh_drift(root, network, keystore.domains, authority)
+    drifts, _ = zenoh_drift(root, network, keystore.domains, authority, now())
     if any(each.enclave == name for each in drifts):
         where = quote(str(root))
         raise KeystoreError(
