@@ -23,6 +23,7 @@ from benchmarks.floor import make_enclaves, sizes_of
 from benchmarks.inputs import enclaves_policy, topics_policy
 from benchmarks.observing import observing
 from benchmarks.picturing import picturing
+from benchmarks.zenoh import zenoh_files
 
 RULES = 14
 
@@ -62,6 +63,9 @@ def main() -> int:
         checked = checking(folder, options.enclaves, RULES, options.rounds)
         checked += explaining(folder, options.enclaves, RULES, options.rounds)
         rows += [Row(name, taken, None, limit, kept) for name, taken, limit, kept in checked]
+        rows += [
+            Row(*figure) for figure in zenoh_files(folder, options.enclaves, RULES, options.rounds)
+        ]
         rows += [Row(*figure) for figure in picturing(folder, options.rounds)]
         rows += _renewal(folder, options.renew) if options.renew else []
     print(f"Python {platform.python_version()}, {os.cpu_count()} cores, medians")
