@@ -14,7 +14,13 @@ from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import ALLOW, Enclave, Source
 from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import Right, parts
-from sros_tool.policy.subtraction import IN_PART, CannotSubtract, listed, subtract
+from sros_tool.policy.subtraction import (
+    IN_PART,
+    CannotSubtract,
+    SubtractionEffort,
+    listed,
+    subtract,
+)
 from sros_tool.zenoh.access import (
     AccessControl,
     AccessRule,
@@ -230,6 +236,7 @@ class _Denials:
             for each in _listed(name, place, _MOST_KEYS):
                 self._places.setdefault(each, place)
         self._names = Names(self._places)
+        self._effort = SubtractionEffort()
 
     def meet(self, name: str) -> bool:
         """Return whether a name without wildcards is denied."""
@@ -247,7 +254,7 @@ class _Denials:
             names = [name]
             if denied:
                 try:
-                    names = subtract(name, denied, most)
+                    names = subtract(name, denied, most, self._effort)
                 except CannotSubtract as error:
                     raise self._inside(name, place, error.denied, denied[0]) from None
             for each in names:

@@ -13,6 +13,8 @@ from sros_tool.cli.common import now
 from sros_tool.errors import KeystoreError, Note, UsageError
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.reader import OpenedEnclave
     from sros_tool.keystore.zenoh.opened import OpenedZenoh
@@ -77,7 +79,8 @@ def loadable_environment(
         domain_from,
         secured_environment,
     )
-    from sros_tool.runtime.rmw import RMW
+    from sros_tool.runtime.rmw import RMW, rmw_implementations
+    from sros_tool.runtime.zenoh_environment import REFUSING_ZENOH, RMW_ZENOH
 
     if domain_text == "":
         raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
@@ -106,6 +109,8 @@ def loadable_environment(
     variables = secured_environment(root, name, domain)
     if zenoh:
         return _zenoh_environment(folder, name, zenoh, variables)
+    if RMW_ZENOH in rmw_implementations(os.environ):
+        variables |= REFUSING_ZENOH  # what chooses it later, such as a launch file, starts no node
     return EnclaveEnvironment({**variables, RMW: rmw} if rmw else variables)
 
 
@@ -201,8 +206,13 @@ def _refuse_outdated(root: Path, name: str) -> None:
     if network is None or (network.router != name and network.mode is Mode.CLIENT):
         return
     authority = load_ca_certificate(root, PERMISSIONS)
-    drifts, _ = zenoh_drift(root, network, keystore.domains, authority, now())
-    if any(each.enclave == name for each in drifts):
+
+    def drifted(moment: datetime | None) -> bool:
+        drifts, _ = zenoh_drift(root, network, keystore.domains, authority, moment)
+        return any(each.enclave == name for each in drifts)
+
+    # The router starts although the permissions of another enclave have expired since.
+    if drifted(now()) and drifted(None):
         where = quote(str(root))
         raise KeystoreError(
             f"the Zenoh configuration of enclave {name} is not in step with the keystore",

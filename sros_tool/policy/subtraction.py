@@ -24,7 +24,7 @@ _LETTERS = "_" + digits + ascii_letters
 _PIECE = re.compile(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _STARS = re.compile(r"\*\*+")
-_MOST_CHARACTERS = 5_000_000
+_MOST_CHARACTERS = 1_000_000
 """Most characters that one search compares: about a second."""
 
 
@@ -67,7 +67,16 @@ def _choices(negated: str, members: str, one: str, text: str) -> Sequence[str]:
     return [each for each in _LETTERS + "/" if (each in chosen) is not bool(negated)]
 
 
-def subtract(wide: str, denied: Iterable[str], most: int) -> list[str]:
+@dataclass
+class SubtractionEffort:
+    """How many characters may still be compared: for all subtractions that belong together."""
+
+    left: int = _MOST_CHARACTERS
+
+
+def subtract(
+    wide: str, denied: Iterable[str], most: int, effort: SubtractionEffort | None = None
+) -> list[str]:
     """Return expressions that match the names that ``wide`` and none of ``denied`` matches.
 
     All are absolute, with ``*`` as the only wildcard; the results may also have `IN_PART`.
@@ -77,7 +86,7 @@ def subtract(wide: str, denied: Iterable[str], most: int) -> list[str]:
             stars where ``wide`` has a star, too.
     """
     without = tuple(dict.fromkeys(denied))
-    search = _Difference(most, _MOST_CHARACTERS)
+    search = _Difference(most, effort or SubtractionEffort())
     begins = [wide.removeprefix("*"), f"/{wide}"] if wide.startswith("*") else [wide]
     try:
         search.run(
@@ -111,7 +120,7 @@ class _Difference:
     """
 
     most: int
-    left: int  # characters that may still be compared
+    effort: SubtractionEffort
     backwards: bool = False
     found: dict[str, None] = field(default_factory=dict)
 
@@ -127,8 +136,8 @@ class _Difference:
     def _following(self, place: _Place) -> Iterable[_Place]:
         """Keep the names of a place, if one expression matches them; else return its parts."""
         read, wide, denied, _ = place
-        self.left -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
-        if self.left < 0:
+        self.effort.left -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
+        if self.effort.left < 0:
             raise CannotSubtract
         denied = tuple(each for each in denied if overlap(each, wide))
         if not denied:
@@ -167,9 +176,8 @@ class _Difference:
     def _keep_backwards(self, read: str, wide: str, denied: tuple[str, ...]) -> None:
         if self.backwards:
             raise CannotSubtract(next(each for each in denied if each.startswith("*"))[::-1])
-        ends = _Difference(self.most, self.left, backwards=True)
+        ends = _Difference(self.most, self.effort, backwards=True)
         ends.run([_Place("", wide[::-1], tuple(each[::-1] for each in denied), _LETTERS)])
-        self.left = ends.left
         for each in ends.found:
             self._keep(read + each[::-1])
 

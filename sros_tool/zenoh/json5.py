@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 MOST_BYTES = 16 * 1024 * 1024
 _MOST_DEPTH = 100
 _MOST_DIGITS = 400
+_MOST_TOKENS = 2_000_000
+"""The router of a thousand enclaves has less than half of it; more would take many seconds."""
 
 
 class Json5Error(ValueError):
@@ -99,8 +101,11 @@ def _is_deep(value: Any) -> bool:
 
 
 def _tokens(text: str) -> Iterator[_Token]:
-    at, line = 0, 1
+    at, line, count = 0, 1, 0
     while at < len(text):
+        count += 1
+        if count > 2 * _MOST_TOKENS:  # every other one may be space
+            raise Json5Error(f"more than {_MOST_TOKENS} tokens", line)
         found = _TOKEN.match(text, at)
         if found is None:
             raise Json5Error(f"unexpected {text[at : at + 10]!r}", line)

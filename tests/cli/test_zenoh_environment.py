@@ -75,6 +75,11 @@ def test_the_only_rmw_that_is_installed_chooses_too(
     env = {"RMW_IMPLEMENTATION": None, "AMENT_PREFIX_PATH": ""}
     assert "ZENOH_SESSION" in sros("env", keystore, "/a", env=env).ok().out
     (index / "rmw_cyclonedds_cpp").touch()
+    either = sros("env", keystore, "/a", env=env).ok().out
+    assert "ZENOH_CONFIG_OVERRIDE" not in either
+    # What chooses Zenoh after that, such as a launch file, starts no node.
+    assert f"export ZENOH_SESSION_CONFIG_URI={NO_CONFIGURATION}" in either
+    (index / "rmw_zenoh_cpp").unlink()
     assert "ZENOH" not in sros("env", keystore, "/a", env=env).ok().out
 
 

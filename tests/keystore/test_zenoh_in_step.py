@@ -165,6 +165,15 @@ def test_expired_permissions_give_no_rights(folder: Path) -> None:
     assert not (root / "enclaves/a/session.json5").exists()
 
 
+def test_who_has_no_valid_certificate_either_keeps_its_rules(folder: Path) -> None:
+    """Nobody gets a connection with it, and a router that starts each day would be out of date."""
+    (folder / "operator.xml").write_text(policy_text({"/operator/x": publish("/x")}))
+    sros("generate_artifacts", "-k", "client", "-p", "operator.xml", cwd=folder).ok()
+    root = folder / "client"
+    due = set_zenoh(root, ZenohNetwork(), now=datetime.now(UTC) + timedelta(days=2), dry_run=True)
+    assert (due.changes, due.notes) == ((), ())
+
+
 def test_a_template_may_choose_the_network(folder: Path) -> None:
     text = (Path(__file__).parents[2] / "keystore_templates/production.toml").read_text()
     (folder / "robot.toml").write_text(

@@ -33,7 +33,7 @@ from sros_tool.keystore.rights import recorded_rights
 from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import common_name_of, subject_text
+from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.policy.model import RIGHTS, Enclave
 from sros_tool.policy.rights import Rules
 from sros_tool.translate_zenoh import (
@@ -142,9 +142,11 @@ def zenoh_drift(
     network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,
-    now: datetime,
+    now: datetime | None,
 ) -> tuple[tuple[Drifted, ...], Mapping[str, str]]:
     """Return the configurations that are not as they shall be, and who gets none with the reason.
+
+    Without ``now``, permissions that have expired count, too.
 
     Raises:
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
@@ -158,10 +160,13 @@ def zenoh_documents(
     network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,
-    now: datetime,
+    now: datetime | None,
     change: ZenohChange = NO_CHANGE,
 ) -> ZenohDocuments:
-    """Return the configurations that the enclaves of a keystore need; arguments as `keep_zenoh`."""
+    """Return the configurations that the enclaves of a keystore need; arguments as `keep_zenoh`.
+
+    Without ``now``, permissions that have expired count, too.
+    """
     of_network = _domains(network, domains, root)
     names = [each for each in enclave_names(root) if each not in change.gone]
     names = sorted({*names, *change.issued})
@@ -249,7 +254,7 @@ class _RightsReader:
         root: Path,
         authority: x509.Certificate,
         domains: Sequence[int],
-        now: datetime,
+        now: datetime | None,
         change: ZenohChange,
     ) -> None:
         self._root = root
@@ -303,7 +308,9 @@ class _RightsReader:
         self._recorded.policy(name, found.digest)
         if found.grant is None:
             return "its permissions are not for its certificate"
-        if found.grant.validity.not_after < self._now:
+        now = self._now
+        # Without a valid certificate nobody gets a connection, so rules would change for nothing.
+        if now and found.grant.validity.not_after < now <= validity_of(certificate).not_after:
             return f"its permissions expired at {found.grant.not_after}"
         return found.grant
 
