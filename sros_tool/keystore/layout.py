@@ -250,8 +250,9 @@ def enclave_names(root: Path) -> tuple[str, ...]:
 
 
 def has_zenoh_files(root: Path) -> bool:
-    """Return whether any enclave has a configuration of Zenoh."""
-    folders = (enclave_path(root, name) for name in enclave_names(root))
+    """Return whether any enclave that this user can read has a configuration of Zenoh."""
+    names, _ = search_enclaves(root)
+    folders = (enclave_path(root, name) for name in names)
     return any((folder / file).is_file() for folder in folders for file in ZENOH_SIGNED)
 
 

@@ -9,7 +9,7 @@ from shlex import quote
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.layout import SETTINGS
-from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.ledger import Ledger, read_ledger
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +31,8 @@ class RecordedRights:
     their rights signed again, with a new date.
     """
 
-    def __init__(self, root: Path) -> None:
-        ledger = read_ledger(root)
+    def __init__(self, root: Path, ledger: Ledger | None = None) -> None:
+        ledger = ledger or read_ledger(root)
         self._root = root
         self._gaps = ledger.gaps
         self._unchained = ledger.unchained

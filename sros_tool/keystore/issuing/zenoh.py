@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from pathlib import Path
 
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import Note
 from sros_tool.keystore.authorities.authority import Authority
-from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh.wanted import (
     NO_CHANGE,
@@ -98,7 +97,10 @@ def keep_zenoh(
         {name: path for path, name in wanted.enclaves.items()},
         written,
         tuple(sorted({each.enclave for each in drifts if each.kind is not Drift.UNSIGNED})),
-        (*_left_out_notes(wanted.left_out), *_revoked_names(root, names, now, change.replaced)),
+        (
+            *_left_out_notes(wanted.left_out),
+            *_revoked_names(wanted.ledger, names, now, change.replaced),
+        ),
     )
 
 
@@ -129,10 +131,10 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
 
 
 def _revoked_names(
-    root: Path, names: Sequence[str], now: datetime, replaced: Collection[str]
+    ledger: Ledger, names: Sequence[str], now: datetime, replaced: Collection[str]
 ) -> Iterable[Note]:
     """Yield a note on names that revoked certificates have, too, until they expire."""
-    entries = read_ledger(root).entries
+    entries = ledger.entries
     revoked = {each.serial for each in entries if each.what == "revocation"}
     again = sorted(
         {

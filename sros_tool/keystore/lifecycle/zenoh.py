@@ -52,7 +52,7 @@ def set_zenoh(
     check_keystore(root)
     with Transaction(root, dry_run=dry_run) as transaction:
         keystore = open_to_issue(transaction, None, keyring, now)
-        _check_settings(root)
+        _check_settings(root, edited=bool(keystore.notes))
         template = replace(keystore.template, zenoh=network)
         entries: tuple[Entry, ...] = ()
         if template != keystore.template:
@@ -65,8 +65,8 @@ def set_zenoh(
     return replace(done, new_keystore=False, restart=removed or done.restart)
 
 
-def _check_settings(root: Path) -> None:
-    """Raise `KeystoreError` if the settings are missing, or were edited by hand."""
+def _check_settings(root: Path, *, edited: bool) -> None:
+    """Raise `KeystoreError` if the settings are missing, or files were ``edited`` by hand."""
     where = quote(str(root))
     if not (root / SETTINGS).exists():
         raise KeystoreError(
@@ -75,7 +75,8 @@ def _check_settings(root: Path) -> None:
             f"Run `sros update_keystore {where} --template sros2 --dry-run`, which shows what "
             "settings change, and then without --dry-run.",
         )
-    if edits := found_edits(root, governance_of(root)):
+    if edited:
+        edits = found_edits(root, governance_of(root))
         raise KeystoreError(
             f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
             "Writing the settings would undo it, or carry it out unseen.",

@@ -385,12 +385,14 @@ def _open_keys(root: Path) -> Iterator[str]:
     for top in _KEY_FOLDERS:
         if _is_open(f"{root}/{top}", stat.S_IFDIR):
             yield top
-        for folder, folders, files in os.walk(f"{root}/{top}"):
-            folders[:] = [each for each in folders if not each.startswith(".")]
-            for name in files:
-                path = f"{folder}/{name}"
-                if name.endswith(KEY_FILE) and _is_open(path, stat.S_IFREG):
-                    yield os.path.relpath(path, root)
+        folders = [f"{root}/{top}"]
+        for folder in folders:  # which grows; os.walk would follow each link to see what it is
+            with contextlib.suppress(OSError), os.scandir(folder) as entries:
+                for each in sorted(entries, key=lambda entry: entry.name):
+                    if each.is_dir(follow_symlinks=False) and not each.name.startswith("."):
+                        folders.append(each.path)
+                    elif each.name.endswith(KEY_FILE) and _is_open(each.path, stat.S_IFREG):
+                        yield os.path.relpath(each.path, root)
 
 
 def _is_open(path: str, kind: int) -> bool:

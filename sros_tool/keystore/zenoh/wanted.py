@@ -27,6 +27,7 @@ from sros_tool.keystore.layout import (
     enclave_names,
     enclave_path,
 )
+from sros_tool.keystore.ledger import Ledger, read_ledger
 from sros_tool.keystore.reader import read_certificate, read_lists, read_signed_grant
 from sros_tool.keystore.recorded import RecordedRights
 from sros_tool.keystore.rights import recorded_rights
@@ -61,11 +62,13 @@ class ZenohDocuments:
 
     ``files`` maps their paths in the keystore to their content, ``enclaves`` to their enclaves.
     ``left_out`` maps enclaves that get none, and no rights at the others, to the reason: a clause.
+    ``ledger`` is that of the keystore.
     """
 
     files: Mapping[str, bytes]
     enclaves: Mapping[str, str]
     left_out: Mapping[str, str]
+    ledger: Ledger
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +219,7 @@ def zenoh_documents(
     for part, rendered in map_slices(list(remotes), render):
         files |= rendered
         enclaves |= zip(rendered, part, strict=True)
-    return ZenohDocuments(files, enclaves, left_out)
+    return ZenohDocuments(files, enclaves, left_out, reader.ledger)
 
 
 def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int, ...]:
@@ -262,7 +265,8 @@ class _RightsReader:
         self._domains = domains
         self._now = now
         self._change = change
-        self._recorded = RecordedRights(root)
+        self.ledger = read_ledger(root)
+        self._recorded = RecordedRights(root, self.ledger)
         self._revoked = {one.serial for each in read_lists(root) for one in each.revoked}
 
     def read(self, names: Iterable[str]) -> dict[str, RemoteRights | str]:
