@@ -23,17 +23,21 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     ROUTER_FILE,
     SESSION_FILE,
-    ZENOH_SIGNED,
     check_keystore,
-    enclave_folder,
     enclave_names,
     enclave_path,
     has_zenoh_files,
 )
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import load_ca_certificate, load_settings, open_enclave
+from sros_tool.keystore.reader import (
+    load_ca_certificate,
+    load_settings,
+    open_enclave,
+    open_keystore,
+)
+from sros_tool.keystore.zenoh.opened import is_signed
+from sros_tool.keystore.zenoh.wanted import Drift, signed_path, zenoh_drift
 from sros_tool.parallel import map_slices
-from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, parts
@@ -268,26 +272,26 @@ class ZenohEvaluator:
 
         Return None if that cannot be told, such as in an export.
         """
-        from sros_tool.keystore.lifecycle.zenoh import set_zenoh
-
         try:
             network = load_settings(self.root).zenoh
             if network is None:
                 return None
-            planned = set_zenoh(self.root, network, now=self._at, dry_run=True).changes
+            domains = open_keystore(self.root).domains
+            authority = load_ca_certificate(self.root, PERMISSIONS)
+            drifts, _ = zenoh_drift(self.root, network, domains, authority, self._at)
         except SrosError:
             return None
         ours = {answer.enclave, self.router.enclave}
-        others = {each.enforcer for each in answer.checks} - ours
-        changed = {each.path for each in planned}
-        found = {f"{enclave_folder(each)}/{self._file_of(each)}" for each in ours | others}
-        found &= changed
-        # Whether the files of the first two are signed is told apart.
-        for each in others:
-            folder = enclave_folder(each)
-            if f"{folder}/{SESSION_FILE}" not in changed:
-                found |= {f"{folder}/{ZENOH_SIGNED[SESSION_FILE]}"} & changed
-        return tuple(sorted(found))
+        deciding = ours | {each.enforcer for each in answer.checks}
+        return tuple(
+            sorted(
+                signed_path(each.path) if each.kind is Drift.UNSIGNED else each.path
+                for each in drifts
+                # Whether the files of the first two are signed is told apart.
+                if each.enclave in deciding
+                and not (each.kind is Drift.UNSIGNED and each.enclave in ours)
+            )
+        )
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
@@ -323,15 +327,11 @@ class ZenohEvaluator:
         )
 
     def _is_signed(self, path: Path) -> bool:
-        """Return whether the permissions CA signed the document of a file next to it."""
         try:
             document = read_bytes(path, "Zenoh configuration")
-            data = read_bytes(path.with_name(ZENOH_SIGNED[path.name]), "signed document")
-            signed = smime.parse(data)
-            signed.verify(load_ca_certificate(self.root, PERMISSIONS))
+            return is_signed(path, document, load_ca_certificate(self.root, PERMISSIONS))
         except SrosError:
             return False
-        return signed.document.replace(b"\r\n", b"\n") == document
 
     def _unsigned(self, own: ZenohFile) -> tuple[str, ...]:
         return tuple(

@@ -114,7 +114,7 @@ def _configuration(path: Path, data: bytes, now: datetime, authority: Path | Non
     if signed != path and signed.exists():
         message = read_bytes(signed, "signed document")
         signature = _signature(signed, message, now, authority)
-        if smime.parse(message).document.replace(b"\r\n", b"\n") != data:
+        if smime.parse(message).text != data:
             problem = f"it is not the document that was signed in {signed.name}"
             signature |= {"signature_verified": False, "signature_problem": problem}
     return {**described, "problems": content_problems(path, now), **signature}
@@ -263,11 +263,11 @@ def _revocation_list(crl: RevocationList, now: datetime) -> Description:
 
 
 def _signed(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
-    document = smime.parse(data).document
+    signed = smime.parse(data)
     signature = _signature(path, data, now, authority)
-    if document.lstrip()[:1] == b"<":
-        return {**_document(document, now), **signature}
-    described = describe_configuration(document.replace(b"\r\n", b"\n"))
+    if signed.document.lstrip()[:1] == b"<":
+        return {**_document(signed.document, now), **signature}
+    described = describe_configuration(signed.text)
     return {**described, "problems": content_problems(path, now), **signature}
 
 

@@ -386,7 +386,7 @@ def _head_fault(
         signed = smime.parse(read_bytes(root / LEDGER_HEAD, "signed head of the ledger"))
         if authorities:
             _verify(signed, authorities)
-        stated = _HEAD.fullmatch(signed.document.replace(b"\r\n", b"\n"))
+        stated = _HEAD.fullmatch(signed.text)
     except SrosError as error:
         return _Fault(lines, f"{LEDGER_HEAD} does not sign its end: {error.what}")
     if not stated:

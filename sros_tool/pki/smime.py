@@ -126,6 +126,11 @@ class SignedDocument:
     _signature: bytes
     _issuer_and_serial: tuple[bytes, int]
 
+    @property
+    def text(self) -> bytes:
+        """The document with LF line ends, as it was before it was signed: S/MIME has CRLF."""
+        return self.document.replace(b"\r\n", b"\n")
+
     def signer(self) -> x509.Certificate | None:
         """Return the signer's certificate, or None if it is not embedded."""
         return self.signer_among(self.certificates)

@@ -15,7 +15,7 @@ LISTENER = f"{FRAME}WARN acc-0 ThreadId(05) zenoh_link_tls::unicast: "
 HINT = ". Hint: increase the system open file limit."
 CONNECT = f"{FRAME}DEBUG ThreadId(01) zenoh::net::runtime::orchestrator: "
 PEER = f"{CONNECT}Unable to connect to configured peer tls/127.0.0.1:7447! "
-END = " at /root/zenoh-link-tls/src/unicast.rs:226.. Retry in 1s."
+END = " at /cargo/zenoh-link-tls/src/unicast.rs:226.. Retry in 1s."
 LINKED = "Can not create a new TLS link bound to IpAddress(V4(Ipv4Addr([127, 0, 0, 1]))): "
 FILES = "Cannot create a new TLS listener to tls/127.0.0.1:7447#enable_mtls=true: "
 SUBJECT = "access_control: 3e781491ba73b7ee did not match any configured ACL subject. Default "
@@ -51,12 +51,12 @@ LINES = {
     "zenoh-port-taken": f"{CONNECT}Unable to open listener tls/127.0.0.1:7447: Can not create a "
     f"new TLS listener on 127.0.0.1:7447: Address already in use (os error 98){END}",
     "zenoh-rules": "ZError: Access control not enabled due to: Rule 'x' in policy #0 does not "
-    "exist in rules list at /root/authorization.rs:551.",
+    "exist in rules list at /cargo/authorization.rs:551.",
     "zenoh-no-rules": f"{FRAME}WARN zenoh::net::routing::interceptor::authorization: Access "
     "control rules list is empty in config file",
     "zenoh-setting": "ZError: unknown field `acces_control`, expected one of `id`, `metadata`",
     "zenoh-expression": "ZError: Invalid Key Expr `**/*`: `**/*` must be replaced by `*/**` to "
-    "reach canon-form at /root/borrowed.rs:777.",
+    "reach canon-form at /cargo/borrowed.rs:777.",
     "zenoh-no-connection": f"{FRAME}WARN zenoh::net::runtime::orchestrator: Unable to connect to "
     f"any of [Single(tls/127.0.0.1:7447)]. Timeout!{END}",
 }

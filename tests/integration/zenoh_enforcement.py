@@ -12,7 +12,6 @@ import os
 import random
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from sros_tool.runtime.netns import enter_isolation, try_isolation
 from sros_tool.zenoh.access import Message
 from sros_tool.zenoh.document import parse_configuration
 from sros_tool.zenoh.enforcement import Remote
-from tests.integration.zenoh_world import MESSAGES, PAUSE, drawn_rule
+from tests.integration.zenoh_world import MESSAGES, PAUSE, drawn_rule, observed_cases
 
 CASES = 60
 REMOTES = {
@@ -126,7 +125,6 @@ def world(keystore: Path, port: int, draw: random.Random, default: str) -> dict[
         base = f"t/{number}"
         asked, declared = (f"{base}/{draw.choices(('a', '*', '**'), (6, 1, 1))[0]}" for _ in "12")
         cases.append((asked, declared, f"{base}/a"))
-    seen: dict[str, set[int]] = {"put": set(), "query": set(), "reply": set()}
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as users:
         users.write("tom:secret\nmary:secret\n")
         users.flush()
@@ -154,29 +152,7 @@ def world(keystore: Path, port: int, draw: random.Random, default: str) -> dict[
             )
             for who, remote in REMOTES.items()
         )
-        kept: list[Any] = []
-        for number, (_, declared, answer) in enumerate(cases):
-
-            def reply(query: Any, number: int = number, answer: str = answer) -> None:
-                with query:
-                    seen["query"].add(number)
-                    query.reply(answer, "answer")
-
-            def hear(_: Any, number: int = number) -> None:
-                seen["put"].add(number)
-
-            kept += [
-                listener.declare_subscriber(declared, hear),
-                listener.declare_queryable(declared, reply),
-            ]
-        publishers = [talker.declare_publisher(asked) for asked, _, _ in cases]
-        time.sleep(2 * PAUSE)
-        for number, (asked, _, _) in enumerate(cases):
-            publishers[number].put("x")
-            got = talker.get(asked, target=zenoh.QueryTarget.ALL, timeout=10.0)
-            if any(each.ok is not None for each in got):
-                seen["reply"].add(number)
-        time.sleep(2 * PAUSE)
+        seen = observed_cases(talker, listener, cases, 2 * PAUSE)
         for session in (talker, listener, router):
             session.close()
     told = {

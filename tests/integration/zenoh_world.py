@@ -13,7 +13,7 @@ import os
 import random
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -335,6 +335,41 @@ def drawn_rule(draw: random.Random, base: str) -> tuple[str, ...]:
     return (f"{base}/{'/'.join(chosen)}",)
 
 
+def observed_cases(
+    talker: Any, listener: Any, cases: Sequence[tuple[str, str, str]], pause: float
+) -> dict[str, set[int]]:
+    """Have the talker put and ask, and return the numbers of the cases that were heard.
+
+    A case is a key that is put and asked, one that the listener declares, and that of its reply.
+    """
+    seen: dict[str, set[int]] = {"put": set(), "query": set(), "reply": set()}
+    kept: list[Any] = []
+    for number, (_, declared, answer) in enumerate(cases):
+
+        def reply(query: Any, number: int = number, answer: str = answer) -> None:
+            with query:
+                seen["query"].add(number)
+                query.reply(answer, "answer")
+
+        def hear(_: Any, number: int = number) -> None:
+            seen["put"].add(number)
+
+        kept += [
+            listener.declare_subscriber(declared, hear),
+            listener.declare_queryable(declared, reply),
+        ]
+    publishers = [talker.declare_publisher(asked) for asked, _, _ in cases]
+    time.sleep(pause)
+    for number, (asked, _, _) in enumerate(cases):
+        publishers[number].put("x")
+        got = talker.get(asked, target=zenoh.QueryTarget.ALL, timeout=10.0)
+        if any(each.ok is not None for each in got):
+            seen["reply"].add(number)
+    time.sleep(pause)
+    del kept
+    return seen
+
+
 def decisions(keystore: Path, count: int) -> dict[str, Any]:
     """Compare what `AccessControl` says with what a router does, on random rules and messages."""
     draw = random.Random(15)
@@ -350,34 +385,11 @@ def decisions(keystore: Path, count: int) -> dict[str, Any]:
     rules = {who: draw.sample(of, len(of)) for who, of in rules.items()}
     control = AccessControl(tuple(RemoteRights(who, tuple(of)) for who, of in rules.items()))
     written = Configuration(Mode.ROUTER, (), (), control)
-    seen: dict[str, set[int]] = {"put": set(), "query": set(), "reply": set()}
     with world(keystore, rules=False) as at:
         enforced = json.loads(written.render())["access_control"]
         at.open("/router", "router.json5", rules=True, access_control=enforced)
         talker, listener = at.open("/talker"), at.open("/listener")
-        kept: list[Any] = []
-        for number, (_, declared, answer) in enumerate(cases):
-
-            def reply(query: Any, number: int = number, answer: str = answer) -> None:
-                with query:
-                    seen["query"].add(number)
-                    query.reply(answer, "answer")
-
-            def hear(_: Any, number: int = number) -> None:
-                seen["put"].add(number)
-
-            kept += [
-                listener.declare_subscriber(declared, hear),
-                listener.declare_queryable(declared, reply),
-            ]
-        publishers = [talker.declare_publisher(asked) for asked, _, _ in cases]
-        time.sleep(4 * PAUSE)
-        for number, (asked, _, _) in enumerate(cases):
-            publishers[number].put("x")
-            got = talker.get(asked, target=zenoh.QueryTarget.ALL, timeout=10.0)
-            if any(each.ok is not None for each in got):
-                seen["reply"].add(number)
-        time.sleep(4 * PAUSE)
+        seen = observed_cases(talker, listener, cases, 4 * PAUSE)
     told: dict[str, set[int]] = {
         what: {
             number

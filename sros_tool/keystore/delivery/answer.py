@@ -111,13 +111,8 @@ def _listed(files: dict[str, bytes]) -> bytes:
 
 def _number_of(message: bytes) -> int:
     """Return the number in a seal, or 0 if an earlier version of sros made it."""
-    head = _SEALED.match(_with_lf(smime.parse(message).document))
+    head = _SEALED.match(smime.parse(message).text)
     return int(head[1] or 0) if head else 0
-
-
-def _with_lf(document: bytes) -> bytes:
-    """Return ``document`` with LF line ends; S/MIME writes CRLF."""
-    return document.replace(b"\r\n", b"\n")
 
 
 def _read_answer(data: bytes) -> RequestAnswer:
@@ -194,7 +189,7 @@ def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate])
         signed = smime.parse(answer.seal)
     except SrosError as error:
         return str(error)
-    head = _SEALED.match(document := _with_lf(signed.document))
+    head = _SEALED.match(document := signed.text)
     if not head or document[head.end() :] != _listed(answer.files):
         return "the files differ from the signed list"
     problem = ""

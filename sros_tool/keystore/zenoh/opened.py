@@ -103,6 +103,16 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
     return OpenedZenoh(present, found, tuple(problems))
 
 
+def is_signed(path: Path, document: bytes, authority: x509.Certificate) -> bool:
+    """Return whether the permissions CA signed a document next to its file ``path``."""
+    try:
+        signed = smime.parse(read_bytes(path.with_name(ZENOH_SIGNED[path.name]), "signed document"))
+        signed.verify(authority)
+    except SrosError:
+        return False
+    return signed.text == document
+
+
 def _exists(path: Path) -> bool:
     return path.exists() or path.is_symlink()
 
@@ -128,7 +138,7 @@ def _read(
         signed.verify(authority)
     except SrosError as error:
         return ZenohProblem(signed_file, str(error).rstrip("."), ZenohFault.SIGNATURE)
-    if signed.document.replace(b"\r\n", b"\n") != document:
+    if signed.text != document:
         text = f"it is not the document that the permissions CA signed in {signed_file}"
         return ZenohProblem(file, text, ZenohFault.OTHER_DOCUMENT)
     try:

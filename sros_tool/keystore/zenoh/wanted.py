@@ -31,9 +31,9 @@ from sros_tool.keystore.ledger import Ledger, read_ledger
 from sros_tool.keystore.reader import read_certificate, read_lists, read_signed_grant
 from sros_tool.keystore.recorded import RecordedRights
 from sros_tool.keystore.rights import recorded_rights
+from sros_tool.keystore.zenoh.opened import is_signed
 from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
-from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.policy.model import RIGHTS, Enclave
 from sros_tool.policy.rights import Rules
@@ -129,7 +129,7 @@ def drifted(
                 kind = Drift.MISSING
             elif present != document:
                 kind = Drift.DIFFERS
-            elif not _is_signed(root / path, document, authority):
+            elif not is_signed(root / path, document, authority):
                 kind = Drift.UNSIGNED
             if kind:
                 found.append(Drifted(wanted.enclaves[path], path, kind))
@@ -363,16 +363,6 @@ def _present(path: Path) -> bytes | None:
         return read_bytes(path, "Zenoh configuration")
     except SrosError:
         return None
-
-
-def _is_signed(path: Path, document: bytes, authority: x509.Certificate) -> bool:
-    """Return whether the permissions CA signed a document next to its file ``path``."""
-    try:
-        signed = smime.parse(read_bytes(path.with_name(ZENOH_SIGNED[path.name]), "signed document"))
-        signed.verify(authority)
-    except SrosError:
-        return False
-    return signed.document.replace(b"\r\n", b"\n") == document
 
 
 def stale_files(root: Path, wanted: Collection[str]) -> Iterable[Drifted]:
