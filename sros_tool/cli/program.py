@@ -77,6 +77,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "check": VerbEntry(
             "check", "Find errors and weaknesses in policies, keystores, the runtime."
         ),
+        "metrics": VerbEntry("metrics", "Give Prometheus the expiry and findings of a keystore."),
         "audit": VerbEntry("audit", "Report what a policy would deny to the running robot."),
         "doctor": VerbEntry("check", "Find out which DDS here enforces security."),
     },
@@ -241,6 +242,7 @@ _PHRASES = {
     "completion": "print the completion script",
     "doctor": "examine this machine",
     "audit": "audit the robot",
+    "metrics": "give the metrics",
 }
 
 

@@ -305,6 +305,11 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("keystore ks --needs-renewal 99y", 1),
         Case("keystore broken --needs-renewal 1d", 2),
     ),
+    "metrics": (
+        Case("ks"),
+        Case("broken -o new.prom"),
+        Case("out --earliest -o new.prom --dry-run"),
+    ),
     "env": (
         Case("ks /a"),
         Case("ks /a --domain 0"),
@@ -353,6 +358,7 @@ ERRORS = {
     "policies": "--copy ks",
     "explain": "ks /none publish /x",
     "view": "none",
+    "metrics": "none",
     "check": "none",
     "audit": "none",
     "doctor": "surplus",

@@ -33,7 +33,7 @@ NEW_NAMES = {("create_request", "name")}
 """Arguments that are a name which does not exist yet."""
 GROWS = {
     "create_enclave", "generate_artifacts", "update_keystore", "renew", "revoke", "rotate_ca",
-    "distribute_key", "verify", "diff_policy", "explain", "view", "check", "zenoh",
+    "distribute_key", "verify", "diff_policy", "explain", "view", "check", "metrics", "zenoh",
 }  # fmt: skip
 
 
@@ -138,6 +138,7 @@ STATUS: dict[str, tuple[str, str, str]] = {
     "view": ("p.xml -o new.svg", NEVER, "nothing"),
     "policies": ("", NEVER, "--copy ks"),
     "check": ("keystore strict --severity error", "damaged", "nothing"),
+    "metrics": ("damaged -o new.prom", NEVER, "nothing -o new.prom"),
     "env": ("ks /a", NEVER, "nothing /a"),
     "completion": ("bash", NEVER, "powershell"),
 }

@@ -1,0 +1,162 @@
+"""The state of a keystore as metrics: when what expires, and how many findings it has."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from sros_tool.checks.kind import Finding, Severity
+from sros_tool.errors import SrosError
+from sros_tool.keystore.expiry import Lifetime, survey
+from sros_tool.keystore.layout import (
+    CRL_FILE,
+    GOVERNANCE_P7S,
+    IDENTITY_CA_FILE,
+    PERMISSIONS,
+    PERMISSIONS_CA_FILE,
+    ROLES,
+    enclave_path,
+)
+from sros_tool.keystore.reader import (
+    OpenedKeystore,
+    load_ca_certificate,
+    load_governance,
+    open_keystore,
+    read_certificate,
+)
+from sros_tool.pki.certificates import validity_of
+from sros_tool.pki.crl import load_crl
+from sros_tool.prometheus import Metric, Sample
+from sros_tool.xml import read_bytes
+
+_KINDS = "certificate, permissions, governance, crl, identity_ca or permissions_ca"
+
+
+@dataclass(frozen=True, slots=True)
+class Expiry:
+    """The moment from which a file is not valid any more; ``enclave`` is "" for a shared file."""
+
+    kind: str
+    enclave: str
+    moment: datetime
+
+
+def keystore_metrics(
+    root: Path, findings: Iterable[Finding], *, now: datetime, each_enclave: bool = True
+) -> tuple[Metric, ...]:
+    """Return the metrics of a keystore, or of an export for a robot.
+
+    Args:
+        root: the keystore.
+        findings: those of `keystore_findings`.
+        now: the moment of which they are.
+        each_enclave: also give the expiry of each enclave's files, not only the earliest.
+
+    Raises:
+        KeystoreError: ``root`` is no keystore, or enclaves of it may be missing.
+    """
+    keystore = open_keystore(root)
+    lifetimes, unreadable = survey(root)
+    expiries = [*_shared(keystore), *_of_enclaves(keystore, lifetimes)]
+    earliest: dict[str, datetime] = {}
+    for each in expiries:
+        earliest[each.kind] = min(each.moment, earliest.get(each.kind, each.moment))
+    place = {"keystore": str(root.absolute())}
+    severities = Counter(each.severity for each in findings)
+    kinds = Counter((each.severity, each.id) for each in findings)
+    return (
+        Metric(
+            "sros_examined_timestamp_seconds",
+            "When the keystore was examined, in seconds since 1970.",
+            (Sample(_seconds(now), place),),
+        ),
+        Metric(
+            "sros_enclaves",
+            "Number of enclaves in the keystore.",
+            (Sample(len(keystore.names), place),),
+        ),
+        Metric(
+            "sros_unreadable_enclaves",
+            "Number of enclaves whose certificate or permissions cannot be read.",
+            (Sample(len(unreadable), place),),
+        ),
+        Metric(
+            "sros_earliest_expiry_timestamp_seconds",
+            f"The first expiry of all files of a kind ({_KINDS}), in seconds since 1970.",
+            tuple(
+                Sample(_seconds(moment), {**place, "kind": kind})
+                for kind, moment in earliest.items()
+            ),
+        ),
+        Metric(
+            "sros_expiry_timestamp_seconds",
+            f"The expiry of a file by its kind ({_KINDS}), in seconds since 1970; "
+            "without enclave for a file that all share.",
+            tuple(
+                Sample(_seconds(each.moment), {**place, "kind": each.kind, "enclave": each.enclave})
+                for each in expiries
+                if each_enclave or not each.enclave
+            ),
+        ),
+        Metric(
+            "sros_findings",
+            "Number of findings of `sros check` by severity (error, warning or note).",
+            tuple(
+                Sample(severities[each], {**place, "severity": each.word})
+                for each in sorted(Severity, reverse=True)
+            ),
+        ),
+        Metric(
+            "sros_findings_of_kind",
+            "Number of findings of `sros check` by the id of their kind.",
+            tuple(
+                Sample(number, {**place, "severity": severity.word, "id": identity})
+                for (severity, identity), number in sorted(kinds.items())
+            ),
+        ),
+    )
+
+
+def _shared(keystore: OpenedKeystore) -> Iterator[Expiry]:
+    """Yield the expiry of what all enclaves share; what cannot be read is a finding."""
+    for role in ROLES:
+        with suppress(SrosError):
+            for certificate in keystore.authority(role)[:1]:
+                yield Expiry(f"{role}_ca", "", validity_of(certificate).not_after)
+    if (keystore.root / GOVERNANCE_P7S).exists():
+        # It names no moment: it is valid for as long as the CA that signed it.
+        with suppress(SrosError):
+            authority = load_ca_certificate(keystore.root, PERMISSIONS)
+            load_governance(keystore.root, authority)
+            yield Expiry("governance", "", validity_of(authority).not_after)
+    with suppress(SrosError):
+        if crl := keystore.revocation_list:
+            yield Expiry("crl", "", crl.next_update)
+
+
+def _of_enclaves(keystore: OpenedKeystore, lifetimes: Iterable[Lifetime]) -> Iterator[Expiry]:
+    for each in lifetimes:
+        yield Expiry("certificate", each.name, each.certificate.not_after)
+        yield Expiry("permissions", each.name, each.permissions.not_after)
+        if not keystore.is_home:
+            yield from _exported(enclave_path(keystore.root, each.name), each.name)
+
+
+def _exported(folder: Path, name: str) -> Iterator[Expiry]:
+    """Yield the expiry of what an export has for each enclave, and a keystore once."""
+    for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
+        with suppress(SrosError):
+            moment = validity_of(read_certificate(folder / file)).not_after
+            yield Expiry(file.removesuffix(".cert.pem"), name, moment)
+    if (folder / CRL_FILE).exists():
+        with suppress(SrosError):
+            crl = load_crl(read_bytes(folder / CRL_FILE, "revocation list"), CRL_FILE)
+            yield Expiry("crl", name, crl.next_update)
+
+
+def _seconds(moment: datetime) -> int:
+    return int(moment.timestamp())

@@ -1,0 +1,89 @@
+"""The verb `metrics`: what Prometheus is told of a keystore."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+
+from sros_tool.cli.common import (
+    PATH,
+    check_output,
+    dry_run_option,
+    json_option,
+    keystore_from_environment,
+    local_zone,
+    now,
+    output_option,
+    print_json,
+    save,
+)
+from sros_tool.cli.progress import progress
+from sros_tool.cli.written import file_change
+from sros_tool.errors import UsageError
+from sros_tool.values import as_plain
+
+_SUFFIX = ".prom"
+"""The only suffix of files that the textfile collector of node_exporter reads."""
+
+
+@click.command(
+    "metrics",
+    epilog="""\b
+Example:
+  $ sros metrics keystore -o /var/lib/prometheus/node-exporter/sros.prom
+  $ sros metrics keystore | grep earliest
+  sros_earliest_expiry_timestamp_seconds{keystore="/home/robot/keystore",...
+
+The exit status is 0 whatever is found. If the keystore cannot be examined it is
+2 and FILE stays as it is: alert also on an old sros_examined_timestamp_seconds.""",
+)
+@click.argument("root", metavar="[ROOT]", type=PATH, required=False)
+@output_option("Replace FILE at once, which ends in .prom, instead of printing.")
+@click.option(
+    "--earliest", is_flag=True, help="Leave out the files of single enclaves, for large keystores."
+)
+@dry_run_option
+@json_option
+def metrics(
+    root: Path | None, output: Path | None, earliest: bool, dry_run: bool, as_json: bool
+) -> None:
+    """Give Prometheus the expiry of all files of a keystore, and its number of findings.
+
+    ROOT is a keystore, or an export on a robot. The text is for the textfile collector of
+    node_exporter.
+    """
+    from sros_tool.checks.keystores.keystore import keystore_findings
+    from sros_tool.checks.keystores.metrics import keystore_metrics
+    from sros_tool.prometheus import render_metrics
+
+    root, moment = root or keystore_from_environment(), now()
+    if output:
+        _check_suffix(output)
+        check_output(output, force=True)
+    with progress("examining"):
+        findings = keystore_findings(root, now=moment, zone=local_zone(os.environ))
+        found = keystore_metrics(root, findings, now=moment, each_enclave=not earliest)
+    text = render_metrics(found)
+    changes = file_change(output, existed=output.exists()) if output else []
+    saved = save(output, text.encode()) if output and not dry_run else ""
+    if as_json:
+        shown = {"dry_run": dry_run, "changes": changes, "notes": []}
+        print_json({"keystore": str(root), "metrics": as_plain(found), **shown})
+    elif dry_run:
+        click.echo(f"would write {output or 'to standard output'}: {len(text)} characters")
+    elif output:
+        click.echo(saved, err=True)
+    else:
+        click.echo(text, nl=False)
+
+
+def _check_suffix(output: Path) -> None:
+    """Raise `UsageError` for a file that node_exporter would not read."""
+    if output.suffix != _SUFFIX and (output.is_file() or not output.exists()):
+        raise UsageError(
+            f"'{output}' does not end in {_SUFFIX}",
+            "node_exporter would not read it.",
+            f"Name it for example '{output.with_suffix(_SUFFIX)}'.",
+        )

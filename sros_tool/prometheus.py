@@ -1,0 +1,78 @@
+"""Metrics as the text that Prometheus reads, such as from a file of node_exporter's textfile.
+
+Source: Prometheus, "Exposition formats", text format 0.0.4.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*\Z", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A value with its labels, which may have any text."""
+
+    value: int | float
+    labels: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A gauge: what it says, and its samples.
+
+    Raises:
+        ValueError: a name is not of lower-case letters, digits and ``_``.
+    """
+
+    name: str
+    help: str
+    samples: tuple[Sample, ...]
+
+    def __post_init__(self) -> None:
+        for name in (self.name, *(label for each in self.samples for label in each.labels)):
+            if not _NAME.match(name) or name.startswith("__"):
+                raise ValueError(f"{name!r} is not a name of Prometheus")
+
+
+def render_metrics(metrics: Iterable[Metric]) -> str:
+    """Return metrics as text, each with its help and its type; those without samples are left out.
+
+    Labels can hold names of files.  Characters that cannot be printed, and bytes that are not
+    UTF-8, become visible escapes, because readers refuse the whole text for a single such byte.
+    For the same reason a series that was given already is left out.
+    """
+    lines: list[str] = []
+    for metric in metrics:
+        series: dict[str, int | float] = {}
+        for each in metric.samples:
+            series.setdefault(_series(metric.name, each.labels), each.value)
+        if not series:
+            continue
+        lines += [f"# HELP {metric.name} {_escaped(metric.help)}", f"# TYPE {metric.name} gauge"]
+        lines += [f"{name} {value}" for name, value in series.items()]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _series(name: str, labels: Mapping[str, str]) -> str:
+    pairs = ",".join(f'{label}="{_quoted(value)}"' for label, value in labels.items())
+    return f"{name}{{{pairs}}}" if pairs else name
+
+
+def _quoted(value: str) -> str:
+    return _escaped(value).replace('"', '\\"')
+
+
+def _escaped(text: str) -> str:
+    shown = "".join(each if each.isprintable() else _visible(each) for each in text)
+    return shown.replace("\\", "\\\\")
+
+
+def _visible(character: str) -> str:
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:  # a byte of a file's name that is not UTF-8
+        return f"\\x{code - 0xDC00:02x}"
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
