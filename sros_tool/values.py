@@ -1,9 +1,10 @@
-"""Reading JSON, and conversion of dataclasses and other values to JSON types."""
+"""Reading JSON, writing YAML, and conversion of dataclasses and other values to JSON types."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import Enum
@@ -32,6 +33,61 @@ def parse_json(data: bytes) -> Any:
         return json.loads(data)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+
+
+_PLAIN_YAML = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*\Z")
+_YAML_WORDS = frozenset(("y", "n", "yes", "no", "on", "off", "true", "false", "null"))
+"""Words that a version of YAML takes for something other than a text, whatever their case."""
+
+
+def yaml_text(value: object) -> str:
+    """Return dictionaries, lists, strings, integers and booleans as a YAML document.
+
+    Every string that could be anything else is a JSON string, which is one of YAML, too: readers
+    of YAML 1.1 and 1.2 find the same.
+
+    Raises:
+        TypeError: a part of ``value`` is of another type.
+    """
+    return "".join(f"{line}\n" for line in _yaml_lines(value))
+
+
+def _yaml_lines(value: object) -> Iterator[str]:
+    if isinstance(value, Mapping) and value:
+        for key, each in value.items():
+            lines = _yaml_lines(each)
+            if isinstance(each, (Mapping, list)) and each:
+                yield f"{_yaml_string(key)}:"
+                yield from (f"  {line}" for line in lines)
+            else:
+                yield f"{_yaml_string(key)}: {next(lines)}"
+    elif isinstance(value, list) and value:
+        for each in value:
+            lines = _yaml_lines(each)
+            yield f"- {next(lines)}"
+            yield from (f"  {line}" for line in lines)
+    elif isinstance(value, bool):
+        yield str(value).lower()
+    elif isinstance(value, int):
+        yield str(value)
+    elif isinstance(value, str):
+        yield _yaml_string(value)
+    elif isinstance(value, (Mapping, list)):
+        yield "{}" if isinstance(value, Mapping) else "[]"
+    else:
+        raise TypeError(f"a {type(value).__name__} has no form in YAML: {value!r}")
+
+
+def _yaml_string(text: str) -> str:
+    if _PLAIN_YAML.match(text) and text.lower() not in _YAML_WORDS:
+        return text
+    quoted = json.dumps(text, ensure_ascii=False)
+    return "".join(each if each.isprintable() else _yaml_escape(each) for each in quoted)
+
+
+def _yaml_escape(character: str) -> str:
+    code = ord(character)
+    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
 def as_plain(value: object) -> Any:

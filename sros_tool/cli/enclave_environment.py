@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
@@ -48,6 +48,7 @@ def loadable_environment(
     rmw: str | None = None,
     *,
     accept_key: bool = False,
+    target: Path | None = None,
 ) -> EnclaveEnvironment:
     """Return the environment of an enclave after checking that a process can run in it.
 
@@ -57,6 +58,7 @@ def loadable_environment(
         domain_text: the value of --domain; None stands for $ROS_DOMAIN_ID.
         rmw: the value of --rmw; None stands for $RMW_IMPLEMENTATION.
         accept_key: accept a private key that other users can read.
+        target: the absolute path of the keystore where the process will run; None stands for here.
 
     Raises:
         UsageError: the domain, the RMW or the enclave's name is invalid.
@@ -106,10 +108,12 @@ def loadable_environment(
         )
     if not accept_key:
         _check_key_closed(folder / KEY_FILE, root, name)
-    variables = secured_environment(root, name, domain)
+    variables = secured_environment(target or root, name, domain)
     if zenoh:
-        return _zenoh_environment(folder, name, zenoh, variables)
-    if RMW_ZENOH in rmw_implementations(os.environ):
+        place = enclave_path(target or root, name)
+        found = _zenoh_environment(place, name, zenoh, variables)
+        return replace(found, notes=()) if target else found  # they are about this process
+    if (target and not rmw) or RMW_ZENOH in rmw_implementations(os.environ):
         variables |= REFUSING_ZENOH  # what chooses it later, such as a launch file, starts no node
     return EnclaveEnvironment({**variables, RMW: rmw} if rmw else variables)
 

@@ -20,9 +20,12 @@ from sros_tool.cli.common import (
     print_notes,
     split_root,
 )
+from sros_tool.cli.containers import INSTALLED, container_text, target_path
 from sros_tool.cli.enclave_environment import RMWS, loadable_environment
 from sros_tool.cli.written import notes_json
 from sros_tool.errors import UnavailableError, UsageError
+from sros_tool.runtime.containers import COMPOSE, KUBERNETES
+from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
 
 _COMMAND = "sros.command"
 _WORDS = click.argument(
@@ -97,7 +100,7 @@ def _refusal_printed(form: str, as_json: bool) -> Iterator[None]:
         raise
 
 
-_FORMS = ("sh", "fish", "json", "systemd", "docker")
+_FORMS = ("sh", "fish", "json", "systemd", "docker", *CONTAINER_FORMS)
 
 
 def _form_of(arguments: Sequence[str]) -> str:
@@ -121,17 +124,38 @@ Example:
   export ROS_SECURITY_ENABLE=true
   export ROS_SECURITY_STRATEGY=Enforce
   export ROS_SECURITY_ENCLAVE_OVERRIDE=/talker
-  export ROS_DOMAIN_ID=0""",
+  export ROS_DOMAIN_ID=0
+  $ sros env keystore /talker --format compose > secured.yaml
+  $ sros env keystore /talker --format kubernetes-secret | \\
+        kubectl apply --server-side -f -
+  $ sros env keystore /talker --format kubernetes --image talker:1 | \\
+        kubectl apply -f -""",
 )
 @_WORDS
 @click.option(
     "--format",
     "form",
+    metavar="FORM",
     type=click.Choice(_FORMS),
     default=_FORMS[0],
     show_default=True,
-    help="For a shell, a systemd unit or Docker; json has names and values alone.",
+    help="For a shell (sh, fish), a program (json), a unit (systemd), an env-file (docker), or a "
+    "container: compose, kubernetes, and kubernetes-secret, which holds the private key.",
 )
+@click.option(
+    "--target",
+    "there",
+    metavar="DIR",
+    help="The path of the keystore where the process runs: on the robot, in the container. "
+    f"[default: ROOT; for containers {INSTALLED}]",
+)
+@click.option(
+    "--name",
+    "container",
+    metavar="NAME",
+    help="The name of the service in Compose, or the Deployment. [default: from the enclave]",
+)
+@click.option("--image", metavar="IMAGE", help="The image of the container.")
 @_DOMAIN
 @_RMW
 @_ACCEPT_KEY
@@ -139,6 +163,9 @@ Example:
 def env(
     words: tuple[str, ...],
     form: str,
+    there: str | None,
+    container: str | None,
+    image: str | None,
     domain: str | None,
     rmw: str | None,
     accept_readable_key: bool,
@@ -150,6 +177,9 @@ def env(
     variables cannot be given, those that are printed let no node start. With rmw_zenoh_cpp, which
     ignores ROS_SECURITY_*, they also name the configuration that `sros zenoh` wrote, and replace
     those of Zenoh that are set.
+
+    A container gets the files of the enclave from an export in DIR (Compose), or from a Secret
+    (Kubernetes). Without --image, what is printed is to be merged with a definition that has one.
     """
     from sros_tool.runtime.environment import render_environment
 
@@ -157,8 +187,23 @@ def env(
     root, rest = split_root(words)
     if len(rest) != 1:
         raise UsageError("env takes a keystore and one enclave")
-    found = loadable_environment(root, rest[0], domain, rmw, accept_key=accept_readable_key)
-    text = render_environment(found.variables, "json" if as_json else form)
+    for option, value in (("--name", container), ("--image", image)):
+        if value is not None and (form not in (COMPOSE, KUBERNETES) or not value):
+            what = f"{option} is empty" if not value else f"the format {form} has no {option}"
+            raise UsageError(what, "", f"It is for {COMPOSE} and {KUBERNETES}.")
+    in_container = form in CONTAINER_FORMS
+    if there is None and in_container:
+        there = INSTALLED
+    target = None if there is None else target_path(there)
+    found = loadable_environment(
+        root, rest[0], domain, rmw, accept_key=accept_readable_key, target=target
+    )
+    if target and in_container:
+        text = container_text(
+            root, rest[0], form, target, found.variables, container or "", image or ""
+        )
+    else:
+        text = render_environment(found.variables, "json" if as_json else form)
     notes = [*found.notes, *found.enclave_notes]
     if as_json:
         print_json(

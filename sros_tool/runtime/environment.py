@@ -18,7 +18,9 @@ from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
 from sros_tool.runtime.zenoh_environment import REFUSING_ZENOH
+from sros_tool.values import yaml_text
 
 KEYSTORE = "ROS_SECURITY_KEYSTORE"
 ENABLE = "ROS_SECURITY_ENABLE"
@@ -97,8 +99,10 @@ def render_refusal(form: str) -> str:
     What reads nothing, such as a shell that evaluates an empty output, or jq, would start nodes
     unsecured: see `REFUSING`.  In a shell, the text also fails as a
     command, also where ``eval $(...)`` without quotes makes it a single line; in a unit, it keeps
-    systemd from starting the service.
+    systemd from starting the service.  Compose and Kubernetes refuse it as it is.
     """
+    if form in CONTAINER_FORMS:
+        return yaml_text({"refused-by-sros": "the enclave cannot be used"})
     text = render_environment(REFUSING, form)
     if form in ("sh", "fish"):
         return "; ".join((*text.splitlines(), "false")) + "\n"

@@ -109,7 +109,7 @@ def distribute(
         KeystoreError: an enclave does not exist or cannot run, ``target`` cannot be used, or holds
             other content that only ``force`` replaces.
     """
-    files = _collect(root, names, now)
+    files = exported_files(root, names, now)
     if target.name.endswith(_ARCHIVE_SUFFIXES):
         return Export(target, tuple(names), _write_archive(target, files, force, dry_run))
     changes = _write_folder(root, target, files, force, dry_run)
@@ -143,12 +143,16 @@ def pack_enclaves(root: Path, names: Sequence[str], *, now: datetime) -> PackedE
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
     """
-    files = _collect(root, names, now)
+    files = exported_files(root, names, now)
     return PackedEnclaves(pack(files), tuple(files))
 
 
-def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
-    """Map the paths of the exported files to their content; refuse an enclave that cannot run."""
+def exported_files(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
+    """Map the paths of the exported files to their content.
+
+    Raises:
+        KeystoreError: an enclave does not exist, or cannot run.
+    """
     existing = set(list_enclaves(root))
     check_readable(root)
     files: dict[str, bytes] = {}
