@@ -236,14 +236,14 @@ _LONGEST_LINE = 4000  # characters: the parser takes quadratic time for a key wi
 _LONGEST_DOCUMENT = 256 * 1024  # characters
 
 
-def parse_toml(text: str) -> dict[str, Any]:
-    """Return the tables of a TOML document.
+def parse_toml(text: str, longest: int = _LONGEST_DOCUMENT) -> dict[str, Any]:
+    """Return the tables of a TOML document of at most ``longest`` characters (256 Ki).
 
     Raises:
         tomllib.TOMLDecodeError: the document is not TOML, too long, or nested too deeply.
     """
-    if len(text) > _LONGEST_DOCUMENT:
-        raise tomllib.TOMLDecodeError(f"it is longer than {_LONGEST_DOCUMENT // 1024} KiB")
+    if len(text) > longest:
+        raise tomllib.TOMLDecodeError(f"it is longer than {longest // 1024} KiB")
     for number, line in enumerate(text.split("\n"), 1):
         if len(line) > _LONGEST_LINE:
             raise tomllib.TOMLDecodeError(

@@ -19,7 +19,7 @@ LAYERS = {
     1: {"errors", "faults", "names", "owners", "validity", "values"}
     | {"xml", "files", "folders", "parallel", "resources", "prometheus"},
     2: {"pki", "policy", "dds", "zenoh"},
-    3: {"translate", "translate_zenoh", "translate_zenoh_back"},
+    3: {"fleet", "translate", "translate_zenoh", "translate_zenoh_back"},
     4: {"translate_from_zenoh", "keystore", "graph", "runtime"},
     5: {"checks", "explain", "demo", "report"},
     6: {"api", "cli"},

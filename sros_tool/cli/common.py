@@ -21,7 +21,7 @@ import click
 from click.core import ParameterSource
 
 from sros_tool.cli.progress import paused
-from sros_tool.errors import DocumentError, PkiError, UsageError
+from sros_tool.errors import DocumentError, PkiError, SrosError, UsageError
 from sros_tool.values import versioned
 
 if TYPE_CHECKING:
@@ -79,8 +79,21 @@ def dry_run_option(function: Decorated) -> Decorated:
     )(function)
 
 
+def robot_option(help_text: str) -> Callable[[Decorated], Decorated]:
+    """Add ``--robot NAME`` to a verb that chooses enclaves of a keystore."""
+    return click.option(
+        "--robot",
+        "robots",
+        multiple=True,
+        metavar="NAME",
+        shell_complete=_complete_robot,
+        help=f"{help_text}  Can be repeated.",
+    )
+
+
 def several_enclaves(function: Decorated) -> Decorated:
-    """Add ``--all`` and ``--match PATTERN`` to a verb that takes several enclaves."""
+    """Add ``--all``, ``--match PATTERN`` and ``--robot NAME`` to a verb for several enclaves."""
+    function = robot_option("All enclaves of this robot of the fleet.")(function)
     function = click.option(
         "--match",
         "patterns",
@@ -94,25 +107,30 @@ def several_enclaves(function: Decorated) -> Decorated:
 
 
 def chosen_enclaves(
-    root: Path, names: Sequence[str], patterns: Sequence[str], *, every: bool
+    root: Path,
+    names: Sequence[str],
+    patterns: Sequence[str],
+    robots: Sequence[str],
+    *,
+    every: bool,
 ) -> tuple[str, ...]:
     """Return the enclaves that the arguments and the options of `several_enclaves` name.
 
     Raises:
         UsageError: none is named.
-        KeystoreError: a pattern matches none.
+        KeystoreError: a pattern matches none, or a robot has none.
     """
-    from sros_tool.keystore.layout import select_enclaves
-
-    if not (names or patterns or every):
+    if not (names or patterns or robots or every):
         raise UsageError(
             "no enclave is named",
             "",
-            "Name one or more, such as /talker, or give --match PATTERN or --all.",
+            "Name one or more, such as /talker, or give --match PATTERN, --robot NAME or --all.",
         )
-    if not (patterns or every):
+    if not (patterns or robots or every):
         return tuple(names)  # the verb says what is wrong with a name
-    return select_enclaves(root, names, patterns, every=every)
+    from sros_tool.keystore.selection import select_enclaves
+
+    return select_enclaves(root, names, patterns, robots=robots, every=every)
 
 
 def output_option(help_text: str) -> Callable[[Decorated], Decorated]:
@@ -187,6 +205,18 @@ def complete_keystore_and_enclave(
         names = search_enclaves(root)[0] if is_keystore(root) else ()
         return [name for name in names if name.startswith(incomplete)]
     return [CompletionItem(incomplete, type="dir")]
+
+
+def _complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the robots of the given keystore's fleet."""
+    from sros_tool.keystore.fleet import load_fleet
+
+    words = ctx.params.get("words") or (ctx.params.get("root") or ctx.params.get("folder"),)
+    given = words[0] or os.environ.get(KEYSTORE_VARIABLE)
+    fleet = None
+    with suppress(SrosError):
+        fleet = load_fleet(Path(given)) if given else None
+    return [name for name in (fleet.robots if fleet else ()) if name.startswith(incomplete)]
 
 
 def complete_file(incomplete: str) -> list[CompletionItem | str]:

@@ -26,6 +26,7 @@ from sros_tool.cli.common import (
     print_notes,
     print_plan,
     print_restart,
+    robot_option,
     several_enclaves,
     split_root,
 )
@@ -80,6 +81,7 @@ def distribute_key(
     words: tuple[str, ...],
     every: bool,
     patterns: tuple[str, ...],
+    robots: tuple[str, ...],
     force: bool,
     dry_run: bool,
     as_json: bool,
@@ -93,11 +95,11 @@ def distribute_key(
 
     root, rest = split_root(words)
     names = rest[:-1]
-    if not rest or not (names or every or patterns):
+    if not rest or not (names or every or patterns or robots):
         raise UsageError("distribute_key takes a keystore, one or more enclaves and a target")
     target = PATH.convert(rest[-1], None, None)
     _check_target(root, rest[-1])
-    selection = select(root, names, patterns, every=every)
+    selection = select(root, names, patterns, robots=robots, every=every)
     notes: tuple[Note, ...] = ()
     if target == _STREAM:
         if not dry_run:
@@ -237,12 +239,14 @@ Example:
     metavar="PATTERN",
     help="Only enclaves that match, such as '/arm/*'.  Can be repeated.",
 )
+@robot_option("Only the enclaves of this robot of the fleet.")
 @json_option
 def verify(
     folder: Path | None,
     domain: str | None,
     at: str | None,
     patterns: tuple[str, ...],
+    robots: tuple[str, ...],
     as_json: bool,
 ) -> int:
     """On a robot: report whether the enclaves in DIR, or the enclave DIR, can be used.
@@ -254,12 +258,13 @@ def verify(
     from sros_tool.checks.keystores.arrival import verify_arrival
     from sros_tool.cli.check import echo_finding
     from sros_tool.cli.common import local_zone
-    from sros_tool.keystore.layout import select_enclaves
+    from sros_tool.keystore.selection import select_enclaves
     from sros_tool.validity import iso
 
     folder = folder or keystore_from_environment()
     wanted, moment = domain_of(domain), moment_of(at)
-    only = select_enclaves(folder, (), patterns) if patterns else None
+    chosen = patterns or robots
+    only = select_enclaves(folder, (), patterns, robots=robots) if chosen else None
     zone = local_zone(os.environ)
     with progress("verifying"):
         arrival = verify_arrival(folder, now=moment, domain=wanted, zone=zone, only=only)

@@ -776,9 +776,10 @@ def _show_zenoh_who(
     """Print which enclaves Zenoh lets do something; return 0 if any, else 1."""
     from sros_tool.explain.question import about_action
     from sros_tool.explain.zenoh import ZenohEvaluator
-    from sros_tool.keystore.layout import check_keystore, select_enclaves
+    from sros_tool.keystore.layout import check_keystore
     from sros_tool.keystore.reader import governance_of
     from sros_tool.keystore.rights import load_rights
+    from sros_tool.keystore.selection import select_enclaves
 
     question = _question_of_who(rest, kind)
     keystore = root or keystore_from_environment()
@@ -1086,8 +1087,9 @@ def _show_who(
     """Print which enclaves of the keystore may do something; return 0 if any may, else 1."""
     from sros_tool.explain.question import about_action, ask
     from sros_tool.explain.who import who
-    from sros_tool.keystore.layout import check_keystore, select_enclaves
+    from sros_tool.keystore.layout import check_keystore
     from sros_tool.keystore.rights import load_rights
+    from sros_tool.keystore.selection import select_enclaves
 
     question = _question_of_who(rest, kind)
     chosen, why = _vendor_of(vendor)

@@ -26,6 +26,7 @@ from sros_tool.cli.common import (
     print_plan,
     print_remarks,
     print_restart,
+    robot_option,
     ros_domain,
     several_enclaves,
     split_root,
@@ -111,6 +112,7 @@ def create_permission(
     words: tuple[str, ...],
     every: bool,
     patterns: tuple[str, ...],
+    robots: tuple[str, ...],
     revoke_old: bool,
     dry_run: bool,
     as_json: bool,
@@ -124,12 +126,12 @@ def create_permission(
     from sros_tool.policy.document import read_policy
 
     root, rest = split_root(words)
-    if len(rest) < (1 if every or patterns else 2):
+    if len(rest) < (1 if every or patterns or robots else 2):
         raise UsageError("create_permission takes a keystore, one or more enclaves and a policy")
     *given, file = rest
     result = create(
         root,
-        chosen_enclaves(root, given, patterns, every=every),
+        chosen_enclaves(root, given, patterns, robots, every=every),
         read_policy(PATH.convert(file, None, None)),
         now=now(),
         domain=ros_domain(),
@@ -312,8 +314,18 @@ Example:
   /talker""",
 )
 @click.argument("root", type=PATH, required=False)
+@click.option(
+    "--match",
+    "patterns",
+    multiple=True,
+    metavar="PATTERN",
+    help="Only enclaves that match, such as '/arm/*'.  Can be repeated.",
+)
+@robot_option("Only the enclaves of this robot of the fleet.")
 @json_option
-def list_enclaves(root: Path | None, as_json: bool) -> None:
+def list_enclaves(
+    root: Path | None, patterns: tuple[str, ...], robots: tuple[str, ...], as_json: bool
+) -> None:
     """List the enclaves of the keystore ROOT, sorted."""
     from sros_tool.errors import KeystoreError
     from sros_tool.keystore.layout import enclave_names, is_keystore, refuse_earlier
@@ -322,12 +334,29 @@ def list_enclaves(root: Path | None, as_json: bool) -> None:
     if not is_keystore(root):
         refuse_earlier(root)
         raise KeystoreError(f"'{root}' is not a valid keystore")
-    names = enclave_names(root)
+    if patterns or robots:
+        from sros_tool.keystore.selection import select_enclaves
+
+        names = tuple(sorted(select_enclaves(root, (), patterns, robots=robots)))
+    else:
+        names = enclave_names(root)
     if as_json:
-        print_json({"keystore": str(root), "enclaves": names})
+        print_json({"keystore": str(root), "enclaves": names, **_robots_of(root, names)})
         return
     for name in names:
         click.echo(name)
+
+
+def _robots_of(root: Path, names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Return the robots of enclaves for --json; nothing for a keystore without a fleet."""
+    from sros_tool.fleet.enclaves import robot_of
+    from sros_tool.keystore.fleet import load_fleet
+
+    fleet = load_fleet(root)
+    if fleet is None:
+        return {}
+    found = ((name, robot_of(fleet, name)) for name in names)
+    return {"robots": {name: robot.name for name, robot in found if robot}}
 
 
 if TYPE_CHECKING:

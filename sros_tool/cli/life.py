@@ -71,6 +71,7 @@ def renew(
     words: tuple[str, ...],
     every: bool,
     patterns: tuple[str, ...],
+    robots: tuple[str, ...],
     all_expiring: str | None,
     new_key: bool,
     revoke_old: bool,
@@ -90,8 +91,8 @@ def renew(
     from sros_tool.keystore.lifecycle.renew import renew as work
 
     root, names = split_root(words)
-    if names or patterns or every or all_expiring is None:
-        names = chosen_enclaves(root, names, patterns, every=every)
+    if names or patterns or robots or every or all_expiring is None:
+        names = chosen_enclaves(root, names, patterns, robots, every=every)
     threshold = parse_threshold(all_expiring) if all_expiring is not None else None
     with progress("renewing") as step:
         result = work(
@@ -196,6 +197,7 @@ def revoke(
     words: tuple[str, ...],
     every: bool,
     patterns: tuple[str, ...],
+    robots: tuple[str, ...],
     reason: str,
     until_retired: bool,
     dry_run: bool,
@@ -213,7 +215,7 @@ def revoke(
     from sros_tool.keystore.lifecycle.revoke import revoke as work
 
     root, given = split_root(words)
-    names = chosen_enclaves(root, given, patterns, every=every)
+    names = chosen_enclaves(root, given, patterns, robots, every=every)
     words_of_rfc = reason.replace("-", "_").split("_")
     reason_text = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
     with progress("revoking"):

@@ -10,7 +10,6 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from shlex import quote
 
@@ -19,6 +18,8 @@ from sros_tool.errors import DocumentError, KeystoreError
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 SETTINGS = "sros.toml"
 """The settings of the keystore; keystores of ros2/sros2 do not have this file."""
+FLEET = "fleet.toml"
+"""The robots whose enclaves the keystore has; it exists once a fleet was named."""
 LEDGER = "ledger.jsonl"
 """The log of issued certificates and documents; keystores of ros2/sros2 do not have it."""
 LEDGER_HEAD = "ledger.p7s"
@@ -120,7 +121,7 @@ Such a keystore is flat: the folder of a node has the name of the node, below th
 """
 _MOST_FOLDERS = 1000
 
-_TOP_FILES = frozenset((SETTINGS, LEDGER, LEDGER_HEAD, ROTATION))
+_TOP_FILES = frozenset((SETTINGS, FLEET, LEDGER, LEDGER_HEAD, ROTATION))
 _OF_NODE = (CERTIFICATE_FILE, KEY_FILE, PERMISSIONS_FILE)
 _FILE_TYPES = (".pem", ".p7s", ".xml", ".json5")
 _TOP_FOLDERS = frozenset((ENCLAVES, PUBLIC, PRIVATE, REVOKED, RETIRED))
@@ -315,30 +316,6 @@ def list_enclaves(root: Path) -> tuple[str, ...]:
     """
     check_keystore(root)
     return enclave_names(root)
-
-
-def select_enclaves(
-    root: Path, names: Sequence[str], patterns: Sequence[str] = (), *, every: bool = False
-) -> tuple[str, ...]:
-    """Return ``names``, then the enclaves that match ``patterns``, or ``every`` one; each once.
-
-    In a pattern ``*`` stands for any part of a name, "/" included, as in policies.
-
-    Raises:
-        KeystoreError: a pattern matches no enclave, or ``every`` is given and there is none.
-    """
-    existing = list_enclaves(root)
-    chosen = dict.fromkeys(names)
-    for pattern in ("*",) if every else patterns:
-        fitting = [name for name in existing if fnmatchcase(name, pattern)]
-        if not fitting:
-            raise KeystoreError(
-                f"no enclave of keystore '{root}' matches {pattern!r}",
-                "",
-                f"See `sros list_enclaves {quote(str(root))}`.",
-            )
-        chosen |= dict.fromkeys(fitting)
-    return tuple(chosen)
 
 
 def earlier_nodes(root: Path) -> Iterator[str]:

@@ -72,9 +72,10 @@ def make_folder(folder: Path) -> None:
     ):
         sros(*line.split(), cwd=folder).ok()
     make_eloquent(folder / "eloquent", {"/talker": EVERYTHING}, now=datetime.now(UTC))
-    for copy in ("turned", "broken", "lost", "wrecked", "partial"):
+    for copy in ("turned", "broken", "lost", "wrecked", "partial", "fleet"):
         shutil.copytree(folder / "ks", folder / copy, symlinks=True)
     sros("rotate_ca", "turned", "--next", cwd=folder).ok()
+    (folder / "fleet/fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.a]\n')
     (folder / "partial/enclaves/a/permissions.p7s").unlink()
     shutil.copytree(folder / "zenoh", folder / "closed", symlinks=True)
     sros("zenoh", "closed", cwd=folder).ok()
@@ -127,7 +128,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks --domain 0,7 --set authorities.validity=20y --allow-looser"),
         Case("ks --template development"),
     ),
-    "list_enclaves": (Case("ks"), Case("empty")),
+    "list_enclaves": (Case("ks"), Case("empty"), Case("fleet --robot a"), Case("ks --match *")),
     "inspect": (
         Case("ks"),
         Case("turned"),

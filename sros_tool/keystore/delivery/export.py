@@ -26,10 +26,10 @@ from sros_tool.keystore.layout import (
     key_on_robot,
     list_enclaves,
     search_enclaves,
-    select_enclaves,
 )
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave
+from sros_tool.keystore.selection import select_enclaves
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh.opened import open_zenoh
@@ -66,19 +66,24 @@ class ExportSelection:
 
 
 def select(
-    root: Path, names: Sequence[str], patterns: Sequence[str] = (), *, every: bool = False
+    root: Path,
+    names: Sequence[str],
+    patterns: Sequence[str] = (),
+    *,
+    robots: Sequence[str] = (),
+    every: bool = False,
 ) -> ExportSelection:
-    """Return the enclaves to export: ``names``, and the matches of ``patterns``, or ``every`` one.
+    """Return the enclaves to export: ``names``, and what `select_enclaves` finds.
 
-    An enclave whose key is on its robot is left out if it only matches a pattern; a named one is
-    refused by `distribute`.
+    An enclave whose key is on its robot is left out if it is not named; a named one is refused by
+    `distribute`.
 
     Raises:
-        KeystoreError: a pattern matches no enclave, or the keys of all matches are on robots.
+        KeystoreError: a pattern matches no enclave, or the keys of all are on robots.
     """
     chosen: list[str] = []
     left_out: list[str] = []
-    for name in select_enclaves(root, names, patterns, every=every):
+    for name in select_enclaves(root, names, patterns, robots=robots, every=every):
         only_matches = name not in names
         at_robot = only_matches and key_on_robot(enclave_path(root, name))
         (left_out if at_robot else chosen).append(name)

@@ -1,0 +1,1 @@
+"""The robots of a fleet, and one policy for all of them."""

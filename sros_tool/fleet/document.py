@@ -1,0 +1,164 @@
+"""Fleet files (TOML): the robots of a fleet, read with all checks."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from sros_tool.dds.domains import MAX_DOMAIN
+from sros_tool.errors import DocumentError
+from sros_tool.files import parse_toml
+from sros_tool.fleet.enclaves import pattern_problem
+from sros_tool.fleet.model import (
+    MAX_ROBOTS,
+    Fleet,
+    Robot,
+    address_problem,
+    name_problem,
+    namespace_problem,
+    user_problem,
+)
+
+MAX_BYTES = 4 * 1024 * 1024
+_MOST_GROUPS = 32  # of one robot
+_MOST_PATTERNS = 10_000
+_VALUES: Mapping[str, Callable[[str], str]] = {
+    "namespace": namespace_problem,
+    "address": address_problem,
+    "user": user_problem,
+}
+"""The values of a robot that are texts, each with the function that says what is wrong with it."""
+_OF_ROBOT = "{robot}"
+"""Stands for the name of a robot in the values of a group."""
+
+
+class FleetError(DocumentError):
+    """A value of a fleet file that is not valid."""
+
+
+def parse_fleet(data: bytes, what: str) -> Fleet:
+    """Return the fleet in a TOML document; ``what`` names it in errors.
+
+    Raises:
+        DocumentError: it is not TOML, or a value in it is not valid.
+    """
+    try:
+        table = parse_toml(data.decode(), longest=MAX_BYTES)
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        why = str(error)
+        raise FleetError(f"{what} is not valid TOML", f"{why[:1].upper()}{why[1:]}.") from error
+    return _Reader(what).fleet(table)
+
+
+class _Reader:
+    def __init__(self, what: str) -> None:
+        self._what = what
+
+    def fleet(self, table: Mapping[str, Any]) -> Fleet:
+        self._known(table, ("groups", "robots", "enclaves"), "")
+        groups = self._tables(table, "groups")
+        robots = self._tables(table, "robots")
+        if not robots:
+            raise self._error("it names no robot", "", "Write for example [robots.r7].")
+        if len(robots) > MAX_ROBOTS:
+            raise self._error(f"it has more than {MAX_ROBOTS} robots", "", "Divide the fleet.")
+        for name, values in groups.items():
+            self._known(values, ("domain", *_VALUES), f"groups.{name}")
+            self._values(values, {key: f"groups.{name}.{key}" for key in values}, "r")
+        enclaves = self._texts(table, "enclaves", "", _MOST_PATTERNS)
+        for path in enclaves:
+            if problem := pattern_problem(path):
+                raise self._refused("enclaves", path, problem)
+        read = [self._robot(name, values, groups) for name, values in robots.items()]
+        return Fleet.of(read, groups, enclaves)
+
+    def _robot(
+        self, name: str, values: Mapping[str, Any], groups: Mapping[str, Mapping[str, Any]]
+    ) -> Robot:
+        at = f"robots.{name}"
+        self._known(values, ("groups", "domain", *_VALUES), at)
+        member = tuple(sorted(set(self._texts(values, "groups", at, _MOST_GROUPS))))
+        for group in member:
+            if problem := name_problem(group):
+                raise self._refused(f"{at}.groups", group, problem)
+        given: dict[str, Any] = {}
+        origin: dict[str, str] = {}
+        for group in member:
+            for key, value in groups.get(group, {}).items():
+                here = f"groups.{group}.{key}"
+                if key in given and key not in values and given[key] != value:
+                    raise self._error(
+                        f"the robot {name} gets its {key} from two groups",
+                        f"{origin[key]} and {here} differ.",
+                        f"Write {at}.{key}.",
+                    )
+                given[key], origin[key] = value, here
+        own = {key: value for key, value in values.items() if key != "groups"}
+        given = self._values(given, origin, name) | self._values(
+            own, {key: f"{at}.{key}" for key in own}
+        )
+        usual = {"namespace": f"/{name}", "address": name, "user": "", "domain": None}
+        return Robot(name, groups=member, **(usual | given))
+
+    def _values(
+        self, values: Mapping[str, Any], places: Mapping[str, str], name: str = ""
+    ) -> dict[str, Any]:
+        """Return values that are checked; those of a group get the ``name`` of the robot."""
+        checked: dict[str, Any] = {}
+        for key, value in values.items():
+            if key == "domain":
+                if type(value) is not int or not 0 <= value <= MAX_DOMAIN:
+                    problem = f"A domain is a whole number from 0 to {MAX_DOMAIN}."
+                    raise self._refused(places[key], value, problem)
+                checked[key] = value
+                continue
+            if not isinstance(value, str):
+                raise self._refused(places[key], value, "It is not a text.")
+            checked[key] = value.replace(_OF_ROBOT, name) if name else value
+            if problem := _VALUES[key](checked[key]):
+                raise self._refused(places[key], value, problem)
+        return checked
+
+    def _tables(self, table: Mapping[str, Any], key: str) -> Mapping[str, Mapping[str, Any]]:
+        """Return the tables below ``key``, each by a name that is valid."""
+        found = table.get(key, {})
+        if not isinstance(found, dict):
+            raise self._error(f"{key} is not a table", "", f"Write [{key}.NAME].")
+        for name, values in found.items():
+            if problem := name_problem(name):
+                raise self._refused(key, name, problem)
+            if not isinstance(values, dict):
+                raise self._error(f"{key}.{name} is not a table", "", f"Write [{key}.{name}].")
+        return found
+
+    def _texts(self, table: Mapping[str, Any], key: str, at: str, most: int) -> tuple[str, ...]:
+        values = table.get(key, [])
+        where = f"{at}.{key}" if at else key
+        if not isinstance(values, list) or not all(isinstance(each, str) for each in values):
+            raise self._error(f"{where} is not a list of names", "", f'Write {key} = ["NAME"].')
+        if len(values) > most:
+            raise self._error(f"{where} has more than {most} names")
+        return tuple(values)
+
+    def _known(self, table: Mapping[str, Any], keys: Iterable[str], at: str) -> None:
+        known = tuple(keys)
+        for key in table:
+            if key not in known:
+                where = f"{at}.{_key(key)}" if at else _key(key)
+                raise self._error(f"{where} is not a known key", f"There are {', '.join(known)}.")
+
+    def _refused(self, at: str, value: object, problem: str) -> FleetError:
+        return self._error(f"{at} has {_short(value)}, which is not valid", problem)
+
+    def _error(self, what: str, why: str = "", remedy: str = "") -> FleetError:
+        return FleetError(f"{self._what}: {what}", why, remedy)
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."
+
+
+def _key(text: str) -> str:
+    return text if text.isidentifier() and len(text) <= 80 else _short(text)

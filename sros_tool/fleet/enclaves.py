@@ -1,0 +1,115 @@
+"""Whose enclave is whose: the enclaves of a robot, and the robot of an enclave.
+
+A fleet has the paths of its enclaves with placeholders, so that neither answer needs a list of all
+enclaves.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
+from typing import NamedTuple
+
+from sros_tool.errors import InvalidNameError
+from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.names import check_enclave_name
+from sros_tool.policy.placeholders import Parts, fill, parts_of, placeholders_of, sample
+
+_PART = r"[A-Za-z_][A-Za-z0-9_]*"
+_VALUES = {"robot": _PART, "namespace": f"(?:/{_PART})*"}
+
+
+def pattern_problem(path: str) -> str:
+    """Return why ``path`` is not that of one enclave for each robot, as a sentence, or ""."""
+    try:
+        parts = parts_of(path)
+        check_enclave_name(sample(parts))
+    except ValueError as error:
+        return str(error)
+    except InvalidNameError as error:
+        return error.why
+    found = placeholders_of(parts)
+    if not found:
+        return "It has no placeholder such as {robot}."
+    if any(each.plural for each in found):
+        return "A path is that of one enclave for each robot: write {robot} or {namespace}."
+    if len({each.group for each in found}) > 1:
+        return "Its placeholders are of different groups."
+    return ""
+
+
+def _group_of(parts: Parts) -> str:
+    """Return the group whose robots have an enclave with this path; "" for the whole fleet."""
+    return placeholders_of(parts)[0].group
+
+
+def _path_for(parts: Parts, robot: Robot) -> str:
+    """Return the path of a robot's enclave."""
+    return "".join(map(str, fill(parts, robot.name, robot.namespace)))
+
+
+def enclaves_of(fleet: Fleet, robot: Robot) -> tuple[str, ...]:
+    """Return the paths of the enclaves that a robot has by the patterns of the fleet, sorted."""
+    found = set()
+    for pattern in fleet.enclaves:
+        parts = parts_of(pattern)
+        if _group_of(parts) in ("", *robot.groups):
+            found.add(_path_for(parts, robot))
+    return tuple(sorted(found))
+
+
+def robot_of(fleet: Fleet, enclave: str) -> Robot | None:
+    """Return the robot that an enclave belongs to, or None: it is that of no robot."""
+    patterns = _patterns(fleet.enclaves)
+    end = len(enclave)
+    while end >= 0:
+        for pattern in patterns.get(enclave[end:], ()):
+            for robot in _candidates(fleet, pattern, enclave):
+                inside = _group_of(pattern.parts) in ("", *robot.groups)
+                if inside and _path_for(pattern.parts, robot) == enclave:
+                    return robot
+        end = enclave.rfind("/", 0, end) if end else -1
+    return None
+
+
+class _Pattern(NamedTuple):
+    parts: Parts
+    expression: re.Pattern[str]
+
+
+@lru_cache(maxsize=8)
+def _patterns(paths: tuple[str, ...]) -> Mapping[str, list[_Pattern]]:
+    """Return the patterns by the whole parts of a name behind their last placeholder."""
+    found: dict[str, list[_Pattern]] = {}
+    for path in paths:
+        parts = parts_of(path)
+        last = parts[-1] if isinstance(parts[-1], str) else ""
+        key = last[last.find("/") :] if "/" in last else ""
+        found.setdefault(key, []).append(_Pattern(parts, _expression(parts)))
+    return found
+
+
+def _expression(parts: Parts) -> re.Pattern[str]:
+    text, seen = "", set()
+    for each in parts:
+        if isinstance(each, str):
+            text += re.escape(each)
+        elif each.value in seen:
+            text += f"(?P={each.value})"
+        else:
+            seen.add(each.value)
+            text += f"(?P<{each.value}>{_VALUES[each.value]})"
+    return re.compile(text, re.ASCII)
+
+
+def _candidates(fleet: Fleet, pattern: _Pattern, enclave: str) -> Iterator[Robot]:
+    match = pattern.expression.fullmatch(enclave)
+    if not match:
+        return
+    values = match.groupdict()
+    if "robot" in values:
+        names: Iterable[str] = [values["robot"]]
+    else:
+        names = fleet.by_namespace.get(values["namespace"] or "/", ())
+    yield from (fleet.robots[name] for name in names if name in fleet.robots)

@@ -1,0 +1,159 @@
+"""A fleet: its robots with what differs between them, and the grammar of these values.
+
+Every value has such a grammar that it can stand in a policy, a command or a path and stay one
+name: no markup, no wildcard, no white space, and "/" only in a namespace.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from ipaddress import ip_address
+from types import MappingProxyType
+
+from sros_tool.errors import DocumentError
+
+MAX_ROBOTS = 10_000
+_MAX_NAME = 64
+"""Longest name of a robot or group in characters: longer ones fit into no enclave's name."""
+__MAX_NAMESPACE = 245
+"""Longest ROS namespace (rmw: RMW_NAMESPACE_MAX_LENGTH)."""
+_MAX_HOST = 253
+"""Longest host name (RFC 1035)."""
+
+_TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
+_HOST = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?\.?", re.ASCII)
+_USER = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A robot: its ROS namespace, and how it is reached.
+
+    ``domain`` is its ROS_DOMAIN_ID, or None for every domain of the keystore.  ``address`` is a
+    host name or IP address, ``user`` the account there, or "" for that of ssh.  ``groups`` are
+    sorted.
+    """
+
+    name: str
+    namespace: str
+    domain: int | None = None
+    address: str = ""
+    user: str = ""
+    groups: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """Robots by their names, and the names of the robots of each group; both sorted.
+
+    ``enclaves`` are paths of enclaves with a placeholder, such as ``/{robot}/base``: they say
+    which robot an enclave belongs to.  ``by_namespace`` has the names of the robots in each
+    namespace.
+    """
+
+    robots: Mapping[str, Robot]
+    groups: Mapping[str, tuple[str, ...]]
+    enclaves: tuple[str, ...] = ()
+    by_namespace: Mapping[str, tuple[str, ...]] = field(default_factory=dict, compare=False)
+
+    @classmethod
+    def of(
+        cls, robots: Iterable[Robot], groups: Iterable[str] = (), enclaves: Sequence[str] = ()
+    ) -> Fleet:
+        """Return the fleet of these robots; ``groups`` may be without robots."""
+        named = {each.name: each for each in sorted(robots, key=lambda robot: robot.name)}
+        members: dict[str, list[str]] = {name: [] for name in groups}
+        spaces: dict[str, list[str]] = {}
+        for robot in named.values():
+            spaces.setdefault(robot.namespace, []).append(robot.name)
+            for group in robot.groups:
+                members.setdefault(group, []).append(robot.name)
+        return cls(
+            MappingProxyType(named),
+            MappingProxyType({name: tuple(members[name]) for name in sorted(members)}),
+            tuple(enclaves),
+            MappingProxyType({name: tuple(spaces[name]) for name in spaces}),
+        )
+
+    def robot(self, name: str) -> Robot:
+        """Return the robot with this name; raise `DocumentError` that names near ones."""
+        if name in self.robots:
+            return self.robots[name]
+        raise DocumentError(f"the fleet has no robot {name!r}", remedy=_near(name, self.robots))
+
+    def members(self, group: str) -> tuple[Robot, ...]:
+        """Return the robots of a group, or all for "".
+
+        Raises:
+            DocumentError: the fleet has no such group; the error names near ones.
+        """
+        if not group:
+            return tuple(self.robots.values())
+        if group not in self.groups:
+            raise DocumentError(
+                f"the fleet has no group {group!r}", remedy=_near(group, self.groups)
+            )
+        return tuple(self.robots[name] for name in self.groups[group])
+
+    def with_enclaves(self, enclaves: Sequence[str]) -> Fleet:
+        """Return the fleet with other paths of enclaves."""
+        return replace(self, enclaves=tuple(enclaves))
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    """Return the remedy for an unknown name: those that are most alike, or the first ones."""
+    names = list(known)
+    found = get_close_matches(name[:_MAX_NAME], names, n=3, cutoff=0.5) or names[:3]
+    return (
+        f"It has {', '.join(found)}{', ...' if len(names) > len(found) else ''}." if found else ""
+    )
+
+
+# ── grammar ────────────────────────────────────────────────────────────────────────────────
+
+
+def name_problem(name: str) -> str:
+    """Return why ``name`` is not the name of a robot or group, as a sentence; "" if it is."""
+    if len(name) > _MAX_NAME:
+        return f"It has {len(name)} characters, more than {_MAX_NAME}."
+    if not _TOKEN.fullmatch(name) or "__" in name:
+        return (
+            "A name is one part of a ROS name: letters, digits and single underscores, and no "
+            "digit at its start, such as r7."
+        )
+    return ""
+
+
+def namespace_problem(namespace: str) -> str:
+    """Return why ``namespace`` is not an absolute ROS namespace, as a sentence; "" if it is."""
+    if len(namespace) > __MAX_NAMESPACE:
+        return f"It has {len(namespace)} characters, more than {__MAX_NAMESPACE}."
+    if namespace == "/":
+        return ""
+    first, *parts = namespace.split("/")
+    if first or not parts or not all(_TOKEN.fullmatch(part) for part in parts):
+        return (
+            "A namespace is absolute, and its parts are letters, digits and underscores, such as "
+            "/warehouse/r7."
+        )
+    return "It contains '__', which ROS does not allow." if "__" in namespace else ""
+
+
+def address_problem(address: str) -> str:
+    """Return why ``address`` is neither a host name nor an IP address; "" if it is one."""
+    if len(address) <= _MAX_HOST and _HOST.fullmatch(address) and ".." not in address:
+        return ""
+    try:
+        ip_address(address)
+    except ValueError:
+        return "It is neither a host name nor an IP address, such as r7.example.com or 10.0.7.1."
+    # An IPv6 address can have a zone of any characters.
+    return "" if "%" not in address else "It has a zone: write the address without it."
+
+
+def user_problem(user: str) -> str:
+    """Return why ``user`` is not the name of an account, as a sentence; "" if it is."""
+    return "" if _USER.fullmatch(user) else "It is not the name of an account, such as ros."

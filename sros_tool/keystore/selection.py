@@ -1,0 +1,70 @@
+"""The enclaves that a verb works on: named ones, those that match a pattern, those of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from shlex import quote
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore.fleet import enclaves_of_robot, load_fleet
+from sros_tool.keystore.layout import check_keystore, list_enclaves
+
+
+def select_enclaves(
+    root: Path,
+    names: Sequence[str],
+    patterns: Sequence[str] = (),
+    *,
+    robots: Sequence[str] = (),
+    every: bool = False,
+) -> tuple[str, ...]:
+    """Return ``names``, then the enclaves that match ``patterns``, those of ``robots``; each once.
+
+    In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  ``every`` means
+    all enclaves.  The enclaves of robots are found without a list of all.
+
+    Raises:
+        KeystoreError: a pattern matches no enclave, a robot has none, or ``every`` is given and
+            there is none.
+        DocumentError: the fleet of the keystore has no such robot; the error names near ones.
+    """
+    check_keystore(root)
+    chosen = dict.fromkeys(names)
+    patterns = ("*",) if every else patterns
+    existing = list_enclaves(root) if patterns else ()
+    for pattern in patterns:
+        fitting = [name for name in existing if fnmatchcase(name, pattern)]
+        if not fitting:
+            raise KeystoreError(
+                f"no enclave of keystore '{root}' matches {pattern!r}",
+                "",
+                f"See `sros list_enclaves {quote(str(root))}`.",
+            )
+        chosen |= dict.fromkeys(fitting)
+    return tuple(chosen | dict.fromkeys(_of_robots(root, robots)))
+
+
+def _of_robots(root: Path, robots: Sequence[str]) -> list[str]:
+    if not robots:
+        return []
+    fleet = load_fleet(root)
+    if fleet is None:
+        raise KeystoreError(
+            f"keystore '{root}' has no fleet, so it has no robot {robots[0]!r}",
+            "",
+            f"Name the fleet's file with `sros generate_artifacts -k {quote(str(root))} -p "
+            "POLICY_FILE --fleet FILE`, or the enclaves with --match.",
+        )
+    found: list[str] = []
+    for name in robots:
+        own = enclaves_of_robot(root, fleet, fleet.robot(name))
+        if not own:
+            raise KeystoreError(
+                f"the robot {name} has no enclave in keystore '{root}'",
+                "",
+                f"See `sros list_enclaves {quote(str(root))}`.",
+            )
+        found += own
+    return found

@@ -1,0 +1,114 @@
+"""Placeholders in the names of a policy: what differs between the robots of a fleet.
+
+``{robot}`` and ``{namespace}`` stand for the name and the ROS namespace of one robot, ``{robots}``
+and ``{namespaces}`` for one name for each robot.  ``{robot:carriers}`` means the robots of a group.
+
+The place of a placeholder is limited so that its value cannot widen a name: no wildcard may stand
+in the same part of the name, because ``/r1*`` would match the names of a robot r10, too.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+
+_BRACES = re.compile(r"\{([^{}]*)\}")
+_KIND = re.compile(r"(robot|namespace)(s?)(?::([A-Za-z_][A-Za-z0-9_]{0,63}))?", re.ASCII)
+_WILDCARDS = frozenset("*?[]!")
+_SAMPLES = {"robot": "r", "namespace": "/r"}
+
+
+@dataclass(frozen=True, slots=True)
+class Placeholder:
+    """A placeholder: ``value`` is robot or namespace; ``group`` is "" for the whole fleet."""
+
+    value: str
+    plural: bool = False
+    group: str = ""
+
+    def __str__(self) -> str:
+        group = f":{self.group}" if self.group else ""
+        return f"{{{self.value}{'s' * self.plural}{group}}}"
+
+
+Parts = tuple[str | Placeholder, ...]
+"""A name: text, and placeholders in it."""
+
+
+def _has_placeholder(text: str) -> bool:
+    """Return whether ``text`` has a brace, which only a placeholder may have."""
+    return "{" in text or "}" in text
+
+
+@lru_cache(maxsize=4096)
+def parts_of(text: str) -> Parts:
+    """Return the text and the placeholders of a name.
+
+    Raises:
+        ValueError: a brace is not of a placeholder, or one stands where it may not; the message
+            is a sentence.
+    """
+    parts: list[str | Placeholder] = []
+    end = 0
+    for found in _BRACES.finditer(text):
+        kind = _KIND.fullmatch(found[1])
+        if not kind:
+            raise ValueError(
+                f"{found[0][:80]!r} is not a placeholder; there are {{robot}}, {{namespace}}, "
+                "{robots} and {namespaces}, and those of a group, such as {robot:carriers}."
+            )
+        placeholder = Placeholder(kind[1], bool(kind[2]), kind[3] or "")
+        if problem := _place_problem(placeholder, text[: found.start()], text[found.end() :]):
+            raise ValueError(problem)
+        parts += [text[end : found.start()], placeholder]
+        end = found.end()
+    parts.append(text[end:])
+    kept = tuple(each for each in parts if each != "")
+    if any(isinstance(each, str) and _has_placeholder(each) for each in kept):
+        raise ValueError("It has a brace that is not of a placeholder such as {robot}.")
+    if len({each.group for each in placeholders_of(kept) if each.plural}) > 1:
+        raise ValueError("It has the robots of several groups, so it is unclear which go together.")
+    return kept
+
+
+def _place_problem(placeholder: Placeholder, before: str, after: str) -> str:
+    """Return why a placeholder may not stand between these texts, as a sentence, or ""."""
+    around = before.rpartition("/")[2] + after.partition("/")[0]
+    in_set = before.rfind("[") > before.rfind("]")
+    if in_set or not _WILDCARDS.isdisjoint(around):
+        return (
+            f"A wildcard is in the same part as {placeholder}, where it would also match names of "
+            f"other robots: /r1* matches /r10. Put a '/' between them, as in {placeholder}/*."
+        )
+    if placeholder.value == "namespace" and (before.endswith("/") or after[:1] not in ("", "/")):
+        return (
+            f"{placeholder} begins with '/' and is a whole namespace: no '/' may stand before it, "
+            f"and nothing but '/' behind it, as in {placeholder}/scan."
+        )
+    return ""
+
+
+def placeholders_of(parts: Parts) -> tuple[Placeholder, ...]:
+    """Return the placeholders of a name, in order."""
+    return tuple(each for each in parts if isinstance(each, Placeholder))
+
+
+def sample(parts: Parts) -> str:
+    """Return the name that the shortest values give, for checks of its grammar."""
+    return "".join(each if isinstance(each, str) else _SAMPLES[each.value] for each in parts)
+
+
+def fill(parts: Parts, robot: str, namespace: str, *, plural: bool = False) -> Parts:
+    """Return the parts with the singular or, with ``plural``, the plural placeholders filled in."""
+    values = {"robot": robot, "namespace": namespace}
+    filled: list[str | Placeholder] = []
+    for index, each in enumerate(parts):
+        if isinstance(each, str) or each.plural is not plural:
+            filled.append(each)
+        elif each.value == "namespace" and namespace == "/":
+            # In the root namespace, {namespace}/scan is /scan.
+            filled.append("" if index + 1 < len(parts) else "/")
+        else:
+            filled.append(values[each.value])
+    return tuple(filled)

@@ -1,0 +1,1 @@
+"""Tests of the fleet: its files, its robots and their policy."""
