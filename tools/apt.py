@@ -62,6 +62,7 @@ FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
     ),
     ("zsh", "a shell that evaluates what env prints", _command("zsh")),
     ("fish", "another shell that does", _command("fish")),
+    ("systemd", "systemd, which verifies its units", _command("systemd-analyze")),
     ("chromium", "a browser for the pages", _command("chromium")),
 )
 """Programs and libraries for the tests: package pattern, description, test of existence."""

@@ -84,6 +84,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
     "Running": {
         "env": VerbEntry("running", "Print the environment of an enclave."),
         "run": VerbEntry("running", "Run a command in an enclave."),
+        "units": VerbEntry("units", "Write systemd units for nodes in enclaves, and timers."),
         "demo": VerbEntry("demo", "Show on a real DDS that secured nodes are isolated."),
         "completion": VerbEntry("running", "Print the completion script of a shell."),
     },
@@ -235,6 +236,7 @@ _PHRASES = {
     "minimize_policy": "minimize the policy",
     "env": "print the environment",
     "run": "run the command",
+    "units": "write the units",
     "demo": "run the demo",
     "policies": "show the policies",
     "crl": "show or sign the revocation list",

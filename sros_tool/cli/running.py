@@ -27,7 +27,8 @@ from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.runtime.containers import COMPOSE, KUBERNETES
 from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
 
-_COMMAND = "sros.command"
+COMMAND = "sros.command"
+"""The key of ``ctx.meta`` with the words after ``--`` of a `WithCommand`."""
 _WORDS = click.argument(
     "words",
     metavar="[ROOT] NAME",
@@ -35,7 +36,7 @@ _WORDS = click.argument(
     required=True,
     shell_complete=complete_keystore_and_enclave,
 )
-_DOMAIN = click.option(
+DOMAIN = click.option(
     "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"
 )
 
@@ -45,13 +46,13 @@ def _complete_rmw(_ctx: click.Context, _parameter: click.Parameter, incomplete: 
     return [each for each in RMWS if each.startswith(incomplete)]
 
 
-_RMW = click.option(
+RMW = click.option(
     "--rmw",
     metavar="NAME",
     shell_complete=_complete_rmw,
     help="The RMW of the process, such as rmw_zenoh_cpp. [default: $RMW_IMPLEMENTATION]",
 )
-_ACCEPT_KEY = click.option(
+ACCEPT_KEY = click.option(
     "--accept-readable-key",
     is_flag=True,
     help="Accept a private key that other users can read, as on a file system without modes.",
@@ -156,9 +157,9 @@ Example:
     help="The name of the service in Compose, or the Deployment. [default: from the enclave]",
 )
 @click.option("--image", metavar="IMAGE", help="The image of the container.")
-@_DOMAIN
-@_RMW
-@_ACCEPT_KEY
+@DOMAIN
+@RMW
+@ACCEPT_KEY
 @json_option
 def env(
     words: tuple[str, ...],
@@ -219,27 +220,29 @@ def env(
         print_notes(notes)
 
 
-class _WithCommand(click.Command):
+class WithCommand(click.Command):
     """A verb with a command as argument, whose options it does not parse.
 
-    The command is all words after ``--``; without it, parsing of options stops at the first word
-    that is not an option.
+    The command is all words after ``--``; without it, if ``needs_no_dashes``, parsing of options
+    stops at the first word that is not an option.
     """
+
+    needs_no_dashes = True
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments of sros, and keep the command to run in ``ctx.meta``."""
         own, command = args, []
         if "--" in args:
             own, command = args[: args.index("--")], args[args.index("--") + 1 :]
-        else:
+        elif self.needs_no_dashes:
             ctx.allow_interspersed_args = False
-        ctx.meta[_COMMAND] = command
+        ctx.meta[COMMAND] = command
         return super().parse_args(ctx, own)
 
 
 @click.command(
     "run",
-    cls=_WithCommand,
+    cls=WithCommand,
     epilog="""\b
 Example:
   $ sros run keystore /talker_listener/talker -- \\
@@ -254,9 +257,9 @@ Example:
     type=click.UNPROCESSED,
     shell_complete=complete_keystore_and_enclave,
 )
-@_DOMAIN
-@_RMW
-@_ACCEPT_KEY
+@DOMAIN
+@RMW
+@ACCEPT_KEY
 @click.option("--no-ros-args", is_flag=True, help="Add no arguments to COMMAND.")
 @click.pass_context
 def run(
@@ -277,7 +280,7 @@ def run(
     from sros_tool.runtime.environment import enclave_argument, with_enclave
 
     root, rest = split_root(words)
-    name, command = rest[0] if rest else "", [*rest[1:], *ctx.meta[_COMMAND]]
+    name, command = rest[0] if rest else "", [*rest[1:], *ctx.meta[COMMAND]]
     if not command:
         raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
     found = loadable_environment(root, name, domain, rmw, accept_key=accept_readable_key)

@@ -306,6 +306,11 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("keystore ks --needs-renewal 99y", 1),
         Case("keystore broken --needs-renewal 1d", 2),
     ),
+    "units": (
+        Case("ks /a new"),
+        Case("ks --job check --sros /bin/sros new --dry-run"),
+        Case("zenoh /a new --rmw rmw_zenoh_cpp", before=("zenoh zenoh",)),
+    ),
     "metrics": (
         Case("ks"),
         Case("broken -o new.prom"),
@@ -360,6 +365,7 @@ ERRORS = {
     "explain": "ks /none publish /x",
     "view": "none",
     "metrics": "none",
+    "units": "none /a new",
     "check": "none",
     "audit": "none",
     "doctor": "surplus",

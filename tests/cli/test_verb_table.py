@@ -33,7 +33,8 @@ NEW_NAMES = {("create_request", "name")}
 """Arguments that are a name which does not exist yet."""
 GROWS = {
     "create_enclave", "generate_artifacts", "update_keystore", "renew", "revoke", "rotate_ca",
-    "distribute_key", "verify", "diff_policy", "explain", "view", "check", "metrics", "zenoh",
+    "distribute_key", "verify", "diff_policy", "explain", "view", "check", "metrics", "units",
+    "zenoh",
 }  # fmt: skip
 
 
@@ -139,6 +140,7 @@ STATUS: dict[str, tuple[str, str, str]] = {
     "policies": ("", NEVER, "--copy ks"),
     "check": ("keystore strict --severity error", "damaged", "nothing"),
     "metrics": ("damaged -o new.prom", NEVER, "nothing -o new.prom"),
+    "units": ("ks /a new --dry-run", NEVER, "nothing /a new"),
     "env": ("ks /a", NEVER, "nothing /a"),
     "completion": ("bash", NEVER, "powershell"),
 }

@@ -1,0 +1,271 @@
+"""Units of systemd: nodes that run in their enclaves, and the regular work on a keystore.
+
+A node gets what a ROS node over DDS or Zenoh needs, and nothing else: sockets of IP, the list of
+network interfaces (netlink), shared memory, devices, and its own enclave without those of others.
+
+Sources: systemd.exec(5), systemd.service(5), systemd.unit(5) of systemd 247 and later.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from enum import StrEnum
+
+from sros_tool.errors import UsageError
+from sros_tool.runtime.environment import render_environment
+
+TEMPLATE = "sros@.service"
+"""The unit of all nodes; its instance name is the enclave, as `unit_instance` writes it."""
+
+_NODES = "/etc/sros/nodes"
+"""The folder with a program for each enclave, where no command is named."""
+
+METRICS_FILE = "/var/lib/sros-metrics/sros.prom"
+
+_MADE = "# Made by `sros units`; change it with `systemctl edit`, and this file stays as it is."
+_PLAIN_PATH = re.compile(r"(/[A-Za-z0-9_][A-Za-z0-9._+-]*)+\Z")
+_USER = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,30}\Z")
+
+_CLOSED = """\
+# Nothing of the system can be changed, and no right be gained.
+NoNewPrivileges=yes
+CapabilityBoundingSet=
+ProtectSystem=strict
+ProtectHome=read-only
+PrivateTmp=yes
+ProtectClock=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+ProtectKernelLogs=yes
+ProtectKernelModules=yes
+ProtectKernelTunables=yes
+LockPersonality=yes
+RestrictNamespaces=yes
+RestrictSUIDSGID=yes
+SystemCallArchitectures=native
+SystemCallFilter=@system-service
+SystemCallErrorNumber=EPERM
+"""
+
+
+class Job(StrEnum):
+    """Regular work on a keystore, which a timer starts."""
+
+    RENEW = "renew"
+    CHECK = "check"
+    METRICS = "metrics"
+
+
+_WHEN = {Job.RENEW: "daily", Job.CHECK: "daily", Job.METRICS: "*:0/15"}
+_SPREAD = {Job.RENEW: "1h", Job.CHECK: "1h", Job.METRICS: "30s"}
+_RENEWED_WITHIN = "30d"
+
+
+def unit_instance(enclave: str) -> str:
+    """Return the instance name of an enclave, as `systemd-escape --path` does.
+
+    The name of an enclave has only letters, digits, "_" and "/", of which "/" alone is escaped.
+    """
+    return enclave.strip("/").replace("/", "-") or "-"
+
+
+def _check_path(path: str, what: str) -> str:
+    """Return a path that is the same for every directive of a unit.
+
+    Raises:
+        UsageError: it is not absolute, or has characters with a meaning in some directives.
+    """
+    if not _PLAIN_PATH.match(path):
+        raise UsageError(
+            f"{what} {path!r} cannot be written in a unit",
+            "systemd reads spaces, '%', '$', ':' and quotes in paths in several ways.",
+            "Name an absolute path of letters, digits and /._+- only, without parts that begin "
+            "with '.'.",
+        )
+    return path
+
+
+def _check_user(name: str) -> str:
+    """Return the name of a user.  Raises `UsageError` if it is not a valid one."""
+    if not _USER.match(name):
+        raise UsageError(f"{name!r} is not the name of a user", "", "Name one such as ros.")
+    return name
+
+
+def node_template(user: str) -> str:
+    """Return the unit of all nodes, `TEMPLATE`.
+
+    It starts nothing for an enclave without `node_settings`, which have its command.
+    """
+    return f"""\
+# Runs a node in the enclave of its instance name, which sros@NAME.service.d/enclave.conf adds.
+{_MADE}
+[Unit]
+Description=ROS node in enclave %f
+# Certificates are not valid before their time, and DDS looks for network interfaces only once.
+Wants=network-online.target time-sync.target
+After=network-online.target time-sync.target
+
+[Service]
+Type=exec
+User={_check_user(user)}
+Restart=on-failure
+RestartSec=5
+UMask=0077
+LogsDirectory=sros/%i
+LogsDirectoryMode=0700
+Environment=ROS_LOG_DIR=%L/sros/%i
+
+{_CLOSED}
+# DDS lists network interfaces through netlink. /dev stays: it has shared memory, and the devices
+# of drivers. No limit on real time, which controllers use.
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+
+def node_settings(
+    enclave: str,
+    variables: Mapping[str, str],
+    keystore: str,
+    *,
+    command: Sequence[str] = (),
+    below: Iterable[str] = (),
+    sros: str = "",
+) -> str:
+    """Return what `TEMPLATE` lacks for an enclave: its environment, its files and its command.
+
+    Args:
+        enclave: the name of the enclave.
+        variables: its environment.
+        keystore: the path of the keystore.
+        command: the command with its arguments; without it, the program in `_NODES` with the path
+            of the enclave.
+        below: the enclaves whose names begin with the parts of this one, and so are in its folder.
+        sros: the path of the program sros, which then verifies the enclave first, or "".
+
+    Raises:
+        UsageError: a path, a word of the command or a variable cannot be written in a unit.
+    """
+    folder = _check_path(keystore, "the keystore") + "/enclaves"
+    place = folder + enclave.rstrip("/")
+    program = " ".join(_words(command)) if command else f"{_NODES}{enclave.rstrip('/') or '/root'}"
+    lines = [
+        f"# Enclave {enclave} for {TEMPLATE}.",
+        _MADE,
+        "[Service]",
+        *render_environment(variables, "systemd").splitlines(),
+        "# The node sees the keys of no other enclave, and of no CA.",
+        f"InaccessiblePaths=-{keystore}/private",
+    ]
+    if place != folder:
+        lines += [
+            f"TemporaryFileSystem={folder}:ro",
+            f"BindReadOnlyPaths=-{folder}/governance.p7s",
+            f"BindReadOnlyPaths={place}",
+        ]
+    lines += [f"InaccessiblePaths=-{folder}{each}" for each in below]
+    if sros:
+        verify = (_check_path(sros, "the program"), "verify", keystore, "--match", enclave)
+        lines.append(f"ExecStartPre={' '.join(_words(verify))}")
+    return "\n".join((*lines, f"ExecStart={program}")) + "\n"
+
+
+def job_units(
+    job: Job, keystore: str, *, user: str, sros: str, passphrase: str = ""
+) -> dict[str, str]:
+    """Return the service and the timer of a job by their names.
+
+    Args:
+        job: the job.
+        keystore: the path of the keystore.
+        user: its owner.
+        sros: the path of the program sros.
+        passphrase: the path of the file with the passphrase of the CA keys, or "".
+
+    Raises:
+        UsageError: a path cannot be written in a unit.
+    """
+    name = f"sros-{job}"
+    root, program = _check_path(keystore, "the keystore"), _check_path(sros, "the program")
+    what, words, own = {
+        Job.RENEW: (
+            f"Renew the enclaves of {root} that expire within {_RENEWED_WITHIN}",
+            ("renew", root, "--all-expiring", _RENEWED_WITHIN),
+            [f"ReadWritePaths={root}", "UMask=0077"],
+        ),
+        Job.CHECK: (
+            f"Check the keystore {root}",
+            ("check", "keystore", root),
+            ["PrivateNetwork=yes"],
+        ),
+        Job.METRICS: (
+            f"Write the metrics of the keystore {root}",
+            ("metrics", root, "-o", METRICS_FILE),
+            ["PrivateNetwork=yes", "StateDirectory=sros-metrics", "UMask=0022"],
+        ),
+    }[job]
+    if passphrase and job is Job.RENEW:
+        _check_path(passphrase, "the file")
+        own += [
+            f"LoadCredential=ca-passphrase:{passphrase}",
+            f"Environment=SROS_CA_PASSPHRASE_FILE=/run/credentials/{name}.service/ca-passphrase",
+        ]
+    service = f"""\
+{_MADE}
+[Unit]
+Description={what}
+Wants=time-sync.target
+After=time-sync.target
+
+[Service]
+Type=oneshot
+User={_check_user(user)}
+ExecStart={" ".join((program, *words))}
+{_lines(own)}
+{_CLOSED}
+PrivateDevices=yes
+RestrictAddressFamilies=AF_UNIX
+"""
+    timer = f"""\
+{_MADE}
+[Unit]
+Description={what}
+
+[Timer]
+OnCalendar={_WHEN[job]}
+RandomizedDelaySec={_SPREAD[job]}
+Persistent=yes
+
+[Install]
+WantedBy=timers.target
+"""
+    return {f"{name}.service": service, f"{name}.timer": timer}
+
+
+def _lines(lines: Iterable[str]) -> str:
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _words(command: Sequence[str]) -> Iterable[str]:
+    """Yield each word as one that systemd changes nothing in.
+
+    Raises:
+        UsageError: the program is not an absolute path, or a word cannot be printed.
+    """
+    _check_path(command[0], "the command")
+    for word in command:
+        if not word.isprintable():
+            raise UsageError(
+                f"the word {word!r} cannot be written in a unit",
+                "systemd ends a line at some characters that cannot be printed.",
+                f"Put the command into a program, such as {_NODES}/NAME.",
+            )
+        if re.fullmatch(r"[A-Za-z0-9_/.,:=+@-]+", word):
+            yield word
+            continue
+        quoted = word.replace("\\", "\\\\").replace('"', '\\"')
+        yield '"' + quoted.replace("%", "%%").replace("$", "$$") + '"'

@@ -1,0 +1,120 @@
+"""The verb units: the files that it writes, replaces only if asked, and refuses to write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.harness import policy_text, publish, snapshot, sros
+
+THERE = "/etc/sros/keystore"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A keystore with nested enclaves; only read."""
+    folder = tmp_path_factory.mktemp("units")
+    names = {each: publish("/x") for each in ("/arm", "/arm/gripper", "/leg")}
+    (folder / "p.xml").write_text(policy_text(names))
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", cwd=folder).ok()
+    return folder / "ks"
+
+
+def settings(folder: Path, instance: str) -> list[str]:
+    path = folder / f"sros@{instance}.service.d/enclave.conf"
+    return path.read_text().splitlines()
+
+
+def test_nodes_of_several_enclaves(made: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "new/units"
+    planned = sros("units", made, "--match", "/arm*", folder, "--dry-run").ok().out
+    assert not folder.exists()
+    said = sros("units", made, "--match", "/arm*", folder).ok()
+    assert said.out == planned.replace("would create", "wrote")
+    assert {str(each.relative_to(folder)) for each in folder.rglob("*") if each.is_file()} == {
+        "sros@.service",
+        "sros@arm.service.d/enclave.conf",
+        "sros@arm-gripper.service.d/enclave.conf",
+    }
+    gripper = settings(folder, "arm-gripper")
+    assert f"BindReadOnlyPaths={THERE}/enclaves/arm/gripper" in gripper
+    assert f"TemporaryFileSystem={THERE}/enclaves:ro" in gripper
+    assert 'Environment="ROS_SECURITY_ENCLAVE_OVERRIDE=/arm/gripper"' in gripper
+    assert gripper[-1] == "ExecStart=/etc/sros/nodes/arm/gripper"
+    assert f"InaccessiblePaths=-{THERE}/enclaves/arm/gripper" in settings(folder, "arm")
+    assert not any("leg" in line for line in [*gripper, *settings(folder, "arm")])
+    assert "User=ros\n" in (folder / "sros@.service").read_text()
+
+
+def test_what_differs_is_replaced_only_if_asked(made: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "units"
+    words = ("units", made, "/leg", folder)
+    sros(*words).ok()
+    before = snapshot(folder)
+    again = sros(*words).ok()
+    assert again.out == "" and "already up to date" in again.err
+    refused = sros(*words, "--domain", "0", "--user", "other")
+    assert refused.status == 2 and "other versions of sros@.service" in refused.err
+    assert snapshot(folder) == before
+    sros(*words[:2], "/arm", folder).ok()
+    done = sros(*words, "--user", "other", "--force", "--", "/bin/true", "a b").ok()
+    assert [line.split()[0] for line in done.out.splitlines()] == ["replaced", "replaced"]
+    assert settings(folder, "leg")[-1] == 'ExecStart=/bin/true "a b"'
+    assert settings(folder, "arm")[-1] == "ExecStart=/etc/sros/nodes/arm"
+
+
+def test_a_node_is_verified_first_where_sros_is(made: Path, tmp_path: Path) -> None:
+    words = ("--sros", "/usr/bin/sros", "--target", "/srv/k")
+    sros("units", made, "/leg", tmp_path / "units", *words).ok()
+    first, last = settings(tmp_path / "units", "leg")[-2:]
+    assert first == "ExecStartPre=/usr/bin/sros verify /srv/k --match /leg"
+    assert last == "ExecStart=/etc/sros/nodes/leg"
+
+
+def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> None:
+    jobs = ("--job", "renew", "--job", "check", "--job", "metrics")
+    words = ("--sros", "/usr/bin/sros", "--passphrase-file", "/etc/sros/pass")
+    sros("units", made, *jobs, tmp_path / "units", *words).ok()
+    names = {each.name for each in (tmp_path / "units").iterdir()}
+    assert names == {f"sros-{job}.{end}" for job in jobs[1::2] for end in ("service", "timer")}
+    renew = (tmp_path / "units/sros-renew.service").read_text()
+    assert f"ExecStart=/usr/bin/sros renew {made} --all-expiring 30d\n" in renew
+    assert f"User={made.owner()}\n" in renew
+    assert "ca-passphrase:/etc/sros/pass\n" in renew
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("/none", "F"), "enclave /none does not exist"),
+        (("F",), "units takes"),
+        (("/leg",), "units takes"),
+        (("--job", "check", "F", "--", "/bin/true"), "no enclave is named"),
+        (("--job", "check", "F", "--passphrase-file", "/x"), "--job renew only"),
+        (("/leg", "F", "--target", "/a b"), "cannot be written in a unit"),
+        (("/leg", "F", "--target", "k"), "--target 'k'"),
+        (("/leg", "F", "--user", "a b"), "name of a user"),
+        (("/leg", "F", "--", "true"), "cannot be written in a unit"),
+        (("/leg", "F", "--", "/bin/true", "a\nUser=root"), "cannot be written in a unit"),
+        (("--job", "renew", "F", "--sros", "sros"), "cannot be written in a unit"),
+    ],
+)
+def test_what_is_refused_writes_nothing(
+    words: tuple[str, ...], why: str, made: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "units"
+    refused = sros("units", made, *(str(folder) if each == "F" else each for each in words))
+    assert refused.status == 2 and why in refused.err, refused
+    assert len(refused.err.splitlines()) == 1
+    assert not folder.exists()
+
+
+def test_no_link_is_followed_out_of_the_folder(made: Path, tmp_path: Path) -> None:
+    (tmp_path / "units").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "units/sros@leg.service.d").symlink_to(tmp_path / "elsewhere")
+    refused = sros("units", made, "/leg", tmp_path / "units")
+    assert refused.status == 2
+    assert not any((tmp_path / "elsewhere").iterdir())
+    assert [each.name for each in (tmp_path / "units").iterdir()] == ["sros@leg.service.d"]
