@@ -78,13 +78,11 @@ def container_text(
 
 def _check_mounted(root: Path, enclave: str, target: Path) -> None:
     """Raise `KeystoreError` if the folder of an enclave cannot be mounted alone."""
-    from sros_tool.keystore.layout import search_enclaves
+    from sros_tool.keystore.layout import enclaves_below
     from sros_tool.keystore.reader import open_keystore
 
     export = f"`sros distribute_key {quote(str(root))} {quote(enclave)} DIR`"
-    below = f"{enclave.rstrip('/')}/"
-    inner = [name for name in search_enclaves(root)[0] if name.startswith(below) and name != "/"]
-    if inner:
+    if inner := enclaves_below(root, enclave):
         raise KeystoreError(
             f"the folder of enclave {enclave} also has {', '.join(inner[:3])}",
             "The container would get the private keys of all of them.",

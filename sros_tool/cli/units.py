@@ -108,6 +108,7 @@ def units(
     words: tuple[str, ...],
     every: bool,
     patterns: tuple[str, ...],
+    robots: tuple[str, ...],
     jobs: tuple[str, ...],
     there: str | None,
     user: str | None,
@@ -126,6 +127,7 @@ def units(
     that a ROS node does not need. COMMAND is its program; without it, that is a file with the path
     of the enclave in /etc/sros/nodes.
     """
+    from sros_tool.keystore.layout import enclaves_below
     from sros_tool.runtime.units import (
         TEMPLATE,
         job_units,
@@ -136,7 +138,8 @@ def units(
 
     root, rest = split_root(words)
     command = tuple(ctx.meta[COMMAND])
-    if not rest or not (rest[1:] or every or patterns or jobs):
+    several = bool(every or patterns or robots)
+    if not rest or not (rest[1:] or several or jobs):
         raise UsageError("units takes a keystore, enclaves or --job, and a folder")
     folder = PATH.convert(rest[-1], None, None)
     if passphrase is not None and Job.RENEW not in jobs:
@@ -145,8 +148,8 @@ def units(
     files: dict[str, str] = {}
     notes: list[Note] = []
     names: Sequence[str] = ()
-    if rest[1:] or every or patterns:
-        names = chosen_enclaves(root, rest[:-1], patterns, every=every)
+    if rest[1:] or several:
+        names = chosen_enclaves(root, rest[:-1], patterns, robots, every=every)
         place = target or Path(INSTALLED)
         files[TEMPLATE] = node_template(user or _NODE_USER)
         with progress("checking"):
@@ -160,7 +163,7 @@ def units(
                     found.variables,
                     str(place),
                     command=command,
-                    below=_below(root, name),
+                    below=enclaves_below(root, name),
                     sros=program or "",
                 )
     elif command:
@@ -194,14 +197,6 @@ def units(
     if not changes:
         click.echo(visible_line(f"the units in '{folder}' are already up to date"), err=True)
     print_notes(list(dict.fromkeys(notes)))
-
-
-def _below(root: Path, name: str) -> list[str]:
-    """Return the enclaves in the folder of an enclave, whose keys its node must not see."""
-    from sros_tool.keystore.layout import enclave_names
-
-    inside = f"{name.rstrip('/')}/"
-    return [each for each in enclave_names(root) if each.startswith(inside) and each != name]
 
 
 def _owner(root: Path) -> str:

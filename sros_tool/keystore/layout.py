@@ -208,9 +208,14 @@ def search_enclaves(root: Path) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]
     followed.
     """
     top = os.fspath(root / ENCLAVES)
+    return _search(top, top)
+
+
+def _search(top: str, start: str) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
+    """Return what `search_enclaves` does, of the folder ``start`` in the folder of enclaves."""
     found: list[str] = []
     unread: list[UnreadPath] = []
-    for folder, files in _walk(top, unread):
+    for folder, files in _walk(start, unread):
         if KEY_FILE in files or CERTIFICATE_FILE in files:
             found.append(folder[len(top) :].replace(os.sep, "/") or "/")
     return tuple(sorted(found)), tuple(unread)
@@ -248,6 +253,19 @@ def enclave_names(root: Path) -> tuple[str, ...]:
     if unread:
         raise _unreadable(root, unread, "Enclaves in it would be missing from the result.")
     return names
+
+
+def enclaves_below(root: Path, name: str) -> tuple[str, ...]:
+    """Return the sorted names of the enclaves in the folder of an enclave, but not its own.
+
+    Raises:
+        KeystoreError: an enclave may be missing, because a folder cannot be read.
+    """
+    top, start = os.fspath(root / ENCLAVES), os.fspath(enclave_path(root, name))
+    names, unread = _search(top, start)
+    if unread:
+        raise _unreadable(root, unread, "Enclaves in it would be missing from the result.")
+    return tuple(each for each in names if each != name)
 
 
 def has_zenoh_files(root: Path) -> bool:

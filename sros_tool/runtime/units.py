@@ -167,7 +167,10 @@ def node_settings(
             f"BindReadOnlyPaths=-{folder}/governance.p7s",
             f"BindReadOnlyPaths={place}",
         ]
-    lines += [f"InaccessiblePaths=-{folder}{each}" for each in below]
+    lines += [
+        f"InaccessiblePaths=-{_check_path(folder + each, 'the folder of an enclave')}"
+        for each in below
+    ]
     if sros:
         verify = (_check_path(sros, "the program"), "verify", keystore, "--match", enclave)
         lines.append(f"ExecStartPre={' '.join(_words(verify))}")

@@ -23,7 +23,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, issue_ca, pem
 from sros_tool.pki.keys import generate_key
 from sros_tool.resources import policies_dir
-from sros_tool.runtime.environment import REFUSING, render_refusal
+from sros_tool.runtime.environment import DOMAIN, REFUSING, render_refusal
 from sros_tool.validity import Window
 from tests.support.children import finish, python, run, wait_for
 from tests.support.harness import (
@@ -658,6 +658,18 @@ def test_the_domain_of_a_process(
     env = {"ROS_DOMAIN_ID": environment}
     said = sros("env", tmp_path / "ks", "/a", *words, "--json", env=env).ok().out
     assert json.loads(said)["variables"]["ROS_DOMAIN_ID"] == chosen
+
+
+def test_the_domain_of_a_process_is_one_that_its_permissions_allow(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--domain", "7").ok()
+    sros("create_enclave", root, "/a").ok()
+    permissions = (root / "enclaves/a/permissions.p7s").read_bytes()
+    sros("update_keystore", root, "--domain", "0,7", "--allow-looser").ok()
+    assert json.loads(sros("env", root, "/a", "--json").ok().out)["variables"][DOMAIN] == "0"
+    (root / "enclaves/a/permissions.p7s").write_bytes(permissions)
+    assert json.loads(sros("env", root, "/a", "--json").ok().out)["variables"][DOMAIN] == "7"
+    assert sros("env", root, "/a", "--domain", "0").status == 2
 
 
 SHOW = """

@@ -152,6 +152,14 @@ def test_a_path_with_a_meaning_for_systemd_is_refused(path: str) -> None:
             job_units(Job.RENEW, words["keystore"], user="root", sros=words["sros"])
 
 
+@pytest.mark.parametrize("name", ["/arm/x\nExecStart=/bin/sh", "/arm/a b", "/arm/%h", "/arm/../x"])
+def test_a_folder_in_that_of_an_enclave_cannot_add_a_line(name: str) -> None:
+    settings = node_settings("/arm", {}, THERE, below=["/arm/x"])
+    assert f"\nInaccessiblePaths=-{THERE}/enclaves/arm/x\n" in settings
+    with pytest.raises(UsageError):
+        node_settings("/arm", {}, THERE, below=["/arm/x", name])
+
+
 @pytest.mark.parametrize("user", ["", "a b", "a\nUser=root", "0", "-x", "a%u", "x" * 40])
 def test_other_names_of_users_are_refused(user: str) -> None:
     with pytest.raises(UsageError):
