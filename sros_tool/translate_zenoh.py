@@ -117,8 +117,8 @@ def remote_of(enclave: str, stated: Mapping[int, Iterable[StatedRight]]) -> Remo
     for domain, rights in stated.items():
         rules += _graph_rules(enclave, domain)
         for right, names in _allowed_chunks(rights):
-            keys = tuple(canonical((str(domain), *each, *_ANY_TYPE)) for each in names)
-            below = tuple(f"{each}/{_ADVANCED}" for each in keys)
+            keys = tuple([canonical((str(domain), *each, *_ANY_TYPE)) for each in names])
+            below = tuple([f"{each}/{_ADVANCED}" for each in keys])
             rules += [
                 AccessRule(flow, messages, below if history else keys)
                 for flow, messages, history in (_MESSAGES[right] if keys else ())
@@ -177,23 +177,12 @@ def _name_in(key: str) -> str:
     return "/".join(["", *name, *last])
 
 
-def control_of_router(remotes: Mapping[str, RemoteRights]) -> AccessControl:
-    """Return what the router enforces: the rights of every enclave, by the enclave's name."""
-    return AccessControl(tuple(remotes[each] for each in sorted(remotes)))
+def as_router(router: str, own: RemoteRights) -> RemoteRights:
+    """Return what a process whose rights are ``own`` allows to its router.
 
-
-def control_of_session(
-    enclave: str, router: str, remotes: Mapping[str, RemoteRights], *, direct: bool
-) -> AccessControl:
-    """Return what a process of ``enclave`` enforces.
-
-    The enclave ``router`` may send and get what the enclave itself may get and send: it passes on
-    what others said.  With ``direct`` connections, every other enclave has its own rights, too.
+    It may send and get what the process itself may get and send: it passes on what others said.
     """
-    own = in_order(each.mirrored() for each in remotes[enclave].rules)
-    known = dict(remotes) if direct else {}
-    known[router] = RemoteRights(router, own)
-    return AccessControl(tuple(known[each] for each in sorted(known)))
+    return RemoteRights(router, in_order(each.mirrored() for each in own.rules))
 
 
 # ── names and denials ──────────────────────────────────────────────────────────────────────
@@ -213,7 +202,7 @@ def _allowed_chunks(
         side = allowed if each.right.qualifier is ALLOW else denied
         side.setdefault(each.right.right, {}).setdefault(each.right.name, each.source)
     for right, places in sorted(allowed.items()):
-        denials = _Denials(right, denied.get(right, {}))
+        denials = _Denials(right, denied[right]) if right in denied else _NONE_DENIED
         found: set[tuple[str, ...]] = set()
         left = _MOST_KEYS
         for name, place in sorted(places.items()):
@@ -284,9 +273,14 @@ class _Denials:
         )
 
 
+_NONE_DENIED = _Denials("", {})
+
+
 def _with_what_is_below(found: set[tuple[str, ...]]) -> set[tuple[str, ...]]:
     """Return the same names, where a name and all names below it are one expression."""
     below = ("*", ANY_CHUNKS)
+    if not any(each[-1] == ANY_CHUNKS for each in found):
+        return found
     both = {each for each in found if (*each, *below) in found}
     return found - both - {(*each, *below) for each in both} | {
         (*each, ANY_CHUNKS) for each in both

@@ -17,7 +17,7 @@ from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Rules, folded, policy_rights
 from sros_tool.resources import policies_dir
 from sros_tool.translate_from_zenoh import RightsBehindRules, name_of_key, policy_of, rights_behind
-from sros_tool.translate_zenoh import control_of_router, remote_rights
+from sros_tool.translate_zenoh import remote_rights
 from sros_tool.zenoh.access import AccessControl, Flow, Message
 from sros_tool.zenoh.configuration import Configuration, Mode
 from sros_tool.zenoh.document import parse_configuration
@@ -131,7 +131,9 @@ def test_session_files_of_zenoh_security_tools() -> None:
 def test_the_shipped_policies_come_back(policy: Path, tmp_path: Path) -> None:
     stated = read_policy(policy)
     remotes = {each.path: remote_rights(each, 0) for each in stated.enclaves}
-    written = Configuration(Mode.ROUTER, ("tls/a:1",), (), control_of_router(remotes)).render()
+    written = Configuration(
+        Mode.ROUTER, ("tls/a:1",), (), AccessControl(tuple(remotes.values()))
+    ).render()
     found = rights_behind(parse_configuration(written, "router.json5"))
     assert not [one for each in found for one in each.rights if one.lacks]
     back = policy_of(found)

@@ -22,9 +22,8 @@ from sros_tool.policy.rights import Rules
 from sros_tool.resources import policies_dir
 from sros_tool.translate import dds_names, permissions_for
 from sros_tool.translate_zenoh import (
+    as_router,
     chunks_of,
-    control_of_router,
-    control_of_session,
     remote_of,
     remote_rights,
     stated_rights,
@@ -348,14 +347,15 @@ def test_a_session_trusts_its_router_with_its_own_rights_alone(tmp_path: Path) -
     remotes = {e.path: remote_rights(e, 0) for e in read_policy(tmp_path / "p.xml").enclaves}
     put_x, put_y = (Message.PUT, f"0/x/{TYPE}"), (Message.PUT, f"0/y/{TYPE}")
     for direct in (True, False):
-        session = control_of_session("/a", "/router", remotes, direct=direct)
+        known = remotes.values() if direct else ()
+        session = AccessControl((*known, as_router("/router", remotes["/a"])))
         assert session.allows("/router", OUT, *put_x)
         assert not session.allows("/router", IN, *put_x)
         assert not session.allows("/router", OUT, *put_y)
         assert session.allows("/b", IN, *put_y) == direct
         assert not session.allows("/b", IN, *put_x)
         assert not session.allows("", IN, *put_x)
-    router = control_of_router(remotes)
+    router = AccessControl(tuple(remotes.values()))
     assert router.allows("/a", IN, *put_x) and router.allows("/b", IN, *put_y)
     assert not router.allows("/a", IN, *put_y)
     assert not router.allows("/router", IN, *put_x)

@@ -122,6 +122,7 @@ Such a keystore is flat: the folder of a node has the name of the node, below th
 _MOST_FOLDERS = 1000
 
 _TOP_FILES = frozenset((SETTINGS, FLEET, LEDGER, LEDGER_HEAD, ROTATION))
+_OF_IDENTITY = (CERTIFICATE_FILE, KEY_FILE)
 _OF_NODE = (CERTIFICATE_FILE, KEY_FILE, PERMISSIONS_FILE)
 _FILE_TYPES = (".pem", ".p7s", ".xml", ".json5")
 _TOP_FOLDERS = frozenset((ENCLAVES, PUBLIC, PRIVATE, REVOKED, RETIRED))
@@ -223,20 +224,37 @@ def _search(top: str, start: str) -> tuple[tuple[str, ...], tuple[UnreadPath, ..
 
 def _walk(top: str, unread: list[UnreadPath]) -> Iterator[tuple[str, list[str]]]:
     """Yield each folder that can hold an enclave, with its files; add the others to ``unread``."""
-
-    def report(error: OSError) -> None:
-        if error.errno not in (errno.ENOENT, errno.ENOTDIR):
-            unread.append(UnreadPath.of(error))
-
-    for folder, folders, files in os.walk(top, onerror=report):
-        folders[:] = [each for each in folders if not each.startswith(".")]
-        for each in folders:
-            path = os.path.join(folder, each)
-            if each.endswith(_FILE_TYPES):
-                continue  # no enclave has such a name: a fault of the enclave in this folder alone
-            if Path(path).is_symlink() and not _is_inside(path, top):
-                unread.append(UnreadPath(path, _FOLDER_ELSEWHERE))
+    pending = [top]
+    while pending:
+        folder = pending.pop()
+        files = []
+        try:
+            with os.scandir(folder) as found:
+                entries = list(found)
+        except OSError as error:
+            if error.errno not in (errno.ENOENT, errno.ENOTDIR):
+                unread.append(UnreadPath.of(error))
+            continue
+        for each in entries:
+            name = each.name
+            if each.is_symlink():
+                # No enclave has a name of a file: where it leads is a fault of its folder alone.
+                of_file = name.endswith(_FILE_TYPES)
+                if (of_file and name not in _OF_IDENTITY) or not _is_folder(each):
+                    files.append(name)
+                elif not of_file and name[0] != "." and not _is_inside(each.path, top):
+                    unread.append(UnreadPath(each.path, _FOLDER_ELSEWHERE))
+            elif not each.is_dir(follow_symlinks=False):
+                files.append(name)
+            elif name[0] != ".":
+                pending.append(each.path)
         yield folder, files
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    with suppress(OSError):
+        return entry.is_dir()
+    return False
 
 
 def _is_inside(path: str, top: str) -> bool:

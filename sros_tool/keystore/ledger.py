@@ -21,6 +21,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from shlex import quote
@@ -117,6 +118,7 @@ _SERIAL = re.compile(r"[0-9a-f]{1,40}")
 _MOST_BITS = 159
 """The length of a serial number (RFC 5280, 4.1.2.2)."""
 _MOST_NUMBER = 10**12
+_MOST_REMEMBERED = 64 * 1024 * 1024
 _HEAD = re.compile(rb"sros ledger 1\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n")
 
 
@@ -206,6 +208,46 @@ def _compare(root: Path, data: bytes | None) -> _Reading:
             return _Reading(Ledger())
         missing = _Fault(0, f"there is no {LEDGER}" if data is None else f"{LEDGER} is empty")
         return _Reading(Ledger(gaps=(missing.text,)), unrecorded=[missing])
+    reader = _remembered if len(data) <= _MOST_REMEMBERED else _read_lines
+    read = reader(data, _MOST_LINES)
+    if read is None:
+        raise _too_large(root / LEDGER, f"{_MOST_LINES} lines")
+    numbered, number, chained = read.entries, read.lines, read.chained
+    faults = [*read.faults]
+    authorities = _authorities(root)
+    if fault := _head_fault(root, data, number, authorities, chained=chained):
+        faults.append(fault)
+    recorded = [_Fault(each.number, each.reason) for _, each in numbered if each.what == GAP]
+    last_recorded = max((at for at, each in numbered if each.what == GAP), default=0)
+    start = _first_of(authorities, numbered)
+    every = [*recorded, *faults]
+    last = max((each.line for each in every), default=0)
+    ledger = Ledger(
+        tuple(entry for _, entry in numbered),
+        tuple(dict.fromkeys(each.text for each in every if each.line >= start)),
+        tuple(entry for at, entry in numbered if at > last),
+        0 if start > read.unchained else read.unchained,
+        number,
+    )
+    unrecorded = [each for each in faults if each.line >= last_recorded]
+    return _Reading(ledger, data, chained, unrecorded)
+
+
+class _Lines(NamedTuple):
+    """The entries in a ledger's bytes with the numbers of their lines, and faults of the chain.
+
+    ``unchained`` is the number of lines before the chain, ``lines`` that of all.
+    """
+
+    entries: Sequence[tuple[int, Entry]]
+    faults: Sequence[_Fault]
+    lines: int
+    unchained: int
+    chained: bool
+
+
+def _read_lines(data: bytes, most: int) -> _Lines | None:
+    """Return the lines of a ledger, or None if there are more than ``most``."""
     numbered: list[tuple[int, Entry]] = []
     faults: list[_Fault] = []
     damaged = 0  # how many lines before this one are no entries
@@ -213,8 +255,8 @@ def _compare(root: Path, data: bytes | None) -> _Reading:
     chained = False
     line, all_before = b"", hashlib.sha256()
     for number, (before, line) in enumerate(_with_previous(data), 1):
-        if number > _MOST_LINES:
-            raise _too_large(root / LEDGER, f"{_MOST_LINES} lines")
+        if number > most:
+            return None
         if not chained and number > 1:
             all_before.update((b"\n" if number > 2 else b"") + before)
         entry = _parse(line)
@@ -238,23 +280,10 @@ def _compare(root: Path, data: bytes | None) -> _Reading:
         faults.append(_not_entries(number, damaged))
     if not chained:
         unchained = number
-    authorities = _authorities(root)
-    if fault := _head_fault(root, data, number, authorities, chained=chained):
-        faults.append(fault)
-    recorded = [_Fault(each.number, each.reason) for _, each in numbered if each.what == GAP]
-    last_recorded = max((at for at, each in numbered if each.what == GAP), default=0)
-    start = _first_of(authorities, numbered)
-    every = [*recorded, *faults]
-    last = max((each.line for each in every), default=0)
-    ledger = Ledger(
-        tuple(entry for _, entry in numbered),
-        tuple(dict.fromkeys(each.text for each in every if each.line >= start)),
-        tuple(entry for at, entry in numbered if at > last),
-        0 if start > unchained else unchained,
-        number,
-    )
-    unrecorded = [each for each in faults if each.line >= last_recorded]
-    return _Reading(ledger, data, chained, unrecorded)
+    return _Lines(numbered, faults, number, unchained, chained)
+
+
+_remembered = lru_cache(maxsize=1)(_read_lines)  # a verb asks several times
 
 
 def _not_entries(last: int, count: int) -> _Fault:

@@ -291,7 +291,7 @@ def recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRigh
     source = Source(f"the permissions of {enclave}", 0)
     rules = tuple(each for each in grant.rules if domain in each.domains.closed())
     rights = grant_rights(enclave, replace(grant, rules=rules))
-    raw = {each for each in rights if each.kind == "dds"}
+    raw = {each for each in rights if not each.name.startswith("/")}
     if unclear := sorted(each.describe() for each in raw if each.qualifier is not ALLOW):
         raise PolicyError(
             f"{source}: DENY {unclear[0]} cannot be said to Zenoh",

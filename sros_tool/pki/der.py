@@ -30,29 +30,27 @@ def children(data: bytes) -> list[Value]:
         PkiError: a value is truncated, or has a form that this reader does not support.
     """
     values = []
-    position, end = 0, len(data)
-    while position < end:
-        start = position
-        if end - position < 2:
+    start, end = 0, len(data)
+    while start < end:
+        if end - start < 2:
             raise PkiError("a DER value is cut short")
-        tag, length = data[position], data[position + 1]
-        position += 2
+        tag, length = data[start], data[start + 1]
+        begin = start + 2
         if length >= 0x80:
             size = length & 0x7F
             if not 1 <= size <= 4:
                 raise PkiError("a DER value has a form that is not supported")
-            length = int.from_bytes(data[position : position + size], "big")
-            position += size
+            length = int.from_bytes(data[begin : begin + size], "big")
+            begin += size
             if length < 0x80 or length >> 8 * (size - 1) == 0:
                 raise PkiError("a DER value has a longer length than it needs")
         if tag & 0x1F == 0x1F or tag == 0:
             raise PkiError("a DER value has a form that is not supported")
-        if position + length > end:
+        after = begin + length
+        if after > end:
             raise PkiError("a DER value is cut short")
-        values.append(
-            Value(tag, data[position : position + length], data[start : position + length])
-        )
-        position += length
+        values.append(Value(tag, data[begin:after], data[start:after]))
+        start = after
     return values
 
 

@@ -14,10 +14,10 @@ from __future__ import annotations
 import base64
 import re
 import secrets
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -49,6 +49,7 @@ _BASE64 = re.compile(
 _OPAQUE = (b"application/pkcs7-mime", b"application/x-pkcs7-mime")
 _SIGNATURE = (b"application/pkcs7-signature", b"application/x-pkcs7-signature")
 
+_SHORT = 1024
 _VERSION = b"\x02\x01\x01"
 _NULL = b"\x05\x00"
 _SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
@@ -206,6 +207,21 @@ class SignedDocument:
         return True
 
 
+_Part = TypeVar("_Part", bytes, der.Value)
+_Read = TypeVar("_Read")
+
+
+def _remembered(read: Callable[[_Part], _Read]) -> Callable[[_Part], _Read]:
+    """Have what was read from short parts remembered: all documents of a keystore have the same."""
+    remembered = lru_cache(maxsize=64)(read)
+
+    def read_or_remember(part: _Part) -> _Read:
+        size = len(part if isinstance(part, bytes) else part.whole)
+        return remembered(part) if size <= _SHORT else read(part)
+
+    return read_or_remember
+
+
 @lru_cache(maxsize=8)  # several callers parse the same document in a row
 def parse(message: bytes) -> SignedDocument:
     """Parse a ``.p7s`` without verifying it; raise `PkiError` if it is not a signed message."""
@@ -228,7 +244,8 @@ def _document(content: bytes) -> bytes:
     return document
 
 
-def _media_type(header: bytes) -> tuple[bytes, dict[bytes, bytes]]:
+@_remembered
+def _media_type(header: bytes) -> tuple[bytes, Mapping[bytes, bytes]]:
     """Return the type in a MIME header, in lower case, and its parameters.
 
     Return an empty type if the header has none or several, or if any of its lines has a form that
@@ -303,6 +320,7 @@ def _optional(values: list[der.Value], place: int, tag: int) -> list[der.Value]:
     return [values.pop(place)] if len(values) > place and values[place].tag == tag else []
 
 
+@_remembered
 def _algorithm(value: der.Value) -> bytes:
     """Return the OID of an AlgorithmIdentifier that has no parameters, or NULL as parameters."""
     oid, *parameters = der.children(value.content)
@@ -348,7 +366,6 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     ]:
         raise ValueError("not the fields of SignerInfo")
     version, identifier, digest, signature_algorithm, signature_value = info
-    issuer, serial = _parts(identifier, der.SEQUENCE, der.INTEGER)
     (listed,) = _parts(digests, der.SEQUENCE)
     algorithm = _DIGESTS.get(_algorithm(digest))
     if _algorithm(listed) != _algorithm(digest) or version.whole != _VERSION:
@@ -367,8 +384,14 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
         _signed_attributes=b"".join(b"\x31" + each.whole[1:] for each in attributes),
         _message_digest=b"".join(_message_digest(each.content) for each in attributes),
         _signature=signature_value.content,
-        _issuer_and_serial=(issuer.whole, der.integer(serial)),
+        _issuer_and_serial=_issuer_and_serial(identifier),
     )
+
+
+@_remembered
+def _issuer_and_serial(identifier: der.Value) -> tuple[bytes, int]:
+    issuer, serial = _parts(identifier, der.SEQUENCE, der.INTEGER)
+    return issuer.whole, der.integer(serial)
 
 
 def _message_digest(attributes: bytes) -> bytes:

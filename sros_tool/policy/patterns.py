@@ -252,9 +252,14 @@ class Names:
 
     def __init__(self, names: Iterable[str], limit: ComparisonLimit | None = None) -> None:
         self._names = tuple(dict.fromkeys(names))
-        self._exact = frozenset(each for each in self._names if not is_expression(each))
         self._wild = tuple(each for each in self._names if is_expression(each))
+        self._every = frozenset(self._names)
+        self._exact = self._every.difference(self._wild)
         self._limit = limit or ComparisonLimit()
+
+    def cover(self, name: str) -> bool:
+        """Return whether ``name`` is one of these, or another one covers it."""
+        return name in self._every or (bool(self._wild) and any(self.covering(name)))
 
     def covering(self, name: str) -> Iterator[str]:
         """Yield the other expressions that cover ``name``, as `covers` decides, in their order."""
@@ -267,7 +272,7 @@ class Names:
         if is_expression(name):
             candidates = map(self._names.__getitem__, self._that_may_meet(name))
             return any(self._tried(overlap(e, name), e, name) for e in candidates)
-        return name in self._exact or any(True for _ in self.covering(name))
+        return name in self._exact or (bool(self._wild) and any(self.covering(name)))
 
     def meeting(self, name: str) -> Iterator[str]:
         """Yield the names of this set that overlap with ``name``, in their order."""

@@ -178,8 +178,14 @@ class Rules:
 
     def allow(self, enclave: str, right: str, name: str) -> bool:
         """Return whether ``name`` is allowed completely, and no part of it is denied."""
-        wanted = Right(enclave, ALLOW, right, name)
-        return self.cover(wanted) and not self.meet(wanted._replace(qualifier=DENY))
+        for part in parts(Right(enclave, ALLOW, right, name)):
+            allowed = self._names.get((enclave, ALLOW, part.right))
+            denied = self._names.get((enclave, DENY, part.right))
+            if not allowed or not allowed.cover(part.name):
+                return False
+            if denied and denied.meets(part.name):
+                return False
+        return True
 
     def _at(self, part: Right) -> Names:
         return self._names.get(part[:3], _NO_NAMES)

@@ -121,9 +121,14 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     for rule in rules:
         found.setdefault((rule.flow, rule.messages), set()).update(rule.key_expressions)
     return in_order(
-        AccessRule(flow, messages, tuple(KeyExpressions(keys).needed()))
+        AccessRule(flow, messages, _needed(frozenset(keys)))
         for (flow, messages), keys in found.items()
     )
+
+
+@lru_cache(maxsize=16)  # several messages of a right have the same keys
+def _needed(keys: frozenset[str]) -> tuple[str, ...]:
+    return tuple(KeyExpressions(keys).needed())
 
 
 _ORDER = {message: number for number, message in enumerate(Message)}

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
 from json.encoder import encode_basestring_ascii
+from typing import NamedTuple
 
 from sros_tool.errors import DocumentError
 from sros_tool.zenoh.access import AccessControl, AccessRule, Flow, Message, RemoteRights
@@ -49,9 +50,33 @@ class Configuration:
 
         TLS has no files yet: a session that is not told where its key is does not open.
         """
-        control = "\n".join(_lines(self.access_control))
-        rest = _rest(self.mode, self.listen, self.connect)
-        return f'{rest},\n "access_control": {{\n{control}\n }}\n}}\n'.encode()
+        rights = [render_rights(each) for each in self.access_control.remotes]
+        return render_configuration(self.mode, self.listen, self.connect, rights)
+
+
+class RenderedRights(NamedTuple):
+    """The lines of a remote enclave's rules, of its subject and of its policy."""
+
+    rules: str
+    subject: str
+    policy: str
+
+
+def render_configuration(
+    mode: Mode,
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    rights: Iterable[RenderedRights],
+) -> bytes:
+    """Return what `Configuration.render` does, from the rendered rights of all remote enclaves."""
+    every = [*rights]
+    lists = []
+    for number, name in enumerate(("rules", "subjects", "policies")):
+        lines = ",\n".join(each[number] for each in every if each[number])
+        lists.append(f'  "{name}": [\n{lines}\n  ]' if lines else f'  "{name}": [\n  ]')
+    control = ",\n".join(('  "enabled": true', '  "default_permission": "deny"', *lists))
+    rest = _rest(mode, listen, connect)
+    return f'{rest},\n "access_control": {{\n{control}\n }}\n}}\n'.encode()
 
 
 @lru_cache
@@ -92,24 +117,8 @@ def _rest(mode: Mode, listen: tuple[str, ...], connect: tuple[str, ...]) -> str:
     return json.dumps(document, indent=1).removesuffix("\n}")
 
 
-def _lines(control: AccessControl) -> Iterator[str]:
-    """Yield the lines of access control: one for each rule, subject and policy."""
-    parts = [_rendered(each) for each in control.remotes]
-    yield '  "enabled": true,'
-    yield '  "default_permission": "deny",'
-    for number, name in enumerate(("rules", "subjects", "policies")):
-        yield f'  "{name}": ['
-        if lines := ",\n".join(part[number] for part in parts if part[number]):
-            yield lines
-        yield "  ]" if name == "policies" else "  ],"
-
-
-@lru_cache(maxsize=2048)
-def _rendered(remote: RemoteRights) -> tuple[str, str, str]:
-    """Return the lines of a remote enclave's rules, of its subject and of its policy.
-
-    Each file of a network in peer mode has them.
-    """
+def render_rights(remote: RemoteRights) -> RenderedRights:
+    """Return the lines of a remote enclave, as each file of a network in peer mode has them."""
     name = remote.common_name
     ids = [f"{name}#{number}" for number in range(len(remote.rules))]
     rules = (
@@ -118,7 +127,7 @@ def _rendered(remote: RemoteRights) -> tuple[str, str, str]:
         for each, rule in zip(ids, remote.rules, strict=True)
     )
     own = _list([name])
-    return (
+    return RenderedRights(
         ",\n".join(rules),
         f'   {{"id": {own[1:-1]}, "cert_common_names": {own}}}',
         f'   {{"rules": {_list(ids)}, "subjects": {own}}}',

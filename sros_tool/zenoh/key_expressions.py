@@ -8,7 +8,7 @@ Source: zenoh.io "Key Expressions"; measured with the wheel 1.10.2.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 
 ANY_PART, ANY_CHUNKS = "$*", "**"
@@ -26,6 +26,10 @@ def canonical(chunks: Iterable[str]) -> str:
     A chunk that is only ``$*`` becomes ``*``, and of wildcards that follow each other, each ``*``
     stands before one ``**``.  Rules in another form keep a session from opening.
     """
+    chunks = tuple(chunks)
+    text = "/".join(chunks)
+    if ANY_PART not in text and ANY_CHUNKS not in text:
+        return text
     found: list[str] = []
     for chunk in chunks:
         while ANY_PART + ANY_PART in chunk:
@@ -70,35 +74,33 @@ class KeyExpressions:
 
     def include(self, narrow: str) -> bool:
         """Return whether one of the expressions includes all of ``narrow``."""
-        return narrow in self._all or any(
-            _includes(wide, narrow) for some in self._wider(narrow) for wide in some
-        )
+        if narrow in self._all:
+            return True
+        return any(_includes(wide, narrow) for wide in self._wider(narrow))
 
     def needed(self) -> list[str]:
         """Return the expressions that no other one includes, sorted; all if they are too alike."""
         ends = {each[len(_fixed_begin(each)) :] for each in self._all}
         if len(ends) == 1 and _SAME_DEPTH.fullmatch(ends.pop()):
             return sorted(self._all)
-        compared = sum(len(some) for each in self._all for some in self._wider(each))
+        compared = sum(len(self._wider(each)) for each in self._all)
         if compared > _MOST_COMPARED:
             return sorted(self._all)
         return sorted(
             each
             for each in self._all
-            if not any(
-                wide != each and _includes(wide, each)
-                for some in self._wider(each)
-                for wide in some
-            )
+            if not any(wide != each and _includes(wide, each) for wide in self._wider(each))
         )
 
-    def _wider(self, narrow: str) -> Iterator[list[str]]:
-        """Yield the expressions with wildcards that begin as ``narrow`` does."""
+    def _wider(self, narrow: str) -> list[str]:
+        """Return the expressions with wildcards that begin as ``narrow`` does."""
+        by_begin, found = self._by_begin, []
         for size in self._sizes:
             if size > len(narrow):
-                return
-            if some := self._by_begin.get(narrow[:size]):
-                yield some
+                break
+            if some := by_begin.get(narrow[:size]):
+                found += some
+        return found
 
 
 @lru_cache(maxsize=_MANY)
@@ -119,7 +121,12 @@ def _includes(wide: str, narrow: str) -> bool:
     if anywhere > 1:
         return _chunks_include(some, others)
     if not anywhere:
-        return len(some) == len(others) and all(map(_chunk_includes, some, others))
+        if len(some) != len(others):
+            return False
+        for one, other in zip(some, others, strict=True):
+            if one != other and not _chunk_includes(one, other):
+                return False
+        return True
     before = some.index(ANY_CHUNKS)
     after = len(some) - before - 1
     between = len(others) - after

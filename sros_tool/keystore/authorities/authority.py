@@ -41,6 +41,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.keys import PrivateKey
+from sros_tool.pki.token import TokenKey
 from sros_tool.validity import iso, window
 
 
@@ -50,6 +51,11 @@ class Authority:
 
     certificate: x509.Certificate
     key: PrivateKey
+
+    @property
+    def on_token(self) -> bool:
+        """Whether a token has the key, so that forked processes cannot sign."""
+        return isinstance(self.key, TokenKey)
 
     def issuer(self) -> Issuer:
         """Return an `Issuer` that signs certificates with this CA."""

@@ -42,12 +42,10 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
 from sros_tool.keystore.recorded import EarlierRights
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction.stage import Staged
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.parallel import Progress, map_slices
+from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import pem, subject_text, validity_of
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem
-from sros_tool.pki.token import TokenKey
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.resources import policies_dir
@@ -172,8 +170,7 @@ class EnclaveWriter:
             self._permissions_validity = self._permissions_validity.within(
                 validity_of(permissions.certificate)
             )
-        keys = (authority.key for authority in (identity, permissions) if authority)
-        self._key_on_token = any(isinstance(key, TokenKey) for key in keys)
+        self._key_on_token = any(each.on_token for each in (identity, permissions) if each)
 
     def write(self, issuance: Issuance) -> Issued:
         """Issue, prove, sign and stage ``issuance``, and record it for the ledger.
@@ -254,22 +251,19 @@ class EnclaveWriter:
         """
         own_process = os.getpid()
 
-        def work_on(
-            part: Sequence[str],
-        ) -> tuple[list[Result], list[Entry], dict[str, Grant], Staged]:
-            mark, first, results = self._transaction.mark(), len(self.entries), []
+        def work_on(part: Sequence[str]) -> tuple[list[Result], list[Entry], dict[str, Grant]]:
+            first, results = len(self.entries), []
             for name in part:
                 results.append(work(name))
                 if progress and os.getpid() == own_process:
                     progress(name)
             grants = {name: self.grants[name] for name in part if name in self.grants}
-            return results, self.entries[first:], grants, self._transaction.since(mark)
+            return results, self.entries[first:], grants
 
-        slices = [(names, work_on(names))] if self._key_on_token else map_slices(names, work_on)
+        slices = self._transaction.on_all_cores(names, work_on, alone=self._key_on_token)
         found: dict[str, Result] = {}
-        for index, (part, (results, entries, grants, staged)) in enumerate(slices):
+        for index, (part, (results, entries, grants)) in enumerate(slices):
             if index:  # this process did the first slice, forked workers did the others
-                self._transaction.absorb(staged)
                 self.entries += entries
                 self.grants |= grants
                 for name in part if progress else ():

@@ -15,11 +15,13 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import Note
 from sros_tool.keystore.authorities.authority import Authority
+from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh.wanted import (
     NO_CHANGE,
     Drift,
+    Drifted,
     ZenohChange,
     drifted,
     signed_path,
@@ -78,20 +80,11 @@ def keep_zenoh(
     root = transaction.root
     wanted = zenoh_documents(root, network, domains, authority, now, change)
     drifts = drifted(root, wanted, authority, change.gone)
-    signing = None
-    written: dict[str, bytes] = {}
     for each in drifts:
         if each.kind is Drift.STALE:
             _remove(transaction, each.path)
-            continue
-        document = wanted.files[each.path]
-        if each.kind is not Drift.UNSIGNED:
-            written[each.path] = document
-        signing = signing or signer()
-        data = b"" if transaction.dry_run else signing.sign(document, "a Zenoh configuration")
-        written[signed_path(each.path)] = data
-    for path, data in written.items():
-        transaction.write(path, data)
+    changed = [each for each in drifts if each.kind is not Drift.STALE]
+    written = _stage(transaction, wanted.files, changed, signer()) if changed else {}
     names = tuple(wanted.enclaves.values())
     return KeptZenoh(
         {name: path for path, name in wanted.enclaves.items()},
@@ -104,9 +97,35 @@ def keep_zenoh(
     )
 
 
+def _stage(
+    transaction: Transaction,
+    files: Mapping[str, bytes],
+    changed: Sequence[Drifted],
+    authority: Authority,
+) -> dict[str, bytes]:
+    """Stage changed configurations and their signed documents on all cores; map them to content."""
+
+    def stage(part: Sequence[Drifted]) -> dict[str, bytes]:
+        written: dict[str, bytes] = {}
+        for each in part:
+            document = files[each.path]
+            if each.kind is not Drift.UNSIGNED:
+                written[each.path] = document
+            data = b"" if transaction.dry_run else authority.sign(document, "a Zenoh configuration")
+            written[signed_path(each.path)] = data
+        for path, data in written.items():
+            transaction.write(path, data)
+        return written
+
+    found: dict[str, bytes] = {}
+    for _, written in transaction.on_all_cores(changed, stage, alone=authority.on_token):
+        found |= written
+    return found
+
+
 def remove_zenoh(transaction: Transaction) -> tuple[str, ...]:
     """Stage the removal of all configurations of a keystore; return their enclaves."""
-    stale = list(stale_files(transaction.root, ()))
+    stale = list(stale_files(transaction.root, (), enclave_names(transaction.root)))
     for each in stale:
         _remove(transaction, each.path)
     return tuple(dict.fromkeys(each.enclave for each in stale))

@@ -21,7 +21,7 @@ import stat
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeVar
 
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder, make_folders, remove_folders
@@ -53,6 +53,9 @@ from sros_tool.keystore.transaction.stage import (
     write_manifest,
 )
 from sros_tool.parallel import map_slices
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _LOG = logging.getLogger(__name__)
 _KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
@@ -298,19 +301,33 @@ class Transaction:
 
     # ── by forked workers ───────────────────────────────────────────────────────────────
 
-    def mark(self) -> tuple[int, int]:
-        """Return a mark of the changes staged so far, for `since`."""
-        return len(self.changes), len(self._moves)
+    def on_all_cores(
+        self,
+        items: Sequence[Item],
+        work: Callable[[Sequence[Item]], Result],
+        *,
+        alone: bool = False,
+    ) -> list[tuple[Sequence[Item], Result]]:
+        """Run ``work``, which may stage changes, on slices of ``items``, as `map_slices` does.
 
-    def since(self, mark: tuple[int, int]) -> Staged:
-        """Return the changes that were staged after ``mark``."""
-        return Staged(tuple(self.changes[mark[0] :]), tuple(self._moves[mark[1] :]))
+        With ``alone``, there are no forked workers: the session of a token does not survive a fork.
+        """
+        own_process, first_change, first_move = os.getpid(), len(self.changes), len(self._moves)
 
-    def absorb(self, staged: Staged) -> None:
-        """Add the changes that a forked worker staged."""
-        self._staged.update(change.path for change in staged.changes)
-        self.changes += staged.changes
-        self._moves += staged.moves
+        def work_on(part: Sequence[Item]) -> tuple[Result, Staged | None]:
+            result = work(part)
+            if os.getpid() == own_process:
+                return result, None
+            changes, moves = self.changes[first_change:], self._moves[first_move:]
+            return result, Staged(tuple(changes), tuple(moves))
+
+        slices = [(items, work_on(items))] if alone else map_slices(items, work_on)
+        for _, (_, staged) in slices:
+            if staged:
+                self._staged.update(change.path for change in staged.changes)
+                self.changes += staged.changes
+                self._moves += staged.moves
+        return [(part, result) for part, (result, _) in slices]
 
     # ── commit ─────────────────────────────────────────────────────────────────────────────
 

@@ -11,6 +11,7 @@ from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 
 from cryptography import x509
 
@@ -37,16 +38,15 @@ from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.policy.model import RIGHTS, Enclave
 from sros_tool.policy.rights import Rules
-from sros_tool.translate_zenoh import (
-    StatedRight,
-    control_of_router,
-    control_of_session,
-    remote_of,
-    remote_rights,
-)
+from sros_tool.translate_zenoh import StatedRight, as_router, remote_of, remote_rights
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import AccessControl, Flow, Message, RemoteRights
-from sros_tool.zenoh.configuration import Configuration, Mode
+from sros_tool.zenoh.configuration import (
+    Mode,
+    RenderedRights,
+    render_configuration,
+    render_rights,
+)
 from sros_tool.zenoh.network import ZenohNetwork
 
 _ANY_PORT_HERE = "tls/localhost:0"
@@ -62,12 +62,13 @@ class ZenohDocuments:
 
     ``files`` maps their paths in the keystore to their content, ``enclaves`` to their enclaves.
     ``left_out`` maps enclaves that get none, and no rights at the others, to the reason: a clause.
-    ``ledger`` is that of the keystore.
+    ``existing`` are the enclaves of the keystore, ``ledger`` is its ledger.
     """
 
     files: Mapping[str, bytes]
     enclaves: Mapping[str, str]
     left_out: Mapping[str, str]
+    existing: tuple[str, ...]
     ledger: Ledger
 
 
@@ -136,7 +137,8 @@ def drifted(
         return found
 
     found = [each for _, part in map_slices(list(wanted.files), compare) for each in part]
-    found += (each for each in stale_files(root, wanted.files) if each.enclave not in gone)
+    stale = stale_files(root, wanted.files, wanted.existing)
+    found += (each for each in stale if each.enclave not in gone)
     return tuple(found)
 
 
@@ -171,8 +173,8 @@ def zenoh_documents(
     Without ``now``, permissions that have expired count, too.
     """
     of_network = _domains(network, domains, root)
-    names = [each for each in enclave_names(root) if each not in change.gone]
-    names = sorted({*names, *change.issued})
+    existing = enclave_names(root)
+    names = sorted({*existing, *change.issued}.difference(change.gone))
     if network.router not in names:
         raise KeystoreError(
             f"keystore '{root}' has no enclave {network.router}, and the router of Zenoh needs it",
@@ -188,38 +190,33 @@ def zenoh_documents(
             "Give the node an enclave of its own.",
         )
     names.remove(network.router)
-    reader = _RightsReader(root, authority, of_network, now, change)
-    read: dict[str, RemoteRights | str] = {}
+    reader = _RightsReader(root, authority, of_network, network.router, now, change)
+    read: dict[str, _RulesOfEnclave | str] = {}
     for _, each in map_slices(names, reader.read):
         read |= each
-    remotes = {name: each for name, each in read.items() if isinstance(each, RemoteRights)}
+    rules = {name: each for name, each in read.items() if not isinstance(each, str)}
     left_out = {name: each for name, each in read.items() if isinstance(each, str)}
     endpoints = tuple(f"tls/{each}" for each in network.endpoints)
     listening = tuple(f"tls/{each}" for each in network.listening())
-    router = Configuration(Mode.ROUTER, listening, (), control_of_router(remotes))
-    files = {_router_path(network.router): router.render()}
-    enclaves = {_router_path(network.router): network.router}
+    of_router = _router_path(network.router)
+    remotes = {name: each.remote for name, each in rules.items()}
+    files = {of_router: render_configuration(Mode.ROUTER, listening, (), remotes.values())}
     direct = network.mode is Mode.PEER
-    if direct and len(files[_router_path(network.router)]) * len(remotes) > _MOST_BYTES:
+    if direct and len(files[of_router]) * len(remotes) > _MOST_BYTES:
         raise UsageError(
             f"the files of {len(remotes)} enclaves would be larger than {_MOST_BYTES >> 20} MB",
             "In peer mode each has the rights of all enclaves.",
             f"Take client mode: `sros zenoh {quote(str(root))} --mode client`.",
         )
 
-    def render(names: Sequence[str]) -> dict[str, bytes]:
-        found = {}
-        for name in names:
-            control = control_of_session(name, network.router, remotes, direct=direct)
-            listen = (_ANY_PORT_HERE,) if direct else ()
-            session = Configuration(network.mode, listen, endpoints, control)
-            found[_session_path(name)] = session.render()
-        return found
-
-    for part, rendered in map_slices(list(remotes), render):
-        files |= rendered
-        enclaves |= zip(rendered, part, strict=True)
-    return ZenohDocuments(files, enclaves, left_out, reader.ledger)
+    listen = (_ANY_PORT_HERE,) if direct else ()
+    for name, own in rules.items():
+        known = {**(remotes if direct else {}), network.router: own.router}
+        in_order = [known[one] for one in sorted(known)] if direct else known.values()
+        session = render_configuration(network.mode, listen, endpoints, in_order)
+        files[_session_path(name)] = session
+    enclaves = {of_router: network.router, **{_session_path(name): name for name in rules}}
+    return ZenohDocuments(files, enclaves, left_out, existing, reader.ledger)
 
 
 def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int, ...]:
@@ -245,6 +242,13 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
 # ── the rights of each enclave ─────────────────────────────────────────────────────────────
 
 
+class _RulesOfEnclave(NamedTuple):
+    """What other processes allow to an enclave, and what the enclave allows to the router."""
+
+    remote: RenderedRights
+    router: RenderedRights
+
+
 class _RightsReader:
     """Reader of the enclaves' rights, as what other processes allow to them.
 
@@ -257,23 +261,25 @@ class _RightsReader:
         root: Path,
         authority: x509.Certificate,
         domains: Sequence[int],
+        router: str,
         now: datetime | None,
         change: ZenohChange,
     ) -> None:
         self._root = root
         self._authority = authority
         self._domains = domains
+        self._router = router
         self._now = now
         self._change = change
         self.ledger = read_ledger(root)
         self._recorded = RecordedRights(root, self.ledger)
         self._revoked = {one.serial for each in read_lists(root) for one in each.revoked}
 
-    def read(self, names: Iterable[str]) -> dict[str, RemoteRights | str]:
-        """Return the rights of enclaves, or why they get none, as a clause."""
+    def read(self, names: Iterable[str]) -> dict[str, _RulesOfEnclave | str]:
+        """Return the rules of enclaves, or why they get none, as a clause."""
         return {name: self._rights(name) for name in names}
 
-    def _rights(self, name: str) -> RemoteRights | str:
+    def _rights(self, name: str) -> _RulesOfEnclave | str:
         grant: Grant | str | None = self._change.issued.get(name)
         if grant is None:
             try:
@@ -290,7 +296,8 @@ class _RightsReader:
                 remote_rights(policy, self._domains[0])  # names the line of the policy
             raise
         _prove(name, rights, stated)
-        return rights
+        of_router = as_router(self._router, rights)
+        return _RulesOfEnclave(render_rights(rights), render_rights(of_router))
 
     def _signed_grant(self, name: str) -> Grant | str:
         folder = enclave_path(self._root, name)
@@ -340,11 +347,9 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
         names = {(e.right.kind, name) for e in rights for name in _examples(e.right.name)}
         for kind, name in names:
             for right in RIGHTS[kind]:
-                check_meaning(
-                    passing[right].include(f"{domain}{name}/type/hash"),
-                    rules.allow(enclave, right, name),
-                    f"the right of {enclave} to {right} {name}",
-                )
+                told = passing[right].include(f"{domain}{name}/type/hash")
+                if told != (meant := rules.allow(enclave, right, name)):
+                    check_meaning(told, meant, f"the right of {enclave} to {right} {name}")
 
 
 def _examples(name: str) -> Iterable[str]:
@@ -365,12 +370,12 @@ def _present(path: Path) -> bytes | None:
         return None
 
 
-def stale_files(root: Path, wanted: Collection[str]) -> Iterable[Drifted]:
-    """Yield the configurations that enclaves should not have.
+def stale_files(root: Path, wanted: Collection[str], names: Iterable[str]) -> Iterable[Drifted]:
+    """Yield the configurations that the enclaves ``names`` should not have.
 
     What nobody ever signed may be a file of somebody's own.
     """
-    for name in enclave_names(root):
+    for name in names:
         for path in (_router_path(name), _session_path(name)):
             if path not in wanted and (root / signed_path(path)).is_file():
                 yield Drifted(name, path, Drift.STALE)
