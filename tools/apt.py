@@ -51,6 +51,10 @@ def _command(*names: str) -> Callable[[], bool]:
     return lambda: any(shutil.which(name) for name in names)
 
 
+def _library(name: str) -> Callable[[], bool]:
+    return lambda: any(Path("/usr/lib").glob(f"*/{name}"))
+
+
 FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
     ("openssl", "OpenSSL", _command("openssl")),
     ("softhsm2", "a PKCS#11 token in software", _command("softhsm2-util")),
@@ -60,6 +64,9 @@ FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
         "Fast DDS for C++, as a second vendor",
         Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp").exists,
     ),
+    ("openssh-server", "robots that Ansible reaches", Path("/usr/sbin/sshd").exists),
+    ("openssh-client", "the way there", _command("ssh")),
+    ("libfaketime", "a robot with a wrong clock", _library("faketime/libfaketime.so.1")),
     ("zsh", "a shell that evaluates what env prints", _command("zsh")),
     ("fish", "another shell that does", _command("fish")),
     ("systemd", "systemd, which verifies its units", _command("systemd-analyze")),

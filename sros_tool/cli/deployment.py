@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.delivery.answer import ImportedEnclave
     from sros_tool.keystore.delivery.export import ExportSelection
     from sros_tool.keystore.delivery.request import Requested
-    from sros_tool.keystore.delivery.signing import Signed
+    from sros_tool.keystore.delivery.signing import Certified, Signed
 
 _STREAM = Path("-")
 """The file argument that means standard input or output."""
@@ -75,6 +75,11 @@ Example:
 )
 @several_enclaves
 @click.option("--force", is_flag=True, help="Replace files in TARGET that differ.")
+@click.option(
+    "--keyless",
+    is_flag=True,
+    help="Also export enclaves whose keys were made on their robots, without the keys.",
+)
 @dry_run_option
 @json_option
 def distribute_key(
@@ -83,6 +88,7 @@ def distribute_key(
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     force: bool,
+    keyless: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -99,14 +105,14 @@ def distribute_key(
         raise UsageError("distribute_key takes a keystore, one or more enclaves and a target")
     target = PATH.convert(rest[-1], None, None)
     _check_target(root, rest[-1])
-    selection = select(root, names, patterns, robots=robots, every=every)
+    selection = select(root, names, patterns, robots=robots, every=every, keyless=keyless)
     notes: tuple[Note, ...] = ()
     if target == _STREAM:
         if not dry_run:
             _refuse_json(as_json)
             _refuse_terminal()
         with progress("exporting"):
-            packed = pack_enclaves(root, selection.names, now=now())
+            packed = pack_enclaves(root, selection.names, now=now(), keyless=keyless)
         changes = [{"action": "send", "path": path} for path in packed.paths]
         if not dry_run:
             _write_stdout(packed.data)
@@ -117,7 +123,13 @@ def distribute_key(
     else:
         with progress("exporting"):
             export = distribute(
-                root, selection.names, target, now=now(), force=force, dry_run=dry_run
+                root,
+                selection.names,
+                target,
+                now=now(),
+                force=force,
+                keyless=keyless,
+                dry_run=dry_run,
             )
         where, done = f"'{target}'", bool(export.changes) and not dry_run
         notes = export.notes
@@ -384,6 +396,12 @@ Example:
     "--renew", is_flag=True, help="Renew an enclave that exists; it keeps its permissions."
 )
 @click.option("--force", is_flag=True, help="Replace ANSWER if it exists.")
+@click.option(
+    "--no-answer",
+    is_flag=True,
+    help="Make no answers, for delivery with `distribute_key --keyless`.  REQUEST may have several "
+    "requests: all are signed, or none; those whose key has a certificate stay as they are.",
+)
 @dry_run_option
 @json_option
 def sign_request(
@@ -392,6 +410,7 @@ def sign_request(
     output: Path | None,
     renew: bool,
     force: bool,
+    no_answer: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -413,6 +432,11 @@ def sign_request(
     if len(rest) != 1:
         raise UsageError("sign_request takes a keystore and one request")
     request = PATH.convert(rest[0], None, None)
+    if no_answer:
+        if output is not None or force:
+            raise UsageError("--no-answer makes no file: leave out -o and --force")
+        _certify(root, request, policy_file, renew=renew, dry_run=dry_run, as_json=as_json)
+        return
     if output is None:
         output = _STREAM if request == _STREAM else Path(request.name).with_suffix(".answer.tar.gz")
     stream = output == _STREAM
@@ -458,6 +482,73 @@ def sign_request(
     if not dry_run:
         print_closed(root, signed.changes)
     print_notes(signed.notes)
+
+
+def _certify(
+    root: Path,
+    request: Path,
+    policy_file: Path | None,
+    *,
+    renew: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Certify the keys of several requests, and print what was done."""
+    from sros_tool.keystore.delivery.signing import certify_requests
+    from sros_tool.policy.document import read_policy
+    from sros_tool.runtime.environment import domain_from
+
+    done = certify_requests(
+        root,
+        _read(request, "signing request"),
+        now=now(),
+        policy=read_policy(policy_file) if policy_file else None,
+        renew=renew,
+        domain=domain_from(os.environ),
+        keyring=keyring(),
+        dry_run=dry_run,
+    )
+    if as_json:
+        print_json(_certified_json(root, done, renew=renew, dry_run=dry_run))
+    elif dry_run:
+        print_plan(root, done.changes)
+    else:
+        for name, key in done.keys.items():
+            if name in done.kept:
+                click.echo(f"the key of enclave {name} has a certificate already", err=True)
+            else:
+                word = "renewed" if renew else "signed the request of"
+                click.echo(f"{word} enclave {name} for the key {key}")
+    if not dry_run:
+        print_closed(root, done.changes)
+    print_notes(done.notes)
+
+
+def _certified_json(root: Path, done: Certified, *, renew: bool, dry_run: bool) -> dict[str, Any]:
+    from sros_tool.keystore.layout import PERMISSIONS
+    from sros_tool.keystore.reader import load_ca_certificate
+
+    outcome = "renewed" if renew else "created"
+    return {
+        "keystore": str(root),
+        "dry_run": dry_run,
+        "answer": None,
+        "enclaves": [
+            {
+                **enclave_json(
+                    root,
+                    name,
+                    "kept" if name in done.kept else outcome,
+                    written=name in done.kept or not dry_run,
+                ),
+                "key_sha256": key,
+            }
+            for name, key in done.keys.items()
+        ],
+        "authorities": _authorities_json(done.identity_ca, load_ca_certificate(root, PERMISSIONS)),
+        "changes": changes_json(root, done.changes),
+        "notes": notes_json(done.notes),
+    }
 
 
 def _signed_json(

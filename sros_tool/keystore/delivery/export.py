@@ -72,11 +72,12 @@ def select(
     *,
     robots: Sequence[str] = (),
     every: bool = False,
+    keyless: bool = False,
 ) -> ExportSelection:
     """Return the enclaves to export: ``names``, and what `select_enclaves` finds.
 
-    An enclave whose key is on its robot is left out if it is not named; a named one is refused by
-    `distribute`.
+    Unless ``keyless`` is set, an enclave whose key is on its robot is left out if it is not named;
+    a named one is refused by `distribute`.
 
     Raises:
         KeystoreError: a pattern matches no enclave, or the keys of all are on robots.
@@ -84,7 +85,7 @@ def select(
     chosen: list[str] = []
     left_out: list[str] = []
     for name in select_enclaves(root, names, patterns, robots=robots, every=every):
-        only_matches = name not in names
+        only_matches = name not in names and not keyless
         at_robot = only_matches and key_on_robot(enclave_path(root, name))
         (left_out if at_robot else chosen).append(name)
     if not chosen:
@@ -103,18 +104,19 @@ def distribute(
     *,
     now: datetime,
     force: bool = False,
+    keyless: bool = False,
     dry_run: bool = False,
 ) -> Export:
     """Export enclaves to ``target``: an archive if it is named ``.tar.gz``, else a folder.
 
     The same enclaves give the same bytes.  In the folder of an earlier export, other enclaves
-    stay.
+    stay.  With ``keyless``, enclaves whose keys are on their robots are exported without them.
 
     Raises:
         KeystoreError: an enclave does not exist or cannot run, ``target`` cannot be used, or holds
             other content that only ``force`` replaces.
     """
-    files = exported_files(root, names, now)
+    files = exported_files(root, names, now, keyless=keyless)
     if target.name.endswith(_ARCHIVE_SUFFIXES):
         return Export(target, tuple(names), _write_archive(target, files, force, dry_run))
     changes = _write_folder(root, target, files, force, dry_run)
@@ -142,18 +144,22 @@ class PackedEnclaves:
     paths: tuple[str, ...]
 
 
-def pack_enclaves(root: Path, names: Sequence[str], *, now: datetime) -> PackedEnclaves:
-    """Return enclaves as an archive in memory.
+def pack_enclaves(
+    root: Path, names: Sequence[str], *, now: datetime, keyless: bool = False
+) -> PackedEnclaves:
+    """Return enclaves as an archive in memory; ``keyless`` as in `distribute`.
 
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
     """
-    files = exported_files(root, names, now)
+    files = exported_files(root, names, now, keyless=keyless)
     return PackedEnclaves(pack(files), tuple(files))
 
 
-def exported_files(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
-    """Map the paths of the exported files to their content.
+def exported_files(
+    root: Path, names: Sequence[str], now: datetime, *, keyless: bool = False
+) -> dict[str, bytes]:
+    """Map the paths of the exported files to their content; ``keyless`` as in `distribute`.
 
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
@@ -165,7 +171,8 @@ def exported_files(root: Path, names: Sequence[str], now: datetime) -> dict[str,
         check_enclave_name(name)
         if name not in existing:
             raise no_such_enclave(root, name, existing)
-        if key_on_robot(enclave_path(root, name)):
+        at_robot = key_on_robot(enclave_path(root, name))
+        if at_robot and not keyless:
             raise KeystoreError(
                 f"the key of enclave {name} is not in keystore '{root}'",
                 "It was made on its robot and stays there, so an export could not run.",
@@ -173,10 +180,11 @@ def exported_files(root: Path, names: Sequence[str], now: datetime) -> dict[str,
             )
         folder = enclave_path(root, name)
         state = open_enclave(folder, now=now)
-        if state.problems:
+        problems = state.problems_at_home if at_robot else state.problems
+        if problems:
             raise KeystoreError(
                 f"enclave {name} would not run on a robot",
-                "; ".join(map(str, state.problems)) + ".",
+                "; ".join(map(str, problems)) + ".",
                 f"See `sros inspect {quote(str(folder))}`.",
             )
         _check_zenoh(root, folder, name, state)

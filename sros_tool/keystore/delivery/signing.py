@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime
@@ -11,7 +13,7 @@ from shlex import quote
 from cryptography import x509
 
 from sros_tool.dds.portable import name_notes
-from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.authorities.authority import load_authorities
@@ -45,7 +47,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     list_enclaves,
 )
-from sros_tool.keystore.ledger import append, document_entry, read_ledger
+from sros_tool.keystore.ledger import Entry, append, document_entry, read_ledger
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
     earlier_permissions,
@@ -71,7 +73,7 @@ from sros_tool.pki.certificates import enclave_subject, has_unique_part, pem, va
 from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import holds_private_key, load_key
 from sros_tool.pki.requests import SigningRequest, key_digest, load_request
-from sros_tool.policy.model import Policy
+from sros_tool.policy.model import Enclave, Policy
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
@@ -132,74 +134,214 @@ def sign_request(
         tidy(root)
     list_enclaves(root)
     with Transaction(root, dry_run=dry_run) as transaction:
-        existing = list_enclaves(root)
-        _check_name(root, name, renew, name in existing)
-        known = KnownKeys(root)
-        _check_key(root, request, known, renew)
-        template = load_settings(root)
-        authorities = load_authorities(root, template, keyring, now)
-        governance = load_governance(root, authorities.permissions.certificate)
-        domains = governance.domains().closed()
-        check_domain(domains, domain, root)
-        notes = _new_key_note(root, request) or [*known.shared_notes([name])] if renew else []
-        rights: EarlierRights | StatedRights
-        if renew and stated is None:
-            rights = _earlier_rights(root, name, authorities.permissions.certificate)
-        else:
-            rights = StatedRights(stated or default_rights(template, name), domains)
-        writer = EnclaveWriter(
-            transaction,
-            template,
-            now,
-            identity=authorities.identity,
-            permissions=authorities.permissions,
-        )
-        unique = template.unique_subject or (
-            renew and has_unique_part(_present_certificate(root, name).subject)
-        )
-        identity = NewIdentity(enclave_subject(name, unique=unique), request.public_key)
-        authority = authorities.permissions.certificate
-        earlier = earlier_permissions(root, name, authority) if renew else None
-        issued = writer.write(Issuance(name, identity, rights))
-        if earlier:
-            notes += _lost_rights(root, earlier, issued, now)
-        transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
-        link_shared_files(transaction, name, present_files(root, name))
-        notes += [*issued.notes(), *writer.notes, *edit_notes(root, governance)]
-        permissions = authorities.permissions
-        kept = keep_zenoh(
-            transaction,
-            template.zenoh,
-            domains,
-            permissions.certificate,
-            lambda: permissions,
-            now,
-            ZenohChange(writer.grants, stated={name: stated}),
-        )
-        notes += kept.notes
+        signer = _Signer(transaction, keyring, domain, now)
+        issued = signer.certify(request, stated, renew=renew)
+        kept = signer.keep_zenoh()
         files = _answer_files(root, issued, kept)
         number = read_ledger(root).next_number()
-        sealed = seal(files, number, authorities.permissions)
+        sealed = seal(files, number, signer.authorities.permissions)
         _check_result(RequestAnswer(name, files, sealed), request, now)
         archive = pack({SEAL: sealed, **files})
         sent = document_entry(now, "answer", sealed, enclave=name, number=number)
-        append(transaction, [*writer.entries, sent], authorities.identity, now)
+        signer.record(sent)
         staged = staged_file(answer, archive) if answer and not dry_run else nullcontext()
         with staged as put_in_place:
             transaction.commit()
             if put_in_place:
                 put_in_place()
-    if not renew:
-        notes += name_notes({*existing, name}, [name])
     return Signed(
         name,
         key_digest(request.public_key),
-        authorities.identity.certificate,
+        signer.authorities.identity.certificate,
         archive,
         renew,
         tuple(transaction.changes),
-        tuple(notes),
+        signer.all_notes(),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Certified:
+    """Requests that were certified without answers.
+
+    ``keys`` maps each enclave to the SHA-256 of its public key; ``kept`` are those of them whose
+    key had a certificate already.
+    """
+
+    keys: Mapping[str, str]
+    kept: tuple[str, ...]
+    identity_ca: x509.Certificate
+    changes: tuple[Change, ...]
+    notes: tuple[Note, ...]
+
+
+def certify_requests(
+    root: Path,
+    data: bytes,
+    *,
+    now: datetime,
+    policy: Policy | None = None,
+    renew: bool = False,
+    domain: int | None = None,
+    keyring: Keyring = IN_KEYSTORE,
+    dry_run: bool = False,
+) -> Certified:
+    """Certify the keys of several requests (PEM, one after the other), all or none.
+
+    As `sign_request`, but no answers are made: an export without keys brings the enclaves to their
+    robots.  Unless ``renew`` is set, an enclave whose key is certified already stays as it is.
+
+    Raises:
+        PkiError: a request is not valid.
+        KeystoreError: as for `sign_request`, or two requests are for one enclave or one key.
+    """
+    requests = [load_request(each, f"number {at}") for at, each in enumerate(_each(data), 1)]
+    if not requests:
+        raise DocumentError("there is no signing request", "", "Give the request.pem of enclaves.")
+    _check_distinct(requests)
+    stated = {
+        each.name: stated_enclave(policy, check_enclave_name(each.name)) if policy else None
+        for each in requests
+    }
+    if not dry_run:
+        tidy(root)
+    list_enclaves(root)
+    kept: tuple[str, ...] = ()
+    with Transaction(root, dry_run=dry_run) as transaction:
+        if not renew:
+            existing = set(list_enclaves(root))
+            kept = tuple(each.name for each in requests if _is_certified(root, each, existing))
+        signer = _Signer(transaction, keyring, domain, now)
+        for request in requests:
+            if request.name not in kept:
+                signer.certify(request, stated[request.name], renew=renew)
+        if len(kept) < len(requests):
+            signer.keep_zenoh()
+            signer.record()
+            transaction.commit()
+    return Certified(
+        {each.name: key_digest(each.public_key) for each in requests},
+        kept,
+        signer.authorities.identity.certificate,
+        tuple(transaction.changes),
+        signer.all_notes(),
+    )
+
+
+_END = b"-----END CERTIFICATE REQUEST-----"
+
+
+def _each(data: bytes) -> list[bytes]:
+    """Return the requests in a series of them; what is no request is left to the reader."""
+    *parts, rest = data.split(_END)
+    return [part + _END + b"\n" for part in parts] + ([rest] if rest.strip() else [])
+
+
+def _check_distinct(requests: Sequence[SigningRequest]) -> None:
+    names = Counter(each.name for each in requests)
+    keys = Counter(key_digest(each.public_key) for each in requests)
+    for request in requests:
+        if names[request.name] > 1:
+            raise KeystoreError(
+                f"two requests are for enclave {request.name}", "", "Give only one of them."
+            )
+        if keys[key_digest(request.public_key)] > 1:
+            raise KeystoreError(
+                f"the key for enclave {request.name} is in another request, too",
+                "Two enclaves with one key are one identity: each can act as the other.",
+                "Create a key for each enclave with `sros create_request`.",
+            )
+
+
+def _is_certified(root: Path, request: SigningRequest, existing: Collection[str]) -> bool:
+    """Return whether the enclave of a request has a certificate for its key."""
+    if request.name not in existing:
+        return False
+    return _present_certificate(root, request.name).public_key() == request.public_key
+
+
+class _Signer:
+    """The certification of requests in one transaction."""
+
+    def __init__(
+        self, transaction: Transaction, keyring: Keyring, domain: int | None, now: datetime
+    ) -> None:
+        root = transaction.root
+        self._transaction = transaction
+        self._root = root
+        self._now = now
+        self._existing = list_enclaves(root)
+        self._known = KnownKeys(root)
+        self._template = load_settings(root)
+        self.authorities = load_authorities(root, self._template, keyring, now)
+        self._governance = load_governance(root, self.authorities.permissions.certificate)
+        self._domains = self._governance.domains().closed()
+        check_domain(self._domains, domain, root)
+        self._writer = EnclaveWriter(
+            transaction,
+            self._template,
+            now,
+            identity=self.authorities.identity,
+            permissions=self.authorities.permissions,
+        )
+        self._stated: dict[str, Enclave | None] = {}
+        self._new: list[str] = []
+        self._notes: list[Note] = []
+
+    def certify(self, request: SigningRequest, stated: Enclave | None, *, renew: bool) -> Issued:
+        """Write all files of an enclave except its key; its rights are ``stated``, or kept."""
+        root, name = self._root, request.name
+        _check_name(root, name, renew, name in self._existing)
+        _check_key(root, request, self._known, renew)
+        if renew:
+            note = _new_key_note(root, request)
+            self._notes += note or [*self._known.shared_notes([name])]
+        else:
+            self._new.append(name)
+        authority = self.authorities.permissions.certificate
+        rights: EarlierRights | StatedRights
+        if renew and stated is None:
+            rights = _earlier_rights(root, name, authority)
+        else:
+            rights = StatedRights(stated or default_rights(self._template, name), self._domains)
+        unique = self._template.unique_subject or (
+            renew and has_unique_part(_present_certificate(root, name).subject)
+        )
+        identity = NewIdentity(enclave_subject(name, unique=unique), request.public_key)
+        earlier = earlier_permissions(root, name, authority) if renew else None
+        issued = self._writer.write(Issuance(name, identity, rights))
+        if earlier:
+            self._notes += _lost_rights(root, earlier, issued, self._now)
+        self._transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
+        link_shared_files(self._transaction, name, present_files(root, name))
+        self._notes += issued.notes()
+        self._stated[name] = stated
+        return issued
+
+    def keep_zenoh(self) -> KeptZenoh:
+        """Write what follows for the files of Zenoh, after all requests."""
+        permissions = self.authorities.permissions
+        self._notes += [*self._writer.notes, *edit_notes(self._root, self._governance)]
+        kept = keep_zenoh(
+            self._transaction,
+            self._template.zenoh,
+            self._domains,
+            permissions.certificate,
+            lambda: permissions,
+            self._now,
+            ZenohChange(self._writer.grants, stated=self._stated),
+        )
+        self._notes += kept.notes
+        return kept
+
+    def record(self, *more: Entry) -> None:
+        """Write the ledger."""
+        entries = [*self._writer.entries, *more]
+        append(self._transaction, entries, self.authorities.identity, self._now)
+
+    def all_notes(self) -> tuple[Note, ...]:
+        """Return all remarks."""
+        return (*self._notes, *name_notes({*self._existing, *self._new}, self._new))
 
 
 def _check_free(answer: Path, force: bool) -> None:

@@ -1,0 +1,200 @@
+"""Exports of enclaves as `sros distribute_key` packs them, read as untrusted input.
+
+Like everything that runs on a robot, this needs Python 3.8 and its standard library, not sros.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import io
+import re
+import tarfile
+import zlib
+from typing import Dict, Iterator
+
+KEY_FILE = "key.pem"
+REQUEST_FILE = "request.pem"
+CERTIFICATE_FILE = "cert.pem"
+AUTHORITY_FILES = ("identity_ca.cert.pem", "permissions_ca.cert.pem")
+SIGNED_FILES = ("governance.p7s", "permissions.p7s")
+ZENOH_FILES = ("session.json5", "session.p7s", "router.json5", "router.p7s")
+REQUIRED_FILES = (CERTIFICATE_FILE, *AUTHORITY_FILES, *SIGNED_FILES)
+CONFIRMED_FILES = (*REQUIRED_FILES, "crl.pem", *ZENOH_FILES)
+"""The files of an enclave that an export has besides the key, and that a confirmation names."""
+_LOCAL_FILES = (KEY_FILE, REQUEST_FILE, "answer.p7s", "permissions.xml", "governance.xml")
+"""Other files that an enclave on a robot may have."""
+
+MOST_PACKED = 64 * 1024 * 1024
+MOST_UNPACKED = 256 * 1024 * 1024
+MOST_FILES = 20_000
+MOST_OF_FILE = 17 * 1024 * 1024
+"""Largest sizes in bytes: of an archive, of its content, of one file; and number of entries."""
+
+_TOP = "enclaves"
+_TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_LONGEST_NAME = 64
+_CERTIFICATE = re.compile(
+    rb"-----BEGIN CERTIFICATE-----\s+([A-Za-z0-9+/=\s]+?)-----END CERTIFICATE-----"
+)
+
+Files = Dict[str, bytes]
+"""The content of files by their paths in a keystore, such as ``enclaves/r7/base/cert.pem``."""
+
+
+class RefusedError(Exception):
+    """Something cannot be done; the text says what, why and what to do."""
+
+
+def folder_of(enclave: str) -> str:
+    """Return the path of an enclave's folder in a keystore."""
+    return _TOP + enclave.rstrip("/")
+
+
+def enclave_of(path: str) -> str:
+    """Return the name of the enclave that a file belongs to, by its path in a keystore."""
+    return path.rpartition("/")[0][len(_TOP) :] or "/"
+
+
+def check_enclave(name: str) -> str:
+    """Return ``name`` if it can be that of an enclave.
+
+    Raises:
+        RefusedError: it cannot.
+    """
+    parts = name[1:].split("/") if name != "/" else []
+    if (
+        not name.startswith("/")
+        or len(name) > _LONGEST_NAME
+        or not all(_TOKEN.fullmatch(each) for each in parts)
+    ):
+        raise RefusedError(
+            f"{name[:200]!r} is not the name of an enclave. It has letters, digits and underscores,"
+            f" such as /robot/camera, and at most {_LONGEST_NAME} characters."
+        )
+    return name
+
+
+def is_enclave_path(path: str) -> bool:
+    """Return whether ``path`` is that of a file that an enclave on a robot may have."""
+    folder, _, file = path.rpartition("/")
+    if folder.split("/")[0] != _TOP or file not in (*CONFIRMED_FILES, *_LOCAL_FILES):
+        return False
+    try:
+        check_enclave(folder[len(_TOP) :] or "/")
+    except RefusedError:
+        return False
+    return True
+
+
+def read_archive(packed: bytes) -> Files:
+    """Return the files of an export (``.tar.gz``).
+
+    Raises:
+        RefusedError: it is damaged, too large, or has anything else than whole enclaves; an enclave
+            may lack its key, which then is on the robot.
+    """
+    try:
+        with tarfile.open(fileobj=io.BytesIO(_unzip(packed)), mode="r:") as archive:
+            files = dict(_members(archive))
+    except (tarfile.TarError, zlib.error, EOFError, OSError, ValueError, OverflowError) as error:
+        raise RefusedError(f"The export is damaged or not a .tar.gz archive: {error}.") from error
+    for enclave in enclaves_in(files):
+        missing = [each for each in REQUIRED_FILES if folder_of(enclave) + "/" + each not in files]
+        if missing:
+            raise RefusedError(
+                "The export of enclave {} lacks {}.".format(enclave, ", ".join(missing))
+            )
+    if not files:
+        raise RefusedError("The export is empty.")
+    return files
+
+
+def _unzip(packed: bytes) -> bytes:
+    if len(packed) > MOST_PACKED:
+        raise ValueError(f"it is larger than {MOST_PACKED} bytes")
+    stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    plain = stream.decompress(packed, MOST_UNPACKED + 1)
+    if len(plain) > MOST_UNPACKED:
+        raise ValueError(f"it unpacks to more than {MOST_UNPACKED} bytes")
+    if not stream.eof or stream.unused_data:
+        raise EOFError("its end is missing, or more follows")
+    return plain
+
+
+def _members(archive: tarfile.TarFile) -> Iterator[tuple]:
+    seen: set[str] = set()
+    for number, entry in enumerate(archive):
+        if number >= MOST_FILES:
+            raise ValueError(f"it has more than {MOST_FILES} entries")
+        if entry.isdir():
+            continue
+        if not entry.isreg() or entry.name in seen or not is_enclave_path(entry.name):
+            raise ValueError(f"{entry.name[:200]!r} does not belong to an export")
+        if entry.name.rpartition("/")[2] not in (KEY_FILE, *CONFIRMED_FILES):
+            raise ValueError(f"{entry.name[:200]!r} does not belong to an export")
+        if entry.size > MOST_OF_FILE:
+            raise ValueError(f"{entry.name!r} is larger than {MOST_OF_FILE} bytes")
+        content = archive.extractfile(entry)
+        if content is None:
+            raise ValueError(f"{entry.name!r} has no content")
+        seen.add(entry.name)
+        yield entry.name, content.read()
+
+
+def enclaves_in(files: Files) -> list[str]:
+    """Return the sorted names of the enclaves that have a file."""
+    return sorted({enclave_of(path) for path in files})
+
+
+def changed_enclaves(before: Files, after: Files) -> list[str]:
+    """Return the sorted names of the enclaves of ``after`` of which a file changed or went away."""
+    different = {path for path in {*before, *after} if before.get(path) != after.get(path)}
+    return sorted({enclave_of(path) for path in different} & set(enclaves_in(after)))
+
+
+def authorities(files: Files) -> frozenset[bytes]:
+    """Return the certificates of the CAs (as base64) that the enclaves trust."""
+    return frozenset(
+        b"".join(block.split())
+        for path, content in files.items()
+        if path.rpartition("/")[2] in AUTHORITY_FILES
+        for block in _CERTIFICATE.findall(content)
+    )
+
+
+def authority_digests(files: Files) -> frozenset[str]:
+    """Return the SHA-256 of the certificates of all permissions CAs, in hexadecimal."""
+    import base64
+    import binascii
+
+    found = set()
+    for path, content in files.items():
+        if path.rpartition("/")[2] == AUTHORITY_FILES[1]:
+            for block in _CERTIFICATE.findall(content):
+                try:
+                    found.add(hashlib.sha256(base64.b64decode(block)).hexdigest())
+                except binascii.Error:
+                    continue
+    return frozenset(found)
+
+
+def confirmation(robot: str, files: Files, now: float) -> dict:
+    """Return what a robot confirms that it has: for each file but keys its SHA-256.
+
+    Args:
+        robot: the name of the robot.
+        files: the files of its keystore.
+        now: seconds since 1970 by the clock of the robot.
+    """
+    moment = datetime.datetime.fromtimestamp(int(now), datetime.timezone.utc)
+    return {
+        "format": 1,
+        "robot": robot,
+        "time": moment.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "files": {
+            path: hashlib.sha256(content).hexdigest()
+            for path, content in sorted(files.items())
+            if path.rpartition("/")[2] in CONFIRMED_FILES
+        },
+    }

@@ -1,0 +1,346 @@
+"""The folder of a robot's enclaves: read as hostile input, replaced whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import fcntl
+import json
+import os
+import pwd
+import shutil
+import stat
+import time
+from typing import Iterator
+
+from ansible_collections.sros.fleet.plugins.module_utils.exports import (
+    KEY_FILE,
+    MOST_FILES,
+    MOST_OF_FILE,
+    MOST_UNPACKED,
+    Files,
+    RefusedError,
+    check_enclave,
+    is_enclave_path,
+)
+
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_EXCHANGE = 2
+_MOST_LINKS = 40
+_LONGEST_WAIT = 60.0
+
+
+class Place:
+    """The folder ``path`` with the enclaves of a robot, and next to it what a change needs.
+
+    Only root and this user may be able to change the folders above it: then no link that somebody
+    else made is on the way, and none can appear.  The folder itself may belong to another user,
+    ``owner``, and so its content is not trusted.
+
+    Next to the folder ``keystore``, ``.keystore.sros-new`` and ``.keystore.sros-old`` exist only
+    during a change, and ``.keystore.sros-restart`` lists the enclaves whose processes still have
+    files of before.
+    """
+
+    def __init__(self, path: str, owner: str | None = None) -> None:
+        """Check the path.
+
+        Raises:
+            RefusedError: the path cannot be used, or there is no user ``owner``.
+        """
+        self.path = os.path.abspath(path)
+        self._parent, self._name = os.path.split(self.path)
+        if not self._name:
+            raise RefusedError("The folder of the enclaves cannot be '/'. Name another one.")
+        self._owner = _user(owner)
+        _check_way(self._parent)
+        if os.path.islink(self.path):
+            raise RefusedError(
+                f"'{self.path}' is a symbolic link. Name the folder that it leads to, or remove it."
+            )
+
+    @property
+    def stage(self) -> str:
+        """The path of the folder in which new files are prepared."""
+        return self._beside("new")
+
+    def _beside(self, what: str) -> str:
+        return os.path.join(self._parent, f".{self._name}.sros-{what}")
+
+    # ── reading ────────────────────────────────────────────────────────────────────────────
+
+    def read(self) -> Files:
+        """Return all files in the folder; none if it does not exist.
+
+        Raises:
+            RefusedError: something in it is not of an enclave, so that the folder may have another
+                purpose, or cannot be read.
+        """
+        found: Files = {}
+        size = 0
+        try:
+            top = os.open(self.path, _FOLDER)
+        except FileNotFoundError:
+            return found
+        except OSError as error:
+            raise RefusedError(f"'{self.path}' cannot be read: {error.strerror}.") from error
+        try:
+            for folder, folders, files, handle in os.fwalk(".", dir_fd=top, onerror=_fail):
+                below = os.path.relpath(folder, ".")
+                names = [(each, True) for each in folders] + [(each, False) for each in files]
+                for name, is_folder in names:
+                    path = name if below == "." else f"{below}/{name}"
+                    if not self._belongs(path, name, is_folder, handle):
+                        raise RefusedError(
+                            f"'{self.path}/{path}' is not a file of an enclave. The folder is"
+                            " replaced as a whole, so only enclaves may be in it: move the file"
+                            " away, or choose another folder."
+                        )
+                    if is_folder:
+                        continue
+                    found[path] = _read_file(handle, name, os.path.join(self.path, path))
+                    size += len(found[path])
+                    if len(found) > MOST_FILES or size > MOST_UNPACKED:
+                        raise RefusedError(f"'{self.path}' has too many or too large files.")
+        except OSError as error:
+            raise RefusedError(f"'{self.path}' cannot be read: {error}.") from error
+        finally:
+            os.close(top)
+        return found
+
+    @staticmethod
+    def _belongs(path: str, name: str, is_folder: bool, handle: int) -> bool:
+        state = os.stat(name, dir_fd=handle, follow_symlinks=False)
+        if not is_folder:
+            return stat.S_ISREG(state.st_mode) and is_enclave_path(path)
+        return stat.S_ISDIR(state.st_mode) and is_enclave_path(path + "/" + KEY_FILE)
+
+    def is_closed(self) -> bool:
+        """Return whether owners and modes are as `replace` leaves them."""
+        wanted = self._owner[0] if self._owner else os.geteuid()
+        for _folder, _, files, handle in os.fwalk(self.path):
+            state = os.fstat(handle)
+            if state.st_uid != wanted or stat.S_IMODE(state.st_mode) != 0o700:
+                return False
+            for name in files:
+                state = os.stat(name, dir_fd=handle, follow_symlinks=False)
+                if state.st_uid != wanted or stat.S_IMODE(state.st_mode) != _mode(name):
+                    return False
+        return True
+
+    # ── changing ───────────────────────────────────────────────────────────────────────────
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Let only one process at a time change the folder; tidy up what a killed one left.
+
+        Raises:
+            RefusedError: another process has it for a minute.
+        """
+        self._make_parents()
+        handle = os.open(
+            self._beside("lock"), os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600
+        )
+        try:
+            end = time.monotonic() + _LONGEST_WAIT
+            while True:
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if time.monotonic() > end:
+                        raise RefusedError(
+                            f"Another process is changing '{self.path}'. Run it again later."
+                        ) from None
+                    time.sleep(0.2)
+            self._recover()
+            yield
+        finally:
+            os.close(handle)
+
+    def _make_parents(self) -> None:
+        try:
+            os.makedirs(self._parent, 0o755, exist_ok=True)
+        except OSError as error:
+            raise RefusedError(
+                f"'{self._parent}' cannot be made: {error.strerror}. Choose a folder of this user,"
+                " or become root."
+            ) from error
+
+    def _recover(self) -> None:
+        """Undo a change that was interrupted before the new folder was in its place."""
+        old = self._beside("old")
+        if not os.path.lexists(self.path) and os.path.isdir(old):
+            os.rename(old, self.path)
+        for each in (self.stage, old):
+            if os.path.lexists(each):
+                shutil.rmtree(each)
+
+    def prepare(self, files: Files) -> None:
+        """Write all files into `stage`, which only this user can open."""
+        os.mkdir(self.stage, 0o700)
+        for path, content in sorted(files.items()):
+            whole = os.path.join(self.stage, path)
+            os.makedirs(os.path.dirname(whole), 0o700, exist_ok=True)
+            handle = os.open(whole, _NEW_FILE, 0o600)
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                os.fchmod(file.fileno(), _mode(whole))
+        for _folder, _, _, handle in os.fwalk(self.stage):
+            os.fchmod(handle, 0o700)  # whatever the umask is
+
+    def discard(self) -> None:
+        """Remove what `prepare` wrote."""
+        if os.path.lexists(self.stage):
+            shutil.rmtree(self.stage)
+
+    def replace(self) -> None:
+        """Put the prepared folder in place of the present one; the present one is removed."""
+        if self._owner:
+            for _, _, files, handle in os.fwalk(self.stage, topdown=False):
+                for name in files:
+                    os.chown(name, *self._owner, dir_fd=handle, follow_symlinks=False)
+                os.fchown(handle, *self._owner)
+        os.sync()
+        old = self._beside("old")
+        if not os.path.lexists(self.path):
+            os.rename(self.stage, self.path)
+        elif _exchange(self.stage, self.path):
+            os.rename(self.stage, old)
+        else:
+            os.rename(self.path, old)
+            os.rename(self.stage, self.path)
+        _flush(self._parent)
+        if os.path.lexists(old):
+            shutil.rmtree(old)
+
+    # ── restarts that are due ──────────────────────────────────────────────────────────────
+
+    def due(self) -> list[str]:
+        """Return the enclaves whose processes have to be restarted since earlier changes."""
+        try:
+            handle = os.open(self._beside("restart"), _FILE)
+            with os.fdopen(handle, "rb") as file:
+                names = json.loads(file.read(MOST_OF_FILE).decode())
+            return sorted({check_enclave(each) for each in names})
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise RefusedError(
+                f"'{self._beside('restart')}' cannot be read: {error}. Restart all processes with"
+                " enclaves, then remove it."
+            ) from error
+
+    def set_due(self, names: list[str]) -> None:
+        """Record the enclaves whose processes have to be restarted; flushed to the disk."""
+        path, spare = self._beside("restart"), self._beside("restart-new")
+        if not names:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(path)
+            return
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(spare)
+        with os.fdopen(os.open(spare, _NEW_FILE, 0o600), "w") as file:
+            json.dump(sorted(names), file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(spare, path)
+        _flush(self._parent)
+
+
+def _mode(path: str) -> int:
+    return 0o600 if os.path.basename(path) == KEY_FILE else 0o644
+
+
+def _user(name: str | None) -> tuple[int, int] | None:
+    """Return the user id and group id of a user, or None if nothing is to be given away."""
+    if not name:
+        return None
+    try:
+        entry = pwd.getpwnam(name)
+    except KeyError:
+        raise RefusedError(f"There is no user {name!r} on this robot.") from None
+    if entry.pw_uid == os.geteuid():
+        return None
+    if os.geteuid() != 0:
+        raise RefusedError(
+            f"Only root can give files to the user {name!r}. Connect as that user, or become root."
+        )
+    return entry.pw_uid, entry.pw_gid
+
+
+def _check_way(path: str) -> None:
+    """Refuse a path on which anybody but root and this user can put a link or another folder."""
+    trusted = (0, os.geteuid())
+    here, rest, links = "/", path.split("/")[::-1], 0
+    while rest:
+        part = rest.pop()
+        if part in ("", "."):
+            continue
+        if part == "..":
+            here = os.path.dirname(here)
+            continue
+        here = os.path.join(here, part)
+        try:
+            state = os.lstat(here)
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise RefusedError(f"'{here}' cannot be used: {error.strerror}.") from error
+        if state.st_uid not in trusted:
+            raise RefusedError(
+                f"'{here}' belongs to another user, who could lead the files elsewhere. Choose a"
+                " folder below one of root's, or connect as that user."
+            )
+        if stat.S_ISLNK(state.st_mode):
+            links += 1
+            if links > _MOST_LINKS:
+                raise RefusedError(f"'{path}' leads through too many links.")
+            target = os.readlink(here)
+            here = "/" if target.startswith("/") else os.path.dirname(here)
+            rest += target.split("/")[::-1]
+        elif not stat.S_ISDIR(state.st_mode):
+            raise RefusedError(f"'{here}' is not a folder.")
+        elif state.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not state.st_mode & stat.S_ISVTX:
+            raise RefusedError(
+                f"Others can write to '{here}' (mode {stat.S_IMODE(state.st_mode):04o}), and could"
+                " lead the files elsewhere. Choose another folder, or take these rights away."
+            )
+
+
+def _fail(error: OSError) -> None:
+    raise error
+
+
+def _read_file(folder: int, name: str, whole: str) -> bytes:
+    with os.fdopen(os.open(name, _FILE, dir_fd=folder), "rb") as file:
+        state = os.fstat(file.fileno())
+        if not stat.S_ISREG(state.st_mode) or state.st_size > MOST_OF_FILE:
+            raise RefusedError(f"'{whole}' is not a regular file, or too large.")
+        return file.read(MOST_OF_FILE)
+
+
+def _exchange(one: str, other: str) -> bool:
+    """Atomically exchange two names (renameat2(2)); return False if that is not supported."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except AttributeError:
+        return False
+    here = -100  # AT_FDCWD
+    if rename(here, os.fsencode(one), here, os.fsencode(other), _EXCHANGE) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
+        return False
+    raise OSError(number, os.strerror(number), one, None, other)
+
+
+def _flush(folder: str) -> None:
+    handle = os.open(folder, _FOLDER)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

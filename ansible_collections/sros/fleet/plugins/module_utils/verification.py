@@ -1,0 +1,198 @@
+"""Whether enclaves on a robot can be used: asked of `sros verify`, or else of OpenSSL."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import re
+import shutil
+import subprocess
+import time
+
+from ansible_collections.sros.fleet.plugins.module_utils.exports import (
+    AUTHORITY_FILES,
+    CERTIFICATE_FILE,
+    KEY_FILE,
+    SIGNED_FILES,
+    RefusedError,
+    folder_of,
+)
+
+_LONGEST = 300
+"""Seconds after which a program is taken to hang."""
+
+_DATES = re.compile(r"<not_(before|after)>\s*([0-9T:+Z-]{10,40})\s*</not_")
+_SUBJECT = re.compile(r"<subject_name>([^<]{1,2000})</subject_name>")
+_MOST_SHOWN = 1000
+
+
+def verify(folder: str, enclaves: list[str], program: list[str]) -> dict:
+    """Return whether a process can run in each of these enclaves.
+
+    Args:
+        folder: the keystore of the robot.
+        enclaves: the enclaves that are to be usable.
+        program: the command that runs sros; where it does not exist, OpenSSL is asked.
+
+    Returns:
+        ``by`` ("sros" or "openssl"), ``ok``, ``problems`` (why an enclave cannot be used) and
+        ``remarks`` (what else sros found).
+
+    Raises:
+        RefusedError: neither program is there, or it could not be asked.
+    """
+    if shutil.which(program[0]):
+        return _by_sros(folder, enclaves, program)
+    openssl = shutil.which("openssl")
+    if not openssl:
+        raise RefusedError(
+            "The enclaves cannot be verified: this robot has neither sros nor openssl. Install the"
+            " package openssl on it."
+        )
+    problems: list[str] = []
+    for name in enclaves:
+        found = _by_openssl(openssl, os.path.join(folder, folder_of(name)), name)
+        problems += [f"{name}: {each}" for each in found]
+    return {"by": "openssl", "ok": not problems, "problems": problems, "remarks": []}
+
+
+def _by_sros(folder: str, enclaves: list[str], program: list[str]) -> dict:
+    done = _run([*program, "verify", folder, "--json"])
+    try:
+        answer = json.loads(done.stdout)
+        loadable = {each["name"]: bool(each["loadable"]) for each in answer["enclaves"]}
+        texts: dict[str, list[str]] = {}
+        for each in answer["findings"]:
+            texts.setdefault(each["enclave"] or "", []).append(str(each["text"]))
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise RefusedError(
+            "`sros verify` gave no answer: {}".format(_short(done.stderr.decode(errors="replace")))
+        ) from error
+    problems: list[str] = []
+    remarks: list[str] = list(texts.pop("", []))
+    for name in enclaves:
+        found = texts.pop(name, [])
+        if loadable.get(name):
+            remarks += [f"{name}: {each}" for each in found]
+        else:
+            problems += [f"{name}: {each}" for each in found or ["it is not loadable"]]
+    return {"by": "sros", "ok": not problems, "problems": problems, "remarks": remarks}
+
+
+def _by_openssl(openssl: str, folder: str, name: str) -> list[str]:
+    """Return why an enclave cannot be used, as far as OpenSSL can tell."""
+    at = {each: os.path.join(folder, each) for each in (KEY_FILE, CERTIFICATE_FILE, "crl.pem")}
+    identity, permissions = (os.path.join(folder, each) for each in AUTHORITY_FILES)
+    problems: list[str] = []
+    chain = [openssl, "verify", "-no-CApath", "-partial_chain", "-CAfile", identity]
+    if os.path.exists(at["crl.pem"]):
+        chain += ["-crl_check", "-CRLfile", at["crl.pem"]]
+    done = _run([*chain, at[CERTIFICATE_FILE]])
+    if done.returncode:
+        problems.append(f"cert.pem: {_why(done)}")
+    shown = _run([openssl, "x509", "-in", at[CERTIFICATE_FILE], "-noout", "-pubkey"])
+    own = _run([openssl, "pkey", "-in", at[KEY_FILE], "-pubout"])
+    if own.returncode:
+        problems.append(f"key.pem: {_why(own)}")
+    elif shown.stdout.split() != own.stdout.split():
+        problems.append("key.pem: it is not the key of cert.pem")
+    subject = _run(
+        [openssl, "x509", "-in", at[CERTIFICATE_FILE], "-noout", "-subject", "-nameopt", "RFC2253"]
+    )
+    if not _names(subject.stdout.decode(errors="replace").partition("=")[2], name):
+        problems.append("cert.pem: it is not for this enclave")
+    for file in SIGNED_FILES:
+        path = os.path.join(folder, file)
+        done = _run(
+            [
+                openssl,
+                "smime",
+                "-verify",
+                "-in",
+                path,
+                "-no-CApath",
+                "-partial_chain",
+                "-CAfile",
+                permissions,
+                "-nointern",
+                "-certfile",
+                permissions,
+                "-purpose",
+                "any",
+            ]
+        )
+        if done.returncode:
+            problems.append(f"{file}: {_why(done)}")
+        elif file == "permissions.p7s":
+            problems += [f"{file}: {each}" for each in _permissions(done.stdout, name)]
+    return problems
+
+
+def _permissions(document: bytes, name: str) -> list[str]:
+    """Return what is wrong with a permissions document that is signed: dates and subject."""
+    text = document.decode(errors="replace")
+    problems = []
+    if not any(_names(each, name) for each in _SUBJECT.findall(text)):
+        problems.append("it is not for this enclave")
+    now = datetime.datetime.fromtimestamp(time.time(), datetime.timezone.utc)
+    for which, written in _DATES.findall(text):
+        try:
+            moment = datetime.datetime.fromisoformat(written.replace("Z", "+00:00"))
+        except ValueError:
+            problems.append(f"its date {written} cannot be read")
+            continue
+        if moment.tzinfo is None:
+            moment = moment.replace(tzinfo=datetime.timezone.utc)
+        if which == "before" and moment > now:
+            problems.append(f"it is not valid before {written}")
+        if which == "after" and moment < now:
+            problems.append(f"it expired at {written}")
+    return problems
+
+
+def _names(subject: str, name: str) -> bool:
+    """Return whether a subject's common name is that of an enclave."""
+    parts = [each.strip() for each in subject.replace("/CN=", ",CN=").split(",")]
+    return any(each == "CN=" + name for each in parts)
+
+
+def _run(command: list[str]) -> subprocess.CompletedProcess:
+    # No certificates but those of the enclave vouch for it.
+    alone = {"SSL_CERT_FILE": os.devnull, "SSL_CERT_DIR": "/nonexistent", "LC_ALL": "C.UTF-8"}
+    try:
+        return subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            env={**os.environ, **alone},
+            timeout=_LONGEST,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise RefusedError(f"{command[0]} did not end within {_LONGEST} s.") from error
+    except OSError as error:
+        raise RefusedError(f"{command[0]} cannot be run: {error.strerror}.") from error
+
+
+def _why(done: subprocess.CompletedProcess) -> str:
+    """Return what OpenSSL says in one line."""
+    lines = (done.stderr or done.stdout).decode(errors="replace").splitlines()
+    told = [each for each in lines if each.startswith("error ")] or lines
+    return _short("; ".join(each.strip() for each in told) or "it cannot be read")
+
+
+def _short(text: str) -> str:
+    shown = "".join(each if each.isprintable() else "?" for each in " ".join(text.split()))
+    return shown if len(shown) <= _MOST_SHOWN else shown[:_MOST_SHOWN] + "..."
+
+
+def clock_remark(here: float, home: float | None, longest: float) -> str:
+    """Return what to say about a clock that differs by more than ``longest`` seconds, or ""."""
+    if home is None or abs(here - home) <= longest:
+        return ""
+    ahead = datetime.timedelta(seconds=int(abs(here - home)))
+    return "The clock of this robot is {} {}. Set it (such as with NTP).".format(
+        ahead,
+        "ahead" if here > home else "behind",
+    )

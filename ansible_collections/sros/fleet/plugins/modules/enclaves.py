@@ -1,0 +1,346 @@
+#!/usr/bin/python
+"""Install the enclaves of a robot, or look at them, on the robot."""
+
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+DOCUMENTATION = r"""
+module: enclaves
+short_description: Install the enclaves of a robot from a keystore of sros
+description:
+  - At home, exports the enclaves of the robot with C(sros distribute_key), and installs them on
+    the robot, all of them or, if anything fails, none.
+  - The new files are verified next to the present ones, and then take their place in one step.
+    Enclaves that the keystore does not have any more are removed. An enclave that waits for the
+    answer to its signing request stays.
+  - A key that was made on the robot stays where it is; the other files have to fit it.
+  - Returns what the robot then has, without secrets, so that C(sros fleet confirm) can record it.
+  - The robot needs Python 3.8 and OpenSSL (the program C(openssl)), not sros. Where it has sros,
+    C(sros verify) checks the enclaves.
+options:
+  keystore:
+    description:
+      - The keystore at home. Without it nothing is installed, and the present enclaves are
+        verified.
+    type: path
+  robot:
+    description: The name of the robot in the fleet of the keystore.
+    type: str
+    required: true
+  patterns:
+    description:
+      - Patterns of the enclaves of this robot, such as V(/r7/*), for a keystore without a fleet.
+    type: list
+    elements: str
+    default: []
+  program:
+    description: The command that runs sros at home.
+    type: list
+    elements: str
+    default: [sros]
+  dest:
+    description:
+      - The folder of the enclaves on the robot, which has nothing else. Only root and the
+        connected user may be able to change the folders above it.
+    type: path
+    default: /etc/sros/keystore
+  owner:
+    description:
+      - The user who runs the nodes and becomes the owner of the files. The default is the
+        connected user.
+    type: str
+  replace_authorities:
+    description:
+      - Also install enclaves of another keystore, which share no CA with the present ones.
+    type: bool
+    default: false
+  verifier:
+    description: The command that runs sros on the robot, where it is installed.
+    type: list
+    elements: str
+    default: [sros]
+  longest_clock_difference:
+    description: Warn if the clocks at home and on the robot differ by more, in seconds.
+    type: int
+    default: 300
+  archive:
+    description: Filled in by the action at home. The export (C(.tar.gz)) in base64.
+    type: str
+  home_time:
+    description: Filled in by the action at home. Seconds since 1970 by its clock.
+    type: float
+attributes:
+  check_mode:
+    support: full
+    description: Says what would change; new files are not verified.
+  diff_mode:
+    support: full
+    description: Shows SHA-256 of files, and the text of governance and permissions; keys never.
+author:
+  - The authors of sros
+"""
+
+EXAMPLES = r"""
+- name: Install the enclaves of this robot
+  sros.fleet.enclaves:
+    keystore: /home/me/keystore
+    robot: "{{ inventory_hostname }}"
+    owner: ros
+
+- name: Look at what the robot has, and verify it
+  sros.fleet.enclaves:
+    robot: "{{ inventory_hostname }}"
+"""
+
+RETURN = r"""
+changed_enclaves:
+  description: Enclaves of which a file changed, or would in check mode.
+  type: list
+  elements: str
+  returned: always
+removed_enclaves:
+  description: Enclaves that were removed, because the keystore does not have them.
+  type: list
+  elements: str
+  returned: always
+restart:
+  description: Enclaves whose processes still have earlier files, of this change or before.
+  type: list
+  elements: str
+  returned: always
+routers:
+  description: Enclaves with the configuration of a Zenoh router.
+  type: list
+  elements: str
+  returned: always
+verification:
+  description: By which program the enclaves were verified, and what it found.
+  type: dict
+  returned: unless something would change in check mode
+confirmation:
+  description: What the robot has, with the SHA-256 of each file but keys.
+  type: dict
+  returned: always
+clock_difference:
+  description: Seconds that the clock of the robot is ahead.
+  type: int
+  returned: when installing
+"""
+
+import base64
+import binascii
+import hashlib
+import re
+import time
+
+from ansible.module_utils.basic import AnsibleModule
+
+from ansible_collections.sros.fleet.plugins.module_utils.exports import (
+    CERTIFICATE_FILE,
+    KEY_FILE,
+    REQUEST_FILE,
+    Files,
+    RefusedError,
+    authorities,
+    changed_enclaves,
+    confirmation,
+    enclave_of,
+    enclaves_in,
+    folder_of,
+    read_archive,
+)
+from ansible_collections.sros.fleet.plugins.module_utils.places import Place
+from ansible_collections.sros.fleet.plugins.module_utils.verification import (
+    clock_remark,
+    verify,
+)
+
+_ARGUMENTS = {
+    "keystore": {"type": "path"},
+    "robot": {"type": "str", "required": True},
+    "patterns": {"type": "list", "elements": "str", "default": []},
+    "program": {"type": "list", "elements": "str", "default": ["sros"]},
+    "dest": {"type": "path", "default": "/etc/sros/keystore"},
+    "owner": {"type": "str"},
+    "replace_authorities": {"type": "bool", "default": False},
+    "verifier": {"type": "list", "elements": "str", "default": ["sros"]},
+    "longest_clock_difference": {"type": "int", "default": 300},
+    "archive": {"type": "str", "no_log": True},
+    "home_time": {"type": "float"},
+}
+
+
+def main() -> None:
+    """Run the module."""
+    module = AnsibleModule(argument_spec=_ARGUMENTS, supports_check_mode=True)
+    now = time.time()
+    remark = clock_remark(
+        now, module.params["home_time"], module.params["longest_clock_difference"]
+    )
+    if remark:
+        module.warn(remark)
+    try:
+        result = _run(module, now)
+    except (RefusedError, OSError) as error:
+        module.fail_json(msg="{}{}".format(error, " " + remark if remark else ""))
+    for each in result.get("verification", {}).get("remarks", []):
+        module.warn(each)
+    module.exit_json(**result)
+
+
+def _run(module: AnsibleModule, now: float) -> dict:
+    asked = module.params
+    place = Place(asked["dest"], asked["owner"])
+    if asked["keystore"] and not asked["archive"]:
+        raise RefusedError("The action that exports the enclaves at home did not run.")
+    if not asked["archive"]:
+        return _look(place, asked, now)
+    try:
+        sent = read_archive(base64.b64decode(asked["archive"], validate=True))
+    except binascii.Error as error:
+        raise RefusedError("The export was damaged on its way.") from error
+    difference = {"clock_difference": int(now - asked["home_time"])} if asked["home_time"] else {}
+    if module.check_mode:
+        before = place.read()
+        return {
+            **_install(place, before, _after(before, sent), asked, now, check=True),
+            **difference,
+        }
+    with place.locked():
+        before = place.read()
+        return {**_install(place, before, _after(before, sent), asked, now), **difference}
+
+
+def _look(place: Place, asked: dict, now: float) -> dict:
+    """Return what is there, verified."""
+    present = place.read()
+    names = [
+        each for each in enclaves_in(present) if folder_of(each) + "/" + CERTIFICATE_FILE in present
+    ]
+    found = verify(place.path, names, asked["verifier"])
+    return {
+        "changed": False,
+        "changed_enclaves": [],
+        "removed_enclaves": [],
+        "restart": place.due(),
+        "routers": _routers(present),
+        "verification": found,
+        "confirmation": confirmation(asked["robot"], present, now),
+    }
+
+
+def _after(before: Files, sent: Files) -> Files:
+    """Return the files after the installation: those that were sent, and the robot's own.
+
+    Raises:
+        RefusedError: the key of an enclave is neither sent nor here.
+    """
+    after = dict(sent)
+    for name in enclaves_in(sent):
+        own, request = (folder_of(name) + "/" + each for each in (KEY_FILE, REQUEST_FILE))
+        if own not in sent:
+            if own not in before:
+                raise RefusedError(
+                    f"The key of enclave {name} is neither at home nor on this robot. Make another"
+                    " one on the robot with the play sros.fleet.requests."
+                )
+            after[own] = before[own]
+            if request in before:
+                after[request] = before[request]
+    for name in set(enclaves_in(before)) - set(enclaves_in(sent)):
+        waits = folder_of(name) + "/" + REQUEST_FILE in before
+        if waits and folder_of(name) + "/" + CERTIFICATE_FILE not in before:
+            after.update((path, before[path]) for path in before if enclave_of(path) == name)
+    return after
+
+
+def _install(
+    place: Place, before: Files, after: Files, asked: dict, now: float, *, check: bool = False
+) -> dict:
+    known, new = authorities(before), authorities(after)
+    if known and not known & new and not asked["replace_authorities"]:
+        raise RefusedError(
+            f"This robot has enclaves of another keystore: no CA of '{place.path}' signed the new"
+            " ones. Nothing was changed. If the robot is to change over, set replace_authorities"
+            " (sros_replace_authorities)."
+        )
+    changed = changed_enclaves(before, after)
+    removed = sorted(set(enclaves_in(before)) - set(enclaves_in(after)))
+    present = before == after and place.is_closed()
+    names = [
+        each for each in enclaves_in(after) if folder_of(each) + "/" + CERTIFICATE_FILE in after
+    ]
+    result = {
+        "changed": not present,
+        "changed_enclaves": changed,
+        "removed_enclaves": removed,
+        "routers": _routers(after),
+        "diff": _difference(before, after),
+    }
+    # In an enclave that had no certificate no process can have run.
+    ran = {enclave_of(each) for each in before if each.endswith("/" + CERTIFICATE_FILE)}
+    due = sorted({*place.due(), *(ran & set(changed))} & set(enclaves_in(after)))
+    if check and not present:
+        return {**result, "restart": due, "confirmation": confirmation(asked["robot"], before, now)}
+    if present:
+        found = verify(place.path, names, asked["verifier"])
+    else:
+        try:
+            place.prepare(after)
+            found = verify(place.stage, names, asked["verifier"])
+            if found["ok"]:
+                # Recorded first: who is killed in between restarts once too often, not never.
+                place.set_due(due)
+                place.replace()
+        finally:
+            place.discard()
+    if not found["ok"]:
+        raise RefusedError(
+            "The enclaves do not verify on this robot ({}): {}. {}".format(
+                found["by"],
+                "; ".join(found["problems"]),
+                "They are installed already." if present else "The earlier files stay.",
+            )
+        )
+    return {
+        **result,
+        "restart": place.due(),
+        "verification": found,
+        "confirmation": confirmation(asked["robot"], after, now),
+    }
+
+
+def _routers(files: Files) -> list:
+    return sorted(enclave_of(each) for each in files if each.endswith("/router.json5"))
+
+
+_SIGNED_TEXT = re.compile(r"Content-Type: text/plain\n\n(.*?)\n-{6}", re.DOTALL)
+
+
+def _difference(before: Files, after: Files) -> list:
+    """Return the difference for --diff; of keys nothing but that they differ."""
+    return [
+        {
+            "before_header": path,
+            "after_header": path,
+            "before": _shown(path, before.get(path)),
+            "after": _shown(path, after.get(path)),
+        }
+        for path in sorted({*before, *after})
+        if before.get(path) != after.get(path)
+    ]
+
+
+def _shown(path: str, content: bytes | None) -> str:
+    if content is None:
+        return ""
+    if path.endswith("/" + KEY_FILE):
+        return "a private key\n"
+    signed = _SIGNED_TEXT.search(content.decode(errors="replace").replace("\r\n", "\n"))
+    text = signed.group(1) + "\n" if signed and path.endswith(".p7s") else ""
+    return f"SHA-256 {hashlib.sha256(content).hexdigest()}\n{text}"
+
+
+if __name__ == "__main__":
+    main()
