@@ -15,11 +15,11 @@ import os
 import shutil
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import BinaryIO, Self
 
 from sros_tool.errors import KeystoreError
 
@@ -120,14 +120,19 @@ class Folder:
 
     def read(self, path: str, *, most: int = _MOST_BYTES) -> bytes:
         """Return the content of the regular file at ``path``, of at most ``most`` bytes."""
-        parent, name = self._at(path)
-        with self._naming(path), open(os.open(name, _OLD_FILE, dir_fd=parent), "rb") as file:
+        with self._naming(path), self.open(path) as file:
             state = os.fstat(file.fileno())
             if not stat.S_ISREG(state.st_mode):
                 raise OSError(errno.EINVAL, "it is not a regular file", str(self.path / path))
             if state.st_size > most:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(self.path / path))
             return file.read(state.st_size)
+
+    def open(self, path: str) -> BinaryIO:
+        """Return what is at ``path``, open for reading; it need not be a regular file."""
+        parent, name = self._at(path)
+        with self._naming(path):
+            return open(os.open(name, _OLD_FILE, dir_fd=parent), "rb")
 
     def read_inside(self, path: str) -> bytes:
         """Return the content of a file, as `read`, also through links that stay in the folder.
@@ -161,10 +166,15 @@ class Folder:
 
     def write(self, path: str, data: bytes, mode: int) -> None:
         """Write the new file ``path``, with permission bits as in `create`."""
+        self.write_parts(path, (data,), mode)
+
+    def write_parts(self, path: str, parts: Iterable[bytes], mode: int) -> None:
+        """Write the new file ``path`` part by part, with permission bits as in `create`."""
         handle = self.create(path, mode)
         try:
-            with self._naming(path):
-                write_all(handle, data)
+            for part in parts:
+                with self._naming(path):
+                    write_all(handle, part)
         finally:
             os.close(handle)
 

@@ -8,6 +8,7 @@ import os
 import stat
 from functools import cache
 from pathlib import Path
+from typing import BinaryIO
 
 from lxml import etree
 
@@ -77,9 +78,14 @@ def _read_open(path: Path, most: int) -> tuple[os.stat_result, bytes]:
 
     Without its content if it is not a regular file, as one that has just been exchanged.
     """
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+    with open_at_once(path) as file:
         state = os.fstat(file.fileno())
         return state, file.read(most + 1) if stat.S_ISREG(state.st_mode) else b""
+
+
+def open_at_once(path: Path) -> BinaryIO:
+    """Return a file open for reading; opening a pipe does not wait for its writer."""
+    return open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
 
 
 _UTF_8 = ("UTF-8", "UTF8", "US-ASCII", "ASCII")

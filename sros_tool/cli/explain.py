@@ -737,10 +737,12 @@ def _beside(
     enclave: LoadedEnclave, question: Question, context: JoinContext
 ) -> ZenohAnswer | SrosError | None:
     """Return what Zenoh decides next to DDS, or why that is not known; None without its files."""
-    from sros_tool.keystore.layout import has_zenoh_files, is_keystore
+    from sros_tool.keystore.layout import is_keystore
 
     root = enclave.root
-    if root is None or enclave.state is None or not is_keystore(root) or not has_zenoh_files(root):
+    if root is None or enclave.state is None or not is_keystore(root):
+        return None
+    if not _runs_on_zenoh(root, enclave.name):
         return None
     from sros_tool.explain.zenoh import ZenohEvaluator
 
@@ -749,6 +751,23 @@ def _beside(
         return evaluator.answer(enclave.name, question, reach=False, brief=True)
     except SrosError as error:
         return error
+
+
+def _runs_on_zenoh(root: Path, name: str) -> bool:
+    """Return whether an enclave has a configuration of Zenoh, or others where settings name Zenoh.
+
+    Without such settings the other enclaves are not looked at: there may be very many.
+    """
+    from sros_tool.keystore.layout import SETTINGS, ZENOH_SIGNED, enclave_path, has_zenoh_files
+    from sros_tool.xml import read_bytes
+
+    if any((enclave_path(root, name) / file).is_file() for file in ZENOH_SIGNED):
+        return True
+    try:
+        named = b"zenoh" in read_bytes(root / SETTINGS, "settings file")
+    except SrosError:
+        named = (root / SETTINGS).exists()
+    return named and has_zenoh_files(root)
 
 
 def _beside_lines(zenoh: ZenohAnswer | SrosError | None) -> Iterator[str]:

@@ -147,7 +147,8 @@ def recorded_policy(root: Path, signed: bytes) -> str:
     from sros_tool.keystore.ledger import read_ledger
 
     digest = hashlib.sha256(signed).hexdigest()
-    found = (e.policy for e in reversed(read_ledger(root).certain) if e.sha256 == digest)
+    ledger = read_ledger(root, having=("sha256", digest))
+    found = (e.policy for e in reversed(ledger.certain) if e.sha256 == digest)
     return next(found, "")
 
 

@@ -125,7 +125,7 @@ def _is_latest(keystore: Path, enclave: str) -> bool:
 
     try:
         signed = (enclave_path(keystore, enclave) / PERMISSIONS_FILE).read_bytes()
-        entries = reversed(read_ledger(keystore).entries)
+        entries = reversed(read_ledger(keystore, having=("enclave", enclave)).entries)
     except (SrosError, OSError):
         return True
     last = (each for each in entries if (each.what, each.enclave) == ("permissions", enclave))

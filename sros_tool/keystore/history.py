@@ -103,9 +103,10 @@ def history(root: Path, *, now: datetime) -> History:
 
     known = {entry.sha256 for entry in entries}
     found = {**retired, **revoked_files, **issued}
+    places = {**found, **settings}
     return History(
         tuple(
-            HistoryItem(entry, status(entry), ({**found, **settings}.get(entry.sha256) or [""])[0])
+            HistoryItem(entry, status(entry), (places.get(entry.sha256) or [""])[0])
             for entry in entries
         ),
         tuple(

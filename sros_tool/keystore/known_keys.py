@@ -23,7 +23,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.keystore.reader import read_certificate, read_lists
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import common_name_of, subject_text
@@ -40,13 +40,15 @@ class KnownKeys:
         self._root = root
 
     @cached_property
+    def _revocations(self) -> Sequence[Entry]:
+        """The revocations in the ledger."""
+        entries = read_ledger(self._root, having=("what", "revocation")).entries
+        return [each for each in entries if each.what == "revocation"]
+
+    @cached_property
     def _revoked(self) -> Mapping[str, str]:
         """Map the digests of revoked keys to a description of the revoked certificate."""
-        recorded = [
-            each
-            for each in read_ledger(self._root).entries
-            if each.what == "revocation" and each.key
-        ]
+        recorded = [each for each in self._revocations if each.key]
         found = {each.key: f"certificate {each.serial} of {each.subject}" for each in recorded}
         serials = {each.serial for each in recorded}
         for path in revoked_certificates(self._root):
@@ -60,11 +62,7 @@ class KnownKeys:
     @cached_property
     def _revoked_serials(self) -> Collection[int]:
         """The serial numbers of certificates that were revoked together with their keys."""
-        found = {
-            int(each.serial, 16)
-            for each in read_ledger(self._root).entries
-            if each.what == "revocation" and each.reason != SUPERSEDED
-        }
+        found = {int(each.serial, 16) for each in self._revocations if each.reason != SUPERSEDED}
         lists = (entry for crl in read_lists(self._root) for entry in crl.revoked)
         return found | {entry.serial for entry in lists if entry.reason != SUPERSEDED}
 
@@ -75,6 +73,9 @@ class KnownKeys:
         Where the ledger was lost, those whose files are in ``revoked``, with a certificate that a
         revocation list names.
         """
+        files = revoked_certificates(self._root)
+        if not files and all(each.reason == SUPERSEDED for each in self._revocations):
+            return set()
         found, recorded = set(), set()
         for each in read_ledger(self._root).entries:
             recorded.add(each.serial)
@@ -82,7 +83,7 @@ class KnownKeys:
                 found.discard(each.enclave)
             elif each.what == "revocation" and each.reason != SUPERSEDED:
                 found.add(each.enclave)
-        for path in revoked_certificates(self._root):
+        for path in files:
             if path.parent.name not in recorded:
                 with suppress(SrosError):  # a file that is no certificate
                     certificate = read_certificate(path)

@@ -288,9 +288,11 @@ def enclaves_below(root: Path, name: str) -> tuple[str, ...]:
 
 def has_zenoh_files(root: Path) -> bool:
     """Return whether any enclave that this user can read has a configuration of Zenoh."""
-    names, _ = search_enclaves(root)
-    folders = (enclave_path(root, name) for name in names)
-    return any((folder / file).is_file() for folder in folders for file in ZENOH_SIGNED)
+    return any(
+        is_enclave(Path(folder)) and Path(folder, file).is_file()
+        for folder, files in _walk(os.fspath(root / ENCLAVES), [])
+        for file in ZENOH_SIGNED.keys() & files
+    )
 
 
 def check_readable(root: Path) -> None:

@@ -16,27 +16,31 @@ import errno
 import hashlib
 import io
 import json
+import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+import stat
+from array import array
+from bisect import bisect_right
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from datetime import datetime
 from functools import lru_cache
-from itertools import islice
+from itertools import chain
 from pathlib import Path
 from shlex import quote
 from sys import intern
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
-from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
+from sros_tool.errors import KeystoreError, PkiError, SrosError
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, ROLES, SETTINGS, ca_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, load_certificates, subject_text, validity_of
 from sros_tool.validity import Window, iso
-from sros_tool.xml import read_bytes
+from sros_tool.xml import open_at_once, read_bytes
 
 if TYPE_CHECKING:
     from sros_tool.keystore.authorities.authority import Authority
@@ -106,20 +110,36 @@ class _Fault(NamedTuple):
     text: str
 
 
-# Ten thousand enclaves that are renewed every month write 150 MB a year, in 240,000 lines.
-_MOST_BYTES = 512 * 1024 * 1024
-_MOST_LINES = 1_000_000
+# A hundred thousand enclaves that are renewed every month write 1 GB a year, in 2,400,000 lines.
+_MOST_BYTES = 4 * 1024**3
+_MOST_LINES = 8_000_000
+_LONGEST_LINE = 4 * 1024**2
+_BLOCK = 1024**2
 _FIELDS = tuple(each.name for each in fields(Entry))
 _TEXTS = tuple(each.name for each in fields(Entry) if each.type == "str")
-_REPEATED = frozenset(
-    ("time", "what", "enclave", "subject", "not_before", "not_after", "policy", "reason")
-)
 _SERIAL = re.compile(r"[0-9a-f]{1,40}")
 _MOST_BITS = 159
 """The length of a serial number (RFC 5280, 4.1.2.2)."""
 _MOST_NUMBER = 10**12
-_MOST_REMEMBERED = 64 * 1024 * 1024
+_MOST_REMEMBERED = 16 * 1024 * 1024
 _HEAD = re.compile(rb"sros ledger 1\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n")
+_VALUES = {
+    "serial": r'"(?P<serial>[0-7][0-9a-f]{39}|[0-9a-f]{1,39})"',
+    "number": r"([1-9][0-9]{0,11})",
+}
+_TEXT = r'"([^"\\\x00-\x1f]+)"'
+_WRITTEN = re.compile(
+    r"\{"
+    + r"".join(
+        f'{"," if index else ""}"{name}":{_VALUES.get(name, _TEXT)}'
+        if name in ("time", "what")
+        else f'(?:,"{name}":{_VALUES.get(name, _TEXT)})?'
+        for index, name in enumerate(_FIELDS)
+    )
+    + r"\}"
+)
+"""A line as `_line` writes it, where no text has to be escaped; a group for each field."""
+_quoted = json.encoder.encode_basestring_ascii
 
 
 # ── entries ────────────────────────────────────────────────────────────────────────────────
@@ -174,116 +194,186 @@ def document_entry(
 # ── reading ────────────────────────────────────────────────────────────────────────────────
 
 
-def read_ledger(root: Path) -> Ledger:
+def read_ledger(root: Path, *, having: tuple[str, str] | None = None) -> Ledger:
     """Return the ledger of a keystore; empty for one that has none (of ros2/sros2).
+
+    With ``having``, a field and its value, others than those entries may be left out: the chain is
+    proven as always, and that is all that the lines of the others cost.
 
     Raises:
         KeystoreError: the file cannot be read at all.
     """
-    return _read(root).ledger
+    text = f'"{having[0]}":{_quoted(having[1])}'.encode() if having else _EVERY
+    return _read(root, having=text).ledger
 
 
 class _Reading(NamedTuple):
-    """The ledger, its bytes, and the faults that no entry ``gap`` records yet."""
+    """The ledger, and what is needed to add to it.
+
+    ``unrecorded`` are the faults that no entry ``gap`` records yet.  ``previous`` is the digest for
+    the next line; ``ended`` says that the last line has its line end.
+    """
 
     ledger: Ledger
-    data: bytes = b""
-    chained: bool = False
     unrecorded: Sequence[_Fault] = ()
+    previous: str = hashlib.sha256().hexdigest()
+    ended: bool = True
 
 
-def _read(root: Path, *, follow_link: bool = True) -> _Reading:
+_EVERY = b""
+_NONE = b"\n"
+"""A text that is in every line, and one that is in none, as ``having`` of `_read`."""
+_GAP, _CA = b'"what":"gap"', b'"what":"ca"'
+
+
+def _read(root: Path, *, follow_link: bool = True, having: bytes = _EVERY) -> _Reading:
+    """Return the ledger; with ``having``, lines without that text are only proven, if chained."""
     while True:
-        data = _bytes(root, follow_link)
-        reading = _compare(root, data)
-        # A transaction of another process may have ended between the reading of the two files.
-        if not reading.unrecorded or _bytes(root, follow_link) == data:
-            return reading
+        head = _read_head(root)
+        with _open(root, follow_link) or io.BytesIO() as file:
+            reading = _compare(root, file, head, having)
+            # A transaction of another process may have ended between the reading of the two files.
+            if not reading.unrecorded or (
+                _is_still(root / LEDGER, file) and _read_head(root) == head
+            ):
+                return reading
 
 
-def _compare(root: Path, data: bytes | None) -> _Reading:
-    """Return the ledger with these bytes, compared with its head."""
-    if not data:
-        if data is None and not any((root / file).exists() for file in (SETTINGS, LEDGER_HEAD)):
-            return _Reading(Ledger())
-        missing = _Fault(0, f"there is no {LEDGER}" if data is None else f"{LEDGER} is empty")
-        return _Reading(Ledger(gaps=(missing.text,)), unrecorded=[missing])
-    reader = _remembered if len(data) <= _MOST_REMEMBERED else _read_lines
-    read = reader(data, _MOST_LINES)
+def _is_still(path: Path, file: BinaryIO) -> bool:
+    """Return whether the open ``file`` is the one at ``path``; an `io.BytesIO` stands for none."""
+    with suppress(OSError):
+        there = path.stat()
+        return not isinstance(file, io.BytesIO) and os.path.samestat(there, os.fstat(file.fileno()))
+    return isinstance(file, io.BytesIO)
+
+
+def _compare(root: Path, file: BinaryIO, head: _Head | None, having: bytes) -> _Reading:
+    """Return the ledger in ``file``, compared with its head; an `io.BytesIO` stands for none."""
+    stated = head.lines if head else 0
+    is_there = not isinstance(file, io.BytesIO)
+    if is_there and os.fstat(file.fileno()).st_size <= _MOST_REMEMBERED:
+        read = _remembered(file.read(), having, stated, _MOST_LINES, _MOST_BYTES)
+    else:
+        read = _read_lines(file, having, stated, _MOST_LINES, _MOST_BYTES)
     if read is None:
-        raise _too_large(root / LEDGER, f"{_MOST_LINES} lines")
-    numbered, number, chained = read.entries, read.lines, read.chained
-    faults = [*read.faults]
-    authorities = _authorities(root)
-    if fault := _head_fault(root, data, number, authorities, chained=chained):
+        raise _too_large(root / LEDGER)
+    if not read.lines:
+        return _without_lines(root, is_there=is_there)
+    entries, numbers, faults = read.entries, read.numbers, [*read.faults]
+    if fault := _head_fault(head, read.lines, read.signed, chained=read.chained):
         faults.append(fault)
-    recorded = [_Fault(each.number, each.reason) for _, each in numbered if each.what == GAP]
-    last_recorded = max((at for at, each in numbered if each.what == GAP), default=0)
-    start = _first_of(authorities, numbered)
+    recorded = [_Fault(each.number, each.reason) for each in entries if each.what == GAP]
+    gaps = (at for at, each in zip(numbers, entries, strict=True) if each.what == GAP)
+    last_recorded = max(gaps, default=0)
+    start = _first_of(_authorities(root), zip(numbers, entries, strict=True))
     every = [*recorded, *faults]
-    last = max((each.line for each in every), default=0)
+    last_fault = max((each.line for each in every), default=0)
     ledger = Ledger(
-        tuple(entry for _, entry in numbered),
+        entries,
         tuple(dict.fromkeys(each.text for each in every if each.line >= start)),
-        tuple(entry for at, entry in numbered if at > last),
+        entries[bisect_right(numbers, last_fault) :],
         0 if start > read.unchained else read.unchained,
-        number,
+        read.lines,
     )
     unrecorded = [each for each in faults if each.line >= last_recorded]
-    return _Reading(ledger, data, chained, unrecorded)
+    return _Reading(ledger, unrecorded, read.previous, read.ended)
 
 
 class _Lines(NamedTuple):
-    """The entries in a ledger's bytes with the numbers of their lines, and faults of the chain.
+    """The entries in a ledger with the ``numbers`` of their lines, and the faults of the chain.
 
-    ``unchained`` is the number of lines before the chain, ``lines`` that of all.
+    ``unchained`` is the number of lines before the chain, ``lines`` that of all.  ``signed`` is the
+    digest of the line that is the last one by the head; the rest is as in `_Reading`.
     """
 
-    entries: Sequence[tuple[int, Entry]]
+    entries: tuple[Entry, ...]
+    numbers: Sequence[int]
     faults: Sequence[_Fault]
     lines: int
     unchained: int
     chained: bool
+    signed: str
+    previous: str
+    ended: bool
 
 
-def _read_lines(data: bytes, most: int) -> _Lines | None:
-    """Return the lines of a ledger, or None if there are more than ``most``."""
-    numbered: list[tuple[int, Entry]] = []
+def _read_lines(
+    file: BinaryIO, having: bytes, stated: int, most: int, most_bytes: int
+) -> _Lines | None:
+    """Return the lines of a ledger, or None if there are more than ``most``, or more bytes.
+
+    ``stated`` is the number of lines that the head states; ``having`` is as in `_read`.
+    """
+    entries: list[Entry] = []
+    numbers = array("Q")
     faults: list[_Fault] = []
     damaged = 0  # how many lines before this one are no entries
-    unchained = number = 0
+    unchained = number = size = 0
     chained = False
-    line, all_before = b"", hashlib.sha256()
-    for number, (before, line) in enumerate(_with_previous(data), 1):
-        if number > most:
+    before = line = b""
+    last = signed = ""  # the digests of the line before, and of the line number ``stated``
+    all_before = hashlib.sha256()
+    for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), 1):
+        size += len(line)
+        if number > most or size > most_bytes:
             return None
+        text = line.removesuffix(b"\n")
         if not chained and number > 1:
             all_before.update((b"\n" if number > 2 else b"") + before)
-        entry = _parse(line)
-        if entry is None:
+        if (
+            chained
+            and not damaged
+            and having not in text
+            and text.endswith(b'","previous":"%b"}' % last.encode())
+            and _GAP not in text
+            and _CA not in text
+        ):
+            pass  # it is as it was when the head was signed, or a later line does not fit
+        elif (entry := _parse(text)) is None:
             damaged += 1
-            continue
-        if damaged:
-            faults.append(_not_entries(number - 1, damaged))
-        if chained and not entry.previous:
-            faults.append(_Fault(number, f"line {number} was added from outside"))
-        elif entry.previous:
-            expected = _digest(before) if chained else all_before.hexdigest()
-            if entry.previous != expected and not damaged:
-                text = f"before line {number}, a line was changed or removed"
-                faults.append(_Fault(number - 1, text))
-            if not chained:
-                chained, unchained = True, number - 1
-        damaged = 0
-        numbered.append((number, entry))
+        else:
+            if damaged:
+                faults.append(_not_entries(number - 1, damaged))
+            if chained and not entry.previous:
+                faults.append(_Fault(number, f"line {number} was added from outside"))
+            elif entry.previous:
+                expected = last if chained else all_before.hexdigest()
+                if entry.previous != expected and not damaged:
+                    reason = f"before line {number}, a line was changed or removed"
+                    faults.append(_Fault(number - 1, reason))
+                if not chained:
+                    chained, unchained = True, number - 1
+            damaged = 0
+            entries.append(entry)
+            numbers.append(number)
+        before, last = text, _digest(text)
+        if number == stated:
+            signed = last
     if damaged:
         faults.append(_not_entries(number, damaged))
     if not chained:
         unchained = number
-    return _Lines(numbered, faults, number, unchained, chained)
+        if number:
+            all_before.update((b"\n" if number > 1 else b"") + before)
+    previous = last if chained else all_before.hexdigest()
+    ended = line.endswith(b"\n") or not number
+    read = tuple(entries)
+    return _Lines(read, numbers, faults, number, unchained, chained, signed, previous, ended)
 
 
-_remembered = lru_cache(maxsize=1)(_read_lines)  # a verb asks several times
+@lru_cache(maxsize=4)  # a verb asks several times
+def _remembered(
+    data: bytes, having: bytes, stated: int, most: int, most_bytes: int
+) -> _Lines | None:
+    return _read_lines(io.BytesIO(data), having, stated, most, most_bytes)
+
+
+def _without_lines(root: Path, *, is_there: bool) -> _Reading:
+    """Return the ledger where the file has no line, or is missing."""
+    if not is_there and not any((root / file).exists() for file in (SETTINGS, LEDGER_HEAD)):
+        return _Reading(Ledger())
+    missing = _Fault(0, f"{LEDGER} is empty" if is_there else f"there is no {LEDGER}")
+    return _Reading(Ledger(gaps=(missing.text,)), [missing])
 
 
 def _not_entries(last: int, count: int) -> _Fault:
@@ -293,21 +383,8 @@ def _not_entries(last: int, count: int) -> _Fault:
     return _Fault(last, f"lines {last - count + 1} to {last} are not entries")
 
 
-def _lines_of(data: bytes) -> Iterator[bytes]:
-    """Yield the lines one by one: a list of them would take as much memory again."""
-    return (line.removesuffix(b"\n") for line in io.BytesIO(data))
-
-
-def _with_previous(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield each line after the line before it."""
-    before = b""
-    for line in _lines_of(data):
-        yield before, line
-        before = line
-
-
-def _bytes(root: Path, follow_link: bool) -> bytes | None:
-    """Return the content of the ledger, or None without one.
+def _open(root: Path, follow_link: bool) -> BinaryIO | None:
+    """Return the ledger, open for reading, or None without one.
 
     While a transaction is being committed, the file is a link.  Whoever holds the lock of the
     keystore does not follow it: another link could lead to a file that is not of the keystore.
@@ -315,17 +392,16 @@ def _bytes(root: Path, follow_link: bool) -> bytes | None:
     path = root / LEDGER
     try:
         if follow_link:
-            return read_bytes(path, "ledger", most=_MOST_BYTES)
+            return _checked(open_at_once(path))
         from sros_tool.folders import Folder  # a question does not load what writes
 
         with Folder(root) as folder:
-            return folder.read(LEDGER, most=_MOST_BYTES)
+            return _checked(folder.open(LEDGER))
+    except FileNotFoundError:
+        return None
     except (OSError, SrosError) as error:
-        cause = error.__cause__ if isinstance(error, DocumentError) else error
-        if isinstance(cause, FileNotFoundError):
-            return None
-        if isinstance(cause, OSError) and cause.errno == errno.EFBIG:
-            raise _too_large(path, f"{_MOST_BYTES // 1024**2} MiB") from error
+        if isinstance(error, OSError) and error.errno == errno.EFBIG:
+            raise _too_large(path) from error
         raise KeystoreError(
             f"the ledger '{path}' cannot be read",
             f"{error.strerror}." if isinstance(error, OSError) else error.why or f"{error.what}.",
@@ -333,11 +409,24 @@ def _bytes(root: Path, follow_link: bool) -> bytes | None:
         ) from error
 
 
-def _too_large(path: Path, limit: str) -> KeystoreError:
+def _checked(file: BinaryIO) -> BinaryIO:
+    """Return ``file``; close it and raise OSError if it is too large or no regular file."""
+    state, error = os.fstat(file.fileno()), None
+    if not stat.S_ISREG(state.st_mode):
+        error = OSError(errno.EINVAL, "it is not a regular file")
+    elif state.st_size > _MOST_BYTES:
+        error = OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+    if error:
+        file.close()
+        raise error
+    return file
+
+
+def _too_large(path: Path) -> KeystoreError:
     root = path.parent
     return KeystoreError(
         f"the ledger '{path}' is too large",
-        f"It has more than {limit}.",
+        f"It has more than {_MOST_BYTES // 1024**2} MiB or {_MOST_LINES} lines.",
         f"If all of it is of this keystore, move {LEDGER} and {LEDGER_HEAD} to an archive, state "
         f"all rights again with `sros generate_artifacts -k {quote(str(root))} -p POLICY_FILE`, "
         "and replace "
@@ -349,10 +438,38 @@ def _too_large(path: Path, limit: str) -> KeystoreError:
 
 def _parse(line: bytes) -> Entry | None:
     """Return the entry of a line, or None if it is not an entry."""
+    found = _WRITTEN.fullmatch(line.decode()) if line.isascii() else None
+    if not found or (found["serial"] and not found["serial"].strip("0")):
+        return _parse_any(line)
+    (time, what, enclave, subject, serial, sha256, begin, end, policy, reason, key) = found.groups(
+        ""
+    )[:11]
+    number, settings, previous = found.groups("")[11:]
+    # Texts that many lines have are in the memory once.
+    return Entry(
+        intern(time),
+        intern(what),
+        intern(enclave),
+        intern(subject),
+        serial,
+        sha256,
+        intern(begin),
+        intern(end),
+        intern(policy),
+        intern(reason),
+        key,
+        int(number or 0),
+        settings,
+        previous,
+    )
+
+
+def _parse_any(line: bytes) -> Entry | None:
+    """Return the entry of a line that has another form than `_line` gives it, as `_parse`."""
     if not line.startswith(b"{"):
         return None
     try:
-        entry = Entry(**json.loads(line, object_pairs_hook=_shared))
+        entry = Entry(**json.loads(line))
     except (ValueError, TypeError, RecursionError):
         return None
     if not all(isinstance(getattr(entry, name), str) for name in _TEXTS):
@@ -364,14 +481,6 @@ def _parse(line: bytes) -> Entry | None:
         if not valid or not 0 < int(entry.serial, 16).bit_length() <= _MOST_BITS:
             return None
     return entry
-
-
-def _shared(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    """Return the fields of a line; texts that many lines have are in the memory once."""
-    return {
-        name: intern(value) if name in _REPEATED and isinstance(value, str) else value
-        for name, value in pairs
-    }
 
 
 def _digest(data: bytes) -> str:
@@ -399,36 +508,48 @@ def _first_of(authorities: Iterable[x509.Certificate], found: Iterable[tuple[int
     return min(lines.values(), default=0) if lines.keys() == wanted else 0
 
 
-def _head_fault(
-    root: Path,
-    data: bytes,
-    lines: int,
-    authorities: Sequence[x509.Certificate],
-    *,
-    chained: bool,
-) -> _Fault | None:
-    """Return what is wrong between the ledger and its signed head, or None."""
+class _Head(NamedTuple):
+    """What the signed head states: the number of lines and the digest of the last, or a fault."""
+
+    lines: int = 0
+    last: str = ""
+    fault: str = ""
+
+
+def _read_head(root: Path) -> _Head | None:
+    """Return the head of a keystore's ledger; None without one."""
     if not (root / LEDGER_HEAD).exists():
-        text = f"{LEDGER_HEAD}, which signs its end, is missing"
-        return _Fault(lines, text) if chained else None
+        return None
     try:
         signed = smime.parse(read_bytes(root / LEDGER_HEAD, "signed head of the ledger"))
-        if authorities:
+        if authorities := _authorities(root):
             _verify(signed, authorities)
         stated = _HEAD.fullmatch(signed.text)
     except SrosError as error:
-        return _Fault(lines, f"{LEDGER_HEAD} does not sign its end: {error.what}")
+        return _Head(fault=f"{LEDGER_HEAD} does not sign its end: {error.what}")
     if not stated:
-        return _Fault(lines, f"{LEDGER_HEAD} is not the signed end of a ledger")
-    count = int(stated[1])
-    if count > lines:
-        missing = count - lines
+        return _Head(fault=f"{LEDGER_HEAD} is not the signed end of a ledger")
+    return _Head(int(stated[1]), stated[2].decode())
+
+
+def _head_fault(head: _Head | None, lines: int, signed: str, *, chained: bool) -> _Fault | None:
+    """Return what is wrong between the ledger and its signed head, or None.
+
+    ``signed`` is the digest of the line in the ledger that is the last one by the head.
+    """
+    if not head:
+        text = f"{LEDGER_HEAD}, which signs its end, is missing"
+        return _Fault(lines, text) if chained else None
+    if head.fault:
+        return _Fault(lines, head.fault)
+    if head.lines > lines:
+        missing = head.lines - lines
         text = f"{missing} line{'s are' if missing > 1 else ' is'} missing at its end"
         return _Fault(lines, text)
-    if not count or _digest(next(islice(_lines_of(data), count - 1, None))) != stated[2].decode():
+    if not head.lines or signed != head.last:
         return _Fault(lines, f"its last lines are not the ones that {LEDGER_HEAD} signs")
-    if count < lines:
-        return _Fault(lines, f"line {count + 1} was added from outside")
+    if head.lines < lines:
+        return _Fault(lines, f"line {head.lines + 1} was added from outside")
     return None
 
 
@@ -444,32 +565,58 @@ def _verify(signed: smime.SignedDocument, authorities: Sequence[x509.Certificate
 
 
 def append(
-    transaction: Transaction, entries: Iterable[Entry], authority: Authority, now: datetime
+    transaction: Transaction, entries: Collection[Entry], authority: Authority, now: datetime
 ) -> None:
     """Stage the ledger with ``entries`` added at its end, and its head, signed by ``authority``.
 
     What is wrong with the present ledger is recorded first, so that the new head hides nothing.
     """
-    added = list(entries)
-    if not added:
+    if not entries:
         return
-    present = _read(transaction.root, follow_link=transaction.dry_run)
-    data, number, chained = present.data, present.ledger.lines, present.chained
-    if data and not data.endswith(b"\n"):
-        data += b"\n"
-    before = data.removesuffix(b"\n")
-    if chained:
-        before = before[before.rfind(b"\n") + 1 :]
+    root, follow = transaction.root, transaction.dry_run
+    present = _read(root, follow_link=follow, having=_NONE)
     gaps = (Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded)
-    new = []
-    for entry in (*gaps, *added):
-        before = _line(replace(entry, previous=_digest(before)))
-        new.append(before)
-    head = f"sros ledger 1\nlines {number + len(new)}\nsha256 {_digest(before)}\n".encode()
-    transaction.write(LEDGER, b"".join((data, *(line + b"\n" for line in new))))
+    links = _Links(chain(gaps, entries), present.previous)
+
+    def content() -> Iterator[bytes]:
+        with _open(root, follow) or io.BytesIO() as file:
+            yield from iter(lambda: file.read(_BLOCK), b"")
+        yield b"" if present.ended else b"\n"
+        yield from links
+
+    transaction.write_parts(LEDGER, content())
+    for _ in links:  # of a dry run, which writes nothing
+        pass
+    lines = present.ledger.lines + links.count
+    head = f"sros ledger 1\nlines {lines}\nsha256 {links.previous}\n".encode()
     transaction.write(LEDGER_HEAD, authority.sign(head, "the head of the ledger"))
 
 
-def _line(entry: Entry) -> bytes:
-    filled = {name: value for name in _FIELDS if (value := getattr(entry, name))}
-    return json.dumps(filled, separators=(",", ":")).encode()
+class _Links:
+    """The lines of new entries, each linked to the one before; they can be taken once.
+
+    ``previous`` is the digest of the last line that was taken, ``count`` their number.
+    """
+
+    def __init__(self, entries: Iterable[Entry], previous: str) -> None:
+        self.previous = previous
+        self.count = 0
+        self._entries = iter(entries)
+
+    def __iter__(self) -> Iterator[bytes]:
+        for entry in self._entries:
+            line = _line(entry, self.previous)
+            self.previous = _digest(line)
+            self.count += 1
+            yield line + b"\n"
+
+
+def _line(entry: Entry, previous: str) -> bytes:
+    """Return the line of an entry, with the digest of the line before it: JSON without spaces."""
+    filled = ((name, getattr(entry, name)) for name in _FIELDS[:-1])
+    parts = [
+        f'"{name}":{_quoted(value) if isinstance(value, str) else value}'
+        for name, value in filled
+        if value
+    ]
+    return f'{{{",".join(parts)},"previous":"{previous}"}}'.encode()

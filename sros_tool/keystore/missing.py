@@ -42,7 +42,7 @@ def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
 def _revocation(root: Path, name: str) -> Entry | None:
     """Return the ledger entry of an enclave's revocation; None if it has a later certificate."""
     try:
-        entries = read_ledger(root).entries
+        entries = read_ledger(root, having=("enclave", name)).entries
     except SrosError:
         return None  # the missing enclave is the error to report here
     of_enclave = [

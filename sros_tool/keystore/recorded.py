@@ -32,7 +32,7 @@ class RecordedRights:
     """
 
     def __init__(self, root: Path, ledger: Ledger | None = None) -> None:
-        ledger = ledger or read_ledger(root)
+        ledger = ledger or read_ledger(root, having=("what", "permissions"))
         self._root = root
         self._gaps = ledger.gaps
         self._unchained = ledger.unchained

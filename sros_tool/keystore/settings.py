@@ -99,7 +99,8 @@ def edit_notes(root: Path, governance: Governance) -> tuple[Note, ...]:
 
 def found_edits(root: Path, governance: Governance | None) -> HandEdits:
     """Return what was edited in a keystore; ``governance`` is the signed one, if it is readable."""
-    return hand_edits(root, read_ledger(root), OpenedKeystore(root).settings, governance)
+    ledger = read_ledger(root, having=("what", "settings"))
+    return hand_edits(root, ledger, OpenedKeystore(root).settings, governance)
 
 
 def edit_remedy(root: Path | str) -> str:

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -239,6 +240,40 @@ def test_a_huge_ledger_and_a_pipe_are_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / LEDGER)
     with pytest.raises(KeystoreError, match="not a regular file"):
         read_ledger(tmp_path)
+
+
+@pytest.mark.parametrize("case", TAMPERED)
+def test_reading_some_entries_proves_the_chain_of_all(case: str, root: Path) -> None:
+    wanted = ("enclave", "/b")
+
+    def some() -> None:
+        every, found = read_ledger(root), read_ledger(root, having=wanted)
+        for entries, those in ((every.entries, found.entries), (every.certain, found.certain)):
+            expected = [each for each in entries if each.enclave == "/b"]
+            assert [each for each in those if each.enclave == "/b"] == expected
+        assert (found.gaps, found.lines, found.unchained) == (
+            every.gaps,
+            every.lines,
+            every.unchained,
+        )
+
+    some()
+    assert len(read_ledger(root, having=wanted).entries) < len(read_ledger(root).entries)
+    put(root, TAMPERED[case](lines_of(root)))
+    some()
+    revoke(root, ["/a"], now=NOW)  # which records what is wrong
+    some()
+
+
+def test_a_line_in_another_form_is_read_as_ever(root: Path) -> None:
+    """A line that was written by hand, or by an earlier version, need not have the form of ours."""
+    before = read_ledger(root).entries
+    spaced = [json.dumps(json.loads(line)).encode() for line in lines_of(root)]
+    put(root, [re.sub(rb', "previous": "[0-9a-f]+"', b"", line) for line in spaced])
+    (root / LEDGER_HEAD).unlink()
+    assert [replace(each, previous="") for each in before] == list(read_ledger(root).entries)
+    put(root, [*lines_of(root)[:4], b'{"time":"x","what":"certificate","serial":"000"}'])
+    assert len(read_ledger(root).entries) == 4
 
 
 def test_a_ledger_of_many_lines_that_are_none(root: Path) -> None:

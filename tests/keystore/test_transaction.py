@@ -32,6 +32,7 @@ from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import lock as locking
 from sros_tool.keystore.transaction import recovery
 from sros_tool.keystore.transaction import stage as stage_of
+from sros_tool.keystore.transaction.stage import Change, Changes
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
@@ -793,3 +794,26 @@ def test_content_is_on_the_disk_before_its_name(
         link = "replace spare"
         assert not [call for call in calls[:copies] if call.startswith(link)]
         assert [call for call in calls[copies:] if call.startswith(link)]
+
+
+def test_changes_are_those_that_were_added() -> None:
+    """Those in a row are kept together, also across what forked workers did."""
+    paths = ["sros.toml", "ledger.jsonl", "enclaves/a/key.pem", "enclaves/a/cert.pem"]
+    paths += ["enclaves/b/key.pem", "enclaves/b/cert.pem", "enclaves/a/crl.pem"]
+    changes, other = Changes(), Changes()
+    assert changes == ()
+    for path in paths[:4]:
+        changes.add("create", path)
+    mark = changes.mark()
+    changes.add("create", "enclaves/a/permissions.xml")
+    assert [run.names for run in changes.since(mark)] == [("permissions.xml",)]
+    for path in paths[4:]:
+        other.add("replace", path)
+    changes.extend(other.since(0))
+    expected = [Change("create", path) for path in (*paths[:4], "enclaves/a/permissions.xml")]
+    expected += [Change("replace", path) for path in paths[4:]]
+    assert changes == expected
+    assert [changes[index] for index in range(-len(expected), 0)] == expected
+    assert (changes[1:3], len(changes)) == (tuple(expected[1:3]), len(expected))
+    with pytest.raises(IndexError):
+        changes[len(expected)]

@@ -50,7 +50,7 @@ class Export:
 
     target: Path
     enclaves: tuple[str, ...]
-    changes: tuple[Change, ...]
+    changes: Sequence[Change]
     notes: tuple[Note, ...] = ()
 
 
@@ -230,7 +230,7 @@ def _real(path: Path) -> Path:
 
 def _write_folder(
     root: Path, target: Path, files: dict[str, bytes], force: bool, dry_run: bool
-) -> tuple[Change, ...]:
+) -> Sequence[Change]:
     if _real(target).is_relative_to(_real(root)):
         raise KeystoreError(
             f"'{target}' is the keystore itself or a folder in it", "", "Choose another folder."
@@ -265,7 +265,7 @@ def _write_folder(
         for path in stale:
             transaction.remove(path)
         transaction.commit()
-    return tuple(transaction.changes)
+    return transaction.changes
 
 
 def _stale_zenoh(target: Path, files: dict[str, bytes]) -> list[str]:
@@ -281,7 +281,7 @@ def _stale_zenoh(target: Path, files: dict[str, bytes]) -> list[str]:
 
 def _write_archive(
     target: Path, files: dict[str, bytes], force: bool, dry_run: bool
-) -> tuple[Change, ...]:
+) -> Sequence[Change]:
     data = pack(files)
     if target.exists():
         if not target.is_file():

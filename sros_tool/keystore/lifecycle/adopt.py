@@ -171,7 +171,7 @@ def adopt_keystore(
         domains,
         True,
         created=tuple(nodes),
-        changes=tuple(transaction.changes),
+        changes=transaction.changes,
         notes=(
             *old.notes,
             *(note for _, notes in done.values() for note in notes),

@@ -117,7 +117,7 @@ class Creation:
     changed: tuple[str, ...] = ()
     completed: tuple[str, ...] = ()
     kept: tuple[str, ...] = ()
-    changes: tuple[Change, ...] = ()
+    changes: Sequence[Change] = ()
     notes: tuple[Note, ...] = ()
     replaced: tuple[ReplacedRights, ...] = ()
     restart: tuple[str, ...] = ()
@@ -157,7 +157,7 @@ def create_keystore(
         template,
         domains,
         True,
-        changes=tuple(transaction.changes),
+        changes=transaction.changes,
         notes=(*keystore.authorities.notes, *place_notes(root)),
     )
 
@@ -213,7 +213,8 @@ def create_permission(
     for name in names:
         if name not in existing:
             raise no_such_enclave(root, name, existing)
-    wanted = {name: stated_enclave(policy, name) for name in names}
+    stated = {each.path: each for each in policy.enclaves}
+    wanted = {name: stated.get(name) or stated_enclave(policy, name) for name in names}
     with Transaction(root, dry_run=dry_run) as transaction:
         keystore = open_to_issue(transaction, domain, keyring, now)
         return write_enclaves(
@@ -280,7 +281,8 @@ def _revoked_before(
     Raises:
         KeystoreError: a revoked enclave is only in a policy, from which nobody removed it.
     """
-    missing = [name for name in wanted if name not in keystore.names]
+    existing = frozenset(keystore.names)
+    missing = [name for name in wanted if name not in existing]
     again = [name for name in missing if name in keystore.known.revoked_enclaves]
     if unasked := [name for name in again if name not in named]:
         raise KeystoreError(
@@ -543,7 +545,7 @@ def write_enclaves(
         _names_with(outcomes, _Outcome.CHANGED),
         _names_with(outcomes, _Outcome.COMPLETED),
         _names_with(outcomes, _Outcome.KEPT),
-        tuple(transaction.changes),
+        transaction.changes,
         (
             *(note for each in done.values() for note in each.notes),
             *(writer.notes if writer.entries else ()),

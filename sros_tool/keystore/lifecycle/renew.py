@@ -66,7 +66,7 @@ class Renewal:
 
     root: Path
     renewed: tuple[str, ...]
-    changes: tuple[Change, ...]
+    changes: Sequence[Change]
     notes: tuple[Note, ...] = ()
     works_until: datetime | None = None
     revoked: int = 0
@@ -169,7 +169,7 @@ def renew(
     return Renewal(
         root,
         renewed,
-        tuple(transaction.changes),
+        transaction.changes,
         notes,
         None if revoked else max((each.not_after for each in valid), default=None),
         revoked.count if revoked else 0,

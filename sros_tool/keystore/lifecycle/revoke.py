@@ -63,7 +63,7 @@ class Revocation:
     revoked: tuple[str, ...]
     restart: tuple[str, ...]
     next_update: datetime
-    changes: tuple[Change, ...]
+    changes: Sequence[Change]
     remarks: tuple[Note, ...] = ()
     zenoh: KeptZenoh = KeptZenoh()  # noqa: RUF009 - frozen
 
@@ -120,7 +120,8 @@ def revoke(
                     listed.add(serial)
                     revoked.append(Revoked(serial, now.replace(microsecond=0), reason))
                     entries.append(_revocation_entry(each, now, reason, key=each.key))
-        remaining = tuple(name for name in existing if name not in names)
+        gone = frozenset(names)
+        remaining = tuple(name for name in existing if name not in gone)
         next_update, signed = lists.sign(revoked, remaining, incomplete=until_retired)
         entries += signed
         _link_everywhere(transaction, remaining)
@@ -133,7 +134,7 @@ def revoke(
                 load_ca_certificate(root, PERMISSIONS),
                 lambda: load_authority(root, PERMISSIONS, template, keyring, now),
                 now,
-                ZenohChange(gone=names),
+                ZenohChange(gone=gone),
             )
         append(transaction, entries, authority, now)
         transaction.commit()
@@ -142,7 +143,7 @@ def revoke(
         tuple(dict.fromkeys(names)),
         remaining,
         next_update,
-        tuple(transaction.changes),
+        transaction.changes,
         (*lists.remarks, *_remarks_on_lack(root, ledger, present), *kept.notes),
         kept,
     )
@@ -169,16 +170,17 @@ def refresh_crl(
         _link_everywhere(transaction, existing)
         append(transaction, entries, authority, now)
         transaction.commit()
-    changes, remarks = tuple(transaction.changes), tuple(lists.remarks)
+    changes, remarks = transaction.changes, tuple(lists.remarks)
     return Revocation(root, (), existing, next_update, changes, remarks)
 
 
 def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
     """Return all enclaves of the keystore; raise if one of ``names`` does not exist."""
     existing = list_enclaves(root)
+    there = frozenset(existing)
     for name in names:
         check_enclave_name(name)
-        if name not in existing:
+        if name not in there:
             raise no_such_enclave(root, name, existing)
     return existing
 

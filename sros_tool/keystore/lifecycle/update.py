@@ -181,7 +181,7 @@ class KeystoreUpdate:
     revoked: int
     restart: tuple[str, ...]
     remarks: tuple[Note, ...]
-    changes: tuple[Change, ...]
+    changes: Sequence[Change]
     notes: tuple[Note, ...] = ()
     zenoh: KeptZenoh = KeptZenoh()  # noqa: RUF009 - frozen
 
@@ -599,7 +599,7 @@ class _Updater:
             revoked.count if revoked else 0,
             restart,
             tuple(remarks),
-            tuple(self._transaction.changes),
+            self._transaction.changes,
             (*(self._writer.notes if reissued else ()), *kept.notes),
             kept,
         )

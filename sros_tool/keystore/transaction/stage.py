@@ -17,9 +17,10 @@ import json
 import os
 import re
 import stat
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 from sros_tool.errors import KeystoreError
 from sros_tool.folders import Folder
@@ -56,11 +57,90 @@ class Change:
     path: str
 
 
+class ChangeRun(NamedTuple):
+    """The same action on several files of one folder, which is "" or ends with "/"."""
+
+    action: str
+    folder: str
+    names: tuple[str, ...]
+
+
+class Changes(Sequence[Change]):
+    """The changes of a transaction, in order.
+
+    Changes in a row that are alike but for the names of their files are kept together: most folders
+    of a large keystore get the same files, whose names are in the memory once.
+    """
+
+    def __init__(self) -> None:
+        """Begin without a change."""
+        self._runs: list[ChangeRun] = []
+        self._ends: list[int] = []  # how many changes there are up to the end of each run
+        self._names: dict[tuple[str, ...], tuple[str, ...]] = {}
+        self._last_is_open = False
+
+    def add(self, action: str, path: str) -> None:
+        """Add a change at the end."""
+        folder, slash, name = path.rpartition("/")
+        names: tuple[str, ...] = (name,)
+        if self._last_is_open and self._runs[-1][:2] == (action, folder + slash):
+            names = (*self._runs.pop().names, name)
+            self._ends.pop()
+        self.extend((ChangeRun(action, folder + slash, names),))
+        self._last_is_open = True
+
+    def extend(self, runs: Iterable[ChangeRun]) -> None:
+        """Add changes at the end."""
+        for run in runs:
+            names = self._names.setdefault(run.names, run.names)
+            self._runs.append(run._replace(names=names))
+            self._ends.append(len(self) + len(names))
+
+    def mark(self) -> int:
+        """Return a mark of the changes so far, for `since`."""
+        self._last_is_open = False
+        return len(self._runs)
+
+    def since(self, mark: int) -> tuple[ChangeRun, ...]:
+        """Return the changes that were added after ``mark``."""
+        return tuple(self._runs[mark:])
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def __iter__(self) -> Iterator[Change]:
+        return (
+            Change(action, f"{folder}{name}")
+            for action, folder, names in self._runs
+            for name in names
+        )
+
+    @overload
+    def __getitem__(self, index: int) -> Change: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Change]: ...
+
+    def __getitem__(self, index: int | slice) -> Change | Sequence[Change]:
+        if isinstance(index, slice):
+            return tuple(self)[index]
+        place = range(len(self))[index]
+        run = bisect_right(self._ends, place)
+        action, folder, names = self._runs[run]
+        return Change(action, f"{folder}{names[place - self._ends[run]]}")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and tuple(self) == tuple(other)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self))
+
+
 @dataclass(frozen=True, slots=True)
 class Staged:
     """The changes that a forked worker staged, sent to the process that commits."""
 
-    changes: tuple[Change, ...]
+    changes: tuple[ChangeRun, ...]
     moves: tuple[Move, ...]
 
 

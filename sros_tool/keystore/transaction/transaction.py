@@ -18,7 +18,7 @@ import logging
 import os
 import secrets
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
@@ -43,7 +43,7 @@ from sros_tool.keystore.transaction.stage import (
     BEFORE,
     CLOSE,
     LIVE,
-    Change,
+    Changes,
     Move,
     Staged,
     point_live,
@@ -71,7 +71,7 @@ class Transaction:
 
     def __init__(self, root: Path, *, fresh: bool = False, dry_run: bool = False) -> None:
         self.root = root
-        self.changes: list[Change] = []
+        self.changes = Changes()
         self.dry_run = dry_run
         self._fresh = fresh
         self._new_root = fresh and not root.exists()
@@ -79,7 +79,8 @@ class Transaction:
         self._folder: Folder | None = None
         self._lock: KeystoreLock | None = None
         self._sibling = ""
-        self._staged: set[str] = set()
+        self._staged: dict[str, tuple[str, ...]] = {}  # the names in each folder
+        self._names: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._folders: dict[str, bool] = {}  # whether the folder exists in the keystore
         self._moves: list[Move] = []
         self._undo: list[Callable[[], None]] = []
@@ -210,11 +211,15 @@ class Transaction:
 
     def write(self, path: str, data: bytes, *, private: bool = False) -> None:
         """Stage a file with the content ``data``; a ``private`` file always has mode 0600."""
+        self.write_parts(path, (data,), private=private)
+
+    def write_parts(self, path: str, parts: Iterable[bytes], *, private: bool = False) -> None:
+        """Stage a file as `write` does, part by part; a dry run takes no part."""
         staged = self._prepare(path, "")
         if staged is None:
             return
         try:
-            self._in.write(staged, data, 0o600 if private else 0o644)
+            self._in.write_parts(staged, parts, 0o600 if private else 0o644)
         except OSError as error:
             error.filename = f"{self.root}/{path}"
             raise
@@ -258,10 +263,19 @@ class Transaction:
         return f"{STAGE}/{AFTER}/{staged_name(path)}" if exists else f"{self._added}{path}"
 
     def _begin_change(self, path: str, action: str) -> None:
-        if path in self._staged:
+        folder, _, name = path.rpartition("/")
+        names = self._staged.get(folder, ())
+        if name in names:
             raise KeystoreError(f"{path} would be written twice")
-        self._staged.add(path)
-        self.changes.append(Change(action, path))
+        self._note_staged(folder, (*names, name))
+        self.changes.add(action, path)
+
+    def _note_staged(self, folder: str, names: tuple[str, ...]) -> None:
+        self._staged[folder] = self._names.setdefault(names, names)
+
+    def _is_staged(self, path: str) -> bool:
+        folder, _, name = path.rpartition("/")
+        return name in self._staged.get(folder, ())
 
     def _at(self, path: str) -> str | None:
         """Return the present state of a path, as in `Move.before`."""
@@ -312,20 +326,22 @@ class Transaction:
 
         With ``alone``, there are no forked workers: the session of a token does not survive a fork.
         """
-        own_process, first_change, first_move = os.getpid(), len(self.changes), len(self._moves)
+        own_process, first_change, first_move = os.getpid(), self.changes.mark(), len(self._moves)
 
         def work_on(part: Sequence[Item]) -> tuple[Result, Staged | None]:
             result = work(part)
             if os.getpid() == own_process:
                 return result, None
-            changes, moves = self.changes[first_change:], self._moves[first_move:]
-            return result, Staged(tuple(changes), tuple(moves))
+            changes, moves = self.changes.since(first_change), self._moves[first_move:]
+            return result, Staged(changes, tuple(moves))
 
         slices = [(items, work_on(items))] if alone else map_slices(items, work_on)
         for _, (_, staged) in slices:
             if staged:
-                self._staged.update(change.path for change in staged.changes)
-                self.changes += staged.changes
+                for _, folder, names in staged.changes:
+                    place = folder.removesuffix("/")
+                    self._note_staged(place, (*self._staged.get(place, ()), *names))
+                self.changes.extend(staged.changes)
                 self._moves += staged.moves
         return [(part, result) for part, (result, _) in slices]
 
@@ -343,7 +359,8 @@ class Transaction:
         if not self.changes:
             return
         if self.dry_run:
-            self.changes += [Change(CLOSE, path) for path in self._open_keys()]
+            for path in self._open_keys():
+                self.changes.add(CLOSE, path)
             return
         folder = self._in
         if self._new_root:
@@ -363,13 +380,13 @@ class Transaction:
             with contextlib.suppress(OSError):  # `check` finds what stays open
                 folder.close_to_others(path)
                 if not folder.mode(path) & 0o077:
-                    self.changes.append(Change(CLOSE, path))
+                    self.changes.add(CLOSE, path)
 
     def _open_keys(self) -> list[str]:
         """Return the paths that other users can open, except those that this change writes."""
         if self._new_root:
             return []
-        return [path for path in _open_keys(self.root) if path not in self._staged]
+        return [path for path in _open_keys(self.root) if not self._is_staged(path)]
 
     def _report_commit(self) -> None:
         _LOG.info("committed %d changes to the keystore '%s'", len(self.changes), self.root)

@@ -114,7 +114,7 @@ class RotationStep:
     stage: RotationStage
     files: tuple[str, ...]
     enclaves: tuple[str, ...]
-    changes: tuple[Change, ...]
+    changes: Sequence[Change]
     kept_elsewhere: tuple[str, ...] = ()
     notes: tuple[Note, ...] = ()
 
@@ -164,7 +164,7 @@ def rotate_ca(
         stage,
         tuple(each.file for each in rotator.replacements),
         names,
-        tuple(transaction.changes),
+        transaction.changes,
         tuple(rotator.kept_elsewhere),
         rotator.notes,
     )
@@ -189,7 +189,7 @@ def _was_replaced(root: Path) -> bool:
     trusted = {subject_text(each.subject) for certificates in names for each in certificates}
     made = Counter(
         each.subject
-        for each in read_ledger(root).entries
+        for each in read_ledger(root, having=("what", "ca")).entries
         if each.what == "ca" and each.reason != SAME_KEY
     )
     return any(number > 1 or subject not in trusted for subject, number in made.items())
@@ -288,9 +288,7 @@ def renew_identity_ca(
         entry = certificate_entry(now, "ca", new, reason=SAME_KEY)
         append(transaction, [entry], Authority(new, key), now)
         transaction.commit()
-    return RotationStep(
-        root, RotationStage.NONE, ("identity_ca",), names, tuple(transaction.changes)
-    )
+    return RotationStep(root, RotationStage.NONE, ("identity_ca",), names, transaction.changes)
 
 
 class _Rotator:
