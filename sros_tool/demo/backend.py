@@ -7,7 +7,9 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import metadata
+from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import ProtectionKind
@@ -39,8 +41,19 @@ _NO_RCLPY = (
     "Source a ROS 2 installation from packages (its Fast DDS has DDS Security built in), or use"
     " `--backend cyclone`."
 )
+_PYTHON = (sys.executable, "-P")  # never import modules from the current folder
+_LEAN_PYTHON = (*_PYTHON, "-S")
+"""Without the site packages: their start-up files, as rclpy has one, take longer than a node."""
 _ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """The variable that keeps Fast DDS from sending messages through shared memory."""
+
+
+@cache
+def _modules() -> Mapping[str, str]:
+    """Return the variable with which `_LEAN_PYTHON` finds what nodes import."""
+    found = map(importlib.util.find_spec, ("sros_tool", "lxml", "zenoh"))
+    folders = (Path(each.origin).parents[1] for each in found if each and each.origin)
+    return {"PYTHONPATH": os.pathsep.join(dict.fromkeys(map(str, folders)))}
 
 
 @dataclass(frozen=True)
@@ -91,16 +104,15 @@ class Backend:
 
         ``names`` are the absolute names of the role's ROS nodes, from `node_names`.
         """
-        # -P: never import modules from the current folder.
         if self.library(role, secured=secured) == RCLPY:
-            program = [sys.executable, "-P", "-m", "sros_tool.demo.nodes.ros", role.value]
+            program = [*_PYTHON, "-m", "sros_tool.demo.nodes.ros", role.value]
             return [*program, *options, *naming_arguments(role, names)]
-        return [sys.executable, "-P", "-m", "sros_tool.demo.nodes.cyclone", role.value, *options]
+        return [*_LEAN_PYTHON, "-m", "sros_tool.demo.nodes.cyclone", role.value, *options]
 
     def zenoh_command(self, role: Role, options: Sequence[str], enclave: str) -> list[str]:
         """Return the command line of a process on Zenoh, and the enclave that it announces."""
         named = ["--ros-args", "--enclave", enclave, "--"] if enclave else []
-        program = [sys.executable, "-P", "-m", "sros_tool.demo.nodes.zenoh", role.value]
+        program = [*_LEAN_PYTHON, "-m", "sros_tool.demo.nodes.zenoh", role.value]
         return [*program, *options, *named]
 
     def environment(
@@ -111,9 +123,11 @@ class Backend:
         ``wire`` keeps its messages out of shared memory; ``denied`` makes it log why it is denied.
         """
         if self.on_zenoh:
-            return {}
+            return _modules()
         on_ros = self.library(role, secured=secured) == RCLPY
-        variables = {RMW: self.rmw} if on_ros and self.rmw else {}
+        variables = {} if on_ros else {**_modules()}
+        if on_ros and self.rmw:
+            variables[RMW] = self.rmw
         if on_ros and wire:
             variables |= _ON_THE_WIRE
         if denied and not on_ros:
