@@ -35,7 +35,8 @@ SETTLED = {EventKind.READY, EventKind.REFUSED, EventKind.FAILED}
 class Node:
     """A talker or listener; with "" as ``keystore`` it is unsecured.
 
-    Those of whom it is expected that they speak or hear (``hears``) are waited for.
+    Those of whom it is expected that they speak or hear (``hears``) are waited for.  ``through``
+    is a program, with arguments, that runs the command of the node.
     """
 
     role: str
@@ -45,6 +46,7 @@ class Node:
     topic: str = "/chatter"
     text: str = "Hello"
     hears: bool = True
+    through: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,7 @@ def start(node: Node, domain: int, folder: Path) -> tuple[subprocess.Popen[bytes
     environment["ROS_DOMAIN_ID"] = str(domain)
     if node.keystore:
         environment |= secured_environment(Path(node.keystore), node.enclave, domain)
-    command = [sys.executable, "-m", "sros_tool.demo.nodes.cyclone", node.role]
+    command = [*node.through, sys.executable, "-m", "sros_tool.demo.nodes.cyclone", node.role]
     command += ["--topic", node.topic, "--text", node.text, "--period", "0.1"]
     with report.with_suffix(".err").open("wb") as errors:
         process = subprocess.Popen(

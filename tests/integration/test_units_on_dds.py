@@ -1,0 +1,100 @@
+"""Nodes on Cyclone DDS under the restrictions of the units that sros writes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
+from sros_tool.keystore.template import load_template
+from sros_tool.policy.document import read_policy
+from sros_tool.runtime.netns import try_isolation
+from sros_tool.runtime.units import node_settings, node_template
+from tests.integration.converse import converse, listener, talker
+from tests.support.children import python, run
+from tests.support.harness import policy_text, publish, sros
+
+pytestmark = [
+    pytest.mark.dds,
+    pytest.mark.skipif(
+        os.geteuid() != 0 or not shutil.which("systemd-analyze") or not try_isolation().isolated,
+        reason="needs root, namespaces, and the groups of system calls of systemd",
+    ),
+]
+
+CONFINED = str(Path(__file__).with_name("confined.py"))
+DOMAIN = 133
+HEARS = '<topics subscribe="ALLOW"><topic>/x</topic></topics>'
+
+TRY = """
+import json, socket, sys, os, tempfile
+def refused(act):
+    try:
+        act()
+    except OSError as error:
+        return type(error).__name__
+    return ""
+own, other, outside = sys.argv[1:]
+print(json.dumps({
+    "own key": refused(lambda: open(own + "/key.pem").read()),
+    "UDP": refused(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)),
+    "interfaces": refused(lambda: socket.socket(socket.AF_NETLINK, socket.SOCK_RAW)),
+    "shared memory": refused(lambda: tempfile.TemporaryFile(dir="/dev/shm")),
+    "temporary file": refused(lambda: tempfile.TemporaryFile(dir="/tmp")),
+    "another key": refused(lambda: open(other + "/key.pem").read()),
+    "change own": refused(lambda: open(own + "/key.pem", "a")),
+    "packets": refused(lambda: socket.socket(socket.AF_PACKET, socket.SOCK_RAW)),
+    "system": refused(lambda: open(outside, "w")),
+    "module": refused(lambda: os.chroot("/")),
+    "owner": refused(lambda: os.setuid(1)),
+}))
+"""
+NEEDED = {"own key", "UDP", "interfaces", "shared memory", "temporary file"}
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    """An export with a talker and a listener."""
+    now = datetime.now(UTC)
+    domains = DomainSet.of((DOMAIN, DOMAIN))
+    create_keystore(tmp_path / "ks", template=load_template("production"), domains=domains, now=now)
+    (tmp_path / "p.xml").write_text(policy_text({"/arm": publish("/x"), "/leg": HEARS}))
+    generate_artifacts(tmp_path / "ks", policies=[read_policy(tmp_path / "p.xml")], now=now)
+    sros("distribute_key", tmp_path / "ks", "--all", tmp_path / "robot").ok()
+    return tmp_path / "robot"
+
+
+@pytest.fixture
+def units(robot: Path, tmp_path: Path) -> Iterator[Path]:
+    """The unit of the talker, as a file."""
+    path = tmp_path / "units"
+    path.write_text(node_template("root") + node_settings("/arm", {}, str(robot)))
+    yield path
+
+
+def test_a_talker_under_the_restrictions_of_its_unit_is_heard(robot: Path, units: Path) -> None:
+    place = tempfile.gettempdir()
+    confined = (sys.executable, CONFINED, str(units), place, "--")
+    speaks = replace(talker(robot, "/arm", topic="/x"), through=confined)
+    said = converse(DOMAIN, speaks, listener(robot, "/leg", topic="/x"))
+    assert said.heard(), said
+
+
+def test_the_restrictions_are_in_force(robot: Path, units: Path) -> None:
+    with tempfile.TemporaryDirectory(dir="/var/tmp") as outside:
+        words = (robot / "enclaves/arm", robot / "enclaves/leg", f"{outside}/file")
+        free = json.loads(python("-c", TRY, *words).stdout)
+        confined = [sys.executable, CONFINED, units, "--"]
+        held = json.loads(run([*confined, sys.executable, "-c", TRY, *words]).stdout)
+    assert {name for name, error in free.items() if error} <= {"packets", "module"}
+    assert {name for name, error in held.items() if not error} == NEEDED, held
