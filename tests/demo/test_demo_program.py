@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -125,6 +126,7 @@ def test_backends(
     name: str | None,
     why: str,
     monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     monkeypatch.setattr(backends, "rclpy_stacks", lambda _probe: iter([ros]))
     monkeypatch.setattr(backends, "cyclone_stack", lambda _probe: cyclone)
@@ -143,8 +145,12 @@ def test_backends(
         remapped = ["-r", "talker:__node:=mouth", "-r", "mouth:__ns:=/robot"]
         assert options == ["--topic", "/x", "--ros-args", *remapped, "--"]
     else:
-        assert chosen.environment(Role.TALKER, wire=True) == {}
+        variables = chosen.environment(Role.TALKER, wire=True)
+        assert list(variables) == ["PYTHONPATH"]
         command = chosen.command(Role.LISTENER, ["--topic", "/x"], ["/robot/ear"])
+        # Without site packages, the module is found by the variable alone, wherever it is run.
+        found = [*command[: command.index("-m")], "-c", "import sros_tool.demo.nodes.cyclone"]
+        subprocess.run(found, env=dict(variables), cwd=tmp_path, check=True)
         assert command[-4:] == ["sros_tool.demo.nodes.cyclone", "listener", "--topic", "/x"]
 
 
