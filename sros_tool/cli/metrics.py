@@ -44,10 +44,23 @@ The exit status is 0 whatever is found. If the keystore cannot be examined it is
 @click.option(
     "--earliest", is_flag=True, help="Leave out the files of single enclaves, for large keystores."
 )
+@click.option(
+    "--policy",
+    "policies",
+    type=PATH,
+    multiple=True,
+    metavar="FILE",
+    help="Also count where the keystore differs from this policy.  Can be repeated.",
+)
 @dry_run_option
 @json_option
 def metrics(
-    root: Path | None, output: Path | None, earliest: bool, dry_run: bool, as_json: bool
+    root: Path | None,
+    output: Path | None,
+    earliest: bool,
+    policies: tuple[Path, ...],
+    dry_run: bool,
+    as_json: bool,
 ) -> None:
     """Give Prometheus the expiry of all files of a keystore, and its number of findings.
 
@@ -56,14 +69,16 @@ def metrics(
     """
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.keystores.metrics import keystore_metrics
+    from sros_tool.policy.document import read_policy
     from sros_tool.prometheus import render_metrics
 
     root, moment = root or keystore_from_environment(), now()
     if output:
         _check_suffix(output)
         check_output(output, force=True)
+    wanted = tuple(read_policy(each) for each in policies)
     with progress("examining"):
-        findings = keystore_findings(root, now=moment, zone=local_zone(os.environ))
+        findings = keystore_findings(root, now=moment, zone=local_zone(os.environ), policies=wanted)
         found = keystore_metrics(root, findings, now=moment, each_enclave=not earliest)
     text = render_metrics(found)
     changes = file_change(output, existed=output.exists()) if output else []

@@ -10,7 +10,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from sros_tool.pki.certificates import validity_of
-from tests.support.harness import certificate, sros
+from tests.support.harness import certificate, policy_text, publish, sros
 
 KINDS = {"certificate", "permissions", "governance", "identity_ca", "permissions_ca"}
 
@@ -63,6 +63,14 @@ def test_damage_is_counted_and_makes_no_error(keystore: Path) -> None:
     assert found["sros_findings_of_kind"]["error", "enclave.certificate-malformed"] == 1
     assert ("certificate", "/a") not in found["sros_expiry_timestamp_seconds"]
     assert ("certificate", "/b") in found["sros_expiry_timestamp_seconds"]
+
+
+def test_drift_from_a_policy_is_counted(keystore: Path, tmp_path: Path) -> None:
+    policy = tmp_path / "p.xml"
+    policy.write_text(policy_text({"/a": publish("new"), "/b": publish("old_b")}))
+    found = read(sros("metrics", keystore, "--policy", policy).ok().out)
+    assert found["sros_findings_of_kind"]["warning", "enclave.stale-permissions"] == 1
+    assert sros("metrics", keystore, "--policy", tmp_path / "none").status == 2
 
 
 def test_an_export_has_the_expiry_of_its_own_files(keystore: Path, tmp_path: Path) -> None:
