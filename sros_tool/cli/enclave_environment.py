@@ -59,6 +59,7 @@ def loadable_environment(
         rmw: the value of --rmw; None stands for $RMW_IMPLEMENTATION.
         accept_key: accept a private key that other users can read.
         target: the absolute path of the keystore where the process will run; None stands for here.
+            A key that was made there need not be here.
 
     Raises:
         UsageError: the domain, the RMW or the enclave's name is invalid.
@@ -102,13 +103,14 @@ def loadable_environment(
         wanted = _permitted_domain(state, domains)
     domain = choose_domain(domains, wanted, root) if domains else 0
     state = open_enclave(folder, now=now(), domain=domain)
-    if state.problems:
+    problems = state.problems_at_home if target else state.problems
+    if problems:
         raise KeystoreError(
             f"a process cannot run in enclave {name}",
-            "; ".join(map(str, state.problems)) + ".",
+            "; ".join(map(str, problems)) + ".",
             f"See `sros inspect {folder}`.",
         )
-    if not accept_key:
+    if not accept_key and not (target and state.key_on_robot):
         _check_key_closed(folder / KEY_FILE, root, name)
     variables = secured_environment(target or root, name, domain)
     if zenoh:

@@ -28,6 +28,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "p.xml").write_text(policy_text(names))
     sros("generate_artifacts", "-k", "ks", "-p", "p.xml", cwd=folder).ok()
     sros("distribute_key", "ks", "/arm", "alone", cwd=folder).ok()
+    sros("create_request", "/born", "robot", cwd=folder).ok()
+    request = "robot/enclaves/born/request.pem"
+    sros("sign_request", "ks", request, "-o", "answer.tgz", cwd=folder).ok()
     shutil.copytree(folder / "ks", folder / "zenoh", symlinks=True)
     sros("zenoh", "zenoh", "--mode", "peer", cwd=folder).ok()
     return folder
@@ -59,6 +62,14 @@ def test_zenoh_has_the_paths_of_the_robot_too(made: Path) -> None:
     assert "enclave-argument" in shown.err and "zenoh.replaced" not in shown.err
     shown = sros("env", made / "zenoh", "/arm/gripper", "--format", "kubernetes-secret").ok()
     assert {"session.json5", "session.p7s"} <= check(shown.out, "kubernetes-secret")["data"].keys()
+
+
+def test_a_key_that_was_made_on_the_robot_is_not_missed(made: Path) -> None:
+    for form in ("compose", "kubernetes"):
+        check(sros("env", made / "ks", "/born", "--format", form).ok().out, form)
+    assert sros("env", made / "ks", "/born").status == 2
+    refused = sros("env", made / "ks", "/born", "--format", "kubernetes-secret")
+    assert refused.status == 2 and "made on its robot" in refused.err
 
 
 def test_no_container_sees_the_keys_of_others(made: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -19,7 +20,7 @@ from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifa
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.runtime.netns import try_isolation
-from sros_tool.runtime.units import node_settings, node_template
+from sros_tool.runtime.units import METRICS_FILE, Job, job_units, node_settings, node_template
 from tests.integration.converse import converse, listener, talker
 from tests.support.children import python, run
 from tests.support.harness import policy_text, publish, sros
@@ -98,3 +99,18 @@ def test_the_restrictions_are_in_force(robot: Path, units: Path) -> None:
         held = json.loads(run([*confined, sys.executable, "-c", TRY, *words]).stdout)
     assert {name for name, error in free.items() if error} <= {"packets", "module"}
     assert {name for name, error in held.items() if not error} == NEEDED, held
+
+
+def test_the_jobs_do_their_work_under_their_restrictions(robot: Path, tmp_path: Path) -> None:
+    keystore, metrics = tmp_path / "ks", tmp_path / "metrics"
+    metrics.mkdir()
+    before = (keystore / "enclaves/arm/cert.pem").read_bytes()
+    for job in Job:
+        files = job_units(job, str(keystore), user="root", sros="/bin/sros")
+        (tmp_path / "job").write_text(files[f"sros-{job}.service"])
+        (line,) = re.findall("^ExecStart=/bin/sros (.*)$", (tmp_path / "job").read_text(), re.M)
+        words = line.replace(METRICS_FILE, str(metrics / "sros.prom")).replace("30d", "9999d")
+        program = [sys.executable, "-m", "sros_tool", *words.split()]
+        run([sys.executable, CONFINED, tmp_path / "job", keystore, metrics, "--", *program])
+    assert (keystore / "enclaves/arm/cert.pem").read_bytes() != before
+    assert "sros_enclaves{" in (metrics / "sros.prom").read_text()
