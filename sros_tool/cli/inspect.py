@@ -139,6 +139,11 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
             yield f"  governance: {d['governance']['error']}"
         else:
             yield from _indented(_governance(d["governance"]))
+    if network := d["zenoh"]:
+        yield (
+            f"  Zenoh in {network['mode']} mode: router {network['router']} at "
+            f"{', '.join(network['endpoints'])}"
+        )
     if d["ledger"]:
         yield f"  LEDGER DAMAGED: {'; '.join(d['ledger'])}"
     yield f"  {len(d['enclaves'])} enclave{'' if len(d['enclaves']) == 1 else 's'}"

@@ -42,6 +42,7 @@ from sros_tool.pki.keys import algorithm, holds_private_key, load_key
 from sros_tool.translate import RosRight, ros_rights
 from sros_tool.validity import iso
 from sros_tool.xml import parse, read_bytes
+from sros_tool.zenoh.network import ZenohNetwork
 
 Description = dict[str, Any]
 _JSON = (".json5", ".json")
@@ -163,9 +164,19 @@ def _keystore(root: Path, now: datetime) -> Description:
         "ledger": gaps,
         "authorities": authorities,
         "governance": governance,
+        "zenoh": _network(settings.zenoh) if settings and settings.zenoh else None,
         "enclaves": enclaves,
         "unreadable": unreadable,
         "problems": problems,
+    }
+
+
+def _network(network: ZenohNetwork) -> Description:
+    return {
+        "router": network.router,
+        "endpoints": list(network.endpoints),
+        "listen": list(network.listening()),
+        "mode": network.mode.value,
     }
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.errors import InvalidNameError, KeystoreError, SrosError
-from sros_tool.keystore.layout import REVOKED
+from sros_tool.keystore.layout import PRIVATE, PUBLIC, REVOKED, SETTINGS
 from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.names import check_enclave_name
 
@@ -35,6 +35,9 @@ def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
     names = sorted(there)
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     why = f"The keystore has {', '.join(names[:_SHOWN]) or 'no enclave'}{more}."
+    if not any((root / part).exists() for part in (PUBLIC, PRIVATE, SETTINGS)):
+        where = f"`sros distribute_key KEYSTORE {name} {quote(str(root))}`"
+        return KeystoreError(what, why, f"If it is not a typo, export it with {where}.")
     create = f"`sros create_enclave {quote(str(root))} {name}`"
     return KeystoreError(what, why, f"If it is not a typo, create it with {create}.")
 

@@ -145,6 +145,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks/enclaves/a/permissions.xml"),
         Case("ks/enclaves/governance.p7s"),
         Case("ks/enclaves/governance.xml"),
+        Case("closed"),
         Case("zenoh/enclaves/a", before=("zenoh zenoh",)),
         Case("zenoh/enclaves/a/session.json5", before=("zenoh zenoh",)),
         Case("zenoh/enclaves/router/router.p7s", before=("zenoh zenoh --mode peer",)),
@@ -210,6 +211,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks robot/enclaves/s/request.pem -o answer.tgz"),
         Case("ks robot/enclaves/s/request.pem -o answer.tgz --dry-run"),
         Case("empty robot/enclaves/s/request.pem -o - --dry-run"),
+        Case("ks robot/enclaves/r/request.pem --no-answer"),
     ),
     "import": (
         Case("r.tgz robot"),

@@ -43,12 +43,15 @@ def test_the_error_names_who_may_be_meant_and_does_not_say_to_make_it() -> None:
     )
 
 
-def test_where_nobody_is_meant_the_error_says_who_is_there() -> None:
-    text = str(no_such_enclave(Path("robot"), "/camera", [*THERE, "/x", "/y"]))
-    assert (
-        "/x and 1 more. If it is not a typo, create it with `sros create_enclave robot /camera`."
-        in text
-    )
+def test_where_nobody_is_meant_the_error_says_who_is_there(tmp_path: Path) -> None:
+    (tmp_path / "ks/public").mkdir(parents=True)
+    text = str(no_such_enclave(tmp_path / "ks", "/camera", [*THERE, "/x", "/y"]))
+    assert "/x and 1 more. If it is not a typo, create it with `sros create_enclave " in text
+
+
+def test_an_export_gets_it_from_its_keystore(tmp_path: Path) -> None:
+    text = str(no_such_enclave(tmp_path, "/camera", THERE))
+    assert f"export it with `sros distribute_key KEYSTORE /camera {tmp_path}`." in text
 
 
 def test_a_name_that_could_not_be_made_is_told_so() -> None:
