@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from sros_tool.errors import Note
+    from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.authorities.keyring import Keyring
     from sros_tool.keystore.issuing.zenoh import KeptZenoh
     from sros_tool.keystore.transaction.stage import Change
@@ -91,6 +92,21 @@ def robot_option(help_text: str) -> Callable[[Decorated], Decorated]:
     )
 
 
+def fleet_option(help_text: str) -> Callable[[Decorated], Decorated]:
+    """Add ``--fleet FILE`` to a verb that reads policies with placeholders."""
+    return click.option("--fleet", "fleet_file", type=PATH, metavar="FILE", help=help_text)
+
+
+def fleet_policies(files: Sequence[Path], fleet_file: Path) -> list[FleetPolicy]:
+    """Return the policies in files, for the fleet in the file that --fleet names."""
+    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.policy.document import read_policy
+
+    fleet = read_fleet(fleet_file)
+    return [FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files]
+
+
 def several_enclaves(function: Decorated) -> Decorated:
     """Add ``--all``, ``--match PATTERN`` and ``--robot NAME`` to a verb for several enclaves."""
     function = robot_option("All enclaves of this robot of the fleet.")(function)
@@ -130,7 +146,7 @@ def chosen_enclaves(
         return tuple(names)  # the verb says what is wrong with a name
     from sros_tool.keystore.selection import select_enclaves
 
-    return select_enclaves(root, names, patterns, robots=robots, every=every)
+    return select_enclaves(root, names, patterns, robots=robots, every=every, checked=True)
 
 
 def output_option(help_text: str) -> Callable[[Decorated], Decorated]:

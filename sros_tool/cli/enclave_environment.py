@@ -95,12 +95,10 @@ def loadable_environment(
         raise no_such_enclave(root, name, list_enclaves(root))
     folder = enclave_path(root, name)
     state = open_enclave(folder, now=now())
-    domains = state.domains()
+    domains = state.domains() if wanted is not None else state.joined_domains()
     zenoh = _opened_zenoh(root, name, state) if with_zenoh else None
     if zenoh and domains:
         wanted = _zenoh_domain(root, zenoh, wanted, domains)
-    if domains and wanted is None:
-        wanted = _permitted_domain(state, domains)
     domain = choose_domain(domains, wanted, root) if domains else 0
     state = open_enclave(folder, now=now(), domain=domain)
     problems = state.problems_at_home if target else state.problems
@@ -120,22 +118,6 @@ def loadable_environment(
     if (target and not rmw) or RMW_ZENOH in rmw_implementations(os.environ):
         variables |= REFUSING_ZENOH  # what chooses it later, such as a launch file, starts no node
     return EnclaveEnvironment({**variables, RMW: rmw} if rmw else variables)
-
-
-def _permitted_domain(state: OpenedEnclave, domains: DomainSet) -> int | None:
-    """Return the domain in which the permissions of an enclave allow something, or None.
-
-    Prefers 0, the default of ROS, then the first: that of its robot, whose only one it is.
-    """
-    rules = [rule for rule in state.grant.rules if rule.allow] if state.grant else []
-    return next(
-        (
-            domain
-            for domain in (0, *domains)
-            if domain in domains and any(domain in rule.domains.closed() for rule in rules)
-        ),
-        None,
-    )
 
 
 def _check_key_closed(key: Path, root: Path, name: str) -> None:

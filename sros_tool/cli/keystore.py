@@ -16,6 +16,8 @@ from sros_tool.cli.common import (
     complete_keystore_and_enclave,
     complete_template,
     dry_run_option,
+    fleet_option,
+    fleet_policies,
     json_option,
     keyring,
     keystore_from_environment,
@@ -155,7 +157,8 @@ Example:
         -p talker_listener.xml mobile_robot.xml
   created enclave /spare
   created enclave /talker_listener/talker
-  ...""",
+  ...
+  $ sros generate_artifacts -k keystore -p robot.xml --fleet fleet.toml""",
 )
 @click.option("-k", "--keystore-root-path", type=PATH, help="The keystore; created if missing.")
 @click.option("-e", "--enclaves", multiple=True, metavar="NAME...", help="Enclaves to create.")
@@ -166,6 +169,10 @@ Example:
     type=PATH,
     metavar="FILE...",
     help="Policies: create their enclaves, with the permissions stated.",
+)
+@fleet_option(
+    "The robots that the placeholders of the policies stand for: a TOML file, or an inventory of "
+    "Ansible."
 )
 @click.option(
     "--template",
@@ -182,6 +189,7 @@ def generate_artifacts(
     keystore_root_path: Path | None,
     enclaves: tuple[str, ...],
     policy_files: tuple[Path, ...],
+    fleet_file: Path | None,
     template_name: str | None,
     revoke_old: bool,
     dry_run: bool,
@@ -192,6 +200,7 @@ def generate_artifacts(
     The permissions in a policy replace the current permissions of an enclave; what --revoke-old
     does then is described at `sros create_permission --help`.
     """
+    from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.layout import is_keystore
     from sros_tool.keystore.lifecycle.create import generate_artifacts as generate
     from sros_tool.keystore.lifecycle.create import refuse_other_template
@@ -203,11 +212,18 @@ def generate_artifacts(
         raise UsageError(
             "neither an enclave nor a policy is named", "", "Give -e NAME... or -p FILE... ."
         )
-    policies = [read_policy(path) for path in policy_files]
+    if fleet_file and not policy_files:
+        raise UsageError("--fleet fills in policies, and none is named", "", "Give -p FILE... .")
+    if fleet_file:
+        policies: list[Policy | FleetPolicy] = [*fleet_policies(policy_files, fleet_file)]
+    else:
+        policies = [read_policy(path) for path in policy_files]
     template = load_template(template_name or DEFAULT_TEMPLATE)
     if template_name is not None and is_keystore(root):
         refuse_other_template(root, template)
-    total = len(enclaves) + sum(len(policy.enclaves) for policy in policies)
+    total = len(enclaves) + sum(
+        len(each if isinstance(each, FleetPolicy) else each.enclaves) for each in policies
+    )
     with progress("signing", total) as step:
         result = generate(
             root,
@@ -362,6 +378,7 @@ def _robots_of(root: Path, names: Sequence[str]) -> dict[str, dict[str, str]]:
 if TYPE_CHECKING:
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.template import NamedValues, Template
+    from sros_tool.policy.model import Policy
 
 
 @click.command(

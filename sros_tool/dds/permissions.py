@@ -73,6 +73,13 @@ class Grant:
         """The validity of the grant by the standard: a date without a zone is in UTC."""
         return Window(parse_iso(self.not_before), parse_iso(self.not_after))
 
+    def domains(self) -> DomainSet:
+        """Return the domains in which some rule allows something."""
+        allowed = (each.domains.closed() for each in self.rules if each.allow)
+        return DomainSet.of(
+            *((part.first or 0, part.last or 0) for each in allowed for part in each.ranges)
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Permissions:

@@ -1,9 +1,11 @@
-"""Fleet files (TOML): the robots of a fleet, read with all checks."""
+"""Fleet files (TOML): the robots of a fleet, read with all checks, and written."""
 
 from __future__ import annotations
 
+import json
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from sros_tool.dds.domains import MAX_DOMAIN
@@ -19,6 +21,7 @@ from sros_tool.fleet.model import (
     namespace_problem,
     user_problem,
 )
+from sros_tool.xml import read_bytes
 
 MAX_BYTES = 4 * 1024 * 1024
 _MOST_GROUPS = 32  # of one robot
@@ -35,6 +38,16 @@ _OF_ROBOT = "{robot}"
 
 class FleetError(DocumentError):
     """A value of a fleet file that is not valid."""
+
+
+def read_fleet(path: Path) -> Fleet:
+    """Return the fleet in the TOML file ``path``.
+
+    Raises:
+        DocumentError: the file cannot be read, is not TOML, or a value in it is not valid; the
+            error names the key.
+    """
+    return parse_fleet(read_bytes(path, "fleet file", most=MAX_BYTES), f"the fleet file '{path}'")
 
 
 def parse_fleet(data: bytes, what: str) -> Fleet:
@@ -162,3 +175,40 @@ def _short(value: object) -> str:
 
 def _key(text: str) -> str:
     return text if text.isidentifier() and len(text) <= 80 else _short(text)
+
+
+# ── writing ────────────────────────────────────────────────────────────────────────────────
+
+
+def render_fleet(fleet: Fleet) -> str:
+    """Return the fleet as TOML text, from which `parse_fleet` returns an equal fleet."""
+    return "".join(f"{line}\n" for line in _lines(fleet))
+
+
+def _lines(fleet: Fleet) -> Iterator[str]:
+    if fleet.enclaves:
+        yield "enclaves = ["
+        yield from (f"  {json.dumps(each)}," for each in fleet.enclaves)
+        yield "]"
+    for group in fleet.groups:
+        yield f"[groups.{group}]"
+    yield "[robots]"
+    for robot in fleet.robots.values():
+        values: dict[str, object] = {
+            "groups": list(robot.groups),
+            "namespace": robot.namespace,
+            "domain": robot.domain,
+            "address": robot.address,
+            "user": robot.user,
+        }
+        usual: dict[str, object] = {
+            "groups": [],
+            "namespace": f"/{robot.name}",
+            "domain": None,
+            "address": robot.name,
+            "user": "",
+        }
+        shown = [
+            f"{key} = {json.dumps(value)}" for key, value in values.items() if value != usual[key]
+        ]
+        yield f"{robot.name} = {{ {', '.join(shown)} }}" if shown else f"{robot.name} = {{}}"

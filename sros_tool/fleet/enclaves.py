@@ -14,7 +14,14 @@ from typing import NamedTuple
 from sros_tool.errors import InvalidNameError
 from sros_tool.fleet.model import Fleet, Robot
 from sros_tool.names import check_enclave_name
-from sros_tool.policy.placeholders import Parts, fill, parts_of, placeholders_of, sample
+from sros_tool.policy.placeholders import (
+    Parts,
+    check_path,
+    fill,
+    parts_of,
+    placeholders_of,
+    sample,
+)
 
 _PART = r"[A-Za-z_][A-Za-z0-9_]*"
 _VALUES = {"robot": _PART, "namespace": f"(?:/{_PART})*"}
@@ -24,27 +31,21 @@ def pattern_problem(path: str) -> str:
     """Return why ``path`` is not that of one enclave for each robot, as a sentence, or ""."""
     try:
         parts = parts_of(path)
+        check_path(parts)
         check_enclave_name(sample(parts))
     except ValueError as error:
         return str(error)
     except InvalidNameError as error:
         return error.why
-    found = placeholders_of(parts)
-    if not found:
-        return "It has no placeholder such as {robot}."
-    if any(each.plural for each in found):
-        return "A path is that of one enclave for each robot: write {robot} or {namespace}."
-    if len({each.group for each in found}) > 1:
-        return "Its placeholders are of different groups."
-    return ""
+    return "" if placeholders_of(parts) else "It has no placeholder such as {robot}."
 
 
-def _group_of(parts: Parts) -> str:
+def group_of(parts: Parts) -> str:
     """Return the group whose robots have an enclave with this path; "" for the whole fleet."""
     return placeholders_of(parts)[0].group
 
 
-def _path_for(parts: Parts, robot: Robot) -> str:
+def path_for(parts: Parts, robot: Robot) -> str:
     """Return the path of a robot's enclave."""
     return "".join(map(str, fill(parts, robot.name, robot.namespace)))
 
@@ -54,8 +55,8 @@ def enclaves_of(fleet: Fleet, robot: Robot) -> tuple[str, ...]:
     found = set()
     for pattern in fleet.enclaves:
         parts = parts_of(pattern)
-        if _group_of(parts) in ("", *robot.groups):
-            found.add(_path_for(parts, robot))
+        if group_of(parts) in ("", *robot.groups):
+            found.add(path_for(parts, robot))
     return tuple(sorted(found))
 
 
@@ -66,8 +67,8 @@ def robot_of(fleet: Fleet, enclave: str) -> Robot | None:
     while end >= 0:
         for pattern in patterns.get(enclave[end:], ()):
             for robot in _candidates(fleet, pattern, enclave):
-                inside = _group_of(pattern.parts) in ("", *robot.groups)
-                if inside and _path_for(pattern.parts, robot) == enclave:
+                inside = group_of(pattern.parts) in ("", *robot.groups)
+                if inside and path_for(pattern.parts, robot) == enclave:
                     return robot
         end = enclave.rfind("/", 0, end) if end else -1
     return None

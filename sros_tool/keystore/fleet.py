@@ -1,14 +1,41 @@
-"""The fleet that a keystore records: its robots, and which enclave is whose."""
+"""The fleet that a keystore records: its robots, which enclave is whose, and their domains.
+
+The ledger has the SHA-256 of the file as sros wrote it last, so that an edit is noticed.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import os
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
+from shlex import quote
+from typing import TYPE_CHECKING
 
-from sros_tool.fleet.document import MAX_BYTES, parse_fleet
-from sros_tool.fleet.enclaves import enclaves_of
+from sros_tool.dds.domains import DomainSet
+from sros_tool.errors import KeystoreError, Note
+from sros_tool.fleet.document import MAX_BYTES, parse_fleet, render_fleet
+from sros_tool.fleet.enclaves import enclaves_of, robot_of
 from sros_tool.fleet.model import Fleet, Robot
-from sros_tool.keystore.layout import FLEET, has_enclave
+from sros_tool.keystore.layout import FLEET, enclave_names, has_enclave
+from sros_tool.keystore.ledger import Entry, Ledger, read_ledger
+from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.transaction.transaction import Transaction
+
+_COMMENT = """\
+# The robots of this keystore; sros wrote them from a fleet file, and knows by them which enclave
+# belongs to which robot. To change them, edit that file and run `sros generate_artifacts --fleet`.
+"""
+FLEET_REMEDY = (
+    "Write it again from the fleet file: `sros generate_artifacts -k ROOT -p POLICY_FILE --fleet "
+    "FLEET_FILE`."
+)
+_SHOWN = 5
 
 
 def load_fleet(root: Path) -> Fleet | None:
@@ -17,12 +44,160 @@ def load_fleet(root: Path) -> Fleet | None:
     Raises:
         DocumentError: the file cannot be read, or is not a fleet.
     """
+    data = _read(root)
+    return None if data is None else _parse(root, data)
+
+
+def checked_fleet(root: Path) -> Fleet | None:
+    """Return the fleet as `load_fleet`, for what is issued or sent because of it.
+
+    Raises:
+        KeystoreError: the file is not the one that sros wrote last.
+    """
+    if problem := edited_fleet(root, read_ledger(root)):
+        raise KeystoreError(
+            f"'{root / FLEET}' {problem}",
+            "It decides which enclaves belong to a robot, and which domains they may join.",
+            FLEET_REMEDY.replace("ROOT", quote(str(root))),
+        )
+    return load_fleet(root)
+
+
+def edited_fleet(root: Path, ledger: Ledger) -> str:
+    """Return how the file of the fleet is not the one that sros wrote, as a clause, or ""."""
+    return _edited(ledger, _read(root))
+
+
+def _edited(ledger: Ledger, data: bytes | None) -> str:
+    last = next((each for each in reversed(ledger.entries) if each.what == "fleet"), None)
+    if last is None:
+        return "" if data is None else "was not written by sros"
+    if data is None:
+        return f"is missing, which sros wrote at {last.time}"
+    same = hashlib.sha256(data).hexdigest() == last.sha256
+    return "" if same else f"is not the one that sros wrote at {last.time}"
+
+
+def _read(root: Path) -> bytes | None:
     path = root / FLEET
-    if not path.exists():
-        return None
-    return parse_fleet(read_bytes(path, "fleet file", most=MAX_BYTES), f"the fleet file '{path}'")
+    return read_bytes(path, "fleet file", most=MAX_BYTES) if os.path.lexists(path) else None
+
+
+def _parse(root: Path, data: bytes) -> Fleet:
+    return parse_fleet(data, f"the fleet file '{root / FLEET}'")
 
 
 def enclaves_of_robot(root: Path, fleet: Fleet, robot: Robot) -> tuple[str, ...]:
     """Return the enclaves of a robot that the keystore has, sorted."""
     return tuple(name for name in enclaves_of(fleet, robot) if has_enclave(root, name))
+
+
+@dataclass(frozen=True, slots=True)
+class EnclaveDomains:
+    """The ROS domains of each enclave: those of the keystore, or the one of its robot."""
+
+    keystore: DomainSet
+    fleet: Fleet | None = None
+
+    def robots(self) -> Collection[Robot]:
+        """Return the robots of the fleet."""
+        return self.fleet.robots.values() if self.fleet else ()
+
+    def of(self, enclave: str) -> DomainSet:
+        """Return the domains of an enclave.
+
+        Raises:
+            KeystoreError: its robot is in a domain that the keystore is not for.
+        """
+        robot = robot_of(self.fleet, enclave) if self.fleet else None
+        if robot is None or robot.domain is None:
+            return self.keystore
+        if robot.domain not in self.keystore:
+            raise KeystoreError(
+                f"the robot {robot.name} is in domain {robot.domain}, and the keystore is for "
+                f"domain {self.keystore}",
+                "In a domain that the governance does not name, nobody communicates.",
+                f"Add it with `sros update_keystore KEYSTORE --domain "
+                f"{self.keystore},{robot.domain} --allow-looser`, or name another in the fleet "
+                "file.",
+            )
+        return DomainSet.of((robot.domain, robot.domain))
+
+
+# ── writing ────────────────────────────────────────────────────────────────────────────────
+
+
+def write_fleet(
+    transaction: Transaction, fleet: Fleet, patterns: Collection[str], now: datetime
+) -> tuple[Fleet, tuple[Entry, ...]]:
+    """Stage ``fleet`` as that of the keystore, if it is another; return it, and ledger entries.
+
+    It gets the paths of enclaves that it names itself, that the keystore had, and ``patterns``.
+    """
+    before = load_fleet(transaction.root)
+    known = (before.enclaves if before else (), fleet.enclaves, patterns)
+    paths = dict.fromkeys(sorted(each for paths in known for each in paths))
+    fleet = fleet.with_enclaves(tuple(paths))
+    document = (_COMMENT + render_fleet(fleet)).encode()
+    if not _edited(read_ledger(transaction.root), document) and _read(transaction.root):
+        return fleet, ()
+    transaction.write(FLEET, document)
+    digest = hashlib.sha256(document).hexdigest()
+    return fleet, (Entry(iso(now), "fleet", sha256=digest),)
+
+
+def refuse_stale_domains(
+    root: Path, before: EnclaveDomains, fleet: Fleet, stated: Collection[str]
+) -> None:
+    """Raise `KeystoreError` if an enclave would keep permissions for other domains.
+
+    Args:
+        root: the keystore.
+        before: the domains of its enclaves until now.
+        fleet: its robots from now on.
+        stated: the enclaves that get new permissions.
+    """
+    after = EnclaveDomains(before.keystore, fleet)
+    if not any(each.domain is not None for one in (before, after) for each in one.robots()):
+        return
+    for name in enclave_names(root):
+        if name in stated or robot_of(fleet, name) is None:
+            continue
+        if before.of(name) != (domains := after.of(name)):
+            raise KeystoreError(
+                f"the enclave {name} would have to be for domain {domains} by the fleet, and has "
+                f"permissions for domain {before.of(name)}",
+                "No policy here states its rights, so it gets no other permissions.",
+                "Name the policies of all enclaves whose robots are in another domain now.",
+            )
+
+
+def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
+    """Yield a note for each robot that has enclaves in the keystore which are no longer its own."""
+    for robot in before.robots.values():
+        names = [
+            name
+            for name in enclaves_of(before, robot)
+            if (owner := robot_of(after, name)) is None or owner.name != robot.name
+        ]
+        left = [name for name in names if has_enclave(root, name)]
+        if left:
+            is_there = robot.name in after.robots
+            why = "has other paths of enclaves now" if is_there else "is no longer in the fleet"
+            shown = ", ".join(left[:_SHOWN])
+            more = f" and {len(left) - _SHOWN} more" if len(left) > _SHOWN else ""
+            yield Note(
+                "fleet.left-enclaves",
+                f"the robot {robot.name} {why}: {shown}{more} stay as they are, and work. To take "
+                f"them back, run `sros revoke {quote(str(root))} {_words(root, left)}`.",
+            )
+
+
+def _words(root: Path, names: Sequence[str]) -> str:
+    """Return the words that name exactly these enclaves of a keystore."""
+    begin = f"{os.path.commonpath(names).rstrip('/')}/"
+    if len(names) > 1 and begin != "/":
+        fitting = [each for each in enclave_names(root) if each.startswith(begin)]
+        if fitting == sorted(names):
+            return f"--match {quote(f'{begin}*')}"
+    return " ".join(names)

@@ -379,6 +379,18 @@ class OpenedEnclave:
         """Return the ROS domains that the governance names, or None without governance."""
         return self.governance.domains().closed() if self.governance else None
 
+    def joined_domains(self) -> DomainSet | None:
+        """Return the ROS domains that governance and permissions name, or None without governance.
+
+        If they have none in common, those of the governance: what is wrong is a problem.
+        """
+        governed = self.domains()
+        if governed is None or self.grant is None:
+            return governed
+        allowed = self.grant.domains()
+        common = DomainSet.of(*((each, each) for each in governed if each in allowed))
+        return common if common.ranges else governed
+
     def valid_until(self) -> datetime | None:
         """Return the first expiry among its certificates and its grant, in UTC.
 

@@ -279,6 +279,12 @@ def _left_out(grants: Iterable[Grant]) -> Iterator[Note]:
             yield Note("rights.rule-order", text)
 
 
+def joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
+    """Return those of the ROS domains that signed permissions let an enclave join."""
+    allowed = grant.domains()
+    return tuple(domain for domain in domains if domain in allowed)
+
+
 def recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRight, ...]:
     """Return the ROS rights that signed permissions give an enclave in a ROS domain.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.fleet import enclaves_of_robot, load_fleet
+from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_fleet
 from sros_tool.keystore.layout import check_keystore, list_enclaves
 
 
@@ -19,11 +19,13 @@ def select_enclaves(
     *,
     robots: Sequence[str] = (),
     every: bool = False,
+    checked: bool = False,
 ) -> tuple[str, ...]:
     """Return ``names``, then the enclaves that match ``patterns``, those of ``robots``; each once.
 
     In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  ``every`` means
-    all enclaves.  The enclaves of robots are found without a list of all.
+    all enclaves.  The enclaves of robots are found without a list of all; with ``checked``, only if
+    the fleet is what sros wrote.
 
     Raises:
         KeystoreError: a pattern matches no enclave, a robot has none, or ``every`` is given and
@@ -43,13 +45,13 @@ def select_enclaves(
                 f"See `sros list_enclaves {quote(str(root))}`.",
             )
         chosen |= dict.fromkeys(fitting)
-    return tuple(chosen | dict.fromkeys(_of_robots(root, robots)))
+    return tuple(chosen | dict.fromkeys(_of_robots(root, robots, checked)))
 
 
-def _of_robots(root: Path, robots: Sequence[str]) -> list[str]:
+def _of_robots(root: Path, robots: Sequence[str], checked: bool) -> list[str]:
     if not robots:
         return []
-    fleet = load_fleet(root)
+    fleet = checked_fleet(root) if checked else load_fleet(root)
     if fleet is None:
         raise KeystoreError(
             f"keystore '{root}' has no fleet, so it has no robot {robots[0]!r}",

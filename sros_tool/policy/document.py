@@ -37,6 +37,14 @@ from sros_tool.policy.model import (
     Qualifier,
     Source,
 )
+from sros_tool.policy.placeholders import (
+    Parts,
+    check_name,
+    check_path,
+    has_placeholder,
+    parts_of,
+    sample,
+)
 from sros_tool.xml import parse, read_bytes, serialize, tag_of
 
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
@@ -263,24 +271,29 @@ _EARLIER_ROOTS = ("profiles",)
 _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
-def read_policy(path: Path, content: bytes | None = None) -> Policy:
+def read_policy(path: Path, content: bytes | None = None, *, placeholders: bool = False) -> Policy:
     """Return the policy in a file and its includes, which must be in its folder or below.
 
-    ``content`` replaces the content of the file, which then need not exist.
+    ``content`` replaces the content of the file, which then need not exist.  With
+    ``placeholders``, names may have those of `sros_tool.policy.placeholders`, and are not filled
+    in: only `sros_tool.fleet.expansion` can use such a policy.
 
     Raises:
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
             a name is not a valid ROS name, or an enclave is defined twice.
     """
-    return _Reader(path, content).policy()
+    return _Reader(path, content, placeholders=placeholders).policy()
 
 
 class _Reader:
     _other_roots: tuple[str, ...] = ()
     """The root elements that are read besides <policy>."""
 
-    def __init__(self, path: Path, content: bytes | None) -> None:
+    def __init__(self, path: Path, content: bytes | None, *, placeholders: bool = False) -> None:
         self._shown = path
+        self._placeholders = placeholders
+        self._owner: Parts = ()
+        """The path of the enclave that is being read, if it has placeholders."""
         self._file = Path(os.path.realpath(path))
         self._includer = Includer(self._file.parent)
         if content is not None:
@@ -358,8 +371,10 @@ class _Reader:
 
     def _enclave(self, element: etree._Element, place: IncludedFile) -> Enclave:
         self._attributes(element, place, required=("path",))
+        path = element.get("path", "")
+        self._owner = self._parts(path, element, place) or ()
         try:
-            path = check_enclave_name(element.get("path", ""))
+            check_enclave_name(sample(self._owner) if self._owner else path)
         except InvalidNameError as error:
             raise PolicyError(
                 f"{self._where(element, place)}: {error.what}", error.why, error.remedy
@@ -391,17 +406,19 @@ class _Reader:
 
     def _profile(self, element: etree._Element, place: IncludedFile) -> Profile:
         self._attributes(element, place, required=("ns", "node"))
-        node = element.get("node", "")
+        node, ns = element.get("node", ""), element.get("ns", "")
+        sampled = self._sample(node, element, place, several=False)
         try:
-            ns = check_namespace(element.get("ns", ""))
+            found = check_namespace(self._sample(ns, element, place, several=False))
+            ns = ns.removesuffix("/") if has_placeholder(ns) else found
         except InvalidNameError as error:
             raise PolicyError(
                 f"{self._where(element, place)}: {error.what}", error.why, error.remedy
             ) from error
-        if node and ("/" in node or "~" in node or expression_problem(node)):
+        if sampled and ("/" in sampled or "~" in sampled or expression_problem(sampled)):
             raise PolicyError(
                 f"{self._where(element, place)}: {_short(node)} is not a valid node name",
-                expression_problem(node)
+                expression_problem(sampled)
                 or "A node name has no '/' and no '~'; its namespace goes into ns=.",
             )
         groups = tuple(self._group(child, at, node) for child, at in self._children(element, place))
@@ -448,7 +465,8 @@ class _Reader:
 
     def _name(self, element: etree._Element, place: IncludedFile, node: str) -> str:
         name = self._written(element)
-        problem = expression_problem(name)
+        sampled = self._sample(name, element, place, several=True)
+        problem = expression_problem(sampled)
         if not problem and name.startswith("~") and not node:
             problem = "A name with ~ is private to a node, and the profile has an empty node name."
         if not problem and name == "/":
@@ -466,6 +484,47 @@ class _Reader:
     def _written(self, element: etree._Element) -> str:
         """Return the name in an element, as written."""
         return element.text or ""
+
+    def _sample(
+        self, text: str, element: etree._Element, place: IncludedFile, *, several: bool
+    ) -> str:
+        """Return a name to check in place of one with placeholders, or ``text``, which has none.
+
+        ``several`` says whether names for each robot can stand in its place.
+        """
+        parts = self._parts(text, element, place, several=several)
+        return sample(parts) if parts else text
+
+    def _parts(
+        self,
+        text: str,
+        element: etree._Element,
+        place: IncludedFile,
+        *,
+        several: bool | None = None,
+    ) -> Parts | None:
+        """Return the parts of a name, or None: it has no placeholder.
+
+        Without ``several``, it is the path of an enclave.
+        """
+        if not has_placeholder(text):
+            return None
+        where = self._where(element, place)
+        try:
+            parts = parts_of(text)
+            if several is None:
+                check_path(parts)
+            else:
+                check_name(parts, self._owner, several=several)
+        except ValueError as error:
+            raise PolicyError(f"{where}: {_short(text)} cannot be used", str(error)) from error
+        if self._placeholders:
+            return parts
+        raise PolicyError(
+            f"{where}: {_short(text)} has a placeholder for the robots of a fleet",
+            "Without a fleet it stands for nothing.",
+            "Name the fleet's file with --fleet FILE.",
+        )
 
     def _children(
         self, element: etree._Element, place: IncludedFile

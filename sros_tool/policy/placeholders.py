@@ -10,7 +10,7 @@ in the same part of the name, because ``/r1*`` would match the names of a robot 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 _BRACES = re.compile(r"\{([^{}]*)\}")
@@ -36,7 +36,7 @@ Parts = tuple[str | Placeholder, ...]
 """A name: text, and placeholders in it."""
 
 
-def _has_placeholder(text: str) -> bool:
+def has_placeholder(text: str) -> bool:
     """Return whether ``text`` has a brace, which only a placeholder may have."""
     return "{" in text or "}" in text
 
@@ -65,7 +65,7 @@ def parts_of(text: str) -> Parts:
         end = found.end()
     parts.append(text[end:])
     kept = tuple(each for each in parts if each != "")
-    if any(isinstance(each, str) and _has_placeholder(each) for each in kept):
+    if any(isinstance(each, str) and has_placeholder(each) for each in kept):
         raise ValueError("It has a brace that is not of a placeholder such as {robot}.")
     if len({each.group for each in placeholders_of(kept) if each.plural}) > 1:
         raise ValueError("It has the robots of several groups, so it is unclear which go together.")
@@ -99,16 +99,52 @@ def sample(parts: Parts) -> str:
     return "".join(each if isinstance(each, str) else _SAMPLES[each.value] for each in parts)
 
 
+def check_path(path: Parts) -> None:
+    """Check that the path of an enclave is one enclave, or one for each robot of one group.
+
+    Raises:
+        ValueError: it is not; the message is a sentence.
+    """
+    found = placeholders_of(path)
+    if plural := next((each for each in found if each.plural), None):
+        one = replace(plural, plural=False)
+        raise ValueError(f"{plural} is all robots, and a path is of one enclave: write {one}.")
+    if len({each.group for each in found}) > 1:
+        raise ValueError("Its placeholders are of different groups.")
+
+
+def check_name(name: Parts, path: Parts, *, several: bool) -> None:
+    """Check that a name has only placeholders that mean something in its enclave.
+
+    Args:
+        name: the name.
+        path: the path of the enclave that states it, which `check_path` accepts.
+        several: whether names for each robot can stand in its place.
+
+    Raises:
+        ValueError: it has another placeholder; the message is a sentence.
+    """
+    owner = placeholders_of(path)
+    for each in placeholders_of(name):
+        if each.plural:
+            if not several:
+                raise ValueError(f"{each} is a name for each robot, and here is only one.")
+        elif not owner:
+            instead = f" For a name for each robot write {replace(each, plural=True)}."
+            raise ValueError(
+                f"{each} is one robot, and the path of the enclave does not say which one."
+                f"{instead if several else ''}"
+            )
+        elif each.group not in ("", owner[0].group):
+            raise ValueError(f"{each} is not the robot of the enclave: leave out the group.")
+
+
 def fill(parts: Parts, robot: str, namespace: str, *, plural: bool = False) -> Parts:
     """Return the parts with the singular or, with ``plural``, the plural placeholders filled in."""
     values = {"robot": robot, "namespace": namespace}
-    filled: list[str | Placeholder] = []
-    for index, each in enumerate(parts):
-        if isinstance(each, str) or each.plural is not plural:
-            filled.append(each)
-        elif each.value == "namespace" and namespace == "/":
-            # In the root namespace, {namespace}/scan is /scan.
-            filled.append("" if index + 1 < len(parts) else "/")
-        else:
-            filled.append(values[each.value])
-    return tuple(filled)
+    if namespace == "/" and len(parts) > 1:
+        values["namespace"] = ""  # in the root namespace, {namespace}/scan is /scan
+    return tuple(
+        values[each.value] if isinstance(each, Placeholder) and each.plural is plural else each
+        for each in parts
+    )

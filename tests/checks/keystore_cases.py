@@ -115,6 +115,7 @@ CASES |= {
     "keystore.file-unreadable": lambda b: b.path("sros.toml").write_text("nonsense\n"),
     "keystore.ledger-damaged": lambda b: b.path("ledger.jsonl").write_text("nonsense\n"),
     "keystore.settings-edited": lambda b: _replace(b, "sros.toml", "180d", "181d"),
+    "keystore.fleet-edited": lambda b: b.path("fleet.toml").write_text("[robots.base]\n"),
     "governance.not-as-settings": lambda b: b.governance(
         ("<rtps_protection_kind>ENCRYPT", "<rtps_protection_kind>SIGN")
     ),
@@ -292,6 +293,11 @@ def _many_topics(text: str) -> str:
     return text.replace("<topics>", f"<topics>{topics}", 1)
 
 
+def _fewer_domains(bench: Bench) -> None:
+    bench.options["on_robot"] = True
+    bench.governance(("<id>0</id>", "<id>0</id><id>1</id>"))
+
+
 CASES |= {
     "portable.several-grants": lambda b: b.sign("enclaves/base/permissions.p7s", _second_grant),
     "portable.default-allow": lambda b: b.permissions(("<default>DENY", "<default>ALLOW")),
@@ -319,6 +325,7 @@ CASES |= {
     ),
     "permissions.unreachable-rule": lambda b: b.permissions((ALLOW, DENY_ALL + ALLOW)),
     "enclave.permissions-domains": lambda b: b.permissions(("<id>0</id>", "<id>0</id><id>1</id>")),
+    "enclave.fewer-domains": _fewer_domains,
     "portable.vendors-differ": lambda b: b.permissions(("<default>DENY", "<default>ALLOW")),
 }
 

@@ -118,7 +118,7 @@ def test_a_value_that_is_not_valid(line: str, problem: str) -> None:
         ("[groups.g]\ndomain = 1\n[groups.h]\ndomain = 2\n[robots.r]\ngroups = ['h', 'g']",
          "gets its domain from two groups"),
         ('enclaves = ["/base"]\n[robots.r]', "no placeholder"),
-        ('enclaves = ["/{robots}"]\n[robots.r]', "one enclave for each robot"),
+        ('enclaves = ["/{robots}"]\n[robots.r]', "write {robot}"),
         ('enclaves = ["/{robot:a}/{robot:b}"]\n[robots.r]', "different groups"),
         ('enclaves = ["{robot}"]\n[robots.r]', "does not start with '/'"),
         ('enclaves = ["/{robot}*"]\n[robots.r]', "wildcard"),

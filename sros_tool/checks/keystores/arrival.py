@@ -179,7 +179,7 @@ def _enclave(root: Path, name: str, now: datetime, domain: int | None) -> Arrive
     if waits_for_answer(folder):
         return ArrivedEnclave(name, False, "", None)
     state = open_enclave(folder, now=now, domain=domain)
-    domains = str(state.domains() or "")
+    domains = str(state.joined_domains() or "")
     # On the robot, where there is no ledger, a key that is missing is lost.
     at_home = (root / LEDGER).is_file()
     elsewhere = at_home and state.key_on_robot and not state.problems_at_home

@@ -17,8 +17,10 @@ from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
+from sros_tool.keystore.fleet import FLEET_REMEDY
 from sros_tool.keystore.layout import (
     CRL,
+    FLEET,
     IDENTITY,
     LEDGER,
     PERMISSIONS,
@@ -244,6 +246,15 @@ SETTINGS_EDITED = FindingKind(
     "sros: the ledger has the settings as sros wrote them.",
     edit_remedy("ROOT"),
 )
+FLEET_EDITED = FindingKind(
+    "keystore.fleet-edited",
+    WARNING,
+    "robots of the fleet that were edited by hand",
+    "The file decides which enclaves belong to a robot, and which domains they may join, so verbs "
+    "that issue, revoke or export by it refuse it.",
+    "sros: the ledger has the SHA-256 of the file as sros wrote it.",
+    FLEET_REMEDY,
+)
 NOT_AS_SETTINGS = FindingKind(
     "governance.not-as-settings",
     WARNING,
@@ -337,6 +348,9 @@ def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
     edits, file = keystore.edits, keystore.shown(SETTINGS)
     if edits.settings:
         yield SETTINGS_EDITED.found("settings", "; ".join(edits.settings), file)
+    if keystore.fleet_edited:
+        clause = f"{FLEET} {keystore.fleet_edited}"
+        yield FLEET_EDITED.found("fleet", clause, keystore.shown(FLEET))
     for clause in edits.unsigned:
         yield NOT_AS_SETTINGS.found("settings", clause, file)
     file = keystore.shown(LEDGER)

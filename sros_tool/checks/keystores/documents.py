@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import chain, islice
@@ -25,6 +26,7 @@ from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Rule, render_permissions
 from sros_tool.errors import SrosError
+from sros_tool.keystore.fleet import EnclaveDomains
 from sros_tool.keystore.layout import GOVERNANCE_XML
 from sros_tool.keystore.settings import edit_remedy
 from sros_tool.keystore.template import Template
@@ -168,7 +170,17 @@ DOMAINS = FindingKind(
     "permissions and governance for different domains",
     "In a domain that only one of them names, no node of the enclave can communicate.",
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; measured.",
-    "Sign both for the same domains: `sros create_permission` uses the domains of the governance.",
+    "Sign both for the same domains: `sros create_permission` uses those of the governance, or the "
+    "one of the robot in the fleet.",
+)
+FEWER_DOMAINS = FindingKind(
+    "enclave.fewer-domains",
+    NOTE,
+    "permissions for fewer domains than the governance",
+    "In the other domains no node of the enclave can communicate. A fleet file that gives a robot "
+    "its domain means just that.",
+    "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; measured.",
+    "Nothing, if the robot is in this domain.",
 )
 
 _MOMENT = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
@@ -323,17 +335,20 @@ def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Findi
     governed = enclave.state.domains()
     if governed is None:
         return
-    allowed = DomainSet.of(
-        *(
-            (part.first or 0, part.last or 0)
-            for rule in grant.rules
-            if rule.allow
-            for part in rule.domains.closed().ranges
-        )
-    )
-    if allowed != governed:
-        text = f"the permissions are for domain {allowed or 'none'}, the governance for {governed}"
-        yield DOMAINS.found(enclave.name, text, file)
+    allowed, wanted = grant.domains(), governed
+    with suppress(SrosError):
+        wanted = EnclaveDomains(governed, enclave.keystore.fleet).of(enclave.name)
+    if allowed == wanted:
+        return
+    text = f"the permissions are for domain {str(allowed) or 'none'}, "
+    if wanted != governed:
+        yield DOMAINS.found(enclave.name, f"{text}its robot is in domain {wanted}", file)
+        return
+    text += f"the governance for {governed}"
+    fewer = bool(allowed.ranges) and all(each in governed for each in allowed)
+    # On a robot nothing says what was meant, and no node talks in a domain that it should not.
+    kind = FEWER_DOMAINS if fewer and not enclave.keystore.is_home else DOMAINS
+    yield kind.found(enclave.name, text, file)
 
 
 _GOVERNANCE = "DDS-Security 1.1, 9.4.1.2"

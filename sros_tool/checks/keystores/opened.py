@@ -14,8 +14,11 @@ from cryptography import x509
 
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import SrosError
+from sros_tool.fleet.model import Fleet
+from sros_tool.keystore.fleet import edited_fleet, load_fleet
 from sros_tool.keystore.layout import (
     CRL,
+    FLEET,
     GOVERNANCE_P7S,
     LEDGER,
     ROLES,
@@ -51,7 +54,8 @@ class CheckedKeystore:
     its CA file, the issuing one first.  ``governance`` is the signed document that its enclaves
     share, or b"".  ``is_home`` is false on a robot, where no CA key may be.  ``policies`` are
     compared with its permissions; ``zone`` is the time zone of the host on which its enclaves run.
-    ``edits`` are what somebody edited by hand.
+    ``edits`` are what somebody edited by hand; ``fleet`` are its robots, and ``fleet_edited`` says
+    how the file of them was, as a clause.
     """
 
     root: Path
@@ -67,6 +71,8 @@ class CheckedKeystore:
     zone: tzinfo = UTC
     is_home: bool = True
     edits: HandEdits = HandEdits()  # noqa: RUF009 - frozen
+    fleet: Fleet | None = None
+    fleet_edited: str = ""
 
     def accepts(self, chosen: Callable[[Template], bool]) -> str:
         """Return text naming the template or keystore that accepts a weakness; "" if none does.
@@ -175,4 +181,6 @@ def read_keystore(
         zone,
         keystore.is_home and not on_robot,
         edits,
+        part(FLEET, lambda: load_fleet(root), None),
+        part(FLEET, lambda: edited_fleet(root, ledger), ""),
     )

@@ -84,7 +84,7 @@ def select(
     """
     chosen: list[str] = []
     left_out: list[str] = []
-    for name in select_enclaves(root, names, patterns, robots=robots, every=every):
+    for name in select_enclaves(root, names, patterns, robots=robots, every=every, checked=True):
         only_matches = name not in names and not keyless
         at_robot = only_matches and key_on_robot(enclave_path(root, name))
         (left_out if at_robot else chosen).append(name)

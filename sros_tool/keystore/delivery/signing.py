@@ -20,6 +20,7 @@ from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack
+from sros_tool.keystore.fleet import EnclaveDomains, checked_fleet
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -277,6 +278,7 @@ class _Signer:
         self._governance = load_governance(root, self.authorities.permissions.certificate)
         self._domains = self._governance.domains().closed()
         check_domain(self._domains, domain, root)
+        self._enclave_domains = EnclaveDomains(self._domains, checked_fleet(root))
         self._writer = EnclaveWriter(
             transaction,
             self._template,
@@ -303,7 +305,8 @@ class _Signer:
         if renew and stated is None:
             rights = _earlier_rights(root, name, authority)
         else:
-            rights = StatedRights(stated or default_rights(self._template, name), self._domains)
+            domains = self._enclave_domains.of(name)
+            rights = StatedRights(stated or default_rights(self._template, name), domains)
         unique = self._template.unique_subject or (
             renew and has_unique_part(_present_certificate(root, name).subject)
         )

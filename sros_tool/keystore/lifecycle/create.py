@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import os
+from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -19,12 +20,22 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.dds.portable import name_notes
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageError
+from sros_tool.fleet.expansion import FleetPolicy
+from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.authorities.authority import (
     Authorities,
     create_authorities,
     load_authorities,
 )
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.fleet import (
+    EnclaveDomains,
+    checked_fleet,
+    left_enclaves,
+    load_fleet,
+    refuse_stale_domains,
+    write_fleet,
+)
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -226,7 +237,7 @@ def generate_artifacts(
     root: Path,
     *,
     enclaves: Sequence[str] = (),
-    policies: Sequence[Policy] = (),
+    policies: Sequence[Policy | FleetPolicy] = (),
     now: datetime,
     domain: int | None = None,
     create: Template | None = None,
@@ -242,16 +253,23 @@ def generate_artifacts(
     ``revoke_old`` its certificate, as by `create_permission`.  If the keystore does not exist and
     ``create`` is given, it is created from that template.
 
+    With policies for a fleet, which have to be for the same one, the keystore records it, and a
+    keystore that is created is for the domains of the robots.
+
     Raises:
-        KeystoreError: a policy names a revoked enclave that ``enclaves`` does not name.
+        KeystoreError: a policy names a revoked enclave that ``enclaves`` does not name, or a robot
+            is in a domain that the keystore is not for.
     """
     wanted = _rights_by_enclave(enclaves, policies)
+    of_fleet = [each for each in policies if isinstance(each, FleetPolicy)]
+    fleet = of_fleet[0].fleet if of_fleet else None
+    patterns = [pattern for each in of_fleet for pattern in each.patterns]
     if not dry_run:
         tidy(root)
     if create is None or is_keystore(root):
         check_keystore(root)
         with Transaction(root, dry_run=dry_run) as transaction:
-            keystore = open_to_issue(transaction, domain, keyring, now)
+            keystore = open_to_issue(transaction, domain, keyring, now, fleet, patterns, wanted)
             again = _revoked_before(keystore, wanted, enclaves, root)
             creation = write_enclaves(
                 transaction,
@@ -265,12 +283,24 @@ def generate_artifacts(
         return replace(creation, notes=(*again, *creation.notes))
     _check_typo(root)
     check_free(root)
-    domains = domains or DomainSet.of((0 if domain is None else domain,) * 2)
+    domains = domains or _domains_of(fleet, domain)
     check_domain(domains, domain, root)
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         keystore = _write_keystore(transaction, create, domains, keyring, now, _NONE_IMPORTED)
+        if fleet:
+            recorded, entries = write_fleet(transaction, fleet, patterns, now)
+            keystore = replace(keystore, fleet=recorded, entries=(*keystore.entries, *entries))
         creation = write_enclaves(transaction, keystore, wanted, now, progress)
     return replace(creation, notes=(*creation.notes, *place_notes(root)))
+
+
+def _domains_of(fleet: Fleet | None, domain: int | None) -> DomainSet:
+    """Return the domains of a new keystore: those of the robots, and ``domain`` or 0 for others."""
+    robots = fleet.robots.values() if fleet else ()
+    named = {robot.domain for robot in robots if robot.domain is not None}
+    if not named or domain is not None or any(robot.domain is None for robot in robots):
+        named.add(domain or 0)
+    return DomainSet.of(*((each, each) for each in named))
 
 
 def _revoked_before(
@@ -318,22 +348,49 @@ def refuse_other_template(root: Path, template: Template) -> None:
         )
 
 
+class _StatedEnclaves(Mapping[str, Enclave | None]):
+    """Enclaves with their rights in policies, or None: those of a fleet as they are asked for."""
+
+    def __init__(self, sources: Mapping[str, Mapping[str, Enclave] | None]) -> None:
+        self._sources = sources
+
+    def __getitem__(self, name: str) -> Enclave | None:
+        source = self._sources[name]
+        return source[name] if source is not None else None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._sources
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._sources)
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+
 def _rights_by_enclave(
-    names: Sequence[str], policies: Sequence[Policy]
-) -> dict[str, Enclave | None]:
+    names: Sequence[str], policies: Sequence[Policy | FleetPolicy]
+) -> Mapping[str, Enclave | None]:
     """Map enclaves to their rights in the policies, or None; raise if two policies differ."""
-    wanted: dict[str, Enclave | None] = {check_enclave_name(name): None for name in names}
+    sources: dict[str, Mapping[str, Enclave] | None] = {
+        check_enclave_name(name): None for name in names
+    }
     for policy in policies:
-        for enclave in policy.enclaves:
-            other = wanted.get(enclave.path)
-            if other is not None and other != enclave:
+        stated: Mapping[str, Enclave] = (
+            policy
+            if isinstance(policy, FleetPolicy)
+            else {each.path: each for each in policy.enclaves}
+        )
+        for name in stated:
+            other = sources.get(name)
+            if other is not None and (one := other[name]) != (enclave := stated[name]):
                 raise PolicyError(
-                    f"the enclave {enclave.path} is in two policies that differ",
-                    f"It is at {other.source} and at {enclave.source}.",
+                    f"the enclave {name} is in two policies that differ",
+                    f"It is at {one.source} and at {enclave.source}.",
                     "Merge them into one policy, for example with `sros merge_policy`.",
                 )
-            wanted[enclave.path] = enclave
-    return wanted
+            sources[name] = stated
+    return _StatedEnclaves(sources)
 
 
 # ── the keystore ───────────────────────────────────────────────────────────────────────────
@@ -343,8 +400,9 @@ def _rights_by_enclave(
 class _Keystore:
     """A keystore that enclaves are added to; ``names`` are the existing enclaves.
 
-    ``known`` are its keys.  ``entries`` are the ledger entries of a new keystore, ``notes`` remarks
-    on files that were edited by hand.
+    ``known`` are its keys.  ``entries`` are the ledger entries of what is staged already, ``notes``
+    remarks on files that were edited by hand and on the fleet.  ``is_new`` says that all of it is
+    staged.
     """
 
     authorities: Authorities
@@ -354,25 +412,48 @@ class _Keystore:
     names: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
     notes: tuple[Note, ...] = ()
+    fleet: Fleet | None = None
+    is_new: bool = False
 
 
 def open_to_issue(
-    transaction: Transaction, domain: int | None, keyring: Keyring, now: datetime
+    transaction: Transaction,
+    domain: int | None,
+    keyring: Keyring,
+    now: datetime,
+    fleet: Fleet | None = None,
+    patterns: Sequence[str] = (),
+    stated: Collection[str] = (),
 ) -> _Keystore:
-    """Return an existing keystore; ``domain``, if given, has to be one of its governance."""
+    """Return an existing keystore; ``domain``, if given, has to be one of its governance.
+
+    A ``fleet`` is staged as that of the keystore, with its enclaves' paths ``patterns``; the
+    enclaves ``stated`` get new permissions.
+    """
     root = transaction.root
     template = load_settings(root)
     authorities = load_authorities(root, template, keyring, now)
     governance = load_governance(root, authorities.permissions.certificate)
     domains = governance.domains().closed()
     check_domain(domains, domain, root)
+    notes = edit_notes(root, governance)
+    entries: tuple[Entry, ...] = ()
+    if fleet is None:
+        fleet = checked_fleet(root)
+    else:
+        before = load_fleet(root)
+        fleet, entries = write_fleet(transaction, fleet, patterns, now)
+        refuse_stale_domains(root, EnclaveDomains(domains, before), fleet, stated)
+        notes = (*notes, *(left_enclaves(root, before, fleet) if before else ()))
     return _Keystore(
         authorities,
         template,
         domains,
         KnownKeys(root),
         enclave_names(root),
-        notes=edit_notes(root, governance),
+        entries,
+        notes,
+        fleet,
     )
 
 
@@ -396,7 +477,7 @@ def _write_keystore(
     settings = keyring.settings_with_places(template)
     entries.append(write_settings(transaction, settings, now))
     known = KnownKeys(transaction.root)
-    return _Keystore(authorities, template, domains, known, entries=tuple(entries))
+    return _Keystore(authorities, template, domains, known, entries=tuple(entries), is_new=True)
 
 
 def check_free(root: Path) -> None:
@@ -492,7 +573,7 @@ def write_enclaves(
     """
     network = keystore.template.zenoh
     if network and network.router not in keystore.names:
-        wanted = {network.router: None, **wanted}
+        wanted = ChainMap({network.router: None}, wanted)  # type: ignore[arg-type]
     writer = EnclaveWriter(
         transaction,
         keystore.template,
@@ -540,7 +621,7 @@ def write_enclaves(
         transaction.root,
         keystore.template,
         keystore.domains,
-        bool(keystore.entries),
+        keystore.is_new,
         created,
         _names_with(outcomes, _Outcome.CHANGED),
         _names_with(outcomes, _Outcome.COMPLETED),
@@ -602,7 +683,7 @@ def _write_enclave(
     rights = None
     if policy or PERMISSIONS_FILE not in present:
         enclave = policy or _default_rights(keystore.template, name)
-        rights = StatedRights(enclave, keystore.domains)
+        rights = StatedRights(enclave, EnclaveDomains(keystore.domains, keystore.fleet).of(name))
     issued = writer.write(Issuance(name, identity, rights))
     link_shared_files(transaction, name, present)
     notes = tuple(issued.notes())

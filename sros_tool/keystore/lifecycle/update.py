@@ -36,6 +36,7 @@ from sros_tool.keystore.expiry import (
     read_credentials,
     refuse_unreadable,
 )
+from sros_tool.keystore.fleet import EnclaveDomains, checked_fleet
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -518,6 +519,9 @@ class _Updater:
         )
         self._kept_open: tuple[str, ...] = ()
         self._recorded = RecordedRights(self._root)
+        fleet = checked_fleet(self._root)
+        self._before = EnclaveDomains(present.domains, fleet)
+        self._after = EnclaveDomains(goal.domains, fleet)
         self._known = KnownKeys(self._root)
         self._writer = EnclaveWriter(
             transaction,
@@ -658,7 +662,7 @@ class _Updater:
         rights: EarlierRights | StatedRights
         if replaces_default:
             enclave = default_rights(self._goal.settings, name)
-            rights = StatedRights(enclave, self._goal.domains)
+            rights = StatedRights(enclave, self._after.of(name))
         else:
             rights = replace(earlier, grant=self._on_domains(name, earlier.grant))
         identity = self._new_identity(state) if certificate else state.certificate
@@ -696,7 +700,7 @@ class _Updater:
         default = default_rights(before, state.name)
         if earlier.policy not in ("", default.digest):
             return False
-        validity, domains = state.lifetime().permissions, self._present.domains
+        validity, domains = state.lifetime().permissions, self._before.of(state.name)
         (meant,) = permissions_for(
             default, subject=state.grant.subject, validity=validity, domains=domains
         ).grants
@@ -712,16 +716,17 @@ class _Updater:
         Raises:
             KeystoreError: a rule is not for the domains of the keystore.
         """
-        if self._present.domains == self._goal.domains:
+        before, after = self._before.of(name), self._after.of(name)
+        if before == after:
             return grant
-        if any(each.domains.closed() != self._present.domains for each in grant.rules):
+        if any(each.domains.closed() != before for each in grant.rules):
             raise KeystoreError(
-                f"the permissions of enclave {name} are not for domain {self._present.domains}",
+                f"the permissions of enclave {name} are not for domain {before}",
                 "So it is not certain which rights it shall have in other domains.",
                 f"State them with `sros create_permission {quote(str(self._root))} {name} "
                 "POLICY_FILE`.",
             )
-        rules = tuple(replace(each, domains=self._goal.domains) for each in grant.rules)
+        rules = tuple(replace(each, domains=after) for each in grant.rules)
         return replace(grant, rules=rules)
 
     # ── authorities ────────────────────────────────────────────────────────────────────────

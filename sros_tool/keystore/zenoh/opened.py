@@ -21,7 +21,7 @@ from sros_tool.keystore.layout import (
     ZENOH_SIGNED,
 )
 from sros_tool.keystore.reader import OpenedEnclave
-from sros_tool.keystore.rights import recorded_rights
+from sros_tool.keystore.rights import joined_domains, recorded_rights
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of
 from sros_tool.translate_zenoh import domains_of, remote_of
@@ -155,7 +155,8 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
     if not is_session or state.grant is None:
         return ""
     control = configuration.access_control
-    stated = {each: recorded_rights(name, state.grant, each) for each in domains_of(control)}
+    domains = joined_domains(state.grant, domains_of(control))
+    stated = {each: recorded_rights(name, state.grant, each) for each in domains}
     try:
         own = remote_of(name, stated)
     except SrosError as error:

@@ -31,7 +31,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Ledger, read_ledger
 from sros_tool.keystore.reader import read_certificate, read_lists, read_signed_grant
 from sros_tool.keystore.recorded import RecordedRights
-from sros_tool.keystore.rights import recorded_rights
+from sros_tool.keystore.rights import joined_domains, recorded_rights
 from sros_tool.keystore.zenoh.opened import is_signed
 from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
@@ -288,12 +288,15 @@ class _RightsReader:
                 return error.what
         if not isinstance(grant, Grant):
             return grant
-        stated = {each: recorded_rights(name, grant, each) for each in self._domains}
+        own = joined_domains(grant, self._domains)
+        if not own:
+            return "its permissions are for no domain of the network"
+        stated = {each: recorded_rights(name, grant, each) for each in own}
         try:
             rights = remote_of(name, stated)
         except PolicyError:
             if policy := self._change.stated.get(name):
-                remote_rights(policy, self._domains[0])  # names the line of the policy
+                remote_rights(policy, own[0])  # names the line of the policy
             raise
         _prove(name, rights, stated)
         of_router = as_router(self._router, rights)

@@ -1,0 +1,174 @@
+"""One policy for many robots: its placeholders filled in from a fleet.
+
+Values are filled into the names of a policy that was read, and every name is checked again by the
+grammar of a policy, so that no value can add an element, a right or a wildcard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
+from sros_tool.fleet.enclaves import group_of, path_for
+from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.names import check_enclave_name, check_namespace, expression_problem
+from sros_tool.policy.model import Enclave, Group, Policy, Profile, Source
+from sros_tool.policy.placeholders import Parts, fill, has_placeholder, parts_of, placeholders_of
+
+_MOST_ENCLAVES = 1_000_000
+_MOST_NAMES = 200_000  # of one enclave: a signed document cannot have more
+
+
+class FleetPolicy(Mapping[str, Enclave]):
+    """The enclaves of a policy for a fleet, by their paths; each is expanded when it is asked for.
+
+    ``fleet`` has the robots.  ``patterns`` are the paths with a placeholder, as `Fleet` has them.
+    """
+
+    def __init__(self, policy: Policy, fleet: Fleet) -> None:
+        """Find the paths of all enclaves.
+
+        Args:
+            policy: a policy that was read with its placeholders.
+            fleet: the robots.
+
+        Raises:
+            PolicyError: a path is not valid for a robot, two enclaves have the same path, or a
+                group is not one of the fleet; with file and line.
+        """
+        self._policy = policy
+        self.fleet = fleet
+        self._of: dict[str, tuple[Enclave, Robot | None]] = {}
+        self._names: dict[tuple[str, Source], tuple[str, ...]] = {}
+        self.patterns = tuple(each.path for each in policy.enclaves if has_placeholder(each.path))
+        for enclave in policy.enclaves:
+            for path, robot in self._paths(enclave):
+                if path in self._of:
+                    raise _twice(path, enclave, self._of[path][0])
+                self._of[path] = enclave, robot
+            if len(self._of) > _MOST_ENCLAVES:
+                raise PolicyError(
+                    f"{enclave.source}: the policy gives more than {_MOST_ENCLAVES} enclaves",
+                    "",
+                    "Divide the fleet or the policy.",
+                )
+
+    def __getitem__(self, path: str) -> Enclave:
+        return self._expanded(path, *self._of[path])
+
+    def __contains__(self, path: object) -> bool:
+        return path in self._of
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._of)
+
+    def __len__(self) -> int:
+        return len(self._of)
+
+    def policy(self) -> Policy:
+        """Return the policy with all enclaves expanded; raise `PolicyError` if there is none."""
+        if not self._of:
+            raise PolicyError(f"'{self._policy.file}': the policy has no enclave for this fleet")
+        return replace(self._policy, enclaves=tuple(self.values()))
+
+    def _paths(self, enclave: Enclave) -> Iterator[tuple[str, Robot | None]]:
+        if not has_placeholder(enclave.path):
+            yield enclave.path, None
+            return
+        parts = parts_of(enclave.path)
+        for robot in self._members(group_of(parts), enclave.source):
+            try:
+                yield check_enclave_name(path_for(parts, robot)), robot
+            except InvalidNameError as error:
+                raise PolicyError(
+                    f"{enclave.source}: for the robot {robot.name}, {error.what}",
+                    error.why,
+                    error.remedy,
+                ) from error
+
+    def _members(self, group: str, source: Source) -> tuple[Robot, ...]:
+        try:
+            return self.fleet.members(group)
+        except DocumentError as error:
+            raise PolicyError(f"{source}: {error.what}", error.why, error.remedy) from error
+
+    def _expanded(self, path: str, enclave: Enclave, robot: Robot | None) -> Enclave:
+        count = 0
+
+        def profile(each: Profile) -> Profile:
+            nonlocal count
+            ns, node = (self._one(text, robot) for text in (each.ns, each.node))
+            if has_placeholder(each.ns):
+                ns = check_namespace(ns)  # in the root namespace it can be empty
+            groups = tuple(group for one in each.groups if (group := self._group(one, robot)).names)
+            count += sum(len(group.names) for group in groups)
+            if count > _MOST_NAMES:
+                raise PolicyError(
+                    f"{each.source}: the enclave {path} has more than {_MOST_NAMES} names",
+                    "",
+                    "Divide it, or name fewer robots, such as a group.",
+                )
+            return replace(each, ns=ns, node=node, groups=groups)
+
+        blocks = tuple(
+            replace(block, profiles=tuple(map(profile, block.profiles)))
+            for block in enclave.profiles
+        )
+        return replace(enclave, path=path, profiles=blocks)
+
+    def _one(self, text: str, robot: Robot | None) -> str:
+        if robot is None or not has_placeholder(text):
+            return text
+        return "".join(map(str, fill(parts_of(text), robot.name, robot.namespace)))
+
+    def _group(self, group: Group, robot: Robot | None) -> Group:
+        """Return the group with its names filled in; it may be left without any."""
+        if not any(map(has_placeholder, group.names)):
+            return group
+        names: list[str] = []
+        lines: list[int] = []
+        for index, name in enumerate(group.names):
+            filled = self._several(self._one(name, robot), name, group.source_of(index))
+            names += filled
+            lines += group.lines[index : index + 1] * len(filled)
+        return replace(group, names=tuple(names), lines=tuple(lines))
+
+    def _several(self, name: str, written: str, source: Source) -> tuple[str, ...]:
+        """Return the names that a name stands for: one, or one for each robot, each once."""
+        if not has_placeholder(name):
+            if name != written and (problem := _name_problem(name)):
+                raise _not_valid(name, problem, source)
+            return (name,)
+        key = name, source
+        found = self._names.get(key)
+        if found is None:
+            parts = parts_of(name)
+            found = tuple(dict.fromkeys(self._for_each(parts, source)))
+            if name == written:  # the same for all enclaves that say it
+                self._names[key] = found
+        return found
+
+    def _for_each(self, parts: Parts, source: Source) -> Iterator[str]:
+        for robot in self._members(placeholders_of(parts)[0].group, source):
+            name = "".join(map(str, fill(parts, robot.name, robot.namespace, plural=True)))
+            if problem := _name_problem(name):
+                raise _not_valid(name, problem, source)
+            yield name
+
+
+def _name_problem(name: str) -> str:
+    return "It is a namespace, not a name." if name == "/" else expression_problem(name)
+
+
+def _not_valid(name: str, problem: str, source: Source) -> PolicyError:
+    return PolicyError(f"{source}: with the values of the fleet, {name!r} is not valid", problem)
+
+
+def _twice(path: str, enclave: Enclave, other: Enclave) -> PolicyError:
+    return PolicyError(
+        f"{enclave.source}: the enclave {path} is defined twice",
+        f"It is also the enclave of {other.source}"
+        f"{', for another robot' if other is enclave else ''}.",
+        "Write paths that differ, for example with {robot} in front.",
+    )

@@ -1,0 +1,250 @@
+"""Fifty robots from one policy and one fleet file: three commands, and the rights written by hand.
+
+The policy that is compared with is made by this file's own text, with the names filled in.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from sros_tool.dds.permissions import Permissions, parse_permissions
+from sros_tool.fleet.expansion import FleetPolicy
+from sros_tool.keystore.fleet import load_fleet
+from sros_tool.keystore.layout import enclave_names
+from sros_tool.pki import smime
+from sros_tool.policy.document import read_policy
+from tests.support.harness import snapshot, sros, topics_of
+
+ROBOTS = sorted(f"r{number}" for number in range(1, 51))
+CARRIERS = [name for name in ROBOTS if int(name[1:]) % 2]
+POLICY = """<policy version="0.2.0"><enclaves>
+<enclave path="/{robot}/base"><profiles><profile ns="{namespace}" node="base">
+<topics publish="ALLOW"><topic>odom</topic><topic>/fleet/{robot}/state</topic></topics>
+<topics subscribe="ALLOW"><topic>~/cmd</topic></topics>
+<topics publish="DENY"><topic>{namespace}/secret/*</topic></topics>
+<services reply="ALLOW"><service>/{robot}_reset</service></services>
+</profile></profiles></enclave>
+<enclave path="/{robot:carriers}/lift"><profiles><profile ns="{namespace}/lift" node="{robot}_lift">
+<actions execute="ALLOW"><action>raise</action></actions>
+</profile></profiles></enclave>
+<enclave path="/dispatcher"><profiles><profile ns="/" node="dispatcher">
+<topics publish="ALLOW"><topic>{namespaces}/base/cmd</topic></topics>
+<topics subscribe="ALLOW"><topic>/fleet/{robots}/state</topic></topics>
+<actions call="ALLOW"><action>{namespaces:carriers}/lift/raise</action></actions>
+</profile></profiles></enclave>
+</enclaves></policy>"""
+
+
+def space(robot: str) -> str:
+    return f"/hall/{robot}" if robot in CARRIERS else f"/{robot}"
+
+
+def written_by_hand() -> str:
+    text = ""
+    for robot in ROBOTS:
+        text += f"""<enclave path="/{robot}/base"><profiles>
+<profile ns="{space(robot)}" node="base">
+<topics publish="ALLOW"><topic>odom</topic><topic>/fleet/{robot}/state</topic></topics>
+<topics subscribe="ALLOW"><topic>~/cmd</topic></topics>
+<topics publish="DENY"><topic>{space(robot)}/secret/*</topic></topics>
+<services reply="ALLOW"><service>/{robot}_reset</service></services>
+</profile></profiles></enclave>"""
+    for robot in CARRIERS:
+        text += f"""<enclave path="/{robot}/lift"><profiles>
+<profile ns="{space(robot)}/lift" node="{robot}_lift">
+<actions execute="ALLOW"><action>raise</action></actions></profile></profiles></enclave>"""
+    commands = "".join(f"<topic>{space(robot)}/base/cmd</topic>" for robot in ROBOTS)
+    states = "".join(f"<topic>/fleet/{robot}/state</topic>" for robot in ROBOTS)
+    lifts = "".join(f"<action>{space(robot)}/lift/raise</action>" for robot in CARRIERS)
+    return f"""<policy version="0.2.0"><enclaves>{text}
+<enclave path="/dispatcher"><profiles><profile ns="/" node="dispatcher">
+<topics publish="ALLOW">{commands}</topics><topics subscribe="ALLOW">{states}</topics>
+<actions call="ALLOW">{lifts}</actions></profile></profiles></enclave></enclaves></policy>"""
+
+
+def fleet_file(robots: list[str] = ROBOTS, domain: int = 5) -> str:
+    text = f'[groups.carriers]\nnamespace = "/hall/{{robot}}"\ndomain = {domain}\n[robots]\n'
+    for robot in robots:
+        groups = ', groups = ["carriers"]' if robot in CARRIERS else ""
+        text += f'{robot} = {{ address = "10.0.0.{robot[1:]}"{groups} }}\n'
+    return text
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fleet")
+    (folder / "robot.xml").write_text(POLICY)
+    (folder / "fleet.toml").write_text(fleet_file())
+    for line in (
+        "create_keystore ks --template production --domain 0,5",
+        "generate_artifacts -k ks -p robot.xml --fleet fleet.toml",
+        "distribute_key ks --robot r7 r7",
+    ):
+        sros(*line.split(), cwd=folder).ok()
+    return folder
+
+
+def permissions(root: Path, name: str) -> Permissions:
+    signed = smime.parse((root / f"enclaves{name}/permissions.p7s").read_bytes())
+    return parse_permissions(signed.document)
+
+
+def test_the_rights_of_each_robot_are_those_written_by_hand(made: Path) -> None:
+    (made / "hand.xml").write_text(written_by_hand())
+    hand = read_policy(made / "hand.xml")
+    assert sorted(each.path for each in hand.enclaves) == list(enclave_names(made / "ks"))
+    assert len(hand.enclaves) == 50 + 25 + 1
+    sros("diff_policy", "hand.xml", "ks", cwd=made).ok()
+    assert topics_of(made / "ks/enclaves/r7/base") == {
+        "ros_discovery_info",
+        "rt/hall/r7/odom",
+        "rt/fleet/r7/state",
+        "rt/hall/r7/base/cmd",
+        "rt/hall/r7/secret/*",
+        "rq/r7_resetRequest",
+        "rr/r7_resetReply",
+    }
+    fleet = load_fleet(made / "ks")
+    assert fleet
+    policy = read_policy(made / "robot.xml", placeholders=True)
+    assert dict(FleetPolicy(policy, fleet)) == {each.path: each for each in hand.enclaves}
+
+
+def test_the_domain_of_a_robot_is_in_its_permissions_and_only_there(made: Path) -> None:
+    for name, domains in (("/r1/base", "5"), ("/r1/lift", "5"), ("/r2/base", "0,5"),
+                          ("/dispatcher", "0,5")):  # fmt: skip
+        (grant,) = permissions(made / "ks", name).grants
+        assert {str(rule.domains) for rule in grant.rules} == {domains}, name
+    sros("explain", "ks", "/r1/base", "publish", "/hall/r1/odom", "--domain", "5", cwd=made).ok()
+    refused = sros(
+        "explain", "ks", "/r1/base", "publish", "/hall/r1/odom", "--domain", "0", cwd=made
+    )
+    assert refused.status == 1
+    assert "ROS_DOMAIN_ID=5" in sros("env", "ks", "/r1/base", cwd=made).ok().out
+    assert "domain 0" in sros("env", "ks", "/r1/base", "--domain", "0", cwd=made).err
+    assert sros("env", "ks", "/r1/base", "--domain", "0", cwd=made).status == 2
+
+
+def test_check_and_verify_find_nothing_wrong_with_it(made: Path) -> None:
+    found = json.loads(sros("check", "ks", "--json", cwd=made).out)["findings"]
+    assert [each for each in found if "domain" in each["id"] or "fleet" in each["id"]] == []
+    sros("verify", "r7", "--domain", "5", cwd=made).ok()
+    assert "loadable in domain 5 until" in sros("verify", "r7", cwd=made).ok().out
+    assert sros("verify", "r7", "--domain", "0", cwd=made).status == 1
+
+
+def test_the_keystore_knows_whose_enclave_is_whose(made: Path) -> None:
+    assert sros("list_enclaves", "ks", "--robot", "r7", cwd=made).out == "/r7/base\n/r7/lift\n"
+    assert sros("list_enclaves", "ks", "--robot", "r2", cwd=made).out == "/r2/base\n"
+    assert sros("list_enclaves", "r7", cwd=made).out == "/r7/base\n/r7/lift\n"
+    found = json.loads(sros("list_enclaves", "ks", "--json", cwd=made).out)["robots"]
+    assert found == {name: name.split("/")[1] for name in enclave_names(made / "ks")
+                     if name != "/dispatcher"}  # fmt: skip
+    unknown = sros("list_enclaves", "ks", "--robot", "r70", cwd=made)
+    assert unknown.status == 2
+    assert "no robot 'r70'. It has r7" in unknown.err
+    assert "has no fleet" in sros("list_enclaves", "r7", "--robot", "r7", cwd=made).err
+
+
+def copied(made: Path, folder: Path) -> Path:
+    return Path(shutil.copytree(made, folder / "w", symlinks=True))
+
+
+@pytest.mark.parametrize("name", ["<r7/>", "r7/../r8", "{robot}", 'r7"><x a="', "r7*", "r 7"])
+def test_a_hostile_name_of_a_robot_is_refused(made: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / "fleet.toml").write_text(f"[robots.{json.dumps(name)}]\n")
+    before = snapshot(made / "ks")
+    words = (
+        "generate_artifacts",
+        "-k",
+        "ks",
+        "-p",
+        "robot.xml",
+        "--fleet",
+        tmp_path / "fleet.toml",
+    )
+    ended = sros(*words, cwd=made)
+    assert ended.status == 2
+    assert "fleet.toml': robots has" in ended.err
+    assert "such as r7" in ended.err
+    assert snapshot(made / "ks") == before
+
+
+def test_a_policy_with_placeholders_needs_a_fleet(made: Path) -> None:
+    ended = sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", cwd=made)
+    assert ended.status == 2
+    assert "robot.xml:2: '/{robot}/base' has a placeholder" in ended.err
+    assert "--fleet FILE" in ended.err
+
+
+def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
+    """Renewed and revoked by robot; a robot that leaves; a domain that changes; an edit by hand."""
+    folder = copied(made, tmp_path)
+    again = ("generate_artifacts", "-k", "ks", "-p", "robot.xml", "--fleet", "fleet.toml")
+    record = (folder / "ks/fleet.toml").read_bytes()
+    ended = sros("renew", "ks", "--robot", "r7", "--robot", "r8", cwd=folder).ok()
+    assert ended.out == "".join(
+        f"renewed enclave {each}\n" for each in ("/r7/base", "/r7/lift", "/r8/base")
+    )
+    ended = sros("revoke", "ks", "--robot", "r7", cwd=folder).ok()
+    assert ended.out == "revoked enclave /r7/base\nrevoked enclave /r7/lift\n"
+    assert "/r8/base" in enclave_names(folder / "ks")
+
+    # A robot that leaves keeps its enclaves until they are revoked, as the note says.
+    (folder / "fleet.toml").write_text(fleet_file([r for r in ROBOTS if r not in ("r7", "r9")]))
+    ended = sros(*again, cwd=folder).ok()
+    assert "created" not in ended.out
+    assert "the robot r9 is no longer in the fleet: /r9/base, /r9/lift stay" in ended.err
+    assert "sros revoke ks --match '/r9/*'" in ended.err
+    assert "r7" not in ended.err.replace("/r7", "")
+    assert "/hall/r9/base/cmd" not in str(permissions(folder / "ks", "/dispatcher"))
+    assert "/hall/r11/base/cmd" in str(permissions(folder / "ks", "/dispatcher"))
+    fleet = load_fleet(folder / "ks")
+    assert fleet and "r9" not in fleet.robots and len(fleet.robots) == 48
+    sros("revoke", "ks", "--match", "/r9/*", cwd=folder).ok()
+
+    # Another domain is in all permissions, or refused.
+    (folder / "fleet.toml").write_text(fleet_file([r for r in ROBOTS if r not in ("r7", "r9")], 6))
+    ended = sros(*again, cwd=folder)
+    assert ended.status == 2
+    assert "is in domain 6, and the keystore is for domain 0,5" in ended.err
+    (folder / "one.xml").write_text(
+        POLICY.replace('<enclave path="/{robot:carriers}/lift">', "<!--").replace(
+            '<enclave path="/dispatcher">', '--><enclave path="/dispatcher">'
+        )
+    )
+    (folder / "fleet.toml").write_text(fleet_file([r for r in ROBOTS if r not in ("r7", "r9")], 0))
+    ended = sros(
+        "generate_artifacts", "-k", "ks", "-p", "one.xml", "--fleet", "fleet.toml", cwd=folder
+    )
+    assert ended.status == 2
+    assert "/lift would have to be for domain 0 by the fleet" in ended.err
+    assert "Name the policies of all enclaves" in ended.err
+
+    # Another domain of the keystore leaves the one of a robot as it is.
+    sros("update_keystore", "ks", "--domain", "0,5,9", "--allow-looser", cwd=folder).ok()
+    for name, domains in (("/r1/base", "5"), ("/r2/base", "0,5,9")):
+        (grant,) = permissions(folder / "ks", name).grants
+        assert {str(rule.domains) for rule in grant.rules} == {domains}, name
+    ended = sros("update_keystore", "ks", "--domain", "0,9", cwd=folder)
+    assert ended.status == 2
+    assert "is in domain 5" in ended.err
+
+    # An edit by hand is noticed before anything follows from it.
+    text = (folder / "ks/fleet.toml").read_text()
+    (folder / "ks/fleet.toml").write_text(text.replace("domain = 5", "domain = 0", 1))
+    for line in ("renew ks --robot r1", "revoke ks --robot r1", "distribute_key ks --robot r1 x",
+                 "create_enclave ks /new"):  # fmt: skip
+        ended = sros(*line.split(), cwd=folder)
+        assert ended.status == 2, line
+        assert "fleet.toml' is not the one that sros wrote at" in ended.err
+    found = sros("check", "ks", "--include", "keystore.fleet-edited", cwd=folder)
+    assert found.status == 1
+    (folder / "fleet.toml").write_text(fleet_file())
+    sros("generate_artifacts", "-k", "ks", "-e", "/r7/base", "/r7/lift", "/r9/base", "/r9/lift",
+         "-p", "robot.xml", "--fleet", "fleet.toml", cwd=folder).ok()  # fmt: skip
+    assert (folder / "ks/fleet.toml").read_bytes() == record
