@@ -46,7 +46,6 @@ WRITING = (
     "rotate_ca {k} --finish",
     "rotate_ca {k} --same-key",
     "sign_request {k} {w}/request.pem -o {w}/answer.tar.gz",
-    "distribute_key {k} /b {w}/robot",
 )
 READING = (
     "list_enclaves {k}",
@@ -134,6 +133,18 @@ def test_a_verb_that_writes_refuses_what_it_cannot_read(
         assert ended.status == 2, (part, ended)
         assert f"ks/{part}" in ended.err, (part, ended)
         assert snapshot(place) == before, part
+
+
+@as_root
+def test_an_export_reads_the_enclaves_that_it_exports(place: Path) -> None:
+    for part in PARTS:
+        with closed(place / "ks" / part):
+            ended = as_owner("distribute_key {k} /a {w}/robot --dry-run", place)
+            other = as_owner("distribute_key {k} /b {w}/robot --dry-run", place)
+        assert (ended.status == 2) == (part != "enclaves/arm"), (part, ended)
+        assert (other.status == 2) == (part == "enclaves"), (part, other)
+        for each in (ended, other):
+            assert each.status == 0 or f"ks/{part}" in each.err, (part, each)
 
 
 @as_root

@@ -188,9 +188,15 @@ def _export_json(
 
 def _check_target(root: Path, word: str) -> None:
     """Raise `UsageError` if the last word is an enclave of the keystore: TARGET is missing."""
-    from sros_tool.keystore.layout import enclave_names
+    from sros_tool.errors import InvalidNameError
+    from sros_tool.keystore.layout import has_enclave
+    from sros_tool.names import check_enclave_name
 
-    if word.startswith("/") and not Path(word).exists() and word in set(enclave_names(root)):
+    try:
+        is_enclave = not Path(word).exists() and has_enclave(root, check_enclave_name(word))
+    except InvalidNameError:
+        return
+    if is_enclave:
         raise UsageError(
             f"no target is named: '{word}' is an enclave",
             "",

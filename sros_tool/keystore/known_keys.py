@@ -131,6 +131,8 @@ class KnownKeys:
 
     def shared_notes(self, names: Sequence[str]) -> Iterator[Note]:
         """Yield a note for each of the enclaves that has its key together with others."""
+        if not names:
+            return
         shared = {
             name: others
             for enclaves in self._enclaves.values()

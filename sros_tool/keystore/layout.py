@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
 
@@ -295,13 +296,18 @@ def has_zenoh_files(root: Path) -> bool:
     )
 
 
-def check_readable(root: Path) -> None:
-    """Raise `KeystoreError` if this user cannot read every file of every enclave.
+def check_readable(root: Path, names: Sequence[str] | None = None) -> None:
+    """Raise `KeystoreError` if this user cannot read every file of every enclave, or of ``names``.
 
     A verb that writes would otherwise leave an enclave behind, such as with a replaced CA.
     """
     unread: list[UnreadPath] = []
-    for folder, files in _walk(os.fspath(root / ENCLAVES), unread):
+    tops = [root / ENCLAVES] if names is None else [enclave_path(root, name) for name in names]
+    walks = (_walk(os.fspath(top), unread) for top in tops)
+    # The first folder of a walk is that of the enclave itself.
+    for folder, files in chain.from_iterable(
+        walk if names is None else islice(walk, 1) for walk in walks
+    ):
         for name in files:
             path = f"{folder}/{name}"
             if name.endswith(_FILE_TYPES) and not os.access(path, os.R_OK):

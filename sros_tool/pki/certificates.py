@@ -264,6 +264,7 @@ def weakness(certificate: x509.Certificate) -> str:
     return ""
 
 
+@lru_cache(maxsize=256)  # the same few certificates are checked repeatedly
 def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
     """Return whether ``authority`` issued and signed ``certificate``; ignore their validity.
 

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
-from functools import lru_cache
 
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID
 
 from sros_tool.pki.certificates import extension, issued_by, subject_text, validity_of
 from sros_tool.validity import iso
-
-_issued_by = lru_cache(maxsize=256)(issued_by)  # the same few certificates are checked repeatedly
-
 
 _CRITICAL = frozenset(
     {
@@ -51,13 +47,13 @@ def chain_fault(
     chains (OpenSSL's ``X509_V_FLAG_X509_STRICT`` with ``X509_V_FLAG_CHECK_SS_SIGNATURE``).
     """
     chain = [start]
-    while not _issued_by(chain[-1], chain[-1]):
+    while not issued_by(chain[-1], chain[-1]):
         issuer = _issuer(chain[-1], [*authorities, *others], at)
         if issuer is None or issuer in chain:
             return f"the issuer {subject_text(chain[-1].issuer)} is not a trusted certificate"
         chain.append(issuer)
     # Of several CA certificates with the same name and key, OpenSSL tries only the first.
-    root = next((each for each in authorities if _issued_by(chain[-1], each)), None)
+    root = next((each for each in authorities if issued_by(chain[-1], each)), None)
     if root != chain[-1]:
         return f"the self-signed {subject_text(chain[-1].subject)} is not a trusted certificate"
     faults = (
@@ -77,7 +73,7 @@ def _issuer(
         for each in among
         if each.subject == certificate.issuer
         and _may_sign_certificates(each)
-        and _issued_by(certificate, each)
+        and issued_by(certificate, each)
     ]
     return next((each for each in found if validity_of(each).contains(at)), next(iter(found), None))
 

@@ -231,7 +231,7 @@ def _below(
             path = os.path.join(parent, name)
             info = os.lstat(path)
             if stat.S_ISLNK(info.st_mode):
-                yield from links.check(Path(path))
+                yield from links.check(path)
                 continue
             yield from _writers(path, info, trusted)
             yield from _openness(path, root, info.st_mode, home)
@@ -240,7 +240,7 @@ def _below(
             path = os.path.join(parent, name)
             info = os.lstat(path)
             if stat.S_ISLNK(info.st_mode):
-                yield from links.check(Path(path))
+                yield from links.check(path)
                 continue
             yield from _writers(path, info, trusted)
             if path in keys:
@@ -305,33 +305,39 @@ class _Links:
 
     def __init__(self, root: str) -> None:
         self._real_root = os.path.realpath(root)
-        self._folders: dict[Path, str] = {}
+        self._folders: dict[str, str] = {}
+        self._ends: dict[str, str] = {}
 
-    def check(self, link: Path) -> Iterator[Finding]:
+    def check(self, link: str) -> Iterator[Finding]:
         """Yield findings about one link."""
-        target, shown = link.readlink(), str(link)
-        if not link.exists():
+        target = os.readlink(link)  # noqa: PTH115 - a Path of each of very many takes long
+        end = os.path.normpath(os.path.join(link.rpartition(os.sep)[0], target))
+        real = self._ends.get(end)
+        if real is None and not Path(link).exists():
             # `check_enclave` reports a missing file that an enclave needs.
-            if not (link.name in REQUIRED_FILES and ENCLAVES in link.parts):
-                yield LINK_DANGLING.found(shown, f"it leads to '{target}'", shown)
+            path = Path(link)
+            if not (path.name in REQUIRED_FILES and ENCLAVES in path.parts):
+                yield LINK_DANGLING.found(link, f"it leads to '{target}'", link)
             return
-        if target.is_absolute():
-            yield LINK_ABSOLUTE.found(shown, f"it leads to '{target}'", shown)
-        real = self._end_of(link, target)
+        if target.startswith(os.sep):
+            yield LINK_ABSOLUTE.found(link, f"it leads to '{target}'", link)
+        if real is None:
+            real = self._end_of(link, end)
         if real != self._real_root and not real.startswith(self._real_root + os.sep):
-            yield LINK_OUTSIDE.found(shown, f"it leads to '{real}'", shown)
+            yield LINK_OUTSIDE.found(link, f"it leads to '{real}'", link)
 
-    def _end_of(self, link: Path, target: Path) -> str:
-        """Return the real path that a link leads to.
+    def _end_of(self, link: str, end: str) -> str:
+        """Return the real path of a link that leads to ``end``, and remember that of a file.
 
         The folder of ``link`` contains no link, so ".." in the path can be removed first.
         """
-        end = Path(os.path.normpath(link.parent / target))
-        if end.is_symlink():
+        if Path(end).is_symlink():
             return os.path.realpath(link)
-        if end.parent not in self._folders:
-            self._folders[end.parent] = os.path.realpath(end.parent)
-        return f"{self._folders[end.parent]}/{end.name}"
+        parent, name = os.path.split(end)
+        if parent not in self._folders:
+            self._folders[parent] = os.path.realpath(parent)
+        self._ends[end] = f"{self._folders[parent]}/{name}"
+        return self._ends[end]
 
 
 def _holds_key(path: str, info: os.stat_result) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
+from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -36,6 +37,12 @@ from sros_tool.policy.model import Policy
 from sros_tool.xml import read_bytes
 
 _Part = TypeVar("_Part")
+
+
+@cache
+def _shipped(name: str) -> Template | None:
+    """Return the template with this name that ships with sros, or None."""
+    return load_template(name) if name in template_names() else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +90,7 @@ class CheckedKeystore:
         """
         if self.settings:
             name = self.settings.name
-            template = load_template(name) if name in template_names() else self.settings
+            template = _shipped(name) or self.settings
             return f"template {name}" if chosen(template) else ""
         return "" if self.is_home else "keystore that it was exported from"
 

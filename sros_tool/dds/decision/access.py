@@ -8,9 +8,10 @@ control that the governance requires (`_GovernedDomain`, `_decide_join`, `Access
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
+from functools import cached_property
 
 from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
@@ -167,36 +168,46 @@ class _GrantRules:
     def __init__(
         self,
         traits: VendorTraits,
-        rules: Iterable[NumberedRule],
+        rules: Sequence[NumberedRule],
         otherwise: RuleVerdict,
         *verbs: str,
     ) -> None:
-        """Index the topics of ``rules``; ``otherwise`` is the verdict if no rule matches."""
+        """Take ``rules``; ``otherwise`` is the verdict if no rule matches."""
         self._traits = traits
+        self._rules = rules
         self._otherwise = otherwise
-        self._entries: list[_Entry] = []
+        self._verbs = verbs
+
+    @cached_property
+    def _index(self) -> tuple[Sequence[_Entry], ExpressionIndex]:
+        """The topics of the rules in order, and their index: many are never asked about."""
+        traits = self._traits
+        entries: list[_Entry] = []
         count = 0
         for index, rule, criteria in (
-            (index, rule, getattr(rule, verb)) for index, rule in rules for verb in verbs
+            (index, rule, getattr(rule, verb))
+            for index, rule in self._rules
+            for verb in self._verbs
         ):
             for each in criteria:
                 count += 1
                 # Fast DDS joins the partitions of all criteria of a verb in a rule.
                 weighed = _partitions(traits, rule, criteria if traits.topic_decides else (each,))
-                self._entries += [
+                entries += [
                     _Entry(count, index, rule.allow, _trimmed(traits, expression), weighed)
                     for expression in each.topics
                     if _trimmed(traits, expression) or traits.crashes_on_empty_texts
                 ]
-        texts = (_usable_expression(traits, entry.expression) for entry in self._entries)
-        self._topics = ExpressionIndex(traits.style, texts)
+        texts = (_usable_expression(traits, entry.expression) for entry in entries)
+        return entries, ExpressionIndex(traits.style, texts)
 
     def ask(self, topic: str, partitions: tuple[str, ...]) -> RuleVerdict:
         """Return the verdict on an endpoint of ``topic`` in ``partitions`` (none: default)."""
         wanted = partitions or _DEFAULT_PARTITION
         passed = 0
-        for position in self._topics.matching(topic):
-            entry = self._entries[position]
+        entries, topics = self._index
+        for position in topics.matching(topic):
+            entry = entries[position]
             if entry.criteria == passed:
                 continue  # only the first matching topic of a criteria counts
             passed = entry.criteria
@@ -207,10 +218,11 @@ class _GrantRules:
 
     def ask_topic(self, topic: str) -> RuleVerdict:
         """Return the verdict on a topic, whatever the partitions."""
-        position = self._topics.first(topic)
+        entries, topics = self._index
+        position = topics.first(topic)
         if position is None:
             return self._otherwise
-        return self._entries[position].verdict(fits=True)
+        return entries[position].verdict(fits=True)
 
     def _fits(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
         style, named = self._traits.style, entry.partitions

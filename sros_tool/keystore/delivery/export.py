@@ -20,9 +20,11 @@ from sros_tool.keystore.layout import (
     PRIVATE,
     REQUIRED_FILES,
     ZENOH_FILES,
+    check_keystore,
     check_readable,
     enclave_folder,
     enclave_path,
+    has_enclave,
     key_on_robot,
     list_enclaves,
     search_enclaves,
@@ -125,9 +127,8 @@ def distribute(
 
 def _notes(root: Path, target: Path) -> Iterator[Note]:
     """Yield a note for each enclave of an earlier export that the keystore does not have now."""
-    existing = set(list_enclaves(root))
     for name in search_enclaves(target)[0]:
-        if name not in existing:
+        if not has_enclave(root, name):
             yield Note(
                 "export.not-in-keystore",
                 f"'{target}' also has enclave {name}, which keystore '{root}' does not have; if it "
@@ -164,13 +165,13 @@ def exported_files(
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
     """
-    existing = set(list_enclaves(root))
-    check_readable(root)
+    check_keystore(root)
+    for name in names:
+        if not has_enclave(root, check_enclave_name(name)):
+            raise no_such_enclave(root, name, list_enclaves(root))
+    check_readable(root, names)
     files: dict[str, bytes] = {}
     for name in names:
-        check_enclave_name(name)
-        if name not in existing:
-            raise no_such_enclave(root, name, existing)
         at_robot = key_on_robot(enclave_path(root, name))
         if at_robot and not keyless:
             raise KeystoreError(

@@ -135,8 +135,8 @@ class EnclaveWriter:
     """Writer of enclaves: issues certificates and permissions within one transaction.
 
     ``identity`` signs certificates, ``permissions`` signs permissions.  ``entries`` are for the
-    ledger, ``grants`` the new permissions of enclaves.  ``notes`` report CAs that expire too early
-    for the validity that the template chooses.
+    ledger; ``grants`` are the new permissions of enclaves, kept where there is a Zenoh network.
+    ``notes`` report CAs that expire too early for the validity that the template chooses.
     """
 
     def __init__(
@@ -202,7 +202,8 @@ class EnclaveWriter:
                 policy=policy,
             )
         )
-        (self.grants[name],) = permissions.grants
+        if self._template.zenoh:
+            (self.grants[name],) = permissions.grants
         short = self._template.longest_validity(name) is not None
         return Issued(issuance, certificate, permissions, message, short_lived=short)
 

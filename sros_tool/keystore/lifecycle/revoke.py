@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -22,6 +23,7 @@ from sros_tool.keystore.layout import (
     REQUIRED_FILES,
     REVOKED,
     ZENOH_FILES,
+    check_keystore,
     enclave_folder,
     list_enclaves,
 )
@@ -98,9 +100,9 @@ def revoke(
         )
     if not dry_run:
         tidy(root)
-    _check_names(root, names)
+    check_keystore(root)
     with Transaction(root, dry_run=dry_run) as transaction:
-        existing = _check_names(root, names)  # another process may have revoked it meanwhile
+        existing = _check_names(root, names)
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
         ledger = read_ledger(root)
@@ -346,10 +348,17 @@ def _move_away(transaction: Transaction, authority: Authority, name: str, now: d
 
 def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
     """Stage the link ``crl.pem`` to the revocation list for each enclave without it."""
-    for name in names:
-        folder = enclave_folder(name)
-        path = transaction.root / folder / "crl.pem"
-        target = "../" * folder.count("/") + f"../{CRL}"
-        # Some ways to copy a keystore replace the link by a file, which would never be updated.
-        if not path.is_symlink() or str(path.readlink()) != target:
-            transaction.link(f"{folder}/crl.pem", target)
+
+    def link(part: Sequence[str]) -> None:
+        for name in part:
+            folder = enclave_folder(name)
+            target = "../" * folder.count("/") + f"../{CRL}"
+            # Some ways to copy a keystore replace the link by a file, which would never be updated.
+            try:
+                there = os.readlink(f"{transaction.root}/{folder}/crl.pem")  # noqa: PTH115 - fast
+            except OSError:
+                there = ""
+            if there != target:
+                transaction.link(f"{folder}/crl.pem", target)
+
+    transaction.on_all_cores(names, link)
