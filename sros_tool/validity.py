@@ -157,6 +157,18 @@ def duration_text(duration: timedelta) -> str:
     return f"{seconds // 86400}d" if seconds % 86400 == 0 else f"{seconds}s"
 
 
+def elapsed(duration: timedelta) -> str:
+    """Return a duration in its two largest units for people to read, such as ``3 d 4 h``."""
+    seconds = max(0, int(duration.total_seconds()))
+    units = (("d", 86400), ("h", 3600), ("min", 60), ("s", 1))
+    numbers: list[tuple[int, str]] = []
+    for unit, size in units:
+        number, seconds = divmod(seconds, size)
+        if number or numbers:
+            numbers.append((number, unit))
+    return " ".join(f"{number} {unit}" for number, unit in numbers[:2] if number) or "0 s"
+
+
 @lru_cache(maxsize=64)  # files that are created together have equal times
 def iso(moment: datetime) -> str:
     """Return ``moment`` as CCYY-MM-DDThh:mm:ssZ, in UTC."""

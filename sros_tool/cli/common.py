@@ -87,7 +87,7 @@ def robot_option(help_text: str) -> Callable[[Decorated], Decorated]:
         "robots",
         multiple=True,
         metavar="NAME",
-        shell_complete=_complete_robot,
+        shell_complete=complete_robot,
         help=f"{help_text}  Can be repeated.",
     )
 
@@ -223,7 +223,7 @@ def complete_keystore_and_enclave(
     return [CompletionItem(incomplete, type="dir")]
 
 
-def _complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
     """Complete the robots of the given keystore's fleet."""
     from sros_tool.keystore.fleet import load_fleet
 
@@ -602,6 +602,28 @@ def _first_line(path: Path) -> str:
 
 
 # ── files and pipes that the user names ─────────────────────────────────────────────────────
+
+
+def read_named(path: Path, what: str, *, most: int = 16 * 1024 * 1024) -> bytes:
+    """Return the bytes of a file, or of standard input for "-"; ``what`` describes it in errors.
+
+    At most one byte more than ``most`` (16 MiB) is read from standard input.
+
+    Raises:
+        DocumentError: the file cannot be read, is larger or not a regular file, or nothing comes.
+    """
+    from sros_tool.xml import read_bytes
+
+    if path != Path("-"):
+        return read_bytes(path, what, most=most)
+    data = sys.stdin.buffer.read(most + 1) if sys.stdin else b""
+    if not data:
+        raise DocumentError(
+            f"the {what} is empty",
+            "Nothing came from standard input.",
+            "Check the command that sends it.",
+        )
+    return data
 
 
 _WRITER_WITHIN = 5.0

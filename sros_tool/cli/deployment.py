@@ -26,6 +26,7 @@ from sros_tool.cli.common import (
     print_notes,
     print_plan,
     print_restart,
+    read_named,
     robot_option,
     several_enclaves,
     split_root,
@@ -38,7 +39,7 @@ from sros_tool.cli.written import (
     file_change,
     notes_json,
 )
-from sros_tool.errors import DocumentError, UsageError
+from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -452,7 +453,7 @@ def sign_request(
     existed = output.exists()
     signed = sign(
         root,
-        _read(request, "signing request"),
+        read_named(request, "signing request"),
         now=now(),
         policy=read_policy(policy_file) if policy_file else None,
         renew=renew,
@@ -506,7 +507,7 @@ def _certify(
 
     done = certify_requests(
         root,
-        _read(request, "signing request"),
+        read_named(request, "signing request"),
         now=now(),
         policy=read_policy(policy_file) if policy_file else None,
         renew=renew,
@@ -628,7 +629,7 @@ def import_verb(
 
     folder = folder or keystore_from_environment()
     pinned = read_pin(pin) if pin is not None else frozenset[str]()
-    data = _read(answer, "answer")
+    data = read_named(answer, "answer")
     done = import_answer(folder, data, now=now(), pinned=pinned, force=force, dry_run=dry_run)
     if not dry_run:
         print_closed(folder, done.changes)
@@ -671,26 +672,6 @@ def _imported_json(
         "changes": changes_json(folder, done.changes),
         "notes": [],
     }
-
-
-def _read(path: Path, what: str) -> bytes:
-    """Return the bytes of a file, or of standard input for "-".
-
-    At most one byte more than the size limit of an archive is read from standard input.
-    """
-    from sros_tool.keystore.delivery.archive import MAX_PACKED
-    from sros_tool.xml import read_bytes
-
-    if path != _STREAM:
-        return read_bytes(path, what)
-    data = sys.stdin.buffer.read(MAX_PACKED + 1) if sys.stdin else b""
-    if not data:
-        raise DocumentError(
-            f"the {what} is empty",
-            "Nothing came from standard input.",
-            "Check the command that sends it.",
-        )
-    return data
 
 
 def _named(certificate: x509.Certificate) -> str:

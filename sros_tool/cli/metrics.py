@@ -74,7 +74,7 @@ def metrics(
 
     root, moment = root or keystore_from_environment(), now()
     if output:
-        _check_suffix(output)
+        check_suffix(output)
         check_output(output, force=True)
     wanted = tuple(read_policy(each) for each in policies)
     with progress("examining"):
@@ -94,7 +94,7 @@ def metrics(
         click.echo(text, nl=False)
 
 
-def _check_suffix(output: Path) -> None:
+def check_suffix(output: Path) -> None:
     """Raise `UsageError` for a file that node_exporter would not read."""
     if output.suffix != _SUFFIX and (output.is_file() or not output.exists()):
         raise UsageError(

@@ -60,6 +60,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "import": VerbEntry(
             "deployment", "Install a signed answer on the robot.", attribute="import_verb"
         ),
+        "fleet": VerbEntry("fleet", "Show what the robots of a fleet have."),
         "zenoh": VerbEntry("zenoh", "Write the files that make Zenoh enforce policies."),
     },
     "Policy": {
@@ -149,8 +150,9 @@ class _Program(click.Group):
         module = importlib.import_module(f"sros_tool.cli.{_VERBS[name].module}")
         command = getattr(module, _VERBS[name].attribute or name)
         assert isinstance(command, click.Command)
-        if _VERBOSE not in command.params:
-            command.params.append(_VERBOSE)
+        for each in (command, *getattr(command, "commands", {}).values()):
+            if _VERBOSE not in each.params:
+                each.params.append(_VERBOSE)
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
@@ -245,6 +247,7 @@ _PHRASES = {
     "doctor": "examine this machine",
     "audit": "audit the robot",
     "metrics": "give the metrics",
+    "fleet": "do this for the fleet",
 }
 
 

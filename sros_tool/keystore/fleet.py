@@ -19,7 +19,7 @@ from sros_tool.errors import KeystoreError, Note
 from sros_tool.fleet.document import MAX_BYTES, parse_fleet, render_fleet
 from sros_tool.fleet.enclaves import enclaves_of, robot_of
 from sros_tool.fleet.model import Fleet, Robot
-from sros_tool.keystore.layout import FLEET, enclave_names, has_enclave
+from sros_tool.keystore.layout import FLEET, check_keystore, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger, read_ledger
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
@@ -85,6 +85,25 @@ def _read(root: Path) -> bytes | None:
 
 def _parse(root: Path, data: bytes) -> Fleet:
     return parse_fleet(data, f"the fleet file '{root / FLEET}'")
+
+
+def recorded_fleet(root: Path) -> Fleet:
+    """Return the fleet of a keystore.
+
+    Raises:
+        KeystoreError: ``root`` is no keystore, or nobody named a fleet.
+        DocumentError: the file cannot be read, or is not a fleet.
+    """
+    check_keystore(root)
+    fleet = load_fleet(root)
+    if fleet is None:
+        raise KeystoreError(
+            f"keystore '{root}' has no fleet",
+            "Nobody has named the robots whose enclaves it has.",
+            f"Name them with `sros generate_artifacts -k {quote(str(root))} -p POLICY_FILE --fleet "
+            "FLEET_FILE`.",
+        )
+    return fleet
 
 
 def enclaves_of_robot(root: Path, fleet: Fleet, robot: Robot) -> tuple[str, ...]:

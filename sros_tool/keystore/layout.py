@@ -21,6 +21,8 @@ SETTINGS = "sros.toml"
 """The settings of the keystore; keystores of ros2/sros2 do not have this file."""
 FLEET = "fleet.toml"
 """The robots whose enclaves the keystore has; it exists once a fleet was named."""
+CONFIRMED = "confirmed"
+"""The folder of what robots say that they have, in a file for each robot of the fleet."""
 LEDGER = "ledger.jsonl"
 """The log of issued certificates and documents; keystores of ros2/sros2 do not have it."""
 LEDGER_HEAD = "ledger.p7s"
@@ -76,6 +78,11 @@ SEAL = "answer.p7s"
 Without it, anyone who transports an answer could put an older governance or another CA into it.
 On the robot it stays next to the files, because its number says which answer they came from.
 """
+
+
+def confirmation_file(robot: str) -> str:
+    """Return the path of the last confirmation of a robot."""
+    return f"{CONFIRMED}/{robot}.json"
 
 
 def ca_certificate(role: str) -> str:

@@ -14,6 +14,7 @@ from tests.support.zenoh_configurations import denying, self_limiting
 WITHOUT_JSON = {
     "run": "it becomes the command that it runs, whose output is the result",
     "completion": "it prints the script of a shell",
+    "fleet report": "it prints a confirmation, which is JSON of a format of its own",
 }
 """The verbs without ``--json``, and why."""
 
@@ -76,6 +77,13 @@ def make_folder(folder: Path) -> None:
         shutil.copytree(folder / "ks", folder / copy, symlinks=True)
     sros("rotate_ca", "turned", "--next", cwd=folder).ok()
     (folder / "fleet/fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.a]\n')
+    with (folder / "fleet/fleet.toml").open("a") as fleet:
+        fleet.write("[robots.b]\n")
+    for robot in ("a", "b"):
+        said = sros("fleet", "report", "out", "--robot", robot, cwd=folder).ok()
+        (folder / f"{robot}.json").write_text(said.out)
+    slow = (folder / "a.json").read_text().replace('"time": "20', '"time": "19')
+    (folder / "slow.json").write_text(slow)
     (folder / "partial/enclaves/a/permissions.p7s").unlink()
     shutil.copytree(folder / "zenoh", folder / "closed", symlinks=True)
     sros("zenoh", "closed", cwd=folder).ok()
@@ -318,6 +326,16 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("broken -o new.prom"),
         Case("out --earliest -o new.prom --dry-run"),
     ),
+    "fleet confirm": (
+        Case("fleet a.json --robot a"),
+        Case("fleet slow.json --robot a"),
+        Case("fleet a.json --robot a --dry-run"),
+    ),
+    "fleet status": (
+        Case("fleet", 1),
+        Case("fleet --robot a", before=("fleet confirm fleet a.json --robot a",)),
+        Case("fleet", 1, before=("fleet confirm fleet b.json --robot b",)),
+    ),
     "env": (
         Case("ks /a"),
         Case("ks /a --domain 0"),
@@ -367,6 +385,8 @@ ERRORS = {
     "explain": "ks /none publish /x",
     "view": "none",
     "metrics": "none",
+    "fleet confirm": "fleet b.json --robot a",
+    "fleet status": "ks",
     "units": "none /a new",
     "check": "none",
     "audit": "none",

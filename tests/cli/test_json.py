@@ -10,13 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import click
 import pytest
 from jsonschema import Draft202012Validator
 from referencing import Registry, Resource
 
 from sros_tool.checks import runtime
-from sros_tool.cli.program import FAMILIES, program
 from sros_tool.demo import doctor
 from sros_tool.demo import program as demo
 from sros_tool.demo.casting import CastMember
@@ -35,11 +33,12 @@ from tests.cli.test_audit import FINE, LOUD, POLICY, SHORT
 from tests.demo.test_demo_result import CLOSED, COST, OPEN, TWIN, result
 from tests.graph.fake_graph import Beside, graph
 from tests.support.harness import Ended, snapshot, sros
+from tests.support.verbs import COMMANDS
 from tools.json_page import SCHEMAS, SHARED, page
 
 pytest_plugins = ["tests.graph.beside"]
 
-VERBS = [name for family in FAMILIES.values() for name in family]
+VERBS = [*COMMANDS]
 Schema = Mapping[str, Any]
 DOCUMENTS: dict[str, Schema] = {
     path.name: json.loads(path.read_text()) for path in sorted(SCHEMAS.glob("*.json"))
@@ -48,18 +47,20 @@ REGISTRY: Registry[Any] = Registry().with_resources(
     (name, Resource.from_contents(schema)) for name, schema in DOCUMENTS.items()
 )
 
+FORMATS = {"confirmation"}
+"""The schemas of documents that robots make, too: they are no output of ``--json``."""
+
 # ── the schemas ────────────────────────────────────────────────────────────────────────────
 
 
 def test_every_verb_prints_json_or_says_why_not() -> None:
     with_option = set()
-    for verb in VERBS:
-        command = program.get_command(click.Context(program), verb)
-        assert command
+    for verb, command in COMMANDS.items():
         if any("--json" in parameter.opts for parameter in command.params):
             with_option.add(verb)
     assert set(VERBS) - with_option == set(WITHOUT_JSON)
-    assert {Path(name).stem for name in DOCUMENTS} == {*with_option, SHARED}
+    names = {verb.replace(" ", "_") for verb in with_option}
+    assert {Path(name).stem for name in DOCUMENTS} == {*names, *FORMATS, SHARED}
 
 
 def objects(schema: Any) -> Iterator[Schema]:
@@ -85,9 +86,11 @@ def test_a_schema_is_closed_and_describes_every_property(name: str) -> None:
         assert set(schema["required"]) <= set(schema["properties"])
 
 
-@pytest.mark.parametrize("name", [name for name in DOCUMENTS if Path(name).stem != SHARED])
+@pytest.mark.parametrize(
+    "name", sorted({Path(name).stem for name in DOCUMENTS} - {*FORMATS, SHARED})
+)
 def test_every_shape_begins_with_the_version(name: str) -> None:
-    schema = DOCUMENTS[name]
+    schema = DOCUMENTS[f"{name}.json"]
     shapes = [schema["$defs"][each["$ref"].rpartition("/")[2]] for each in schema.get("oneOf", ())]
     for shape in shapes or [schema]:
         assert next(iter(shape["properties"])) == shape["required"][0] == "version"
@@ -111,16 +114,18 @@ class Seen:
         """Fail unless the output is one object that fits the schema of the verb."""
         value = json.loads(ended.out)
         assert next(iter(value.items())) == ("version", 1)
+        name = verb.replace(" ", "_")
         problems = [
             f"{each.json_path}: {each.message}"
-            for problem in _validator(f"{verb}.json").iter_errors(value)
+            for problem in _validator(f"{name}.json").iter_errors(value)
             for each in (problem, *(problem.context or ()))
         ]
         assert problems == [], ended.out
-        self._walk(DOCUMENTS[f"{verb}.json"], value, f"{verb}.json", "")
+        self._walk(DOCUMENTS[f"{name}.json"], value, f"{name}.json", "")
 
     def unseen(self, name: str) -> list[str]:
         """Return the properties of a schema that no output had."""
+        name = name.replace(" ", "_")
         return sorted(set(_properties(DOCUMENTS[f"{name}.json"], f"{name}.json#")) - self._seen)
 
     def _walk(self, schema: Schema, value: Any, file: str, place: str) -> None:
@@ -183,7 +188,7 @@ def both_ways(verb: str, case: Case, made: Path, place: Path) -> Ended:
         folder = Path(shutil.copytree(made, place / str(number), symlinks=True))
         for before in case.before:
             sros(*before.split(), cwd=folder).ok()
-        ended.append(sros(verb, *case.words.split(), *option, cwd=folder))
+        ended.append(sros(*verb.split(), *case.words.split(), *option, cwd=folder))
         shutil.rmtree(folder)
     text, shown = ended
     assert (text.status, shown.status) == (case.status, case.status), (text, shown)
@@ -282,9 +287,9 @@ def test_a_dry_run_says_what_would_be_done(
 ) -> None:
     folder = Path(shutil.copytree(made_folder, tmp_path / "made", symlinks=True))
     words = [each for each in case.words.split() if each != "--dry-run"]
-    would = json.loads(sros(verb, *words, "--dry-run", "--json", cwd=folder).out)
+    would = json.loads(sros(*verb.split(), *words, "--dry-run", "--json", cwd=folder).out)
     assert snapshot(folder) == snapshot(made_folder)
-    done = json.loads(sros(verb, *words, "--json", cwd=folder).out or "{}")
+    done = json.loads(sros(*verb.split(), *words, "--json", cwd=folder).out or "{}")
     if not done:  # what needs a choice is shown by a dry run, and refused
         return
     assert (would["dry_run"], done["dry_run"]) == (True, False)
@@ -359,8 +364,8 @@ def test_a_path_that_no_json_holds_is_not_in_an_environment(
 @pytest.mark.parametrize("verb", sorted({*VERBS} - {*WITHOUT_JSON, "env"}))
 def test_an_error_prints_no_json(verb: str, made_folder: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(made_folder, tmp_path / "made", symlinks=True))
-    text = sros(verb, *ERRORS[verb].split(), cwd=folder)
-    shown = sros(verb, *ERRORS[verb].split(), "--json", cwd=folder)
+    text = sros(*verb.split(), *ERRORS[verb].split(), cwd=folder)
+    shown = sros(*verb.split(), *ERRORS[verb].split(), "--json", cwd=folder)
     assert (shown.status, shown.out) == (text.status, "")
     assert shown.status in (1, 2)
     assert len(shown.err.splitlines()) == 1

@@ -15,18 +15,19 @@ from pathlib import Path
 import click
 import pytest
 
-from sros_tool.cli.program import FAMILIES, program
 from tests.conftest import POLICY
 from tests.support.harness import policy_text, publish, sros
-
-ENTRIES = {name: entry for family in FAMILIES.values() for name, entry in family.items()}
-COMMANDS = {name: program.get_command(click.Context(program), name) for name in ENTRIES}
+from tests.support.verbs import COMMANDS, module_of
 
 # What a verb does not have, and why.
-NO_JSON = {"run": "its output is that of the command", "completion": "its output is a script"}
+NO_JSON = {
+    "run": "its output is that of the command",
+    "completion": "its output is a script",
+    "fleet report": "its output is the JSON of a confirmation",
+}
 READS = {
     "list_enclaves", "inspect", "verify", "diff_policy", "explain", "check", "doctor", "env",
-    "completion",
+    "completion", "fleet report",
 }  # fmt: skip
 RUNS = {"run", "demo"}
 NEW_NAMES = {("create_request", "name")}
@@ -34,38 +35,36 @@ NEW_NAMES = {("create_request", "name")}
 GROWS = {
     "create_enclave", "generate_artifacts", "update_keystore", "renew", "revoke", "rotate_ca",
     "distribute_key", "verify", "diff_policy", "explain", "view", "check", "metrics", "units",
-    "zenoh",
+    "zenoh", "fleet report", "fleet status",
 }  # fmt: skip
 
 
 def options(verb: str) -> set[str]:
     command = COMMANDS[verb]
-    assert command
     return {word for parameter in command.params for word in parameter.opts}
 
 
-@pytest.mark.parametrize("verb", ENTRIES)
+@pytest.mark.parametrize("verb", COMMANDS)
 def test_every_verb_has_an_example_with_its_name(verb: str) -> None:
     command = COMMANDS[verb]
-    assert command and command.epilog
+    assert command.epilog
     assert "Example" in command.epilog
     assert f"sros {verb}" in command.epilog
 
 
-@pytest.mark.parametrize("verb", ENTRIES)
+@pytest.mark.parametrize("verb", COMMANDS)
 def test_every_verb_has_json(verb: str) -> None:
     assert ("--json" in options(verb)) != (verb in NO_JSON)
 
 
-@pytest.mark.parametrize("verb", ENTRIES)
+@pytest.mark.parametrize("verb", COMMANDS)
 def test_every_verb_that_writes_has_a_dry_run(verb: str) -> None:
     assert ("--dry-run" in options(verb)) != (verb in READS | RUNS)
 
 
-@pytest.mark.parametrize("verb", ENTRIES)
+@pytest.mark.parametrize("verb", COMMANDS)
 def test_every_argument_completes(verb: str) -> None:
     command = COMMANDS[verb]
-    assert command
     for parameter in command.params:
         if not isinstance(parameter, click.Argument) or (verb, parameter.name) in NEW_NAMES:
             continue
@@ -75,7 +74,7 @@ def test_every_argument_completes(verb: str) -> None:
 
 @pytest.mark.parametrize("verb", sorted(GROWS))
 def test_work_that_grows_with_the_keystore_shows_progress(verb: str) -> None:
-    module = import_module(f"sros_tool.cli.{ENTRIES[verb].module}")
+    module = import_module(module_of(verb))
     assert "with progress(" in inspect.getsource(module)
 
 
@@ -97,6 +96,7 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "generate_artifacts -k strict -p p.xml",
         "distribute_key strict --all robot",
         "distribute_key strict --all damaged",
+        "distribute_key strict /a alone",
         "create_request /r asking",
         "sign_request ks asking/enclaves/r/request.pem -o answer.tar.gz",
         "generate_artifacts -k late -p p.xml",
@@ -104,6 +104,12 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):
         sros(*line.split(), cwd=folder).ok()
     (folder / "damaged/enclaves/a/cert.pem").write_text("damaged")
+    shutil.copytree(folder / "strict", folder / "fleet", symlinks=True)
+    (folder / "fleet/fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.a]\n[robots.b]\n')
+    for name in ("a", "b"):
+        said = sros("fleet", "report", "alone", "--robot", name, cwd=folder).ok()
+        (folder / f"{name}.json").write_text(said.out)
+    sros("fleet", "confirm", "fleet", "a.json", "--robot", "a", cwd=folder).ok()
     shutil.copy(folder / "asking/enclaves/r/request.pem", folder / "request.pem")
     return folder
 
@@ -142,6 +148,9 @@ STATUS: dict[str, tuple[str, str, str]] = {
     "metrics": ("damaged -o new.prom", NEVER, "nothing -o new.prom"),
     "units": ("ks /a new --dry-run", NEVER, "nothing /a new"),
     "env": ("ks /a", NEVER, "nothing /a"),
+    "fleet report": ("robot --robot a", NEVER, "nothing --robot a"),
+    "fleet confirm": ("fleet b.json --robot b", NEVER, "fleet b.json --robot a"),
+    "fleet status": ("fleet --robot a", "fleet", "ks"),
     "completion": ("bash", NEVER, "powershell"),
 }
 ELSEWHERE = {
@@ -153,7 +162,7 @@ ELSEWHERE = {
 
 
 def test_the_status_of_every_verb_is_tested() -> None:
-    assert STATUS.keys() | ELSEWHERE.keys() == ENTRIES.keys()
+    assert STATUS.keys() | ELSEWHERE.keys() == COMMANDS.keys()
     assert not STATUS.keys() & ELSEWHERE.keys()
     assert all(Path(__file__).parents[2].joinpath(path).exists() for path in ELSEWHERE.values())
 
@@ -165,8 +174,8 @@ def test_status(verb: str, made: Path, tmp_path: Path) -> None:
         words = STATUS[verb][wanted]
         if words == NEVER and wanted == 1:
             continue
-        ended = sros(verb, *words.split(), cwd=folder)
+        ended = sros(*verb.split(), *words.split(), cwd=folder)
         assert ended.status == wanted, ended
         assert not (wanted == 2 and ended.out and verb != "env"), ended
-        usage = sros(verb, "--no-such-option", cwd=folder)
+        usage = sros(*verb.split(), "--no-such-option", cwd=folder)
         assert usage.status == 2 and f"sros {verb}" in usage.err

@@ -15,6 +15,7 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.errors import KeystoreError
 from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
+    CONFIRMED,
     ENCLAVES,
     LEDGER,
     LEDGER_HEAD,
@@ -370,6 +371,7 @@ def _other(path: str, root: str, info: os.stat_result, home: bool) -> Iterator[F
         or (place in (PUBLIC, PRIVATE) and _KNOWN_ANYWHERE.match(name))
         or (place == REVOKED and name in _KNOWN)
         or place == RETIRED
+        or (place == CONFIRMED and name.endswith(".json"))
     )
     if not known:
         yield UNKNOWN_FILE.found(path, "neither ROS 2 nor sros uses this name there", path)

@@ -13,7 +13,7 @@ from sros_tool.errors import DocumentError
 from sros_tool.keystore.layout import folder_mode
 
 SUFFIXES = (".tar.gz", ".tgz")
-MAX_PACKED = 16 * 1024 * 1024
+_MAX_PACKED = 16 * 1024 * 1024
 MAX_UNPACKED = 40 * 1024 * 1024
 MAX_MEMBER = 17 * 1024 * 1024
 """Largest size in bytes: of a packed archive, of its unpacked content, and of a file in it.
@@ -70,8 +70,8 @@ def unpack(data: bytes) -> dict[str, bytes]:
 
 
 def _unzip(data: bytes) -> bytes:
-    if len(data) > MAX_PACKED:
-        raise DocumentError(f"it is too large: more than {MAX_PACKED // 1024**2} MiB")
+    if len(data) > _MAX_PACKED:
+        raise DocumentError(f"it is too large: more than {_MAX_PACKED // 1024**2} MiB")
     stream = zlib.decompressobj(_GZIP)
     plain = stream.decompress(data, MAX_UNPACKED + 1)
     if len(plain) > MAX_UNPACKED:

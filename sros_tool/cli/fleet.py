@@ -1,0 +1,346 @@
+"""The verbs of a fleet: what each robot has, by what it confirmed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sros_tool.cli.common import (
+    PATH,
+    check_output,
+    complete_file,
+    complete_robot,
+    dry_run_option,
+    json_option,
+    keystore_from_environment,
+    now,
+    output_option,
+    print_json,
+    print_notes,
+    read_named,
+    robot_option,
+    save,
+    split_root,
+    visible,
+    visible_line,
+)
+from sros_tool.cli.metrics import check_suffix
+from sros_tool.cli.progress import progress
+from sros_tool.cli.written import file_change, notes_json
+from sros_tool.errors import Note, UsageError
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from sros_tool.keystore.fleet_status import FleetStatus, RobotStatus
+
+
+@click.group(
+    "fleet",
+    epilog="""\b
+Example:
+  $ sros fleet status keystore
+  50 robots: 48 current, 1 earlier, 1 never confirmed""",
+)
+def fleet() -> None:
+    """Show what the robots of a fleet have."""
+
+
+# ── on the robot ───────────────────────────────────────────────────────────────────────────
+
+
+@fleet.command(
+    "report",
+    epilog="""\b
+Example:
+  $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
+        sros fleet confirm keystore --robot r7 -""",
+)
+@click.argument("folder", metavar="[DIR]", type=PATH, required=False)
+@click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
+def _report(folder: Path | None, robot: str) -> None:
+    """On a robot: print what it has, for `sros fleet confirm` at the keystore.
+
+    It is JSON with the SHA-256 of each file of the enclaves in DIR but their keys, and the time.
+    docs/json.md describes it under confirmation.
+    """
+    from sros_tool.keystore.confirmation import make_confirmation, render_confirmation
+
+    folder = folder or keystore_from_environment()
+    with progress("reading"):
+        made = make_confirmation(folder, robot, now=now())
+    click.echo(render_confirmation(made), nl=False)
+
+
+# ── at home ────────────────────────────────────────────────────────────────────────────────
+
+
+@fleet.command(
+    "confirm",
+    epilog="""\b
+Example:
+  $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
+        sros fleet confirm keystore --robot r7 -
+  r7: current, 18 files of 2 enclaves""",
+)
+@click.argument(
+    "words",
+    metavar="[ROOT] FILE",
+    nargs=-1,
+    required=True,
+    shell_complete=lambda _ctx, _parameter, incomplete: complete_file(incomplete),
+)
+@click.option(
+    "--robot",
+    metavar="NAME",
+    required=True,
+    shell_complete=complete_robot,
+    help="The robot that it comes from.",
+)
+@dry_run_option
+@json_option
+def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -> None:
+    """Keep in the keystore ROOT what a robot says that it has.
+
+    FILE is what `sros fleet report` or the Ansible collection made on the robot; - is standard
+    input. It replaces the last one of the robot, and proves nothing about it: `sros fleet status`
+    compares it with what the robot should have.
+    """
+    from sros_tool.keystore.confirmation import MAX_BYTES, keep, receive
+    from sros_tool.keystore.fleet import recorded_fleet
+    from sros_tool.keystore.layout import confirmation_file
+    from sros_tool.validity import iso
+
+    root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
+    if len(rest) != 1:
+        raise UsageError("fleet confirm takes a keystore and one file")
+    recorded_fleet(root).robot(robot)
+    file = PATH.convert(rest[0], None, None)
+    what = "standard input" if rest[0] == "-" else f"'{file}'"
+    data = read_named(file, "confirmation", most=MAX_BYTES)
+    received = receive(data, robot, what, now=now())
+    path = confirmation_file(robot)
+    changes = file_change(root / path, existed=(root / path).exists())
+    if not dry_run:
+        keep(root, received)
+    confirmation = received.confirmation
+    enclaves = confirmation.enclaves()
+    notes = [Note("fleet.clock", f"{robot}: {text}")] if (text := received.clock_note()) else []
+    if as_json:
+        shown = {"dry_run": dry_run, "changes": changes, "notes": notes_json(notes)}
+        moments = {"received": iso(received.time), "clock": iso(confirmation.time)}
+        numbers = {"enclaves": list(enclaves), "files": len(confirmation.files)}
+        print_json({"keystore": str(root), "robot": robot, **moments, **numbers, **shown})
+    else:
+        done = "would keep" if dry_run else "kept"
+        click.echo(
+            f"{done} what {robot} has: {_number(len(confirmation.files), 'file')} of "
+            f"{_number(len(enclaves), 'enclave')}"
+        )
+    print_notes(notes)
+
+
+@fleet.command(
+    "status",
+    epilog="""\b
+Example:
+  $ sros fleet status keystore
+  50 robots: 47 current, 1 earlier, 1 another's files, 1 never confirmed
+  robot  state            confirmed   what
+  r7     earlier          3 d 4 h ago 1 permissions of 2027-05-01T06:05:29Z
+  r8     another's files  2 min ago   10 of r9
+  r31    never confirmed  -           2 enclaves
+  $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
+
+The exit status is 0 if every robot confirmed that it has what an export would
+give it now, and 1 if not.""",
+)
+@click.argument("root", metavar="[ROOT]", type=PATH, required=False)
+@robot_option("Only this robot of the fleet, with all that it has.")
+@click.option("--prometheus", is_flag=True, help="Print metrics for node_exporter's textfile.")
+@click.option("--html", is_flag=True, help="Print a page.")
+@output_option("Replace FILE at once instead of printing.")
+@dry_run_option
+@json_option
+def _status(
+    root: Path | None,
+    robots: tuple[str, ...],
+    prometheus: bool,
+    html: bool,
+    output: Path | None,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    """Show what each robot of the keystore ROOT has, by what it last confirmed.
+
+    What a robot confirmed is compared with what an export would give it now. A file is current;
+    earlier, which the keystore issued for the enclave before; another's; revoked; missing; or
+    unknown, which the keystore never issued. Files on a robot take effect when its processes are
+    restarted, which a confirmation does not tell.
+    """
+    from sros_tool.keystore.fleet_status import fleet_status
+
+    if as_json + prometheus + html > 1:
+        raise UsageError("--json, --prometheus and --html exclude each other", "", "Choose one.")
+    if as_json and output:
+        raise UsageError("--json takes no --output", "", "Leave one of them out.")
+    root, moment = root or keystore_from_environment(), now()
+    if output:
+        if prometheus:
+            check_suffix(output)
+        check_output(output, force=True)
+    with progress("comparing"):
+        found = fleet_status(root, robots)
+    if as_json:
+        print_json(_status_json(found, moment))
+        return 0 if found.complete else 1
+    if prometheus:
+        from sros_tool.keystore.fleet_metrics import fleet_metrics
+        from sros_tool.prometheus import render_metrics
+
+        text = render_metrics(fleet_metrics(found, now=moment))
+    elif html:
+        from sros_tool.report.fleet_page import render_fleet_page
+
+        text = render_fleet_page(_status_json(found, moment))
+    else:
+        text = "".join(f"{visible_line(line)}\n" for line in _lines(found, moment, robots))
+    if output and not dry_run:
+        click.echo(save(output, text.encode()), err=True)
+    elif output:
+        click.echo(f"would {'replace' if output.exists() else 'create'} {visible(str(output))}")
+    else:
+        click.echo(text, nl=False)
+    return 0 if found.complete else 1
+
+
+_WORDS = {
+    "none": "no enclave",
+    "missing": "files missing",
+    "broken": "broken at home",
+    "never": "never confirmed",
+    "unknown": "unknown files",
+    "revoked": "revoked files",
+    "another": "another's files",
+}
+"""How a state is called that is not called by its own name."""
+_MOST_LINES, _MOST_GROUPS = 50, 3
+"""How many files of a robot are listed, and how many groups of files are summed up."""
+
+
+def _lines(found: FleetStatus, moment: datetime, robots: Sequence[str]) -> Iterator[str]:
+    """Yield the numbers first, then the robots that need something, or those that were named."""
+    counts = ", ".join(f"{number} {_word(state)}" for state, number in found.counts.items())
+    yield f"{_number(len(found.robots), 'robot')}: {counts}"
+    if found.stage != "complete":
+        behind = sum(each.stage != found.stage for each in found.robots if each.enclaves)
+        yield f"CA rotation: {found.stage}; {_number(behind, 'robot')} not there yet"
+    if found.unassigned:
+        yield f"{_number(found.unassigned, 'enclave')} of no robot: nothing is known of them"
+    rows = [("robot", "state", "confirmed", "what")]
+    rows += [
+        (each.robot, _word(each.state), _age(each, moment), "; ".join(_summary(each, found.stage)))
+        for each in found.robots
+        if robots or each.state not in ("current", "none") or each.notes
+    ]
+    widths = [max(len(row[column]) for row in rows) for column in range(3)]
+    for row in rows if len(rows) > 1 else ():
+        cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=False))
+        yield "  ".join((*cells, row[3])).rstrip()
+    for each in found.robots if robots else ():
+        yield from _details(each)
+
+
+def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
+    """Yield what a robot has that it should not have, the worst first."""
+    if robot.state == "never":
+        yield _number(robot.enclaves, "enclave")
+    foreign = Counter(
+        each.robot or each.enclave for each in robot.pending if each.state == "another"
+    )
+    for whose, number in foreign.items():
+        yield f"{_number(number, 'file')} of {whose}"
+    if revoked := sum(each.state == "revoked" for each in robot.pending):
+        yield f"{_number(revoked, 'revoked file')}"
+    groups: dict[tuple[str, str], Counter[str]] = {}
+    for each in robot.pending:
+        if each.state not in ("another", "revoked"):
+            groups.setdefault((each.state, each.since), Counter())[each.kind] += 1
+    for (state, since), kinds in list(groups.items())[:_MOST_GROUPS]:
+        named = (kind if number == 1 else f"{number} {kind}" for kind, number in kinds.items())
+        yield f"{state} {', '.join(named)}{f' of {since}' if since else ''}"
+    if len(groups) > _MOST_GROUPS:
+        yield f"more, see --robot {robot.robot}"
+    if robot.received and robot.enclaves and robot.stage != stage:
+        yield f"CA files of the stage {robot.stage}"
+    yield from robot.notes
+
+
+def _details(robot: RobotStatus) -> Iterator[str]:
+    """Yield the files of a robot: their number by kind and state, and those that differ."""
+    yield f"{robot.robot}:"
+    for kind, states in robot.files.items():
+        yield f"  {kind:14} {', '.join(f'{number} {state}' for state, number in states.items())}"
+    for each in robot.pending[:_MOST_LINES]:
+        issued = f" of {each.since}" if each.since else ""
+        whose = f" of {each.robot or each.enclave}" if each.enclave else ""
+        action = "remove" if each.surplus else "deliver"
+        yield f"  {action} {each.path}: {each.state}{issued}{whose}"
+    if (more := len(robot.pending) - _MOST_LINES) > 0:
+        yield f"  and {more} more, see --json"
+
+
+def _age(robot: RobotStatus, moment: datetime) -> str:
+    from sros_tool.validity import elapsed
+
+    return f"{elapsed(moment - robot.received)} ago" if robot.received else "-"
+
+
+def _word(state: str) -> str:
+    return _WORDS.get(state, state)
+
+
+def _number(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _status_json(found: FleetStatus, moment: datetime) -> dict[str, Any]:
+    from sros_tool.validity import iso
+
+    return {
+        "keystore": str(found.root),
+        "at": iso(moment),
+        "complete": found.complete,
+        "stage": found.stage,
+        "counts": dict(found.counts),
+        "unassigned": found.unassigned,
+        "robots": [
+            {
+                "robot": each.robot,
+                "state": each.state,
+                "enclaves": each.enclaves,
+                "received": iso(each.received) if each.received else None,
+                "clock": iso(each.clock) if each.clock else None,
+                "stage": each.stage or None,
+                "files": {kind: dict(states) for kind, states in each.files.items()},
+                "pending": [
+                    {
+                        "path": file.path,
+                        "kind": file.kind,
+                        "state": file.state,
+                        "since": file.since or None,
+                        "enclave": file.enclave or None,
+                        "robot": file.robot or None,
+                        "action": "remove" if file.surplus else "deliver",
+                    }
+                    for file in each.pending
+                ],
+                "notes": list(each.notes),
+            }
+            for each in found.robots
+        ],
+    }

@@ -1,0 +1,314 @@
+"""Confirmations: what a robot says that it has, as the digests of the files of its enclaves.
+
+A confirmation proves nothing: whoever has the robot can write what he likes into it.  So it is read
+as hostile input, and only compared with what the keystore knows; no path in it is ever opened.
+`sros_tool/schemas/confirmation.json` describes the format.
+"""
+
+from __future__ import annotations
+
+import binascii
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from sros_tool.errors import DocumentError, InvalidNameError
+from sros_tool.files import staged_file
+from sros_tool.fleet.model import name_problem
+from sros_tool.folders import Folder
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    CONFIRMED,
+    ENCLAVES,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
+    OPTIONAL_FILES,
+    PERMISSIONS_CA_FILE,
+    REQUIRED_FILES,
+    ZENOH_FILES,
+    confirmation_file,
+    enclave_folder,
+    list_enclaves,
+)
+from sros_tool.names import check_enclave_name
+from sros_tool.validity import elapsed, iso, parse_iso
+from sros_tool.values import parse_json
+from sros_tool.xml import read_bytes
+
+_FORMAT = 1
+MAX_BYTES = 4 * 1024 * 1024
+"""Largest size of a confirmation: that of a robot with 4,000 enclaves."""
+CONFIRMED_FILES = (
+    *(file for file in REQUIRED_FILES if file != KEY_FILE),
+    *OPTIONAL_FILES,
+    *ZENOH_FILES,
+)
+"""The files of an enclave that a confirmation names: what is exported, without the key."""
+_CERTIFICATE_FILES = (CERTIFICATE_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
+
+_KEYS = {"format", "robot", "time", "files"}
+_CLOCK_TOLERANCE = timedelta(minutes=1)
+_MOST_CERTIFICATES = 32  # in a file
+_DIGEST = re.compile(r"[0-9a-f]{64}\Z")
+_MOMENT = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z")
+_PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERTIFICATE-----")
+
+
+@dataclass(frozen=True, slots=True)
+class Confirmation:
+    """What a robot says that it has, and the time of its clock.
+
+    ``files`` maps the paths of files to the SHA-256 of their bytes; ``certificates`` the paths of
+    files with certificates to the SHA-256 of each certificate (DER), in their order; where they are
+    left out, earlier certificates are not recognised.
+    """
+
+    robot: str
+    time: datetime
+    files: Mapping[str, str]
+    certificates: Mapping[str, tuple[str, ...]]
+
+    def enclaves(self) -> tuple[str, ...]:
+        """Return the names of the enclaves that have a file, sorted."""
+        return tuple(sorted({enclave_of(path) for path in self.files}))
+
+
+def enclave_of(path: str) -> str:
+    """Return the enclave that a file belongs to, by its path in a keystore."""
+    return path.rpartition("/")[0].removeprefix(ENCLAVES) or "/"
+
+
+# ── on the robot ───────────────────────────────────────────────────────────────────────────
+
+
+def make_confirmation(root: Path, robot: str, *, now: datetime) -> Confirmation:
+    """Return the confirmation of all enclaves in a folder of a robot, or in a keystore.
+
+    A folder whose name is not one of an enclave is left out: no process can run in it.
+
+    Raises:
+        DocumentError: ``robot`` is not a robot's name.
+        KeystoreError: ``root`` is no keystore, or a file in it is a link that leads out of it.
+        OSError: a file cannot be read: a confirmation without it would not be true.
+    """
+    if problem := name_problem(robot):
+        raise DocumentError(f"{robot!r} is not the name of a robot", problem)
+    files: dict[str, str] = {}
+    certificates: dict[str, tuple[str, ...]] = {}
+    names = [name for name in list_enclaves(root) if name == "/" or _is_enclave_name(name)]
+    with Folder(root) as folder:
+        for name in names:
+            for file in CONFIRMED_FILES:
+                path = f"{enclave_folder(name)}/{file}"
+                if not os.path.lexists(root / path):
+                    continue
+                data = folder.read_inside(path)
+                files[path] = hashlib.sha256(data).hexdigest()
+                if file in _CERTIFICATE_FILES:
+                    certificates[path] = certificate_digests(data)
+    return Confirmation(robot, now, files, certificates)
+
+
+def certificate_digests(data: bytes) -> tuple[str, ...]:
+    """Return the SHA-256 of each certificate (DER) in a PEM file; damaged ones are left out."""
+    found = []
+    for each in _PEM.finditer(data):
+        try:
+            found.append(hashlib.sha256(binascii.a2b_base64(each[1])).hexdigest())
+        except binascii.Error:
+            continue
+    return tuple(found[:_MOST_CERTIFICATES])
+
+
+def render_confirmation(confirmation: Confirmation) -> bytes:
+    """Return a confirmation as JSON that `parse_confirmation` reads; the same gives the same."""
+    return _json(_value_of(confirmation))
+
+
+def _value_of(confirmation: Confirmation) -> dict[str, Any]:
+    return {
+        "format": _FORMAT,
+        "robot": confirmation.robot,
+        "time": iso(confirmation.time),
+        "files": dict(sorted(confirmation.files.items())),
+        "certificates": {
+            path: list(digests) for path, digests in sorted(confirmation.certificates.items())
+        },
+    }
+
+
+def _json(value: Mapping[str, Any]) -> bytes:
+    return json.dumps(value, indent=1).encode() + b"\n"
+
+
+# ── at home ────────────────────────────────────────────────────────────────────────────────
+
+
+def parse_confirmation(data: bytes, what: str) -> Confirmation:
+    """Return the confirmation in a JSON document; ``what`` names it in errors.
+
+    Raises:
+        DocumentError: it is too large, or not a confirmation; the error names the place.
+    """
+    if len(data) > MAX_BYTES:
+        raise DocumentError(
+            f"{what} is too large", f"A confirmation has at most {MAX_BYTES // 1024**2} MiB."
+        )
+    try:
+        value = parse_json(data)
+    except ValueError as error:
+        raise _refused(what, "it is not JSON") from error
+    return _confirmation_from(value, what)
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A confirmation, and when the keystore received it, by the clock at home."""
+
+    confirmation: Confirmation
+    time: datetime
+
+    def clock_note(self) -> str:
+        """Return what is wrong with the clock of the robot, as a clause; "" for up to a minute."""
+        ahead = self.confirmation.time - self.time
+        if abs(ahead) <= _CLOCK_TOLERANCE:
+            return ""
+        if ahead > timedelta():
+            return f"its clock is {elapsed(ahead)} ahead"
+        late = "or its confirmation was on its way that long"
+        return f"its clock is {elapsed(-ahead)} behind, {late}"
+
+
+def receive(data: bytes, robot: str, what: str, *, now: datetime) -> Received:
+    """Return the confirmation of ``robot`` that was received ``now``.
+
+    Raises:
+        DocumentError: it is not a confirmation, or the one of another robot.
+    """
+    confirmation = parse_confirmation(data, what)
+    if confirmation.robot != robot:
+        raise DocumentError(
+            f"{what} is the confirmation of {confirmation.robot}, not of {robot}",
+            "No robot can confirm for another one.",
+            f"Name the robot that it comes from with --robot {confirmation.robot}.",
+        )
+    return Received(confirmation, now.replace(microsecond=0))
+
+
+def keep(root: Path, received: Received) -> str:
+    """Keep the last confirmation of a robot in the keystore; return its path there."""
+    path = confirmation_file(received.confirmation.robot)
+    value = {"received": iso(received.time), "confirmation": _value_of(received.confirmation)}
+    with Folder(root, for_owner=True) as folder:
+        if not folder.is_folder(CONFIRMED):
+            folder.mkdir(CONFIRMED, 0o755)
+    with staged_file(root / path, _json(value), mode=0o644) as put_in_place:
+        put_in_place()
+    return path
+
+
+def last_confirmation(root: Path, robot: str) -> Received | None:
+    """Return the last confirmation of a robot, or None: there is none.
+
+    Raises:
+        DocumentError: the file is damaged, or cannot be read.
+    """
+    path = root / confirmation_file(robot)
+    if not os.path.lexists(path):
+        return None
+    what = f"'{path}'"
+    try:
+        value = parse_json(read_bytes(path, "confirmation", most=2 * MAX_BYTES))
+    except ValueError as error:
+        raise _refused(what, "it is not JSON") from error
+    if not isinstance(value, dict) or value.keys() != {"received", "confirmation"}:
+        raise _refused(what, "it has other keys than received and confirmation")
+    confirmation = _confirmation_from(value["confirmation"], what)
+    if confirmation.robot != robot:
+        raise _refused(what, f"it is that of {confirmation.robot}")
+    return Received(confirmation, _moment(value["received"], what))
+
+
+def _confirmation_from(value: Any, what: str) -> Confirmation:
+    """Return the confirmation that a JSON value states, as `parse_confirmation`."""
+    if not isinstance(value, dict):
+        raise _refused(what, "it is not a JSON object")
+    if value.get("format") != _FORMAT or type(value["format"]) is not int:
+        raise _refused(what, f"its format is not {_FORMAT}", "Use an sros of the same version.")
+    if unknown := sorted(value.keys() - {*_KEYS, "certificates"}):
+        raise _refused(what, f"it has the unknown key {_short(unknown[0])}")
+    if missing := sorted(_KEYS - value.keys()):
+        raise _refused(what, f"it lacks {', '.join(missing)}")
+    robot = value["robot"]
+    if not isinstance(robot, str) or name_problem(robot):
+        raise _refused(what, f"{_short(robot)} is not the name of a robot")
+    files = dict(_entries(value, "files", what))
+    for path, digest in files.items():
+        if not _is_digest(digest):
+            raise _refused(what, f"the digest of {path} is not a SHA-256")
+    certificates = {}
+    for path, digests in _entries({"certificates": {}, **value}, "certificates", what):
+        if path not in files or path.rpartition("/")[2] not in _CERTIFICATE_FILES:
+            raise _refused(what, f"{path} has certificates, but is no file of certificates in it")
+        listed = isinstance(digests, list) and len(digests) <= _MOST_CERTIFICATES
+        if not listed or not all(_is_digest(each) for each in digests):
+            raise _refused(what, f"the certificates of {path} are not a list of SHA-256")
+        certificates[path] = tuple(digests)
+    return Confirmation(robot, _moment(value["time"], what), files, certificates)
+
+
+def _entries(value: Mapping[str, Any], key: str, what: str) -> Iterator[tuple[str, Any]]:
+    """Yield the entries of a map from the paths of files; each path is one of an enclave."""
+    found = value[key]
+    if not isinstance(found, dict):
+        raise _refused(what, f"{key} is not an object")
+    known: set[str] = set()
+    for path, each in found.items():
+        folder, _, file = path.rpartition("/")
+        if folder not in known:
+            if not _is_enclave_folder(folder):
+                raise _refused(what, f"{_short(path)} is not the path of a file of an enclave")
+            known.add(folder)
+        if file not in CONFIRMED_FILES:
+            raise _refused(what, f"{_short(path)} is not one of the files that are confirmed")
+        yield path, each
+
+
+def _is_enclave_folder(folder: str) -> bool:
+    top, slash, name = folder.partition("/")
+    return top == ENCLAVES and (not slash or _is_enclave_name(f"/{name}"))
+
+
+def _is_enclave_name(name: str) -> bool:
+    try:
+        return check_enclave_name(name) != "/"
+    except InvalidNameError:
+        return False
+
+
+def _is_digest(value: object) -> bool:
+    return isinstance(value, str) and bool(_DIGEST.match(value))
+
+
+def _moment(text: object, what: str) -> datetime:
+    if isinstance(text, str) and _MOMENT.match(text):
+        try:
+            return parse_iso(text)
+        except ValueError:
+            pass
+    raise _refused(what, f"its time {_short(text)} is not such as 2027-05-21T12:50:48Z")
+
+
+def _refused(what: str, why: str, remedy: str = "Make it again on the robot.") -> DocumentError:
+    return DocumentError(f"{what} is not a confirmation: {why}", "", remedy)
+
+
+def _short(value: object) -> str:
+    text = ascii(value) if isinstance(value, (str, int, float, bool)) else type(value).__name__
+    return text if len(text) <= 80 else f"{text[:80]}..."

@@ -1,0 +1,454 @@
+"""What is where: what each robot of a fleet last confirmed, compared with what it should have.
+
+A robot should have what an export would give now.  What it has instead is looked up in the ledger,
+so an earlier file is known by when it was issued, and another robot's by whose it is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import NamedTuple
+
+from sros_tool.errors import SrosError
+from sros_tool.fleet.enclaves import robot_of
+from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.folders import Folder
+from sros_tool.keystore.confirmation import (
+    CONFIRMED_FILES,
+    certificate_digests,
+    enclave_of,
+    last_confirmation,
+)
+from sros_tool.keystore.fleet import enclaves_of_robot, recorded_fleet
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    CRL_FILE,
+    GOVERNANCE_FILE,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
+    PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
+    REQUIRED_FILES,
+    enclave_folder,
+    enclave_names,
+    has_enclave,
+)
+from sros_tool.keystore.ledger import Entry, read_ledger
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+from sros_tool.keystore.reader import authority_files, certificates_of
+from sros_tool.parallel import map_slices
+from sros_tool.pki.certificates import digest
+from sros_tool.pki.crl import SUPERSEDED
+
+
+class State(StrEnum):
+    """How a confirmed file compares with the present one, and the worst of a robot's files.
+
+    The order is from good to bad.
+    """
+
+    CURRENT = "current"
+    NONE = "none"
+    """The robot has no enclave in the keystore."""
+    EARLIER = "earlier"
+    """An earlier file that the keystore issued for the same enclave."""
+    DIFFERENT = "different"
+    """A file of Zenoh that is not the present one; the ledger does not have earlier ones."""
+    MISSING = "missing"
+    BROKEN = "broken"
+    """The file at home is missing or cannot be read, so no export can be made."""
+    NEVER = "never"
+    """The robot has confirmed nothing."""
+    UNKNOWN = "unknown"
+    """A file that the keystore did not issue, as far as its ledger tells."""
+    REVOKED = "revoked"
+    ANOTHER = "another"
+    """A file of an enclave of another robot, or of an enclave of no robot."""
+
+
+_BADNESS = {state: place for place, state in enumerate(State)}
+
+_KINDS = {
+    CERTIFICATE_FILE: "certificate",
+    PERMISSIONS_FILE: "permissions",
+    GOVERNANCE_FILE: "governance",
+    CRL_FILE: "crl",
+    IDENTITY_CA_FILE: "identity_ca",
+    PERMISSIONS_CA_FILE: "permissions_ca",
+}
+_ZENOH = "zenoh"
+_AUTHORITIES = ("identity_ca", "permissions_ca")
+
+
+def _kind_of(path: str) -> str:
+    """Return what the file at a path is, such as ``permissions``; all files of Zenoh are one."""
+    return _KINDS.get(path.rpartition("/")[2], _ZENOH)
+
+
+@dataclass(frozen=True, slots=True)
+class ConfirmedFile:
+    """A file that is not the one that an export would give now.
+
+    ``since`` is when the keystore issued what the robot has, or "".  ``enclave`` and ``robot`` say
+    whose it is, if it is another's.  With ``surplus``, the robot should have no such file.
+    """
+
+    path: str
+    kind: str
+    state: State
+    since: str = ""
+    enclave: str = ""
+    robot: str = ""
+    surplus: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RobotStatus:
+    """What a robot last confirmed.
+
+    ``received`` is when, by the clock at home; ``clock`` is the time of the robot's clock in it.
+    ``stage`` is the stage of a CA rotation that its CA files are of: the one of the CA that is
+    behind.  ``files`` counts the files of its enclaves by kind and state; ``pending`` are those
+    that are not current.
+    """
+
+    robot: str
+    state: State
+    enclaves: int
+    received: datetime | None
+    clock: datetime | None
+    stage: str
+    files: Mapping[str, Mapping[State, int]]
+    pending: tuple[ConfirmedFile, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FleetStatus:
+    """The robots of a fleet, and the stage of the keystore's CA rotation.
+
+    ``unassigned`` is the number of enclaves that belong to no robot, of which nothing is known.
+    """
+
+    root: Path
+    stage: str
+    robots: tuple[RobotStatus, ...]
+    unassigned: int
+
+    @property
+    def counts(self) -> Mapping[State, int]:
+        """The number of robots in each state, from good to bad."""
+        counts = Counter(each.state for each in self.robots)
+        return {state: counts[state] for state in State if counts[state]}
+
+    @property
+    def complete(self) -> bool:
+        """Whether each robot that has enclaves confirmed that it has the present files."""
+        return all(each.state in (State.CURRENT, State.NONE) for each in self.robots)
+
+
+def fleet_status(root: Path, names: Sequence[str] = ()) -> FleetStatus:
+    """Return what is where, of the robots with these names, or of all.
+
+    Raises:
+        KeystoreError: ``root`` is no keystore, has no fleet, or enclaves of it may be missing.
+        DocumentError: the fleet has no such robot.
+    """
+    fleet = recorded_fleet(root)
+    robots = [fleet.robot(name) for name in names] or list(fleet.robots.values())
+    compared = _compare_robots(root, fleet, robots)
+    stages = _Stages(root)
+    known = _Known(root, fleet, compared)
+    unassigned = 0
+    if not names:
+        unassigned = len(enclave_names(root)) - sum(len(each.enclaves) for each in compared)
+    found = tuple(_status(each, known, stages) for each in compared)
+    return FleetStatus(root, stages.at_home, found, unassigned)
+
+
+# ── comparing a confirmation with the files at home ────────────────────────────────────────
+
+
+class _Difference(NamedTuple):
+    """A file that is not as at home.
+
+    ``confirmed`` is the SHA-256 of what the robot has, or "": it has none; ``certificates`` are
+    those in it.  ``at_home`` says whether an export would give another one, None that the file at
+    home cannot be read.
+    """
+
+    path: str
+    confirmed: str
+    certificates: tuple[str, ...]
+    at_home: bool | None
+    own: bool
+
+
+class _ComparedRobot(NamedTuple):
+    """What a robot confirmed, compared with the files of its enclaves at home.
+
+    ``authorities`` has, by the kind of a CA file, the certificates in the files of each enclave as
+    the robot confirmed them.  ``current`` counts the files that are as at home, by kind.
+    """
+
+    robot: Robot
+    enclaves: tuple[str, ...]
+    received: datetime | None
+    clock: datetime | None
+    current: Mapping[str, int]
+    different: tuple[_Difference, ...]
+    authorities: Mapping[str, frozenset[tuple[str, ...]]]
+    notes: tuple[str, ...]
+
+
+def _compare_robots(root: Path, fleet: Fleet, robots: Sequence[Robot]) -> list[_ComparedRobot]:
+    """Return what each robot confirmed, compared with the files at home, on all cores."""
+
+    def work(part: Sequence[Robot]) -> list[_ComparedRobot]:
+        with Folder(root) as folder:
+            at_home = _Home(root, folder)
+            return [_compare(root, fleet, robot, at_home) for robot in part]
+
+    return [each for _, part in map_slices(robots, work) for each in part]
+
+
+def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _ComparedRobot:
+    enclaves = enclaves_of_robot(root, fleet, robot)
+    notes: list[str] = []
+    received = None
+    try:
+        received = last_confirmation(root, robot.name)
+    except SrosError as error:
+        notes.append(f"its last confirmation cannot be used: {error}")
+    if received is None:
+        return _ComparedRobot(robot, enclaves, None, None, {}, (), {}, tuple(notes))
+    if note := received.clock_note():
+        notes.append(note)
+    confirmed = received.confirmation
+    current: Counter[str] = Counter()
+    different: list[_Difference] = []
+    authorities: dict[str, set[tuple[str, ...]]] = {kind: set() for kind in _AUTHORITIES}
+    left = set(confirmed.files)
+    for name in enclaves:
+        for path, file in at_home.files_of(name).items():
+            left.discard(path)
+            sha256, kind = confirmed.files.get(path, ""), _kind_of(path)
+            if file and sha256 == file.sha256:
+                current[kind] += 1
+                certificates = file.certificates
+            else:
+                certificates = confirmed.certificates.get(path, ())
+                there = None if file is None else True
+                different.append(_Difference(path, sha256, certificates, there, own=True))
+            if kind in authorities:
+                authorities[kind].add(certificates)
+    folders = {enclave_folder(name) for name in enclaves}
+    for path in sorted(left):
+        certificates = confirmed.certificates.get(path, ())
+        own = path.rpartition("/")[0] in folders
+        different.append(_Difference(path, confirmed.files[path], certificates, False, own))
+    return _ComparedRobot(
+        robot,
+        enclaves,
+        received.time,
+        confirmed.time,
+        current,
+        tuple(different),
+        {kind: frozenset(found) for kind, found in authorities.items()},
+        tuple(notes),
+    )
+
+
+class _FileAtHome(NamedTuple):
+    sha256: str
+    certificates: tuple[str, ...]
+
+
+class _Home:
+    """The digests of the files of enclaves; a file that many enclaves share is read once."""
+
+    def __init__(self, root: Path, folder: Folder) -> None:
+        self._root = root
+        self._folder = folder
+        self._shared: dict[str, _FileAtHome | None] = {}
+
+    def files_of(self, name: str) -> Mapping[str, _FileAtHome | None]:
+        """Map the paths of the files that an export has, without the key, to their digests.
+
+        A file that is missing although every export has it, or that cannot be read, is None.
+        """
+        folder = enclave_folder(name)
+        found: dict[str, _FileAtHome | None] = dict.fromkeys(
+            f"{folder}/{file}" for file in REQUIRED_FILES if file != KEY_FILE
+        )
+        with suppress(OSError), os.scandir(self._root / folder) as entries:
+            for each in entries:
+                if each.name in CONFIRMED_FILES:
+                    path = f"{folder}/{each.name}"
+                    link = str(Path(each.path).readlink()) if each.is_symlink() else ""
+                    found[path] = self._linked(path, link) if link else self._read(path)
+        return found
+
+    def _linked(self, path: str, link: str) -> _FileAtHome | None:
+        target = os.path.normpath(f"{path}/../{link}")
+        if target not in self._shared:
+            self._shared[target] = self._read(path)
+        return self._shared[target]
+
+    def _read(self, path: str) -> _FileAtHome | None:
+        try:
+            data = self._folder.read_inside(path)
+        except (SrosError, OSError):
+            return None
+        is_bundle = _kind_of(path) in _AUTHORITIES
+        certificates = certificate_digests(data) if is_bundle else ()
+        return _FileAtHome(hashlib.sha256(data).hexdigest(), certificates)
+
+
+# ── what a robot has instead ───────────────────────────────────────────────────────────────
+
+
+class _Known:
+    """What the ledger tells of files that are not the present ones."""
+
+    def __init__(self, root: Path, fleet: Fleet, compared: Sequence[_ComparedRobot]) -> None:
+        self._root = root
+        self._fleet = fleet
+        self._issued: dict[str, Entry] = {}
+        self._revoked_serials: set[str] = set()
+        self._revoked: set[str] = set()
+        different = [each for robot in compared for each in robot.different if each.confirmed]
+        wanted = {each.confirmed for each in different}
+        wanted.update(one for each in different for one in each.certificates)
+        for entry in read_ledger(root).entries if wanted else ():
+            if entry.sha256 in wanted:
+                self._issued.setdefault(entry.sha256, entry)
+            if entry.what == "certificate":
+                self._revoked.discard(entry.enclave)
+            elif entry.what == "revocation":
+                self._revoked_serials.add(entry.serial)
+                if entry.reason != SUPERSEDED:
+                    self._revoked.add(entry.enclave)
+
+    def file(self, robot: Robot, each: _Difference) -> ConfirmedFile:
+        """Return what a robot has instead of the file at home."""
+        kind, name = _kind_of(each.path), enclave_of(each.path)
+        state, since, owner = self._identify(each, kind, name)
+        if not each.own and state is not State.REVOKED:
+            if name in self._revoked and not has_enclave(self._root, name):
+                state = State.REVOKED
+            elif has_enclave(self._root, name) or robot_of(self._fleet, name) not in (None, robot):
+                state, owner = State.ANOTHER, name
+        whose = robot_of(self._fleet, owner) if owner else None
+        return ConfirmedFile(
+            each.path,
+            kind,
+            state,
+            since,
+            owner,
+            whose.name if whose else "",
+            surplus=each.at_home is False,
+        )
+
+    def _identify(self, each: _Difference, kind: str, name: str) -> tuple[State, str, str]:
+        """Return the state of a file, when it was issued, and the enclave that it is of instead."""
+        if each.at_home is None:
+            return State.BROKEN, "", ""
+        if not each.confirmed:
+            return State.MISSING, "", ""
+        if kind == _ZENOH:
+            return State.DIFFERENT, "", ""
+        if kind in _AUTHORITIES:
+            entries = [self._issued.get(one) for one in each.certificates]
+            if not entries or not all(one and one.what == "ca" for one in entries):
+                return State.UNKNOWN, "", ""
+            return State.EARLIER, max(one.time for one in entries if one), ""
+        sha256 = each.confirmed
+        if kind == "certificate":
+            sha256 = each.certificates[0] if each.certificates else ""
+        entry = self._issued.get(sha256)
+        if entry is None or entry.what != kind:
+            return State.UNKNOWN, "", ""
+        if entry.enclave and entry.enclave != name:
+            return State.ANOTHER, entry.time, entry.enclave
+        if entry.serial and entry.serial in self._revoked_serials:
+            return State.REVOKED, entry.time, ""
+        return State.EARLIER, entry.time, ""
+
+
+def _status(compared: _ComparedRobot, known: _Known, stages: _Stages) -> RobotStatus:
+    different = tuple(known.file(compared.robot, each) for each in compared.different)
+    counts: dict[str, Counter[State]] = {}
+    for kind, number in compared.current.items():
+        counts.setdefault(kind, Counter())[State.CURRENT] = number
+    for each in different:
+        counts.setdefault(each.kind, Counter())[each.state] += 1
+    if different:
+        state = max((each.state for each in different), key=_BADNESS.__getitem__)
+    elif not compared.enclaves:
+        state = State.NONE
+    else:
+        state = State.NEVER if compared.received is None else State.CURRENT
+    return RobotStatus(
+        compared.robot.name,
+        state,
+        len(compared.enclaves),
+        compared.received,
+        compared.clock,
+        stages.of(compared),
+        {kind: counts[kind] for kind in (*_KINDS.values(), _ZENOH) if kind in counts},
+        different,
+        compared.notes,
+    )
+
+
+# ── the stages of a rotation ───────────────────────────────────────────────────────────────
+
+
+class _Stages:
+    """The stage of a rotation that the CA files of a robot are of."""
+
+    BEFORE, COMPLETE, UNKNOWN = "before", "complete", "unknown"
+    ORDER = (UNKNOWN, BEFORE, "distribute", "reissue", COMPLETE)
+
+    def __init__(self, root: Path) -> None:
+        rotation = read_rotation(root)
+        is_complete = rotation.stage is RotationStage.NONE
+        self.at_home = self.COMPLETE if is_complete else rotation.stage.value
+        self._new: dict[str, str] = {}
+        self._at_home: dict[str, tuple[tuple[str, ...], str]] = {}
+        for file, roles in authority_files(root).items():
+            certificates = tuple(digest(each) for each in certificates_of(root, file))
+            new = [each.new for each in rotation.replacements if each.file == file]
+            for kind in (f"{role}_ca" for role in roles):
+                self._new[kind] = new[0] if new else certificates[0]
+                self._at_home[kind] = certificates, self.at_home if new else self.COMPLETE
+
+    def of(self, compared: _ComparedRobot) -> str:
+        """Return the stage of the CA file that is behind; "" if the robot confirmed none."""
+        stages = {
+            self._stage(kind, certificates)
+            for kind, files in compared.authorities.items()
+            for certificates in files
+        }
+        return min(stages, key=self.ORDER.index, default="")
+
+    def _stage(self, kind: str, certificates: tuple[str, ...]) -> str:
+        if certificates == self._at_home[kind][0]:
+            return self._at_home[kind][1]
+        if not certificates:
+            return self.UNKNOWN
+        new = self._new[kind]
+        if new not in certificates:
+            return self.BEFORE
+        if len(certificates) == 1:
+            return self.COMPLETE
+        return "reissue" if certificates[0] == new else "distribute"
