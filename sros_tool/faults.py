@@ -161,6 +161,22 @@ class Fault(Enum):
         'Fast DDS 2.14.5 ("Error verifying private key"), Cyclone DDS 0.10.2; measured.',
         _NEW_KEY,
     )
+    TOKEN_URI = (
+        "token-uri",
+        "a key.p11 that does not name a key on a token",
+        "No node of ROS 2 finds the key, or whoever can read the file has the PIN.",
+        "RFC 7512; rmw_dds_common of ROS 2 Jazzy (security.cpp); libp11 0.4.12 (eng_parse.c).",
+        "Write one line into {path}: pkcs11:token=TOKEN;object=LABEL;type=private, and for a file "
+        "with the PIN, ?pin-source=file:PATH after it.",
+    )
+    KEY_TWICE = (
+        "key-twice",
+        "an enclave with a key in a file, and another on a token",
+        "rmw_fastrtps of ROS 2 Jazzy and later uses the one on the token, every other RMW the "
+        "file, which can be copied.",
+        "rmw_dds_common of ROS 2 Jazzy (security.cpp).",
+        "Keep the one that belongs to cert.pem: delete key.pem, or {path}.",
+    )
     CRL_MALFORMED = (
         "crl-malformed",
         "a revocation list that cannot be read",
@@ -303,6 +319,15 @@ class Fault(Enum):
         "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5; measured.",
         "Use EC prime256v1 keys, which every vendor accepts.",
     )
+    KEY_ON_TOKEN = (
+        "key-on-token",
+        "a key on a token, which only Fast DDS uses",
+        "Only rmw_fastrtps of ROS 2 Jazzy and later reads key.p11; without key.pem, no node "
+        "of another RMW, or of ROS 2 Humble or Iron, starts.",
+        "rmw_fastrtps_shared_cpp 8.4 (participant.cpp), rmw_cyclonedds 2.2 and rmw_connextdds 0.22 "
+        "(they ask rmw_dds_common for files alone); Fast DDS 2.9.1, measured.",
+        "Use rmw_fastrtps_cpp, or a key in a file.",
+    )
     DOCUMENT_SIZE = (
         "document-size",
         "permissions that are too large for a handshake",
@@ -355,6 +380,7 @@ VENDOR_FAULTS = (
     Fault.CA_CHAIN,
     Fault.SIGNATURE_HASH,
     Fault.KEY_ALGORITHM,
+    Fault.KEY_ON_TOKEN,
     Fault.DOCUMENT_SIZE,
 )
 """The faults for which only some vendors refuse an enclave."""

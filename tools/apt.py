@@ -58,6 +58,11 @@ def _library(name: str) -> Callable[[], bool]:
 FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
     ("openssl", "OpenSSL", _command("openssl")),
     ("softhsm2", "a PKCS#11 token in software", _command("softhsm2-util")),
+    (
+        "libengine-pkcs11-openssl",
+        "keys on tokens for Fast DDS",
+        lambda: any(Path("/usr/lib").glob("*/engines-3/pkcs11.so")),
+    ),
     (r"g\+\+", "a C++ compiler, for the programs that ask Fast DDS", _command("g++")),
     (
         "libfastrtps-dev",

@@ -13,7 +13,10 @@ from sros_tool.checks.policies import policy_file_findings
 from sros_tool.checks.zenoh import configuration_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.layout import (
+    KEY_URI_FILE,
+    PERMISSIONS_FILE,
     REQUIRED_FILES,
+    is_enclave,
     is_keystore,
     locate_enclave,
     refuse_earlier,
@@ -21,7 +24,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.policy.model import Policy
 from sros_tool.xml import parse, read_bytes
 
-_ENCLAVE_FILES = (*REQUIRED_FILES, "permissions.xml", "crl.pem", "request.pem")
+_ENCLAVE_FILES = (*REQUIRED_FILES, KEY_URI_FILE, "permissions.xml", "crl.pem", "request.pem")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +52,7 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     if is_keystore(path):
         return _keystore(path, at, None)
     enclave = path if path.is_dir() else path.parent
-    if any((enclave / name).exists() for name in ("cert.pem", "key.pem", "permissions.p7s")) and (
+    if (is_enclave(enclave) or (enclave / PERMISSIONS_FILE).exists()) and (
         path.is_dir() or path.name in _ENCLAVE_FILES
     ):
         root, name = locate_enclave(enclave)

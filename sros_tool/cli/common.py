@@ -517,6 +517,15 @@ def secrets_taken() -> Iterator[None]:
         _taken.clear()
 
 
+key_option = click.option(
+    "--key",
+    metavar="URI",
+    default="",
+    help="Where the key is on a token, or where to make it: pkcs11:token=NAME;object=LABEL. "
+    "Only Fast DDS can use it.",
+)
+
+
 def keyring(
     identity: str | None = None, permissions: str | None = None, *, encrypt: bool = False
 ) -> Keyring:
@@ -543,6 +552,11 @@ def _absolute(place: str) -> str:
     if is_token_uri(place):
         return place
     return f"file:{Path(place.removeprefix('file:')).absolute()}"
+
+
+def secrets() -> Callable[[str], str]:
+    """Return a secrets handler for PINs of tokens: environment or prompt."""
+    return _Secrets(new=False)
 
 
 class _Secrets:

@@ -17,6 +17,7 @@ from sros_tool.cli.common import (
     domain_of,
     dry_run_option,
     json_option,
+    key_option,
     keyring,
     keystore_from_environment,
     moment_of,
@@ -28,6 +29,7 @@ from sros_tool.cli.common import (
     print_restart,
     read_named,
     robot_option,
+    secrets,
     several_enclaves,
     split_root,
 )
@@ -115,6 +117,7 @@ def distribute_key(
         with progress("exporting"):
             packed = pack_enclaves(root, selection.names, now=now(), keyless=keyless)
         changes = [{"action": "send", "path": path} for path in packed.paths]
+        notes = packed.notes
         if not dry_run:
             _write_stdout(packed.data)
         elif not as_json:
@@ -259,6 +262,9 @@ Example:
     help="Only enclaves that match, such as '/arm/*'.  Can be repeated.",
 )
 @robot_option("Only the enclaves of this robot of the fleet.")
+@click.option(
+    "--tokens", is_flag=True, help="Also have each token prove that it has its key: needs the PIN."
+)
 @json_option
 def verify(
     folder: Path | None,
@@ -266,6 +272,7 @@ def verify(
     at: str | None,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
+    tokens: bool,
     as_json: bool,
 ) -> int:
     """On a robot: report whether the enclaves in DIR, or the enclave DIR, can be used.
@@ -286,7 +293,14 @@ def verify(
     only = select_enclaves(folder, (), patterns, robots=robots) if chosen else None
     zone = local_zone(os.environ)
     with progress("verifying"):
-        arrival = verify_arrival(folder, now=moment, domain=wanted, zone=zone, only=only)
+        arrival = verify_arrival(
+            folder,
+            now=moment,
+            domain=wanted,
+            zone=zone,
+            only=only,
+            secrets=secrets() if tokens else None,
+        )
     if as_json:
         print_json({**arrival.as_json(), "at": iso(moment), "domain": wanted})
         return 1 if arrival.findings else 0
@@ -299,7 +313,8 @@ def verify(
             if each.key_elsewhere
             else coloured("NOT LOADABLE")
         )
-        click.echo(f"{each.name}  {state}")
+        place = f", key on the token {each.token.token}" if each.token else ""
+        click.echo(f"{each.name}  {state}{place}")
     for finding in arrival.findings:
         echo_finding(finding)
     return 1 if arrival.findings else 0
@@ -319,20 +334,24 @@ Example:
 @click.argument("name")
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
 @click.option("--again", is_flag=True, help="Make the request again, for the existing key.")
+@key_option
 @dry_run_option
 @json_option
 def create_request(
-    name: str, folder: Path | None, again: bool, dry_run: bool, as_json: bool
+    name: str, folder: Path | None, again: bool, key: str, dry_run: bool, as_json: bool
 ) -> None:
     """On a robot: create the key of the enclave NAME in the folder DIR, and a signing request.
 
-    The key never leaves DIR.  Send the request to the keystore, where `sros sign_request` answers
-    it; `sros import` installs the answer next to the key.
+    The key never leaves DIR, or with --key the robot's PKCS#11 token: DIR then has only its place.
+    The PIN comes from pin-source= in URI, $SROS_PKCS11_PIN or a prompt.
+
+    Send the request to the keystore, where `sros sign_request` answers it; `sros import` installs
+    the answer next to the key.
     """
     from sros_tool.keystore.delivery.request import create_request as create
 
     folder = folder or keystore_from_environment()
-    made = create(folder, name, again=again, dry_run=dry_run)
+    made = create(folder, name, again=again, key=key, secrets=secrets(), dry_run=dry_run)
     if as_json:
         print_json(_requested_json(folder, made, again, dry_run))
         return
@@ -341,10 +360,16 @@ def create_request(
         return
     if again:
         click.echo(f"made the request of enclave {name} again, for the existing key")
+    elif made.token:
+        click.echo(
+            f"the key of enclave {name} is {made.token.object!r} on the token "
+            f"{made.token.token}, and stays there"
+        )
     else:
         click.echo(f"made the key of enclave {name}, which stays in '{folder}'")
     click.echo(f"  its SHA-256 is {made.key}")
     click.echo(f"  have '{made.file}' signed: sros sign_request")
+    print_notes(made.notes)
 
 
 def _requested_json(folder: Path, made: Requested, again: bool, dry_run: bool) -> dict[str, Any]:
@@ -363,7 +388,7 @@ def _requested_json(folder: Path, made: Requested, again: bool, dry_run: bool) -
             }
         ],
         "changes": changes_json(folder, made.changes),
-        "notes": [],
+        "notes": notes_json(made.notes),
     }
 
 

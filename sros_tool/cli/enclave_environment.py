@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.reader import OpenedEnclave
     from sros_tool.keystore.zenoh.opened import OpenedZenoh
+    from sros_tool.pki.token_uri import TokenUri
 
 RMWS = (
     "rmw_connextdds",
@@ -34,11 +35,13 @@ class EnclaveEnvironment:
     """The environment variables of an enclave, and notes on them.
 
     ``enclave_notes`` are for nodes that are not started with ``--ros-args --enclave``.
+    ``needs_pin``: the key is on a token, and nothing but an environment variable has its PIN.
     """
 
     variables: dict[str, str]
     notes: tuple[Note, ...] = ()
     enclave_notes: tuple[Note, ...] = ()
+    needs_pin: bool = False
 
 
 def loadable_environment(
@@ -57,7 +60,7 @@ def loadable_environment(
         name: the enclave.
         domain_text: the value of --domain; None stands for $ROS_DOMAIN_ID.
         rmw: the value of --rmw; None stands for $RMW_IMPLEMENTATION.
-        accept_key: accept a private key that other users can read.
+        accept_key: accept a private key, or the PIN of its token, that other users can read.
         target: the absolute path of the keystore where the process will run; None stands for here.
             A key that was made there need not be here.
 
@@ -66,6 +69,7 @@ def loadable_environment(
         KeystoreError: the enclave does not exist, a process cannot run in it, or others can read
             its private key.
     """
+    from sros_tool.keystore.issuing.tokens import pin_notes
     from sros_tool.keystore.layout import (
         KEY_FILE,
         check_keystore,
@@ -76,6 +80,7 @@ def loadable_environment(
     from sros_tool.keystore.missing import no_such_enclave
     from sros_tool.keystore.reader import open_enclave
     from sros_tool.names import check_enclave_name
+    from sros_tool.pki.token import MODULE_VARIABLE
     from sros_tool.runtime.environment import (
         DOMAIN,
         choose_domain,
@@ -96,7 +101,7 @@ def loadable_environment(
     folder = enclave_path(root, name)
     state = open_enclave(folder, now=now())
     domains = state.domains() if wanted is not None else state.joined_domains()
-    zenoh = _opened_zenoh(root, name, state) if with_zenoh else None
+    zenoh = _opened_zenoh(root, name, state) if with_zenoh and not state.token else None
     if zenoh and domains:
         wanted = _zenoh_domain(root, zenoh, wanted, domains)
     domain = choose_domain(domains, wanted, root) if domains else 0
@@ -108,7 +113,11 @@ def loadable_environment(
             "; ".join(map(str, problems)) + ".",
             f"See `sros inspect {folder}`.",
         )
-    if not accept_key and not (target and state.key_on_robot):
+    if state.token:
+        _check_token_used(state.token, name, rmw)
+        if not (accept_key or target):
+            _check_pin(state.token, name)
+    elif not accept_key and not (target and state.key_on_robot):
         _check_key_closed(folder / KEY_FILE, root, name)
     variables = secured_environment(target or root, name, domain)
     if zenoh:
@@ -117,7 +126,16 @@ def loadable_environment(
         return replace(found, notes=()) if target else found  # they are about this process
     if (target and not rmw) or RMW_ZENOH in rmw_implementations(os.environ):
         variables |= REFUSING_ZENOH  # what chooses it later, such as a launch file, starts no node
-    return EnclaveEnvironment({**variables, RMW: rmw} if rmw else variables)
+    if rmw:
+        variables[RMW] = rmw
+    if not state.token:
+        return EnclaveEnvironment(variables)
+    # The module is only the one that the user names for this process: loading it runs its code.
+    module = os.environ.get(MODULE_VARIABLE)
+    if module and not target:
+        variables[MODULE_VARIABLE] = module
+    notes = () if target else tuple(pin_notes(state.token))
+    return EnclaveEnvironment(variables, notes, needs_pin=not state.token.pin_source)
 
 
 def _check_key_closed(key: Path, root: Path, name: str) -> None:
@@ -130,6 +148,36 @@ def _check_key_closed(key: Path, root: Path, name: str) -> None:
             f"Run `chmod 600 {quote(str(key))}`. If others had access, give the enclave another "
             f"key: `sros renew {quote(str(root))} {name} --new-key --revoke-old`. To run it "
             "nevertheless, add --accept-readable-key.",
+        )
+
+
+# ── keys on tokens ─────────────────────────────────────────────────────────────────────────
+
+
+def _check_token_used(place: TokenUri, name: str, rmw: str | None) -> None:
+    """Raise `KeystoreError` if a process would use an RMW that reads keys from files alone."""
+    from sros_tool.runtime.rmw import chosen_rmw, vendor_of
+
+    chosen = chosen_rmw(rmw, os.environ)
+    vendor = vendor_of(chosen)
+    if chosen and not (vendor and vendor.traits.reads_tokens):
+        raise KeystoreError(
+            f"a process of {chosen} cannot run in enclave {name}",
+            f"Its key is on the token {place.token!r}, and {chosen} reads a key from key.pem "
+            "alone.",
+            "Use rmw_fastrtps_cpp of ROS 2 Jazzy or later, or an enclave with a key in a file.",
+        )
+
+
+def _check_pin(place: TokenUri, name: str) -> None:
+    """Raise `KeystoreError` if others can read the PIN of a token, or this user cannot."""
+    from sros_tool.keystore.issuing.tokens import pin_file_problem
+
+    if problem := pin_file_problem(place):
+        raise KeystoreError(
+            f"the PIN for the key of enclave {name} is not safe or not there",
+            f"{problem[:1].upper()}{problem[1:]}.",
+            "To run it nevertheless, add --accept-readable-key.",
         )
 
 

@@ -152,6 +152,8 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
         state = "loadable" if enclave["loadable"] else "NOT LOADABLE"
         if enclave["key_on_robot"] and not enclave["problems"]:
             state = "key on its robot"
+        elif enclave["token"]:
+            state += f", key on the token {enclave['token']['token']}"
         yield f"    {enclave['name']}  {state}, certificate until {until or 'unknown'}"
         for problem in enclave["problems"]:
             yield f"      {problem}"
@@ -173,6 +175,8 @@ def _enclave(d: dict[str, Any]) -> Iterator[str]:
     identity, permissions = _named(d, "identity_ca"), _named(d, "permissions_ca")
     yield f"  identity CA {identity}, permissions CA {permissions}"
     yield f"  domains {d['domains']}"
+    if token := d["token"]:
+        yield f"  {_place(token)}"
     for grant in d["permissions"] or ():
         yield from _indented(_grant(grant))
     if zenoh := d["zenoh"]:
@@ -220,6 +224,15 @@ def _key(d: dict[str, Any]) -> Iterator[str]:
     yield f"private key {d['path']}: {d['algorithm']}, mode {d['mode']}"
     if d["mode"] not in ("0600", "0400"):
         yield "  others can read it: chmod 600"
+
+
+def _place(d: dict[str, Any]) -> str:
+    pin = f", PIN in {d['pin_source']}" if d["pin_source"] else ""
+    return f"key {d['object']} on the token {d['token']}{pin}"
+
+
+def _key_on_token(d: dict[str, Any]) -> Iterator[str]:
+    yield f"{d['path']}: {_place(d)}"
 
 
 def _permissions(d: dict[str, Any]) -> Iterator[str]:
@@ -336,6 +349,7 @@ _TEXT = {
     "enclave": _enclave,
     "certificate": _certificate,
     "private key": _key,
+    "key on a token": _key_on_token,
     "revocation list": _revocation_list,
     "permissions": _permissions,
     "governance": _governance_file,

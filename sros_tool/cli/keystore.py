@@ -19,6 +19,7 @@ from sros_tool.cli.common import (
     fleet_option,
     fleet_policies,
     json_option,
+    key_option,
     keyring,
     keystore_from_environment,
     now,
@@ -50,7 +51,9 @@ if TYPE_CHECKING:
 Example:
   $ sros create_enclave keystore /talker /listener
   created enclave /talker
-  created enclave /listener""",
+  created enclave /listener
+  $ sros create_enclave keystore /arm --key 'pkcs11:token=robot;object=arm'
+  created enclave /arm""",
 )
 @click.argument(
     "words",
@@ -59,12 +62,14 @@ Example:
     required=True,
     shell_complete=complete_keystore_and_enclave,
 )
+@key_option
 @dry_run_option
 @json_option
-def create_enclave(words: tuple[str, ...], dry_run: bool, as_json: bool) -> None:
+def create_enclave(words: tuple[str, ...], key: str, dry_run: bool, as_json: bool) -> None:
     """Create the enclaves NAME... in the keystore ROOT.
 
-    An existing enclave keeps its key and its permissions; missing files are added.
+    An existing enclave keeps its key and its permissions; missing files are added. With --key, the
+    key is on a PKCS#11 token and cannot be copied; without object= in URI, its label is NAME.
     """
     from sros_tool.keystore.lifecycle.create import create_enclaves
 
@@ -77,6 +82,7 @@ def create_enclave(words: tuple[str, ...], dry_run: bool, as_json: bool) -> None
             names,
             now=now(),
             domain=ros_domain(),
+            key=key,
             keyring=keyring(),
             dry_run=dry_run,
             progress=step,

@@ -15,6 +15,7 @@ from sros_tool.cli.common import (
     complete_keystore_and_enclave,
     dry_run_option,
     json_option,
+    key_option,
     keyring,
     keystore_from_environment,
     now,
@@ -60,6 +61,7 @@ Example:
     "enclaves that are short-lived have to be named.",
 )
 @click.option("--new-key", is_flag=True, help="Create new keys as well.")
+@key_option
 @click.option(
     "--revoke-old",
     is_flag=True,
@@ -74,6 +76,7 @@ def renew(
     robots: tuple[str, ...],
     all_expiring: str | None,
     new_key: bool,
+    key: str,
     revoke_old: bool,
     dry_run: bool,
     as_json: bool,
@@ -86,6 +89,8 @@ def renew(
     Anyone who has a copy of a replaced certificate and its permissions can use them until they
     expire.  With --revoke-old, processes that load the new crl.pem refuse them: restart the
     renewed processes first, then all others.
+
+    With --key, the enclaves NAME... get other keys, on a token; a key.pem that one had is removed.
     """
     from sros_tool.keystore.expiry import parse_threshold
     from sros_tool.keystore.lifecycle.renew import renew as work
@@ -101,6 +106,7 @@ def renew(
             now=now(),
             expiring=threshold,
             new_key=new_key,
+            key=key,
             revoke_old=revoke_old,
             keyring=keyring(),
             dry_run=dry_run,

@@ -23,12 +23,18 @@ from sros_tool.cli.common import (
 from sros_tool.cli.containers import INSTALLED, container_text, target_path
 from sros_tool.cli.enclave_environment import RMWS, loadable_environment
 from sros_tool.cli.written import notes_json
-from sros_tool.errors import UnavailableError, UsageError
+from sros_tool.errors import Note, UnavailableError, UsageError
 from sros_tool.runtime.containers import COMPOSE, KUBERNETES
 from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
 
 COMMAND = "sros.command"
 """The key of ``ctx.meta`` with the words after ``--`` of a `WithCommand`."""
+_FAST_DDS_PIN = "FASTDDS_PKCS11_PIN"
+"""The variable from which Fast DDS takes the PIN of a token (Pkcs11Provider.cpp)."""
+_NO_PIN = (
+    f"no file has the PIN of the token (pin-source), so Fast DDS takes it from ${_FAST_DDS_PIN}, "
+    "which root and this user can read in /proc."
+)
 _WORDS = click.argument(
     "words",
     metavar="[ROOT] NAME",
@@ -55,7 +61,8 @@ RMW = click.option(
 ACCEPT_KEY = click.option(
     "--accept-readable-key",
     is_flag=True,
-    help="Accept a private key that other users can read, as on a file system without modes.",
+    help="Accept a private key, or the PIN of its token, that other users can read, as on a file "
+    "system without modes.",
 )
 
 
@@ -206,6 +213,8 @@ def env(
     else:
         text = render_environment(found.variables, "json" if as_json else form)
     notes = [*found.notes, *found.enclave_notes]
+    if found.needs_pin:
+        notes.append(Note("token.no-pin", _NO_PIN))
     if as_json:
         print_json(
             {
@@ -298,6 +307,12 @@ def run(
             f"added {added}, so that the ROS graph shows the enclave (--no-ros-args: do not)",
             err=True,
         )
+    environment = {**os.environ, **found.variables}
+    pin = environment.pop(_FAST_DDS_PIN, None)
+    if found.needs_pin and pin is None:
+        print_notes([Note("token.no-pin", _NO_PIN)])
+    elif found.needs_pin and pin is not None:
+        environment[_FAST_DDS_PIN] = pin
     print_notes(found.notes)
     if enclave_argument(command) != name:
         print_notes(found.enclave_notes)
@@ -305,7 +320,7 @@ def run(
     sys.stderr.flush()
     for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them, and COMMAND would too
         signal.signal(ignored, signal.SIG_DFL)
-    os.execve(program, command, {**os.environ, **found.variables})
+    os.execve(program, command, environment)
 
 
 @click.command(

@@ -19,6 +19,7 @@ from sros_tool.keystore.describe_zenoh import (
 )
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
+    KEY_URI_FILE,
     ROLES,
     ZENOH_SIGNED,
     ca_certificate,
@@ -39,6 +40,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
 from sros_tool.pki.keys import algorithm, holds_private_key, load_key
+from sros_tool.pki.token_uri import TokenUri, read_token_file
 from sros_tool.translate import RosRight, ros_rights
 from sros_tool.validity import iso
 from sros_tool.xml import parse, read_bytes
@@ -66,7 +68,7 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
     if path.is_dir():
         if is_keystore(path):
             return _keystore(path, now)
-        if any((path / name).exists() for name in ("cert.pem", "permissions.p7s")):
+        if any((path / name).exists() for name in ("cert.pem", "permissions.p7s", KEY_URI_FILE)):
             return {
                 "kind": "enclave",
                 "path": str(path),
@@ -91,6 +93,8 @@ def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Des
         return {"kind": "certificate", **_certificates(data, "in it", now)}
     if CRL_MARK in data:
         return {"kind": "revocation list", **_revocation_list(load_crl(data, "in it"), now)}
+    if path.name == KEY_URI_FILE:
+        return {"kind": "key on a token", **_token(read_token_file(data))}
     if holds_private_key(data):
         mode = path.stat().st_mode & 0o777
         key = load_key(data, "in it")
@@ -215,8 +219,18 @@ def _describe_enclave(state: OpenedEnclave) -> Description:
         **_authority("identity_ca", state.identity_ca),
         **_authority("permissions_ca", state.permissions_ca),
         "domains": str(domains) if domains else None,
+        "token": _token(state.token) if state.token else None,
         "permissions": _permissions(state.permissions) if state.permissions else None,
         "permissions_bytes": state.permissions_bytes,
+    }
+
+
+def _token(place: TokenUri) -> Description:
+    """Describe the place of a key on a token."""
+    return {
+        "token": place.token,
+        "object": place.object,
+        "pin_source": place.pin_source or None,
     }
 
 

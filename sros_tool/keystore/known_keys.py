@@ -19,6 +19,7 @@ from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     KEY_FILE,
+    REQUEST,
     enclave_names,
     enclave_path,
     revoked_certificates,
@@ -29,7 +30,7 @@ from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import common_name_of, subject_text
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
-from sros_tool.pki.requests import key_digest
+from sros_tool.pki.requests import key_digest, load_request
 from sros_tool.xml import read_bytes
 
 
@@ -163,13 +164,14 @@ def _digest_of(certificate: x509.Certificate) -> str:
 
 
 def _digests(root: Path, name: str) -> Iterator[str]:
-    """Yield the digest of an enclave's key, from its certificate, or else from its key file."""
+    """Yield the digest of an enclave's key, from its certificate, or else its key or request."""
     folder = enclave_path(root, name)
     try:
         if (folder / CERTIFICATE_FILE).exists():
             yield _digest_of(read_certificate(folder / CERTIFICATE_FILE))
-        else:
-            path = folder / KEY_FILE
+        elif (path := folder / KEY_FILE).exists():
             yield key_digest(load_key(read_bytes(path, "private key"), f"'{path}'").public_key())
+        elif (path := folder / REQUEST).exists():  # the key is on a token
+            yield key_digest(load_request(read_bytes(path, "request"), f"'{path}'").public_key)
     except PkiError:
         return  # a damaged file, which no DDS loads; `sros check` reports it

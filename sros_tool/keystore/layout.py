@@ -60,6 +60,12 @@ REQUIRED_FILES = (
     PERMISSIONS_FILE,
 )
 """The files that rcl and the RMWs read from an enclave; without one of them no node starts."""
+KEY_URI_FILE = "key.p11"
+"""In place of ``key.pem``: the PKCS#11 URI of a key on a token (REP 2015).
+
+Source: rmw_dds_common of ROS 2 Jazzy and later (security.cpp); only rmw_fastrtps asks it for one.
+"""
+KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 
 CRL_FILE = "crl.pem"
 OPTIONAL_FILES = (CRL_FILE,)
@@ -132,7 +138,8 @@ _MOST_FOLDERS = 1000
 _TOP_FILES = frozenset((SETTINGS, FLEET, LEDGER, LEDGER_HEAD, ROTATION))
 _OF_IDENTITY = (CERTIFICATE_FILE, KEY_FILE)
 _OF_NODE = (CERTIFICATE_FILE, KEY_FILE, PERMISSIONS_FILE)
-_FILE_TYPES = (".pem", ".p7s", ".xml", ".json5")
+_OF_ENCLAVE = (CERTIFICATE_FILE, *KEY_FILES)
+_FILE_TYPES = (".pem", ".p7s", ".p11", ".xml", ".json5")
 _TOP_FOLDERS = frozenset((ENCLAVES, PUBLIC, PRIVATE, REVOKED, RETIRED))
 
 
@@ -167,7 +174,7 @@ def is_keystore(root: Path) -> bool:
 
 def is_enclave(folder: Path) -> bool:
     """Return whether ``folder`` has a certificate or a key of an enclave."""
-    return any(os.path.lexists(f"{folder}/{file}") for file in (CERTIFICATE_FILE, KEY_FILE))
+    return any(os.path.lexists(f"{folder}/{file}") for file in _OF_ENCLAVE)
 
 
 def has_enclave(root: Path, name: str) -> bool:
@@ -177,7 +184,12 @@ def has_enclave(root: Path, name: str) -> bool:
 
 def key_on_robot(folder: Path) -> bool:
     """Return whether the key of an enclave was made on its robot and stays there."""
-    return (folder / REQUEST).exists() and not (folder / KEY_FILE).exists()
+    return (folder / REQUEST).exists() and not has_key(folder)
+
+
+def has_key(folder: Path) -> bool:
+    """Return whether an enclave's folder has its key, or names the one on a token."""
+    return any((folder / file).exists() for file in KEY_FILES)
 
 
 def waits_for_answer(folder: Path) -> bool:
@@ -225,7 +237,7 @@ def _search(top: str, start: str) -> tuple[tuple[str, ...], tuple[UnreadPath, ..
     found: list[str] = []
     unread: list[UnreadPath] = []
     for folder, files in _walk(start, unread):
-        if KEY_FILE in files or CERTIFICATE_FILE in files:
+        if any(file in files for file in _OF_ENCLAVE):
             found.append(folder[len(top) :].replace(os.sep, "/") or "/")
     return tuple(sorted(found)), tuple(unread)
 

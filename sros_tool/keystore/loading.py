@@ -24,6 +24,8 @@ from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     IDENTITY,
     IDENTITY_CA_FILE,
+    KEY_FILE,
+    KEY_URI_FILE,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
 )
@@ -59,6 +61,9 @@ def vendor_problems(
     content are taken from ``state``.
     """
     kept = [each for each in state.problems if each.fault not in _VENDOR_SPECIFIC]
+    if state.token and not traits.reads_tokens:
+        text = f"{traits.title} does not read it, and there is no {KEY_FILE}"
+        kept.append(Problem(KEY_URI_FILE, text, Fault.KEY_ON_TOKEN))
     # Files that every vendor refuses already: do not report a second problem.
     known = {
         each.file

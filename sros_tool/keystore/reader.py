@@ -8,6 +8,7 @@ differences between vendors.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -23,7 +24,7 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
-from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.errors import KeystoreError, PkiError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -34,6 +35,7 @@ from sros_tool.keystore.layout import (
     IDENTITY,
     IDENTITY_CA_FILE,
     KEY_FILE,
+    KEY_URI_FILE,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
@@ -71,6 +73,7 @@ from sros_tool.pki.crl import (
     signed_by,
 )
 from sros_tool.pki.keys import load_key
+from sros_tool.pki.token_uri import TokenUri, read_token_file
 from sros_tool.validity import Window, iso
 from sros_tool.values import shows
 from sros_tool.xml import read_bytes
@@ -353,6 +356,11 @@ class OpenedEnclave:
     """The XML in ``permissions.p7s``, even if malformed; empty if its signature is not valid."""
     key_on_robot: bool = False
     """Whether the key was generated on the robot and stays there."""
+    token: TokenUri | None = None
+    """The place of the key on a PKCS#11 token, which ``key.p11`` names.
+
+    The key is not compared with the certificate, because no token is opened to read an enclave.
+    """
 
     @property
     def subject(self) -> str:
@@ -465,7 +473,14 @@ class _EnclaveFiles:
         self._problems: list[Problem] = []
 
     def check(self, domain: int | None) -> OpenedEnclave:
-        files = {name: self._read(name) for name in REQUIRED_FILES}
+        token_file = self._read_token_file()
+        files = {
+            name: self._read(name)
+            for name in REQUIRED_FILES
+            if name != KEY_FILE or token_file is None or (self._folder / name).exists()
+        }
+        files.setdefault(KEY_FILE, None)
+        token = self._token(token_file, files[KEY_FILE]) if token_file is not None else None
         identity_ca = self._certificate(IDENTITY_CA_FILE, files)
         permissions_ca = self._certificate(PERMISSIONS_CA_FILE, files)
         certificate = self._certificate(CERTIFICATE_FILE, files)
@@ -498,6 +513,7 @@ class _EnclaveFiles:
             {name: data for name, data in files.items() if data is not None},
             document or b"",
             key_on_robot(self._folder),
+            token,
         )
 
     def _add(self, file: str, text: str, fault: Fault) -> None:
@@ -522,6 +538,23 @@ class _EnclaveFiles:
             self._add(name, "it is empty", Fault.FILE_EMPTY)
             return None
         return data
+
+    def _read_token_file(self) -> bytes | None:
+        path = self._folder / KEY_URI_FILE
+        return self._read(KEY_URI_FILE) or b"" if os.path.lexists(path) else None
+
+    def _token(self, data: bytes, key: bytes | None) -> TokenUri | None:
+        """Return the key that ``key.p11`` names; ``key`` is that of ``key.pem``."""
+        if key is not None:
+            text = f"{KEY_FILE} is there, too"
+            self._add(KEY_URI_FILE, text, Fault.KEY_TWICE)
+        if not data:  # it was reported already
+            return None
+        try:
+            return read_token_file(data)
+        except PkiError as error:
+            self._add(KEY_URI_FILE, error.why.rstrip("."), Fault.TOKEN_URI)
+            return None
 
     def _certificate(self, name: str, files: dict[str, bytes | None]) -> x509.Certificate | None:
         data = files[name]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import secrets as random
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_dss_signature
@@ -16,10 +18,11 @@ from cryptography.hazmat.primitives.serialization import load_der_public_key
 
 from sros_tool.errors import PkiError, UnavailableError, UsageError
 from sros_tool.owners import file_of_root
-from sros_tool.pki.token_uri import TokenUri, parse_token_uri
+from sros_tool.pki.token_uri import TokenUri, parse_token_uri, token_file
 from sros_tool.xml import read_bytes
 
-_MODULE_VARIABLE = "PKCS11_MODULE_PATH"
+MODULE_VARIABLE = "PKCS11_MODULE_PATH"
+"""The variable that names the PKCS#11 module, for sros and for the engine of libp11."""
 Secrets = Callable[[str], str]
 """Function that returns the secret that its argument names, such as "the PIN of the token X"."""
 
@@ -33,7 +36,7 @@ def _module_of(parsed: TokenUri, *, named: bool) -> str:
     Raises:
         UsageError: no library is named, or it is not one to be loaded.
     """
-    own = os.environ.get(_MODULE_VARIABLE, "")
+    own = os.environ.get(MODULE_VARIABLE, "")
     path = Path(parsed.module)
     if parsed.module and named:
         return parsed.module
@@ -41,29 +44,63 @@ def _module_of(parsed: TokenUri, *, named: bool) -> str:
         return str(real)
     if own:
         return own
+    if not parsed.module and (proxy := _proxy()):
+        return proxy
     if parsed.module:
         raise UsageError(
             f"the PKCS#11 module '{parsed.module}' is not loaded",
             "Only the keystore names it, and users other than root could have put it there; its "
             "code would run in this process.",
-            f"If you trust it, set {_MODULE_VARIABLE} to its path.",
+            f"If you trust it, set {MODULE_VARIABLE} to its path.",
         )
     raise UsageError(
         f"no PKCS#11 module is named for the token {parsed.token!r}",
         "",
-        f"Add ?module-path=FILE to the URI, or set {_MODULE_VARIABLE}.",
+        f"Add ?module-path=FILE to the URI, or set {MODULE_VARIABLE}.",
     )
+
+
+def _proxy() -> str:
+    """Return the module of p11-kit, which loads all that are registered here; "" without it.
+
+    libp11 loads it, too, where no other is named (Debian and Ubuntu, libengine-pkcs11-openssl).
+    """
+    found = sorted(each for folder in _PROXIES for each in Path("/").glob(folder))
+    return next((str(real) for each in found if (real := file_of_root(each))), "")
+
+
+_PROXIES = ("usr/lib/*/p11-kit-proxy.so", "usr/lib64/p11-kit-proxy.so", "usr/lib/p11-kit-proxy.so")
 
 
 class TokenKey(ec.EllipticCurvePrivateKey):
     """A private key on the curve prime256v1, stored on a token.
 
     `cryptography` signs certificates, documents and revocation lists with it as with other keys.
+    ``place`` names the key.  One that is only planned has no ``private`` part, and cannot sign.
     """
 
-    def __init__(self, private: Any, public: ec.EllipticCurvePublicKey) -> None:
+    def __init__(self, private: Any, public: ec.EllipticCurvePublicKey, place: TokenUri) -> None:
         self._private = private
         self._public = public
+        self.place = place
+
+    @property
+    def file(self) -> bytes:
+        """The content of a ``key.p11`` that names this key."""
+        return token_file(self.place)
+
+    @property
+    def never_left(self) -> bool:
+        """Whether the token says that the key was made on it, and that it never gives it out."""
+        from pkcs11 import Attribute, PKCS11Error
+
+        try:
+            return self._private is None or bool(
+                self._private[Attribute.NEVER_EXTRACTABLE]
+                and self._private[Attribute.ALWAYS_SENSITIVE]
+            )
+        except PKCS11Error:
+            return False
 
     def public_key(self) -> ec.EllipticCurvePublicKey:
         """Return the public key."""
@@ -83,6 +120,8 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         """Return a DER signature by the token (CKM_ECDSA over a digest computed here)."""
         import pkcs11
 
+        if self._private is None:
+            raise PkiError("a key that is only planned cannot sign")
         algorithm = signature_algorithm.algorithm
         if isinstance(algorithm, Prehashed):
             digest = bytes(data)
@@ -90,11 +129,25 @@ class TokenKey(ec.EllipticCurvePrivateKey):
             hasher = hashes.Hash(algorithm)
             hasher.update(data)
             digest = hasher.finalize()
-        raw = self._private.sign(digest, mechanism=pkcs11.Mechanism.ECDSA)
+        try:
+            raw = self._private.sign(digest, mechanism=pkcs11.Mechanism.ECDSA)
+        except (pkcs11.PKCS11Error, RuntimeError, OSError) as error:  # it was taken out
+            raise _unusable(self.place, error) from error
         half = len(raw) // 2
         return encode_dss_signature(
             int.from_bytes(raw[:half], "big"), int.from_bytes(raw[half:], "big")
         )
+
+    def signs_for(self, public: object) -> bool:
+        """Return whether the token signs what ``public``, the key of a certificate, verifies."""
+        if not isinstance(public, ec.EllipticCurvePublicKey):
+            return False
+        message, algorithm = random.token_bytes(32), ec.ECDSA(hashes.SHA256())
+        try:
+            public.verify(self.sign(message, algorithm), message, algorithm)
+        except InvalidSignature:
+            return False
+        return True
 
     def exchange(self, algorithm: ec.ECDH, peer_public_key: ec.EllipticCurvePublicKey) -> bytes:
         """Raise `PkiError`: this key can only sign."""
@@ -128,7 +181,10 @@ def holds_token_key(uri: str, secrets: Secrets, *, named: bool) -> bool:
         UsageError: the URI is not valid, or its module is not one to be loaded.
         PkiError: the token cannot be used.
     """
-    parsed = _usable_uri(uri, named=named)
+    return _holds(_usable_uri(uri, named=named), secrets)
+
+
+def _holds(parsed: TokenUri, secrets: Secrets) -> bool:
     import pkcs11
 
     try:
@@ -148,9 +204,33 @@ def create_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
     return _open(_usable_uri(uri, named=named), secrets, create=True)
 
 
+def make_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
+    """Return the key at a place that the user named; it is generated if the token lacks it.
+
+    Raises:
+        UsageError: no module is named.
+        PkiError: the token cannot be used.
+    """
+    usable = _usable(place, named=True)
+    return _open(usable, secrets, create=not _holds(usable, secrets))
+
+
+def open_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
+    """Return the key at a place that a ``key.p11`` names; errors as of `make_enclave_key`."""
+    return _open(_usable(place, named=False), secrets, create=False)
+
+
+def planned_key(place: TokenUri) -> TokenKey:
+    """Return what stands for a key to be made, in a dry run, which opens no token."""
+    return TokenKey(None, ec.generate_private_key(ec.SECP256R1()).public_key(), place)
+
+
 def _usable_uri(uri: str, *, named: bool) -> TokenUri:
+    return _usable(parse_token_uri(uri), named=named)
+
+
+def _usable(parsed: TokenUri, *, named: bool) -> TokenUri:
     """Return the parts of a URI with the module to load, once tokens can be used at all."""
-    parsed = parse_token_uri(uri)
     parsed = replace(parsed, module=_module_of(parsed, named=named))
     if importlib.util.find_spec("pkcs11") is None:
         raise UnavailableError(
@@ -187,7 +267,7 @@ def _open(parsed: TokenUri, secrets: Secrets, *, create: bool) -> TokenKey:
             "Not every DDS vendor accepts other keys.",
             "Name another object of the token.",
         )
-    return TokenKey(private, loaded)
+    return TokenKey(private, loaded, parsed)
 
 
 def _unusable(parsed: TokenUri, error: Exception) -> PkiError:
@@ -233,7 +313,15 @@ def _create(session: Any, parsed: TokenUri) -> None:
         {pkcs11.Attribute.EC_PARAMS: encode_named_curve_parameters("secp256r1")},
         local=True,
     )
-    parameters.generate_keypair(label=parsed.object, store=True)
+    parameters.generate_keypair(
+        id=random.token_bytes(16),  # libp11 finds the public key by it
+        label=parsed.object,
+        store=True,
+        private_template={
+            pkcs11.Attribute.SENSITIVE: True,
+            pkcs11.Attribute.EXTRACTABLE: False,
+        },
+    )
 
 
 def _pin(parsed: TokenUri, secrets: Secrets) -> str:

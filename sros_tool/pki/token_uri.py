@@ -1,13 +1,13 @@
-"""PKCS#11 URIs (RFC 7512) that name the key of a CA; none of them may contain a PIN."""
+"""PKCS#11 URIs (RFC 7512) that name the key of a CA or enclave; none may contain a PIN."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import unquote
+from urllib.parse import quote, unquote
 
-from sros_tool.errors import UsageError
+from sros_tool.errors import PkiError, UsageError
 
 _SCHEME = "pkcs11:"
 # RFC 7512, 2.3.  ``pin-value`` is missing on purpose, see `refuse_pin`.
@@ -17,6 +17,10 @@ _PATH_ATTRIBUTES = frozenset(
     | {"token", "type"}
 )
 _QUERY_ATTRIBUTES = frozenset({"module-name", "module-path", "pin-source"})
+_OF_ENCLAVE = (frozenset({"token", "object", "type"}), frozenset({"module-path", "pin-source"}))
+_OF_FILE = (_OF_ENCLAVE[0], frozenset({"pin-source"}))
+_MOST_BYTES = 2000
+_LONGEST_TOKEN, _LONGEST_OBJECT = 32, 128  # bytes; CK_TOKEN_INFO of PKCS#11, and enough
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +83,77 @@ def parse_token_uri(uri: str) -> TokenUri:
             "Write pin-source=/PATH/OF/FILE.",
         )
     return TokenUri(token, label, options.get("module-path", ""), pin_source)
+
+
+def parse_enclave_uri(uri: str, name: str) -> TokenUri:
+    """Parse the URI of an enclave's key; without ``object``, it is ``name``, the enclave.
+
+    Only what sros uses and Fast DDS reads is accepted, so that both find the same key.
+
+    Raises:
+        UsageError: the URI is not valid, or has another attribute.
+    """
+    if is_token_uri(uri) and "object=" not in uri:
+        path, query, options = uri.partition("?")
+        uri = f"{path};object={quote(name, safe='')}{query}{options}"
+    parsed = parse_token_uri(uri)
+    path, _, query = uri[len(_SCHEME) :].partition("?")
+    kind = _attributes(path.split(";"), _OF_ENCLAVE[0]).get("type", "private")
+    _attributes(query.split("&"), _OF_ENCLAVE[1])
+    too_long = (
+        len(parsed.token.encode()) > _LONGEST_TOKEN or len(parsed.object.encode()) > _LONGEST_OBJECT
+    )
+    texts = (parsed.token, parsed.object, parsed.module, parsed.pin_source)
+    if kind != "private" or too_long or not all(map(str.isprintable, texts)):
+        raise UsageError(
+            "the PKCS#11 URI cannot name the key of an enclave",
+            f"A token has at most {_LONGEST_TOKEN} bytes, an object {_LONGEST_OBJECT}, its type is "
+            "private, and nothing in it is a control character.",
+            "Write pkcs11:token=NAME;object=LABEL?pin-source=FILE.",
+        )
+    return parsed
+
+
+def token_file(parsed: TokenUri) -> bytes:
+    """Return the content of a ``key.p11``: one line, which Fast DDS gives to OpenSSL.
+
+    The module is not in it: libp11 0.4.12 refuses the attribute, and takes the module from
+    ``PKCS11_MODULE_PATH`` (libp11, eng_parse.c and eng_back.c).
+    """
+    uri = f"{_SCHEME}token={_encoded(parsed.token)};object={_encoded(parsed.object)};type=private"
+    if parsed.pin_source:
+        uri += f"?pin-source=file:{quote(parsed.pin_source, safe='/')}"
+    return f"{uri}\n".encode()
+
+
+def read_token_file(data: bytes) -> TokenUri:
+    """Return the key that a ``key.p11`` names; an error shows nothing of it, as it may have a PIN.
+
+    The RMWs read its first word, so nothing may follow.
+
+    Raises:
+        PkiError: it is not one PKCS#11 URI that sros and Fast DDS read alike.
+    """
+    text = data.decode("utf-8", "replace").removesuffix("\n")
+    if len(data) > _MOST_BYTES or not text.startswith(_SCHEME) or len(text.split()) != 1:
+        raise PkiError(
+            "it is not a PKCS#11 URI",
+            "It has to be one line that begins with pkcs11: and has no spaces",
+        )
+    try:
+        path, _, query = text[len(_SCHEME) :].partition("?")
+        refuse_pin(text)
+        named = _attributes(path.split(";"), _OF_FILE[0])
+        _attributes(query.split("&"), _OF_FILE[1])
+        if not (named.get("token") and named.get("object")):
+            raise UsageError("it names no token, or no object of one")
+        return parse_enclave_uri(text, "")
+    except UsageError as error:
+        raise PkiError(error.what, error.what) from error
+
+
+def _encoded(text: str) -> str:
+    return quote(text, safe="")
 
 
 def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:

@@ -402,6 +402,14 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         refuses=Refused.PARTICIPANT,
     ),
     _text(
+        "token", _FAST, r"Error opening the private key \w+=|Error retrieving 'pkcs11' engine"
+        r"|Error initializing the HSM provider library|Error setting the PIN in the 'pkcs11'",
+        "the key is on a PKCS#11 token that Fast DDS cannot use: the token, OpenSSL's engine "
+        "(libengine-pkcs11-openssl), its module or the PIN is missing or wrong",
+        "`sros verify DIR --tokens` asks the token for the key.", (Fault.TOKEN_URI,),
+        refuses=Refused.PARTICIPANT,
+    ),
+    _text(
         "key-unreadable", _FAST, r"Error obtaining private key",
         "key.pem is encrypted, damaged or empty", "Store it as PEM without a passphrase.",
         (*_KEY, *_FILES),

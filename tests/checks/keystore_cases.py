@@ -62,6 +62,13 @@ def weakly_encrypted(bench: Bench) -> None:
     path.write_bytes(pem_of(serialization.Encoding.PEM, form, secret))
 
 
+def on_token(bench: Bench, *attributes: str) -> None:
+    """Give an enclave a key on a token, which nobody opens."""
+    bench.unlink("enclaves/base/key.pem")
+    uri = ";".join(("pkcs11:token=robot", *attributes))
+    bench.path("enclaves/base/key.p11").write_text(f"{uri}\n")
+
+
 IS_CA = (x509.BasicConstraints(True, None), True)
 
 
@@ -178,6 +185,11 @@ CASES |= {
     "enclave.key-mismatch": lambda b: b.path("enclaves/base/key.pem").write_bytes(
         key_pem(new_key())
     ),
+    "enclave.token-uri": lambda b: on_token(b, "object=base?pin-value=1234"),
+    "portable.key-on-token": lambda b: on_token(b, "object=base"),
+    "enclave.pin-file": lambda b: on_token(
+        b, f"object=base?pin-source=file:{b.path('enclaves/base/cert.pem')}"
+    ),
     "enclave.crl-malformed": lambda b: b.path("enclaves/base/crl.pem").write_text("x"),
     "enclave.crl-issuer": lambda b: b.revoke(by=b.foreign()),
     "enclave.crl-partial": lambda b: b.revoke(scope="http://example.org/crl"),
@@ -200,6 +212,18 @@ CASES |= {
         b.path("enclaves/arm/permissions.p7s"), b.path("enclaves/base/permissions.p7s")
     ),
 }
+
+
+@case("enclave.key-twice")
+def _(bench: Bench) -> None:
+    on_token(bench, "object=base")
+    shutil.copy(bench.path("enclaves/arm/key.pem"), bench.path("enclaves/base"))
+
+
+@case("zenoh.key-on-token")
+def _(bench: Bench) -> None:
+    on_token(bench, "object=base")
+    bench.path("enclaves/base/session.json5").write_text("{}")
 
 
 @case("enclave.permissions-domain")

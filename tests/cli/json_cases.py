@@ -76,6 +76,9 @@ def make_folder(folder: Path) -> None:
     for copy in ("turned", "broken", "lost", "wrecked", "partial", "fleet"):
         shutil.copytree(folder / "ks", folder / copy, symlinks=True)
     sros("rotate_ca", "turned", "--next", cwd=folder).ok()
+    shutil.copytree(folder / "out", folder / "token")
+    (folder / "token/enclaves/a/key.pem").unlink()
+    (folder / "token/enclaves/a/key.p11").write_text("pkcs11:token=t;object=o;type=private\n")
     (folder / "fleet/fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.a]\n')
     with (folder / "fleet/fleet.toml").open("a") as fleet:
         fleet.write("[robots.b]\n")
@@ -139,6 +142,9 @@ CASES: dict[str, tuple[Case, ...]] = {
     "list_enclaves": (Case("ks"), Case("empty"), Case("fleet --robot a"), Case("ks --match *")),
     "inspect": (
         Case("ks"),
+        Case("token"),
+        Case("token/enclaves/a"),
+        Case("token/enclaves/a/key.p11"),
         Case("turned"),
         Case("broken", 1),
         Case("wrecked", 1),

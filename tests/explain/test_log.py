@@ -255,6 +255,7 @@ def test_cyclone_says_nothing_of_a_whole_enclave(keystore: Path, tmp_path: Path)
         ("cyclone_0.10.2.peer_key_mismatch_1.log", ["peer-handshake"]),
         ("fastdds_2.9.1.working.log", ["topic-denied", "topic-denied"]),
         ("fastdds_2.9.1.domain_not_in_governance.log", ["domain"]),
+        ("fastdds_2.9.1.key_without_its_token.log", ["token"]),
         ("fastdds_2.9.1.permissions_expired.log", ["participant"]),
         ("fastdds_2.9.1.permissions_without_default.log", ["malformed"]),
         ("fastdds_2.9.1.revoked.log", ["identity"]),

@@ -26,6 +26,7 @@
 #include <cstdint>
 #include <cstring>
 #include <filesystem>
+#include <fstream>
 #include <iostream>
 #include <memory>
 #include <sstream>
@@ -89,6 +90,14 @@ public:
     }
 };
 
+// The key as rmw_fastrtps of ROS 2 Jazzy finds it: the PKCS#11 URI in key.p11, or else key.pem.
+std::string private_key(const std::string& folder)
+{
+    std::string uri;
+    std::ifstream named(folder + "/key.p11");
+    return named >> uri && uri.rfind("pkcs11:", 0) == 0 ? uri : "file://" + folder + "/key.pem";
+}
+
 fast::DomainParticipant* join(std::uint32_t domain, const std::string& folder)
 {
     fast::DomainParticipantQos qos;
@@ -107,7 +116,7 @@ fast::DomainParticipant* join(std::uint32_t domain, const std::string& folder)
     set("dds.sec.crypto.plugin", "builtin.AES-GCM-GMAC");
     set(identity + "identity_ca", file + "identity_ca.cert.pem");
     set(identity + "identity_certificate", file + "cert.pem");
-    set(identity + "private_key", file + "key.pem");
+    set(identity + "private_key", private_key(folder));
     if (std::filesystem::exists(folder + "/crl.pem"))
     {
         set(identity + "identity_crl", file + "crl.pem");

@@ -5,16 +5,14 @@ One fleet goes through its life, in the order of these tests; each test says wha
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from tests.integration.robots import FAKETIME, MISSING, Fleet, fleet, names
-from tests.support.harness import policy_text, publish, snapshot, sros, topics_of
+from tests.integration.robots import MISSING, Fleet, fleet, names
+from tests.support.harness import snapshot, sros
 
 pytestmark = [
     pytest.mark.dds,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -12,13 +12,14 @@ from typing import Any
 
 from sros_tool.checks.keystores.enclaves import WAITS
 from sros_tool.checks.keystores.keystore import keystore_findings
-from sros_tool.checks.kind import Finding
+from sros_tool.checks.kind import ERROR, Finding, FindingKind
 from sros_tool.checks.registry import FindingFilter
-from sros_tool.errors import DocumentError
+from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.delivery.archive import SUFFIXES
 from sros_tool.keystore.layout import (
     KEY_FILE,
+    KEY_URI_FILE,
     LEDGER,
     OPTIONAL_FILES,
     REQUIRED_FILES,
@@ -31,17 +32,20 @@ from sros_tool.keystore.layout import (
     waits_for_answer,
 )
 from sros_tool.keystore.reader import open_enclave
+from sros_tool.pki.token import Secrets, open_enclave_key
+from sros_tool.pki.token_uri import TokenUri
 from sros_tool.validity import iso
 
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
-_FILES = (*REQUIRED_FILES, *OPTIONAL_FILES)
+_FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES)
 
 
 @dataclass(frozen=True, slots=True)
 class ArrivedEnclave:
     """An enclave on a robot: whether a process can run in it, in which domain, and until when.
 
-    ``key_elsewhere`` says that only its key is missing here, because it was made on its robot.
+    ``key_elsewhere`` says that only its key is missing here, because it was made on its robot;
+    ``token`` is the place of a key on a token.
     """
 
     name: str
@@ -49,6 +53,7 @@ class ArrivedEnclave:
     domains: str
     until: datetime | None
     key_elsewhere: bool = False
+    token: TokenUri | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +82,7 @@ class Arrival:
                     "domains": each.domains or None,
                     "valid_until": iso(each.until) if each.until else None,
                     "key_on_robot": each.key_elsewhere,
+                    "token": each.token.token if each.token else None,
                 }
                 for each in self.enclaves
             ],
@@ -111,6 +117,7 @@ def verify_arrival(
     domain: int | None = None,
     zone: tzinfo = UTC,
     only: Sequence[str] | None = None,
+    secrets: Secrets | None = None,
 ) -> Arrival:
     """Return the state of the enclaves in a robot's folder, or of one enclave, with findings.
 
@@ -123,6 +130,8 @@ def verify_arrival(
         domain: the ROS domain that the enclaves have to join.
         zone: the time zone of the robot.
         only: the enclaves to check; None for all of them and the folder itself.
+        secrets: called for the PINs of tokens, which then have to prove that they have the keys;
+            without it, no token is opened.
 
     Raises:
         DocumentError: ``path`` is neither of them.
@@ -155,6 +164,8 @@ def verify_arrival(
         )
         if not (each.file in elsewhere and each.id == _FILE_MISSING)
     ]
+    if secrets:
+        found += [each for name in names for each in _token_findings(root, name, now, secrets)]
     shown = FindingFilter().choose(found).shown
     return Arrival(
         path,
@@ -163,6 +174,32 @@ def verify_arrival(
         enclaves,
         tuple(each for each in found if each in shown or each.kind is WAITS),
     )
+
+
+TOKEN_KEY = FindingKind(
+    "enclave.token-key",
+    ERROR,
+    "a token that does not have the key of an enclave",
+    "Without its token, with another key, or with a PIN that is refused, no node starts.",
+    "Fast DDS 2.9.1 (Pkcs11Provider.cpp); measured.",
+    "Check that the token is there, and its module and PIN. If its key is lost, make another one, "
+    "with `sros create_request` in another folder.",
+)
+
+
+def _token_findings(root: Path, name: str, now: datetime, secrets: Secrets) -> Iterator[Finding]:
+    """Yield a finding unless the token signs for an enclave's certificate."""
+    state = open_enclave(enclave_path(root, name), now=now)
+    if not state.token:
+        return
+    file = str(enclave_path(root, name) / KEY_URI_FILE)
+    try:
+        key = open_enclave_key(state.token, secrets)
+        if state.certificate and not key.signs_for(state.certificate.public_key()):
+            text = f"the key {state.token.object!r} on it is not the key of cert.pem"
+            yield TOKEN_KEY.found(name, text, file)
+    except SrosError as error:
+        yield TOKEN_KEY.found(name, str(error), file)
 
 
 def _why_none(path: Path) -> str:
@@ -183,4 +220,5 @@ def _enclave(root: Path, name: str, now: datetime, domain: int | None) -> Arrive
     # On the robot, where there is no ledger, a key that is missing is lost.
     at_home = (root / LEDGER).is_file()
     elsewhere = at_home and state.key_on_robot and not state.problems_at_home
-    return ArrivedEnclave(name, not state.problems, domains, state.valid_until(), elsewhere)
+    until = state.valid_until()
+    return ArrivedEnclave(name, not state.problems, domains, until, elsewhere, state.token)

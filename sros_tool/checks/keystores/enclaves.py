@@ -12,17 +12,22 @@ from cryptography import x509
 from sros_tool.checks.keystores.authorities import WEAK, key_findings, shared_ca_findings
 from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, by_id
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
 from sros_tool.faults import VENDOR_FAULTS, Fault
+from sros_tool.keystore.issuing.tokens import pin_file_problem, pin_line_break
 from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
+    KEY_URI_FILE,
     PERMISSIONS_CA_FILE,
     REQUEST,
+    ZENOH_FILES,
     waits_for_answer,
 )
 from sros_tool.keystore.reader import weaknesses
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
+from sros_tool.pki.token_uri import TokenUri
 from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 from sros_tool.xml import read_bytes
@@ -163,6 +168,31 @@ WAITS = FindingKind(
     "import`.",
 )
 
+ON_TOKEN = FindingKind(
+    "portable.key-on-token",
+    NOTE,
+    *(Fault.KEY_ON_TOKEN.title, Fault.KEY_ON_TOKEN.why, Fault.KEY_ON_TOKEN.source),
+    Fault.KEY_ON_TOKEN.remedy,
+    vendors=tuple(each for each in Vendor if not each.traits.reads_tokens),
+)
+TOKEN_ON_ZENOH = FindingKind(
+    "zenoh.key-on-token",
+    WARNING,
+    "a Zenoh configuration of an enclave whose key is on a token",
+    "Zenoh reads its key from key.pem alone, so a process of rmw_zenoh_cpp does not start.",
+    "Zenoh 1.x (io/zenoh-links/zenoh-link-tls); rmw_zenoh_cpp.",
+    "Use a key in a file, or Fast DDS.",
+)
+PIN_FILE = FindingKind(
+    "enclave.pin-file",
+    WARNING,
+    "a PIN file that others can use, or that Fast DDS cannot",
+    "Whoever can read it can use the key while the token is there; a node that cannot does not "
+    "start.",
+    "RFC 7512, 2.4 and 4; libp11 0.4.12 (eng_parse.c), measured.",
+    "Write the PIN alone into the file, with mode 0600, for the user that runs the node.",
+)
+
 _SOON = timedelta(days=30)
 _LONG = timedelta(days=2 * 366)
 
@@ -174,6 +204,8 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
         return
     yield from _check_loading(enclave)
     yield from _weak(enclave)
+    if place := enclave.state.token:
+        yield from _on_token(enclave, place)
     grant = grant_of(enclave)
     if certificate := enclave.state.certificate:
         yield from _certificate(enclave, certificate)
@@ -193,6 +225,18 @@ def _weak(enclave: CheckedEnclave) -> Iterator[Finding]:
     for file, text in weaknesses(enclave.state):
         if not enclave.keystore.is_home or file not in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
             yield WEAK.found(enclave.name, text, enclave.file(file))
+
+
+def _on_token(enclave: CheckedEnclave, place: TokenUri) -> Iterator[Finding]:
+    """Yield findings about a key on a token, without opening the token."""
+    name, file = enclave.name, enclave.file(KEY_URI_FILE)
+    yield ON_TOKEN.found(name, f"its key is {place.object!r} on the token {place.token!r}", file)
+    if any((enclave.folder / each).exists() for each in ZENOH_FILES):
+        yield TOKEN_ON_ZENOH.found(name, "it has no key.pem", file)
+    here = not enclave.keystore.is_home or Path(place.pin_source).exists()
+    for problem in (pin_file_problem(place), pin_line_break(place)) if here else ():
+        if problem:
+            yield PIN_FILE.found(name, problem, file)
 
 
 def grant_of(enclave: CheckedEnclave) -> Grant | None:

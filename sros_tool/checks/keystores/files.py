@@ -17,6 +17,8 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
     CONFIRMED,
     ENCLAVES,
+    KEY_FILE,
+    KEY_URI_FILE,
     LEDGER,
     LEDGER_HEAD,
     OPTIONAL_FILES,
@@ -173,6 +175,7 @@ _KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
 _MOST_READ = 65536
 _KNOWN = (
     *REQUIRED_FILES,
+    KEY_URI_FILE,
     *OPTIONAL_FILES,
     *ZENOH_FILES,
     "permissions.xml",
@@ -219,8 +222,8 @@ def _below(
     start: str, keystore: CheckedKeystore, links: _Links, trusted: frozenset[int]
 ) -> Iterator[Finding]:
     root = os.fspath(keystore.root)
-    keys = {os.path.join(root, ENCLAVES, name[1:], "key.pem") for name in keystore.names}
-    keys |= {os.path.join(root, ENCLAVES, "key.pem")}
+    keys = {os.path.join(root, ENCLAVES, name[1:], KEY_FILE) for name in keystore.names}
+    keys |= {os.path.join(root, ENCLAVES, KEY_FILE)}
     home = keystore.is_home
     unread: list[OSError] = []
     for parent, folders, files in os.walk(start, onerror=unread.append):
@@ -246,8 +249,8 @@ def _below(
             yield from _writers(path, info, trusted)
             if path in keys:
                 yield from key_mode_findings(path, info.st_mode)
-            elif name in _KNOWN and inside.startswith(ENCLAVES) and name != "key.pem":
-                if name.endswith("_ca.cert.pem"):
+            elif name in _KNOWN and inside.startswith(ENCLAVES) and name != KEY_FILE:
+                if name == KEY_URI_FILE or name.endswith("_ca.cert.pem"):
                     with suppress(OSError):  # `check_enclave` reports an unreadable one
                         if _holds_key(path, info):
                             yield from _other(path, root, info, home)

@@ -163,6 +163,8 @@ class VendorTraits:
     """The first certificate of a CA file is verified, strictly, when it is loaded."""
     hashes: Hashes = Hashes.ANY
     keys: Keys = Keys.ANY
+    reads_tokens: bool = True
+    """The key of an enclave can be on a PKCS#11 token, as ``key.p11`` names it."""
     largest_document: int | None = None
     """With larger signed permissions, in bytes, a handshake may never finish."""
 
@@ -245,10 +247,14 @@ class Vendor(StrEnum):
             signers=Signers.CHAIN,
             reads_first_authority=True,
             keys=Keys.SMALL,
+            reads_tokens=False,
         ),
     )
-    OPENDDS = "opendds", VendorTraits("OpenDDS", product="OpenDDS")
-    CONNEXT = "connext", VendorTraits("Connext 6.1.1 and later", product="Connext")
+    OPENDDS = "opendds", VendorTraits("OpenDDS", product="OpenDDS", reads_tokens=False)
+    CONNEXT = (
+        "connext",
+        VendorTraits("Connext 6.1.1 and later", product="Connext", reads_tokens=False),
+    )
 
     @property
     def title(self) -> str:  # type: ignore[override]

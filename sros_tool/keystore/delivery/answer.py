@@ -21,12 +21,15 @@ from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
+    KEY_FILE,
     OPTIONAL_FILES,
+    REQUEST,
     REQUIRED_FILES,
     SEAL,
     ZENOH_FILES,
     ZENOH_SIGNED,
     enclave_folder,
+    has_key,
 )
 from sros_tool.keystore.reader import (
     OpenedEnclave,
@@ -48,12 +51,12 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import SUPERSEDED, load_crl
 from sros_tool.pki.keys import PublicKey, load_key
+from sros_tool.pki.requests import load_request
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
-_KEY = "key.pem"
 _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
-_REQUIRED = tuple(file for file in REQUIRED_FILES if file != _KEY)
+_REQUIRED = tuple(file for file in REQUIRED_FILES if file != KEY_FILE)
 _AGAIN = "Have the request signed again, and import the new answer."
 _SEALED = re.compile(rb"sros answer (?:1|2\nnumber ([1-9][0-9]{0,12}))\n")
 """The first lines of a seal; earlier versions wrote no number."""
@@ -160,12 +163,12 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
             write_new_file(Path(folder, path.rpartition("/")[2]), data)
         state = open_enclave(Path(folder), now=now)
         zenoh = open_zenoh(Path(folder), answer.name, state)
-    problems = [str(each) for each in state.problems if each.file != _KEY]
+    problems = [str(each) for each in state.problems if each.file != KEY_FILE]
     if zenoh.files:
         problems += [str(each) for each in zenoh.problems if each.file != CERTIFICATE_FILE]
     certificate = state.certificate
     if certificate and certificate.public_key() != key:
-        problems.insert(0, "cert.pem: it does not belong to the enclave's key.pem")
+        problems.insert(0, "cert.pem: it does not belong to the enclave's key")
     if state.permissions_ca and (problem := _broken_seal(answer, [state.permissions_ca])):
         problems.append(f"{SEAL}: {problem}")
     if certificate and common_name_of(certificate.subject) != answer.name:
@@ -231,7 +234,7 @@ def import_answer(
     if not dry_run and folder.is_dir():
         tidy(folder)
     refuse_ca_keystore(folder, "Name the folder in which the request was made.")
-    if not (place / _KEY).is_file():
+    if not has_key(place):
         raise KeystoreError(
             f"'{folder}' has no key of enclave {name}",
             "An answer is installed next to the key, in the folder where the request was made.",
@@ -240,13 +243,13 @@ def import_answer(
         )
     ran = any((place / file).exists() for file in ZENOH_SIGNED)
     with Transaction(folder, dry_run=dry_run) as transaction:
-        key = load_key(read_bytes(place / _KEY, "private key"), f"'{place / _KEY}'")
-        state = check_answer(answer, key.public_key(), now=now)
+        key = _public_key(place, name)
+        state = check_answer(answer, key, now=now)
         assert state.certificate and state.identity_ca and state.permissions_ca
         until = state.valid_until()
         assert until
         _check_pinned(answer, state.identity_ca, state.permissions_ca, pinned)
-        _check_key(folder, answer, key.public_key())
+        _check_key(folder, answer, key)
         known = trusted_in(folder, "permissions_ca.cert.pem")
         if not force:
             _check_known(folder, answer, known)
@@ -269,6 +272,19 @@ def import_answer(
         tuple(transaction.changes),
         ran and any(Path(each.path).name in ZENOH_SIGNED for each in transaction.changes),
     )
+
+
+def _public_key(place: Path, name: str) -> PublicKey:
+    """Return the public key of an enclave; of one on a token it is in the request, which it signed.
+
+    Raises:
+        SrosError: the key, or the request, is missing or cannot be read.
+    """
+    path = place / KEY_FILE
+    if path.exists():
+        return load_key(read_bytes(path, "private key"), f"'{path}'").public_key()
+    request = load_request(read_bytes(place / REQUEST, "signing request"), f"of enclave {name}")
+    return request.public_key
 
 
 def _check_pinned(

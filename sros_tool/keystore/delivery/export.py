@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -15,7 +15,10 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
 from sros_tool.keystore.delivery.trust import check_same_authority
 from sros_tool.keystore.layout import (
+    ENCLAVES,
     KEY_FILE,
+    KEY_FILES,
+    KEY_URI_FILE,
     OPTIONAL_FILES,
     PRIVATE,
     REQUIRED_FILES,
@@ -37,6 +40,7 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh.opened import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.keys import holds_private_key
+from sros_tool.pki.token_uri import read_token_file
 from sros_tool.xml import read_bytes
 
 _ARCHIVE_SUFFIXES = SUFFIXES
@@ -119,10 +123,24 @@ def distribute(
             other content that only ``force`` replaces.
     """
     files = exported_files(root, names, now, keyless=keyless)
+    notes = tuple(_token_notes(files))
     if target.name.endswith(_ARCHIVE_SUFFIXES):
-        return Export(target, tuple(names), _write_archive(target, files, force, dry_run))
+        return Export(target, tuple(names), _write_archive(target, files, force, dry_run), notes)
     changes = _write_folder(root, target, files, force, dry_run)
-    return Export(target, tuple(names), changes, tuple(_notes(root, target)))
+    return Export(target, tuple(names), changes, (*notes, *_notes(root, target)))
+
+
+def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
+    """Yield a note for each enclave of which there is no key to export."""
+    for path in files:
+        folder, _, file = path.rpartition("/")
+        if file == KEY_URI_FILE:
+            place = read_token_file(files[path])
+            text = (
+                f"{folder.removeprefix(ENCLAVES) or '/'}: there is no key to export. It is "
+                f"{place.object} on the token {place.token}, which has to be in the robot."
+            )
+            yield Note("export.key-on-token", text)
 
 
 def _notes(root: Path, target: Path) -> Iterator[Note]:
@@ -139,10 +157,11 @@ def _notes(root: Path, target: Path) -> Iterator[Note]:
 
 @dataclass(frozen=True, slots=True)
 class PackedEnclaves:
-    """An archive (``.tar.gz``), and the paths of the files in it."""
+    """An archive (``.tar.gz``), the paths of the files in it, and notes."""
 
     data: bytes
     paths: tuple[str, ...]
+    notes: tuple[Note, ...] = ()
 
 
 def pack_enclaves(
@@ -154,7 +173,7 @@ def pack_enclaves(
         KeystoreError: an enclave does not exist, or cannot run.
     """
     files = exported_files(root, names, now, keyless=keyless)
-    return PackedEnclaves(pack(files), tuple(files))
+    return PackedEnclaves(pack(files), tuple(files), tuple(_token_notes(files)))
 
 
 def exported_files(
@@ -196,7 +215,7 @@ def exported_files(
         ):
             raise _holds_ca_key(folder / KEY_FILE)
         with Folder(root) as opened:
-            for file in (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES):
+            for file in (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES):
                 path = f"{enclave_folder(name)}/{file}"
                 if (folder / file).exists():
                     files[path] = opened.read_inside(path)
@@ -247,7 +266,7 @@ def _write_folder(
             "Choose another folder.",
         )
     check_same_authority(target, files)
-    stale = _stale_zenoh(target, files)
+    stale = _stale(target, files)
     different = {
         path: data
         for path, data in files.items()
@@ -269,13 +288,13 @@ def _write_folder(
     return transaction.changes
 
 
-def _stale_zenoh(target: Path, files: dict[str, bytes]) -> list[str]:
-    """Return the Zenoh files of earlier exports of the enclaves that have none of them now."""
+def _stale(target: Path, files: dict[str, bytes]) -> list[str]:
+    """Return the Zenoh files and keys of earlier exports that the enclaves do not have now."""
     folders = {path.rpartition("/")[0] for path in files}
     return sorted(
         path
         for folder in folders
-        for path in (f"{folder}/{file}" for file in ZENOH_FILES)
+        for path in (f"{folder}/{file}" for file in (*ZENOH_FILES, *KEY_FILES))
         if path not in files and os.path.lexists(target / path)
     )
 

@@ -40,6 +40,7 @@ from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
     KEY_FILE,
+    KEY_URI_FILE,
     PERMISSIONS_FILE,
     REQUEST,
     SEAL,
@@ -388,15 +389,19 @@ def _check_key(root: Path, request: SigningRequest, known: KnownKeys, renew: boo
     known.refuse_revoked(request.public_key, f"the request for {request.name}", remedy, same)
     if not same:
         known.refuse_second(request.public_key, request.name, remedy)
-    path = enclave_path(root, request.name) / KEY_FILE
+    folder = enclave_path(root, request.name)
+    path, fits = folder / KEY_FILE, True
     if path.exists():
         key = load_key(read_bytes(path, "private key"), f"'{path}'")
-        if key.public_key() != request.public_key:
-            raise KeystoreError(
-                f"enclave {request.name} has another key in keystore '{root}'",
-                "Its key.pem would not fit a certificate for the key in the request.",
-                f"Revoke the enclave first, with `sros revoke {quote(str(root))} {request.name}`.",
-            )
+        fits = key.public_key() == request.public_key
+    elif (path := folder / KEY_URI_FILE).exists():
+        fits = same is not None
+    if not fits:
+        raise KeystoreError(
+            f"enclave {request.name} has another key in keystore '{root}'",
+            f"Its {path.name} would not fit a certificate for the key in the request.",
+            f"Revoke the enclave first, with `sros revoke {quote(str(root))} {request.name}`.",
+        )
 
 
 def _check_result(answer: RequestAnswer, request: SigningRequest, now: datetime) -> None:

@@ -33,6 +33,7 @@ from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
     KEY_FILE,
+    KEY_URI_FILE,
     PERMISSIONS_FILE,
     ROLES,
     ca_certificate,
@@ -46,6 +47,7 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import pem, subject_text, validity_of
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem
+from sros_tool.pki.token import TokenKey
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.resources import policies_dir
@@ -64,7 +66,8 @@ _NOTED_LOSS = 0.01
 class NewIdentity:
     """The subject and the key that a certificate is issued for.
 
-    ``new_key`` is the private key if it was just generated; it is staged with the certificate.
+    ``new_key`` is the private key if it was just generated; it is staged with the certificate,
+    or if it is on a token, its place.
     """
 
     subject: x509.Name
@@ -137,6 +140,7 @@ class EnclaveWriter:
     ``identity`` signs certificates, ``permissions`` signs permissions.  ``entries`` are for the
     ledger; ``grants`` are the new permissions of enclaves, kept where there is a Zenoh network.
     ``notes`` report CAs that expire too early for the validity that the template chooses.
+    ``keys_on_token``: enclaves get keys on a token.
     """
 
     def __init__(
@@ -147,6 +151,7 @@ class EnclaveWriter:
         *,
         identity: Authority | None,
         permissions: Authority | None,
+        keys_on_token: bool = False,
     ) -> None:
         self.entries: list[Entry] = []
         self.grants: dict[str, Grant] = {}
@@ -170,7 +175,8 @@ class EnclaveWriter:
             self._permissions_validity = self._permissions_validity.within(
                 validity_of(permissions.certificate)
             )
-        self._key_on_token = any(each.on_token for each in (identity, permissions) if each)
+        signs = (each.on_token for each in (identity, permissions) if each)
+        self._key_on_token = keys_on_token or any(signs)
 
     def write(self, issuance: Issuance) -> Issued:
         """Issue, prove, sign and stage ``issuance``, and record it for the ledger.
@@ -216,7 +222,11 @@ class EnclaveWriter:
         if self._issuer is None:
             raise KeystoreError("there is no identity CA to issue the certificate")
         folder = enclave_folder(name)
-        if identity.new_key:
+        if isinstance(identity.new_key, TokenKey):
+            if (enclave_path(self._transaction.root, name) / KEY_FILE).exists():
+                self._transaction.remove(f"{folder}/{KEY_FILE}")
+            self._transaction.write(f"{folder}/{KEY_URI_FILE}", identity.new_key.file)
+        elif identity.new_key:
             pem_of_key = key_pem(identity.new_key)
             self._transaction.write(f"{folder}/{KEY_FILE}", pem_of_key, private=True)
         certificate = self._issuer.issue(

@@ -47,12 +47,14 @@ from sros_tool.keystore.issuing.enclave import (
     stated_enclave,
 )
 from sros_tool.keystore.issuing.governance import write_governance
+from sros_tool.keystore.issuing.tokens import EnclaveTokens, place_in, token_notes, token_places
 from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
     KEY_FILE,
+    KEY_FILES,
     PERMISSIONS_FILE,
     PRIVATE,
     PUBLIC,
@@ -101,12 +103,15 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.keys import PublicKey, generate_key, load_key
+from sros_tool.pki.token import TokenKey, open_enclave_key
+from sros_tool.pki.token_uri import TokenUri
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso, window
 from sros_tool.xml import read_bytes
 
 _NONE_IMPORTED: Mapping[str, bytes] = MappingProxyType({})
+_OF_KEY = {*KEY_FILES, REQUEST}
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +184,7 @@ def create_enclaves(
     *,
     now: datetime,
     domain: int | None = None,
+    key: str = "",
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
     progress: Progress | None = None,
@@ -186,13 +192,16 @@ def create_enclaves(
     """Create enclaves with the default permissions of the keystore's template.
 
     An existing enclave keeps its key and its permissions, and gets its missing files.  ``domain``
-    is the caller's ROS_DOMAIN_ID; the governance must name it.
+    is the caller's ROS_DOMAIN_ID; the governance must name it.  ``key`` is the ``pkcs11:`` URI of
+    the key, which is made on the token if it is not there; without ``object`` in it, the label of
+    the key is the name of its enclave.
     """
     return generate_artifacts(
         root,
         enclaves=names,
         now=now,
         domain=domain,
+        key=key,
         keyring=keyring,
         dry_run=dry_run,
         progress=progress,
@@ -243,6 +252,7 @@ def generate_artifacts(
     create: Template | None = None,
     domains: DomainSet | None = None,
     revoke_old: bool = False,
+    key: str = "",
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
     progress: Progress | None = None,
@@ -264,6 +274,7 @@ def generate_artifacts(
     of_fleet = [each for each in policies if isinstance(each, FleetPolicy)]
     fleet = of_fleet[0].fleet if of_fleet else None
     patterns = [pattern for each in of_fleet for pattern in each.patterns]
+    places = token_places(key, list(wanted)) if key else {}
     if not dry_run:
         tidy(root)
     if create is None or is_keystore(root):
@@ -279,6 +290,7 @@ def generate_artifacts(
                 progress,
                 revoke_old=revoke_old,
                 keyring=keyring,
+                places=places,
             )
         return replace(creation, notes=(*again, *creation.notes))
     _check_typo(root)
@@ -290,7 +302,9 @@ def generate_artifacts(
         if fleet:
             recorded, entries = write_fleet(transaction, fleet, patterns, now)
             keystore = replace(keystore, fleet=recorded, entries=(*keystore.entries, *entries))
-        creation = write_enclaves(transaction, keystore, wanted, now, progress)
+        creation = write_enclaves(
+            transaction, keystore, wanted, now, progress, keyring=keyring, places=places
+        )
     return replace(creation, notes=(*creation.notes, *place_notes(root)))
 
 
@@ -566,10 +580,12 @@ def write_enclaves(
     *,
     revoke_old: bool = False,
     keyring: Keyring = IN_KEYSTORE,
+    places: Mapping[str, TokenUri] = MappingProxyType({}),
 ) -> Creation:
     """Create or complete the enclaves, sign the permissions of their policies, and commit.
 
-    A keystore with a Zenoh network gets the enclave of its router, too.
+    A keystore with a Zenoh network gets the enclave of its router, too.  ``places`` are those of
+    new keys on tokens, by enclave; other new keys are in files.
     """
     network = keystore.template.zenoh
     if network and network.router not in keystore.names:
@@ -580,11 +596,15 @@ def write_enclaves(
         now,
         identity=keystore.authorities.identity,
         permissions=keystore.authorities.permissions,
+        keys_on_token=bool(places),
+    )
+    keys = EnclaveTokens(
+        places, keyring.secrets, keystore.known, keystore.authorities, transaction.dry_run
     )
 
     def write(name: str) -> _Written:
         return _write_enclave(
-            writer, transaction, keystore, name, wanted[name], now, revoke_old=revoke_old
+            writer, transaction, keystore, name, wanted[name], now, keys, revoke_old=revoke_old
         )
 
     done = writer.for_each(list(wanted), write, progress)
@@ -662,6 +682,7 @@ def _write_enclave(
     name: str,
     policy: Enclave | None,
     now: datetime,
+    keys: EnclaveTokens,
     *,
     revoke_old: bool,
 ) -> _Written:
@@ -669,7 +690,7 @@ def _write_enclave(
     root = transaction.root
     present = present_files(root, name)
     before = len(transaction.changes)
-    identity = _identity(root, keystore, name, present, now, replaced=bool(policy))
+    identity = _identity(root, keystore, name, present, now, keys, replaced=bool(policy))
     earlier, old = None, None
     if policy and PERMISSIONS_FILE in present:
         authority = keystore.authorities.permissions.certificate
@@ -687,7 +708,9 @@ def _write_enclave(
     issued = writer.write(Issuance(name, identity, rights))
     link_shared_files(transaction, name, present)
     notes = tuple(issued.notes())
-    if not present & {KEY_FILE, REQUEST}:
+    if isinstance(identity, NewIdentity) and isinstance(identity.new_key, TokenKey):
+        notes += tuple(token_notes(identity.new_key))
+    if not present & _OF_KEY:
         return _Written(_Outcome.CREATED, notes)
     if PERMISSIONS_FILE in present and policy:
         (grant,) = issued.permissions.grants
@@ -714,6 +737,7 @@ def _identity(
     name: str,
     present: set[str],
     now: datetime,
+    keys: EnclaveTokens,
     *,
     replaced: bool,
 ) -> NewIdentity | x509.Certificate:
@@ -727,8 +751,10 @@ def _identity(
             not the latest ones.
     """
     folder = enclave_path(root, name)
+    if name in keys.places and not present.isdisjoint(_OF_KEY):
+        keys.check_present(name, root)
     if CERTIFICATE_FILE in present:
-        if not present & {KEY_FILE, REQUEST}:
+        if not present & _OF_KEY:
             raise KeystoreError(
                 f"enclave {name} has a certificate but no key",
                 f"Its {KEY_FILE} is missing, and the certificate does not work with a new key.",
@@ -744,15 +770,19 @@ def _identity(
             message = read_bytes(folder / PERMISSIONS_FILE, "permissions document")
             RecordedRights(root).policy(name, hashlib.sha256(message).hexdigest())
             subject = found
-    if KEY_FILE in present:
-        path = folder / KEY_FILE
-        public = load_key(read_bytes(path, "private key"), f"'{path}'").public_key()
-        remedy = f"Move '{path}' away, and a new key is created."
-        keystore.known.refuse_revoked(public, f"enclave {name}", remedy)
-        keystore.known.refuse_second(public, name, remedy)
-        return NewIdentity(subject, public)
-    new_key = generate_key()
-    return NewIdentity(subject, new_key.public_key(), new_key)
+    if present.isdisjoint(KEY_FILES):
+        new_key = keys.key(name) if name in keys.places else generate_key()
+        return NewIdentity(subject, new_key.public_key(), new_key)
+    path = folder / next(each for each in KEY_FILES if each in present)
+    public = (
+        load_key(read_bytes(path, "private key"), f"'{path}'")
+        if path.name == KEY_FILE
+        else open_enclave_key(place_in(path), keys.secrets)
+    ).public_key()
+    remedy = f"Move '{path}' away, and a new key is created."
+    keystore.known.refuse_revoked(public, f"enclave {name}", remedy)
+    keystore.known.refuse_second(public, name, remedy)
+    return NewIdentity(subject, public)
 
 
 def _usable_certificate(

@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from shlex import quote
 
-from sros_tool.errors import KeystoreError, Note, SrosError
+from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.authorities.authority import Authorities, load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.expiry import (
@@ -24,13 +24,15 @@ from sros_tool.keystore.issuing.enclave import (
     Issuance,
     NewIdentity,
 )
+from sros_tool.keystore.issuing.tokens import EnclaveTokens, token_notes, token_places
 from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
-    KEY_FILE,
+    KEY_URI_FILE,
     check_keystore,
     enclave_path,
     has_enclave,
+    has_key,
     list_enclaves,
 )
 from sros_tool.keystore.ledger import append
@@ -82,6 +84,7 @@ def renew(
     now: datetime,
     expiring: Threshold | None = None,
     new_key: bool = False,
+    key: str = "",
     revoke_old: bool = False,
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
@@ -89,14 +92,22 @@ def renew(
 ) -> Renewal:
     """Renew the named enclaves, and all that are due by ``expiring``; all or nothing.
 
-    The new certificate is for the same key, or with ``new_key`` for a new key; the signed rights do
-    not change.  All files are replaced at once.  A replaced certificate works for anyone who
-    has its key until it expires or is revoked; ``revoke_old`` revokes all earlier certificates of
-    the renewed enclaves, and gives them subjects that no earlier permissions fit.
+    The new certificate is for the same key, or with ``new_key`` for a new key, or for the one on a
+    token that ``key`` names, as in `create_enclaves`; the signed rights do not change.  All files
+    are replaced at once.  A replaced certificate works for anyone who has its key until it expires
+    or is revoked; ``revoke_old`` revokes all earlier certificates of the renewed enclaves, and
+    gives them subjects that no earlier permissions fit.
 
     Raises:
         KeystoreError: enclaves cannot be renewed; the error names all of them.
     """
+    if key and (expiring or new_key):
+        raise UsageError(
+            "--key takes the names of its enclaves, and excludes --new-key",
+            "It gives the named enclaves new keys on a token.",
+            "Name the enclaves, and leave the other options out.",
+        )
+    places = token_places(key, names) if key else {}
     if not dry_run:
         tidy(root)
     check_keystore(root)
@@ -112,6 +123,7 @@ def renew(
             now,
             identity=authorities.identity,
             permissions=authorities.permissions,
+            keys_on_token=bool(places),
         )
         known = KnownKeys(root)
         renewer = _Renewer(
@@ -121,6 +133,7 @@ def renew(
             now,
             known=known,
             new_key=new_key,
+            on_token=EnclaveTokens(places, keyring.secrets, known, authorities, dry_run),
             unique=template.unique_subject or revoke_old,
         )
         existing = list_enclaves(root) if expiring or revoke_old else ()
@@ -139,10 +152,10 @@ def renew(
         )
         replaced = [each for each in done.values() if isinstance(each, Superseded)]
         renewed = tuple(each.name for each in replaced)
-        notes = writer.notes if replaced else ()
+        notes = (*writer.notes, *renewer.notes) if replaced else ()
         with suppress(SrosError):  # its governance is not what is renewed
             notes += edit_notes(root, governance_of(root))
-        if not new_key:
+        if not (new_key or places):
             notes += tuple(known.shared_notes(renewed))
         valid = [each for each in replaced if each.not_after >= now]
         entries, revoked = writer.entries, None
@@ -191,14 +204,17 @@ class _Renewer:
         *,
         known: KnownKeys,
         new_key: bool,
+        on_token: EnclaveTokens,
         unique: bool,
     ) -> None:
+        self.notes: list[Note] = []
         self._root = transaction.root
         self._writer = writer
         self._authorities = authorities
         self._now = now
         self._known = known
         self._new_key = new_key
+        self._on_token = on_token
         self._unique = unique
         self._recorded = RecordedRights(transaction.root)
 
@@ -225,7 +241,12 @@ class _Renewer:
         # Once earlier permissions were cut off by a unique subject, they stay cut off.
         unique = self._unique or has_unique_part(state.certificate.subject)
         subject = enclave_subject(name, unique=unique)
-        if self._new_key:
+        if name in self._on_token.places:
+            self._refuse_key_on_robot(name)
+            made = self._on_token.key(name)
+            self.notes += token_notes(made)
+            identity = NewIdentity(subject, made.public_key(), made)
+        elif self._new_key:
             key = self._generate_key(name)
             identity = NewIdentity(subject, key.public_key(), key)
         else:
@@ -238,14 +259,25 @@ class _Renewer:
         return Issuance(name, identity, rights)
 
     def _generate_key(self, name: str) -> PrivateKey:
-        if not (enclave_path(self._root, name) / KEY_FILE).exists():
+        folder = enclave_path(self._root, name)
+        if (folder / KEY_URI_FILE).exists():
+            raise KeystoreError(
+                f"the key of enclave {name} is on a token",
+                f"A new one in a file would not be used: its {KEY_URI_FILE} names the one there.",
+                f"Make one on the token: `sros renew {quote(str(self._root))} {name} --key "
+                "'pkcs11:token=NAME;object=LABEL'`, with a label that the token does not have.",
+            )
+        self._refuse_key_on_robot(name)
+        return generate_key()
+
+    def _refuse_key_on_robot(self, name: str) -> None:
+        if not has_key(enclave_path(self._root, name)):
             raise KeystoreError(
                 f"the key of enclave {name} is not in this keystore",
                 "It was generated on the robot and stays there, so no new key is generated here.",
                 "Create a new request on the robot with `sros create_request`, and sign it here "
                 "with `sros sign_request --renew`.",
             )
-        return generate_key()
 
 
 def checked_rights(

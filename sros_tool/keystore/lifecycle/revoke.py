@@ -17,6 +17,7 @@ from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
 from sros_tool.keystore.layout import (
     CRL,
     IDENTITY,
+    KEY_URI_FILE,
     OPTIONAL_FILES,
     PERMISSIONS,
     REQUEST,
@@ -47,7 +48,14 @@ from sros_tool.pki.crl import REASONS, SUPERSEDED, Revoked
 from sros_tool.pki.requests import key_digest
 from sros_tool.validity import iso
 
-_FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES, "permissions.xml", REQUEST)
+_FILES = (
+    *REQUIRED_FILES,
+    KEY_URI_FILE,
+    *OPTIONAL_FILES,
+    *ZENOH_FILES,
+    "permissions.xml",
+    REQUEST,
+)
 _PRIVATE = "key.pem"
 
 
