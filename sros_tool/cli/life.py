@@ -429,6 +429,11 @@ Example:
 @click.option(
     "--delete-old-key", is_flag=True, help="Delete the old key: keep no copy in 'retired'."
 )
+@click.option(
+    "--allow-unconfirmed",
+    is_flag=True,
+    help="Go on although robots of the fleet have not confirmed the stage: they are cut off.",
+)
 @json_option
 @dry_run_option
 def rotate_ca(
@@ -445,6 +450,7 @@ def rotate_ca(
     permissions_key: str | None,
     encrypt_ca_keys: bool,
     delete_old_key: bool,
+    allow_unconfirmed: bool,
     as_json: bool,
     dry_run: bool,
 ) -> None:
@@ -459,6 +465,9 @@ def rotate_ca(
     Cyclone DDS (0.10.2) trusts one CA at a time: after stage 2, restart all its processes
     together. To only extend the validity of the identity CA, use --same-key: it has no stages and
     needs no common restart.
+
+    In a keystore with a fleet, a stage is refused while robots have not confirmed the one before
+    (`sros fleet confirm`).
     """
     from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca
     from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca as work
@@ -495,6 +504,7 @@ def rotate_ca(
                 new_keys=_new_keys(identity_key, permissions_key, encrypt_ca_keys),
                 validity=validity,
                 delete_old_key=delete_old_key,
+                allow_unconfirmed=allow_unconfirmed,
                 dry_run=dry_run,
                 progress=tick,
             )
@@ -507,6 +517,13 @@ def rotate_ca(
         _print_step(step, rotation_status(root, now=now()), together=finish, same_key=same_key)
     if not dry_run:
         print_closed(root, step.changes)
+    if step.cut_off:
+        verb = "would be" if dry_run else "are"
+        click.echo(
+            f"cut off: {', '.join(step.cut_off)} {verb} unable to talk to robots with the files of "
+            "this stage until they get them, too",
+            err=True,
+        )
     print_notes(step.notes)
 
 
@@ -524,6 +541,7 @@ def _step_json(step: RotationStep, remarks: Sequence[str], dry_run: bool) -> dic
             for name in step.enclaves
         ],
         "old_keys_elsewhere": list(step.kept_elsewhere),
+        "cut_off": list(step.cut_off),
         "remarks": list(remarks),
         "changes": changes_json(step.root, step.changes),
         "notes": notes_json(step.notes),

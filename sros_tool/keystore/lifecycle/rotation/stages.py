@@ -58,6 +58,7 @@ from sros_tool.keystore.ledger import (
     read_ledger,
 )
 from sros_tool.keystore.lifecycle.revocation_list import sign_list
+from sros_tool.keystore.lifecycle.rotation.confirmed import robots_cut_off
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     Rotation,
@@ -100,6 +101,9 @@ from sros_tool.pki.keys import PublicKey, algorithm, is_weak
 from sros_tool.validity import Span, Window, span_text, window
 from sros_tool.xml import read_bytes
 
+_SHOWN = 10
+"""The number of robots that an error names; it counts the others."""
+
 
 @dataclass(frozen=True, slots=True)
 class RotationStep:
@@ -107,7 +111,8 @@ class RotationStep:
 
     ``stage`` is the stage of the keystore afterwards.  ``files`` are the stems of the CA files that
     are replaced ("identity_ca", "permissions_ca" or "ca").  ``kept_elsewhere`` are the places of
-    old keys outside of the keystore, which sros does not delete.
+    old keys outside of the keystore, which sros does not delete.  ``cut_off`` are robots that have
+    not confirmed the stage before.
     """
 
     root: Path
@@ -117,6 +122,7 @@ class RotationStep:
     changes: Sequence[Change]
     kept_elsewhere: tuple[str, ...] = ()
     notes: tuple[Note, ...] = ()
+    cut_off: tuple[str, ...] = ()
 
 
 def rotate_ca(
@@ -130,6 +136,7 @@ def rotate_ca(
     new_keys: Keyring = IN_KEYSTORE,
     validity: Span | None = None,
     delete_old_key: bool = False,
+    allow_unconfirmed: bool = False,
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> RotationStep:
@@ -138,10 +145,12 @@ def rotate_ca(
     If the keystore is at the stage ``to`` already, nothing is changed.  ``roles`` ("identity",
     "permissions"; default: both) and ``validity`` of the new CAs are only used when a rotation
     begins.  ``keyring`` opens the present keys; ``new_keys`` names the places of new keys outside
-    of the keystore.
+    of the keystore.  In a keystore with a fleet, a stage that cuts robots off, because they have
+    not confirmed the one before, needs ``allow_unconfirmed``.
 
     Raises:
-        KeystoreError: a key is missing, or an enclave cannot be moved to the new CA.
+        KeystoreError: a key is missing, an enclave cannot be moved to the new CA, or robots would
+            be cut off.
         UsageError: the stage ``to`` is over, or is not the next stage.
     """
     if not dry_run:
@@ -154,9 +163,13 @@ def rotate_ca(
         rotator = _Rotator(
             transaction, rotation, names, keyring, now, delete_old_key=delete_old_key
         )
+        cut_off: tuple[str, ...] = ()
         if finish or stage not in (rotation.stage, RotationStage.NONE):
             if rotation.stage is not RotationStage.REISSUE:  # the last stage signs nothing
                 _refuse_edited(root)
+            cut_off = robots_cut_off(root, rotation, stage)
+            if cut_off and not allow_unconfirmed:
+                raise _would_cut_off(root, rotation, cut_off)
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
             transaction.commit()
     return RotationStep(
@@ -167,6 +180,18 @@ def rotate_ca(
         transaction.changes,
         tuple(rotator.kept_elsewhere),
         rotator.notes,
+        cut_off,
+    )
+
+
+def _would_cut_off(root: Path, rotation: Rotation, robots: Sequence[str]) -> KeystoreError:
+    more = f" and {len(robots) - _SHOWN} more" if len(robots) > _SHOWN else ""
+    stage = "a rotation" if rotation.stage is RotationStage.NONE else f"the stage {rotation.stage}"
+    return KeystoreError(
+        f"not every robot has confirmed {stage}: {', '.join(robots[:_SHOWN])}{more}",
+        "The next step would cut them off from the others.",
+        f"Bring them the present files and confirm them; see `sros fleet status "
+        f"{quote(str(root))}`. --allow-unconfirmed goes on without them.",
     )
 
 

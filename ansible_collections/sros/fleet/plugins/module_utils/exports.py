@@ -5,6 +5,7 @@ Like everything that runs on a robot, this needs Python 3.8 and its standard lib
 
 from __future__ import annotations
 
+import binascii
 import datetime
 import hashlib
 import io
@@ -165,22 +166,17 @@ def authorities(files: Files) -> frozenset[bytes]:
 
 def authority_digests(files: Files) -> frozenset[str]:
     """Return the SHA-256 of the certificates of all permissions CAs, in hexadecimal."""
-    import base64
-    import binascii
-
-    found = set()
+    found: set[str] = set()
     for path, content in files.items():
         if path.rpartition("/")[2] == AUTHORITY_FILES[1]:
-            for block in _CERTIFICATE.findall(content):
-                try:
-                    found.add(hashlib.sha256(base64.b64decode(block)).hexdigest())
-                except binascii.Error:
-                    continue
+            found.update(_certificate_digests(content))
     return frozenset(found)
 
 
 def confirmation(robot: str, files: Files, now: float) -> dict:
-    """Return what a robot confirms that it has: for each file but keys its SHA-256.
+    """Return what a robot confirms that it has: the SHA-256 of each file but keys.
+
+    It also has those of the certificates (DER) in files, by which the ledger knows earlier ones.
 
     Args:
         robot: the name of the robot.
@@ -197,4 +193,20 @@ def confirmation(robot: str, files: Files, now: float) -> dict:
             for path, content in sorted(files.items())
             if path.rpartition("/")[2] in CONFIRMED_FILES
         },
+        "certificates": {
+            path: _certificate_digests(content)
+            for path, content in sorted(files.items())
+            if path.rpartition("/")[2] in (CERTIFICATE_FILE, *AUTHORITY_FILES)
+        },
     }
+
+
+def _certificate_digests(content: bytes) -> list[str]:
+    """Return the SHA-256 of each certificate in a PEM file; damaged ones are left out."""
+    found = []
+    for block in _CERTIFICATE.findall(content):
+        try:
+            found.append(hashlib.sha256(binascii.a2b_base64(block)).hexdigest())
+        except binascii.Error:
+            continue
+    return found[:32]

@@ -1,0 +1,304 @@
+"""What is where in a fleet: true after each thing that happens to robots, with real exports."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from sros_tool.keystore.layout import ENCLAVES
+from sros_tool.keystore.ledger import read_ledger
+from sros_tool.validity import iso, parse_iso
+from tests.keystore.test_confirmation import hostile
+from tests.support.harness import Ended, policy_text, publish, sros
+
+ROBOTS = ("r1", "r2", "r3")
+POLICY = policy_text({"/{robot}/base": publish("/{robot}/x"), "/dispatcher": publish("/y")})
+SHARED = ("governance", "identity_ca", "permissions_ca")
+
+
+@dataclass(frozen=True)
+class Field:
+    """A keystore with a fleet, and a folder for each robot."""
+
+    folder: Path
+
+    @property
+    def root(self) -> Path:
+        return self.folder / "ks"
+
+    def run(self, *words: object, status: int = 0) -> Ended:
+        """Run the program; the keystore is the first word after the verb."""
+        ended = sros(*words, cwd=self.folder)
+        assert ended.status == status, ended
+        return ended
+
+    def deliver(self, *robots: str) -> None:
+        """Export the enclaves of robots to them, and confirm what they have then."""
+        for robot in robots:
+            self.run("distribute_key", "ks", "--robot", robot, robot, "--force")
+            self.confirm(robot)
+
+    def confirm(self, robot: str, **changed: object) -> Ended:
+        """Confirm what a robot has, with ``changed`` values."""
+        said = self.run("fleet", "report", robot, "--robot", robot).out
+        (self.folder / "said.json").write_text(json.dumps(json.loads(said) | changed))
+        return self.run("fleet", "confirm", "ks", "said.json", "--robot", robot)
+
+    def status(self) -> dict[str, Any]:
+        """Return what is where; the exit status says whether all of it is as it should be."""
+        ended = sros("fleet", "status", "ks", "--json", cwd=self.folder)
+        found: dict[str, Any] = json.loads(ended.out)
+        states = {each["state"] for each in found["robots"]}
+        assert found["complete"] == (states <= {"current", "none"})
+        assert ended.status == (0 if found["complete"] else 1)
+        found["robots"] = {each["robot"]: each for each in found["robots"]}
+        return found
+
+    def states(self) -> dict[str, str]:
+        """Return the state of each robot."""
+        return {name: each["state"] for name, each in self.status()["robots"].items()}
+
+    def pending(self, robot: str) -> dict[str, tuple[str, str]]:
+        """Return what a robot lacks, or has too much, by kind: its state, and what to do."""
+        found = self.status()["robots"][robot]["pending"]
+        return {each["kind"]: (each["state"], each["action"]) for each in found}
+
+    def issued(self, what: str, enclave: str) -> list[str]:
+        """Return when what an enclave has was issued."""
+        entries = read_ledger(self.root).entries
+        return [each.time for each in entries if (each.what, each.enclave) == (what, enclave)]
+
+
+@pytest.fixture(scope="module")
+def delivered(tmp_path_factory: pytest.TempPathFactory) -> Field:
+    """A fleet in which every robot has confirmed what it should have; only to be copied."""
+    field = Field(tmp_path_factory.mktemp("fleet"))
+    (field.folder / "fleet.toml").write_text("".join(f"[robots.{each}]\n" for each in ROBOTS))
+    (field.folder / "policy.xml").write_text(POLICY)
+    field.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    assert field.states() == dict.fromkeys(ROBOTS, "never")
+    field.deliver(*ROBOTS)
+    return field
+
+
+@pytest.fixture
+def field(delivered: Field, tmp_path: Path) -> Field:
+    return Field(shutil.copytree(delivered.folder, tmp_path / "field", symlinks=True))
+
+
+def test_a_fleet_that_has_all_it_should_have(field: Field) -> None:
+    found = field.status()
+    assert found["counts"] == {"current": 3}
+    assert (found["stage"], found["unassigned"]) == ("complete", 1)
+    assert found["robots"]["r1"]["pending"] == []
+    assert found["robots"]["r1"]["files"]["permissions"] == {"current": 1}
+    assert field.run("fleet", "status", "ks").out.splitlines()[0] == "3 robots: 3 current"
+    (field.root / "confirmed/notes.txt").write_text("mine")
+    said = field.run("check", "keystore", "ks", "--severity", "note").out
+    assert "confirmed/notes.txt" in said and "r1.json" not in said
+
+
+def test_a_robot_that_was_not_reached(field: Field) -> None:
+    (first,) = field.issued("permissions", "/r1/base")
+    field.run("renew", "ks", "--robot", "r1", "--robot", "r2")
+    field.deliver("r2")
+    assert field.states() == {"r1": "earlier", "r2": "current", "r3": "current"}
+    assert field.pending("r1") == dict.fromkeys(
+        ("certificate", "permissions"), ("earlier", "deliver")
+    )
+    assert {each["since"] for each in field.status()["robots"]["r1"]["pending"]} == {first}
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert "3 robots: 2 current, 1 earlier" in said
+    assert f"earlier certificate, permissions of {first}" in said and "\nr2 " not in said
+
+
+def test_a_robot_that_was_restored_from_a_backup(field: Field) -> None:
+    shutil.copytree(field.folder / "r1", field.folder / "backup")
+    field.run("renew", "ks", "/r1/base", "--revoke-old")
+    field.deliver(*ROBOTS)
+    assert field.states() == dict.fromkeys(ROBOTS, "current")
+    shutil.rmtree(field.folder / "r1")
+    (field.folder / "backup").rename(field.folder / "r1")
+    field.confirm("r1")
+    assert field.states() == {"r1": "revoked", "r2": "current", "r3": "current"}
+    assert field.pending("r1") == {
+        "certificate": ("revoked", "deliver"),
+        "permissions": ("earlier", "deliver"),
+        "crl": ("missing", "deliver"),
+    }
+
+
+def test_a_robot_that_got_the_files_of_another_one(field: Field) -> None:
+    shutil.rmtree(field.folder / "r1")
+    shutil.copytree(field.folder / "r2", field.folder / "r1")
+    field.confirm("r1")
+    assert field.states() == {"r1": "another", "r2": "current", "r3": "current"}
+    found = field.status()["robots"]["r1"]["pending"]
+    theirs = [each for each in found if each["robot"] == "r2"]
+    assert {each["action"] for each in theirs} == {"remove"} and len(theirs) == 5
+    assert {each["state"] for each in found if each not in theirs} == {"missing"}
+    place = field.folder / "r1" / ENCLAVES  # now its own name, with the other's identity
+    (place / "r2").rename(place / "r1")
+    field.confirm("r1")
+    assert field.pending("r1") == dict.fromkeys(
+        ("certificate", "permissions"), ("another", "deliver")
+    )
+    assert "2 files of r2" in field.run("fleet", "status", "ks", status=1).out
+
+
+def test_files_that_the_keystore_never_issued(field: Field) -> None:
+    with (field.folder / "r1" / ENCLAVES / "r1/base/permissions.p7s").open("a") as file:
+        file.write("\n")
+    field.confirm("r1")
+    assert field.pending("r1") == {"permissions": ("unknown", "deliver")}
+    (field.root / ENCLAVES / "r2/base/permissions.p7s").unlink()
+    assert field.pending("r2") == {"permissions": ("broken", "deliver")}
+
+
+def test_a_robot_that_was_revoked(field: Field) -> None:
+    field.run("revoke", "ks", "--robot", "r3")
+    assert field.states() == {"r1": "missing", "r2": "missing", "r3": "revoked"}
+    assert field.pending("r1") == {"crl": ("missing", "deliver")}
+    assert field.pending("r3") == dict.fromkeys(
+        ("certificate", "permissions", *SHARED), ("revoked", "remove")
+    )
+    field.deliver("r1", "r2")
+    (field.root / "confirmed/r3.json").unlink()
+    assert field.states() == {"r1": "current", "r2": "current", "r3": "none"}
+
+
+def test_a_changed_policy(field: Field) -> None:
+    (field.folder / "policy.xml").write_text(POLICY.replace("/y", "/z").replace("}/x", "}/new"))
+    field.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    field.deliver("r2")
+    assert field.states() == {"r1": "earlier", "r2": "current", "r3": "earlier"}
+    assert field.pending("r1") == {"permissions": ("earlier", "deliver")}
+
+
+def test_a_rotation_goes_on_when_every_robot_has_confirmed_its_stage(field: Field) -> None:
+    for now, then in (("distribute", "before"), ("reissue", "distribute"), ("complete", "reissue")):
+        field.run("rotate_ca", "ks", "--next")
+        found = field.status()
+        assert found["stage"] == now
+        assert {each["stage"] for each in found["robots"].values()} == {then}
+        assert field.states() == dict.fromkeys(ROBOTS, "earlier")
+        field.deliver("r1", "r3")
+        if now != "complete":
+            step = "--next" if now == "distribute" else "--finish"
+            refused = field.run("rotate_ca", "ks", step, status=2).err
+            assert f"confirmed the stage {now}: r2. " in refused
+            assert field.status()["stage"] == now
+        field.deliver("r2")
+        assert field.states() == dict.fromkeys(ROBOTS, "current")
+        assert {each["stage"] for each in field.status()["robots"].values()} == {now}
+
+
+def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> None:
+    assert "a rotation: r1, r2, r3. " in field.run("rotate_ca", "ks", "--finish", status=2).err
+    field.run("rotate_ca", "ks", "--next", "--identity")
+    field.deliver("r1", "r3")
+    words = ("rotate_ca", "ks", "--to", "reissue", "--allow-unconfirmed")
+    assert "cut off: r2 would be unable" in field.run(*words, "--dry-run").err
+    ended = field.run(*words, "--json")
+    assert json.loads(ended.out)["cut_off"] == ["r2"]
+    assert "cut off: r2 are unable" in ended.err
+    (field.root / "fleet.toml").write_text("[robots.r1]\n")
+    assert "is not the one that sros wrote" in field.run("rotate_ca", "ks", "--next", status=2).err
+
+
+@pytest.mark.parametrize(
+    ("hours", "text"), [(2, "r1: its clock is 2 h ahead"), (-49, "r1: its clock is 2 d 1 h behind")]
+)
+def test_a_clock_that_is_wrong(field: Field, hours: int, text: str) -> None:
+    said = json.loads(field.run("fleet", "report", "r1", "--robot", "r1").out)
+    moment = parse_iso(said["time"])
+    assert field.confirm("r1", time=iso(moment + timedelta(seconds=20))).err == ""
+    # A second may pass between the report and its receipt.
+    wrong = moment + timedelta(hours=hours, seconds=30 if hours > 0 else 0)
+    assert text in field.confirm("r1", time=iso(wrong)).err
+    found = field.status()["robots"]["r1"]
+    assert found["state"] == "current"
+    assert text.removeprefix("r1: ") in found["notes"][0]
+    received: datetime = parse_iso(found["received"])
+    assert abs(received - moment) < timedelta(hours=1)
+    assert "\nr1     current" in field.run("fleet", "status", "ks").out
+
+
+def test_a_hostile_confirmation_is_refused_and_changes_nothing(field: Field) -> None:
+    kept = field.root / "confirmed/r1.json"
+    before = kept.read_bytes()
+    other = field.run("fleet", "report", "r2", "--robot", "r2").out.encode()
+    file = field.folder / "said.json"
+    options: tuple[tuple[str, ...], ...] = ((), ("--json",), ("--dry-run",))
+    for number, (name, data) in enumerate([*hostile(), ("of another robot", other)]):
+        file.write_bytes(data)
+        words = ("ks", file, "--robot", "r1", *options[number % 3])
+        ended = sros("fleet", "confirm", *words, cwd=field.folder)
+        assert (ended.status, ended.out) == (2, ""), name
+        assert ended.err.isascii() and ended.err.strip().isprintable(), name
+        assert kept.read_bytes() == before, name
+    for robot in ("../r1", "r9", "\x1b[2J"):
+        ended = sros("fleet", "confirm", "ks", file, "--robot", robot, cwd=field.folder)
+        assert ended.status == 2 and ended.err.strip().isprintable()
+    assert sorted(each.name for each in kept.parent.iterdir()) == ["r1.json", "r2.json", "r3.json"]
+
+
+def test_a_kept_confirmation_that_was_damaged_counts_as_none(field: Field) -> None:
+    for text in ("{", "[]", '{"received": "\x1b", "confirmation": {}}', "\x1b[2J" * 100):
+        (field.root / "confirmed/r1.json").write_text(text)
+        found = field.status()["robots"]["r1"]
+        assert found["state"] == "never" and "cannot be used" in found["notes"][0]
+        assert "\x1b" not in field.run("fleet", "status", "ks", status=1).out
+    (field.root / "confirmed/r1.json").write_bytes((field.root / "confirmed/r2.json").read_bytes())
+    assert field.states()["r1"] == "never"
+    (field.root / "confirmed").rename(field.folder / "elsewhere")
+    (field.root / "confirmed").symlink_to(field.folder / "elsewhere")
+    (field.folder / "said.json").write_text(field.run("fleet", "report", "r1", "--robot", "r1").out)
+    refused = field.run("fleet", "confirm", "ks", "said.json", "--robot", "r1", status=2)
+    assert "is a symbolic link" in refused.err
+
+
+def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:
+    parts = "ansible_collections/sros/fleet/plugins/module_utils/exports.py"
+    spec = importlib.util.spec_from_file_location("exports", Path(__file__).parents[2] / parts)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    robot = field.folder / "r1"
+    files = {
+        str(path.relative_to(robot)): path.read_bytes()
+        for path in robot.rglob("*")
+        if path.is_file()
+    }
+    said = json.loads(field.run("fleet", "report", "r1", "--robot", "r1").out)
+    assert module.confirmation("r1", files, parse_iso(said["time"]).timestamp()) == said
+
+
+def test_metrics_and_the_page(field: Field) -> None:
+    renamed = field.root.rename(field.folder / "<b>ks")
+    field.run("renew", renamed, "/r1/base")
+    text = field.run("fleet", "status", renamed, "--prometheus", status=1).out
+    samples = {
+        (each.name, each.labels.get("robot", ""), each.labels.get("state", "")): each.value
+        for family in text_string_to_metric_families(text)
+        for each in family.samples
+    }
+    assert samples["sros_fleet_robots", "", "current"] == 2
+    assert samples["sros_fleet_robot_state", "r1", "earlier"] == 1
+    assert samples["sros_fleet_clock_ahead_seconds", "r2", ""] < 60
+    field.run("fleet", "status", renamed, "--prometheus", "-o", "x.prom", "--dry-run", status=1)
+    assert not (field.folder / "x.prom").exists()
+    field.run("fleet", "status", renamed, "--prometheus", "-o", "x.prom", status=1)
+    assert "sros_fleet_robots" in (field.folder / "x.prom").read_text()
+    page = field.run("fleet", "status", renamed, "--html", status=1).out
+    assert "1 certificate earlier" in page and "&lt;b&gt;ks" in page and "<b>ks" not in page
+    for words in ("--json --html", "--json -o x.json", "--prometheus -o x.txt"):
+        field.run("fleet", "status", renamed, *words.split(), status=2)
