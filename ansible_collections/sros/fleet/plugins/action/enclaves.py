@@ -9,7 +9,11 @@ from typing import Any
 from ansible.plugins.action import ActionBase
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
-from ansible_collections.sros.fleet.plugins.module_utils.home import ask, decoded
+from ansible_collections.sros.fleet.plugins.module_utils.home import (
+    ask,
+    check_facts,
+    decoded,
+)
 
 
 class ActionModule(ActionBase):  # type: ignore[misc]
@@ -28,6 +32,7 @@ class ActionModule(ActionBase):  # type: ignore[misc]
         }
         if arguments.get("keystore"):
             try:
+                check_facts(task_vars or {})
                 packed = export(arguments)
             except RefusedError as error:
                 return {**result, "failed": True, "msg": str(error)}

@@ -3,10 +3,36 @@
 from __future__ import annotations
 
 import subprocess
+from typing import Any
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
 
 _MOST_SHOWN = 4000
+_SETTINGS = "sros_"
+"""How the names of all variables of this collection begin."""
+
+
+def check_facts(variables: dict[str, Any]) -> None:
+    """Refuse to do anything at home for a robot that returned facts named as settings.
+
+    Every answer of a robot can have facts, and Ansible lets them take the place of variables of the
+    inventory: so a robot could choose the command that runs at home, or whose keys it gets.
+
+    Args:
+        variables: the variables of a task, with the facts of its robot.
+
+    Raises:
+        RefusedError: the robot returned such facts.
+    """
+    facts = variables.get("ansible_facts") or {}
+    if found := sorted(str(each) for each in facts if str(each).startswith(_SETTINGS)):
+        shown = decoded(", ".join(found).encode(errors="replace")[:200]).replace("\n", "?")
+        raise RefusedError(
+            f"This robot returned facts with the names of settings ({shown}). No robot has to do"
+            " that: it could choose the commands that run at home, or get the keys of another."
+            " Nothing was done for it. Look at the robot, and delete its facts if they are cached"
+            " (ansible-playbook --flush-cache)."
+        )
 
 
 def ask(command: list[str], said: bytes = b"") -> subprocess.CompletedProcess:
