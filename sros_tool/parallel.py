@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import mmap
 import os
 import pickle
 import signal
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import TypeVar
 
@@ -24,8 +26,65 @@ Result = TypeVar("Result")
 Progress = Callable[[str], None]
 """Callback that gets the name of each enclave when the work on that enclave is done."""
 
-_SMALLEST_SLICE = 100
 _MOST_PROCESSES = 8
+
+
+class Tally:
+    """How much of a long list is done, also by forked workers, which share its memory.
+
+    ``total`` is the number of items that `map_slices` works on now, or 0.
+    """
+
+    def __init__(self) -> None:
+        self.total = 0
+        self._memory = mmap.mmap(-1, 8 * _MOST_PROCESSES)
+        self._counts = memoryview(self._memory).cast("Q")  # of each process
+        self._began = 0.0
+        self._place = 0
+
+    def begin(self, total: int) -> None:
+        """Begin with a list of ``total`` items; 0 for none."""
+        self._counts[:] = memoryview(bytes(8 * _MOST_PROCESSES)).cast("Q")
+        self.total, self._began = total, time.monotonic()
+
+    def of_worker(self, place: int) -> None:
+        """Count what this process does from now on at a place of its own."""
+        self._place = place
+
+    def add(self) -> None:
+        """Count one more item as done."""
+        self._counts[self._place] += 1
+
+    def done(self) -> int:
+        """Return the number of items that are done."""
+        return sum(self._counts)
+
+    def left(self) -> float | None:
+        """Return the seconds that the rest will take at this pace; None if nothing is done."""
+        done = self.done()
+        return (time.monotonic() - self._began) * (self.total - done) / done if done else None
+
+
+_tallies: list[Tally] = []
+
+
+@contextlib.contextmanager
+def tallied() -> Iterator[Tally]:
+    """Count the items of `map_slices` that `tick` reports, until the body ends."""
+    _tallies.append(Tally())
+    try:
+        yield _tallies[-1]
+    finally:
+        _tallies.pop()
+
+
+def tick() -> None:
+    """Report that the work on one item of `map_slices` is done."""
+    for each in _tallies:
+        each.add()
+
+
+_SMALLEST_SLICE = 100
 _PR_SET_PDEATHSIG = 1
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -46,7 +105,19 @@ def map_slices(
     cores = len(os.sched_getaffinity(0))
     count = min(cores, len(items) // _SMALLEST_SLICE, _MOST_PROCESSES)
     if count < 2 or threading.active_count() > 1:
-        return [(items, work(items))]
+        count = 1
+    for tally in _tallies:
+        tally.begin(len(items))
+    try:
+        return _on_slices(items, work, count)
+    finally:
+        for tally in _tallies:
+            tally.begin(0)
+
+
+def _on_slices(
+    items: Sequence[Item], work: Callable[[Sequence[Item]], Result], count: int
+) -> list[tuple[Sequence[Item], Result]]:
     bounds = [len(items) * index // count for index in range(count + 1)]
     slices = [items[begin:end] for begin, end in pairwise(bounds)]
     workers: list[tuple[int, int]] = []
@@ -90,6 +161,8 @@ def _fork(
         os.close(reader)
         _die_with(parent)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for tally in _tallies:
+            tally.of_worker(len(workers) + 1)
         with open(writer, "wb") as pipe:
             pickle.dump(_result_or_error(items, work), pipe)
     finally:

@@ -10,8 +10,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sros_tool.parallel import Tally
 
 _FIRST, _EVERY = 1.0, 0.5  # seconds
+_ESTIMATED = 3.0
+"""Seconds from which on the time that is left is shown."""
 _ERASE = "\r\x1b[K"
 
 
@@ -22,8 +28,8 @@ class _Line:
     forked for the work, and they do not inherit it.
     """
 
-    def __init__(self, label: str, total: int) -> None:
-        self._label, self._total = label, total
+    def __init__(self, label: str, total: int, tally: Tally) -> None:
+        self._label, self._total, self._tally = label, total, tally
         self._done = 0
         self._drawn = False
         self._began = time.monotonic()
@@ -50,10 +56,19 @@ class _Line:
         signal.signal(signal.SIGALRM, self._before)
 
     def _draw(self, _number: int, _frame: FrameType | None) -> None:
-        count = f" {self._done} of {self._total}" if self._total and self._done else ""
+        done, total, left = self._done, self._total, None
+        if self._tally.total:
+            done, total, left = self._tally.done(), self._tally.total, self._tally.left()
+        count = f" {done} of {total}" if total and done else ""
         seconds = time.monotonic() - self._began
-        _write(f"{_ERASE}{self._label}{count} ... {seconds:.0f} s")
+        rest = "" if left is None or seconds < _ESTIMATED else f", about {_rounded(left)} left"
+        _write(f"{_ERASE}{self._label}{count} ... {seconds:.0f} s{rest}")
         self._drawn = True
+
+
+def _rounded(seconds: float) -> str:
+    """Return a time as text, in minutes from two on."""
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
 def _write(text: str) -> None:
@@ -78,13 +93,16 @@ def progress(label: str, total: int = 0) -> Iterator[Callable[[str], None] | Non
     if not on_terminal or _lines or threading.current_thread() is not threading.main_thread():
         yield None
         return
-    line = _Line(label, total)
-    _lines.append(line)
-    try:
-        yield line.step
-    finally:
-        _lines.pop()
-        line.end()
+    from sros_tool.parallel import tallied
+
+    with tallied() as tally:
+        line = _Line(label, total, tally)
+        _lines.append(line)
+        try:
+            yield line.step
+        finally:
+            _lines.pop()
+            line.end()
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
 from sros_tool.explain.question import Question
 from sros_tool.keystore.layout import enclave_names, enclave_path
 from sros_tool.names import is_expression
-from sros_tool.parallel import map_slices
+from sros_tool.parallel import map_slices, tick
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,11 @@ def who(
     """
 
     def work(names: Sequence[str]) -> list[EnclaveOutcome]:
-        return [_outcome(name) for name in names]
+        found = []
+        for name in names:
+            found.append(_outcome(name))
+            tick()
+        return found
 
     def _outcome(name: str) -> EnclaveOutcome:
         enclave = load_enclave(name, enclave_path(root, name), at=at)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 
 from sros_tool.cli import main
 from sros_tool.cli import progress as showing
+from sros_tool.parallel import map_slices, tick
 from tests.support.harness import sros
 
 ERASE = "\r\x1b[K"
@@ -63,6 +65,30 @@ def test_long_work_is_shown_and_leaves_no_line(monkeypatch: pytest.MonkeyPatch) 
     said = on_terminal(lambda: until_drawn("signing", 3))
     assert "signing 1 of 3 ... 0 s" in said
     assert said.endswith(ERASE)
+
+
+def test_the_time_that_is_left_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("_FIRST", "_EVERY", "_ESTIMATED"):
+        monkeypatch.setattr(showing, name, 0.01)
+
+    def sign(names: Sequence[int]) -> None:
+        for _ in names[:50]:
+            tick()
+        line = showing._lines[0]
+        line._drawn = False
+        while not line._drawn:
+            time.sleep(0.01)
+
+    def work() -> None:
+        with showing.progress("signing"):
+            time.sleep(0.02)
+            map_slices(range(150), sign)
+
+    said = on_terminal(work)
+    assert re.search(r"signing 50 of 150 \.\.\. \d+ s, about \d+ s left", said), said
+    assert [showing._rounded(each) for each in (1.2, 119.4, 121, 3600)] == [
+        "1 s", "119 s", "2 min", "60 min",
+    ]  # fmt: skip
 
 
 def test_short_work_shows_nothing() -> None:

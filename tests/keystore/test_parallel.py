@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from sros_tool import parallel
-from tests.support.children import python
+from tests.support.children import python, wait_for
 
 ITEMS = range(1000)
 
@@ -20,6 +21,26 @@ def test_the_outcomes_come_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
         [sum(ITEMS[:500]), sum(ITEMS[500:])],
         [sum(ITEMS)],  # a test runner with threads of its own
     )
+
+
+def test_what_forked_workers_have_done_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    own, seen = os.getpid(), []
+
+    def work(share: Sequence[int]) -> None:
+        for _ in share:
+            parallel.tick()
+        if os.getpid() == own:
+            wait_for(lambda: tally.done() == len(ITEMS), "the worker counts its share")
+            seen.append((tally.total, tally.left()))
+
+    with parallel.tallied() as tally:
+        assert tally.left() is None
+        for _ in range(2):
+            parallel.map_slices(ITEMS, work)
+            assert (tally.total, tally.done()) == (0, 0)
+    assert seen == [(len(ITEMS), 0.0)] * 2
+    parallel.tick()  # without anybody who counts
 
 
 INTERRUPTED = """

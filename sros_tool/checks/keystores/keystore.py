@@ -34,7 +34,7 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_P7S, enclave_path
 from sros_tool.keystore.reader import open_enclave
-from sros_tool.parallel import map_slices
+from sros_tool.parallel import map_slices, tick
 from sros_tool.pki import smime
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right
@@ -84,6 +84,7 @@ def keystore_findings(
             found += _enclave_findings(enclave, wanted, only_differing=name != first)
             if each := summary_of(enclave):
                 issued.append(each)
+            tick()
         return found, issued
 
     outcomes = [outcome for _, outcome in map_slices(names, work)]

@@ -44,7 +44,7 @@ from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
 from sros_tool.keystore.recorded import EarlierRights
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.parallel import Progress
+from sros_tool.parallel import Progress, tick
 from sros_tool.pki.certificates import pem, subject_text, validity_of
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem
 from sros_tool.pki.token import TokenKey
@@ -266,6 +266,7 @@ class EnclaveWriter:
             first, results = len(self.entries), []
             for name in part:
                 results.append(work(name))
+                tick()
                 if progress and os.getpid() == own_process:
                     progress(name)
             grants = {name: self.grants[name] for name in part if name in self.grants}
