@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +19,7 @@ from pathlib import Path
 from benchmarks.checking import checking
 from benchmarks.deciding import deciding
 from benchmarks.explaining import explaining
+from benchmarks.fleet import fleet
 from benchmarks.floor import make_enclaves, sizes_of
 from benchmarks.inputs import enclaves_policy, topics_policy
 from benchmarks.observing import observing
@@ -50,10 +51,15 @@ def main() -> int:
     parser.add_argument("--enclaves", type=int, default=1000, help="enclaves of a keystore")
     parser.add_argument("--topics", type=int, default=20000, help="topics of one policy group")
     parser.add_argument("--renew", type=int, default=0, help="also renew this number of enclaves")
+    parser.add_argument(
+        "--fleet", type=int, default=0, help="only measure a fleet of this number of enclaves"
+    )
     parser.add_argument("--check", action="store_true", help="exit 1 if a limit is not kept")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        if options.fleet:
+            return _report((Row(*each) for each in fleet(folder, options.fleet, RULES)), options)
         rows = _artifacts(folder, options.enclaves, options.rounds)
         rows += _topics(folder, options.topics, options.rounds)
         rows += _starts(folder, options.rounds)
@@ -68,16 +74,23 @@ def main() -> int:
         ]
         rows += [Row(*figure) for figure in picturing(folder, options.rounds)]
         rows += _renewal(folder, options.renew) if options.renew else []
+    return _report(rows, options)
+
+
+def _report(rows: Iterable[Row], options: argparse.Namespace) -> int:
+    """Print each row of the table as soon as it is there; return the exit status."""
     print(f"Python {platform.python_version()}, {os.cpu_count()} cores, medians")
-    print(f"{'task':58} {'sros':>9} {'floor':>9} {'ratio':>6}  limit")
+    print(f"{'task':58} {'sros':>9} {'floor':>9} {'ratio':>6}  limit", flush=True)
+    shown: list[Row] = []
     for row in rows:
         floor = f"{row.floor:9.3f}" if row.floor is not None else " " * 9
         ratio = f"{row.value / row.floor:6.2f}" if row.floor else " " * 6
         kept = "" if row.kept else "  NOT KEPT"
-        print(f"{row.name:58} {row.value:9.3f} {floor} {ratio}  {row.limit}{kept}")
+        print(f"{row.name:58} {row.value:9.3f} {floor} {ratio}  {row.limit}{kept}", flush=True)
+        shown.append(row)
     if options.json:
-        options.json.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
-    return 1 if options.check and not all(row.kept for row in rows) else 0
+        options.json.write_text(json.dumps([asdict(row) for row in shown], indent=2) + "\n")
+    return 1 if options.check and not all(row.kept for row in shown) else 0
 
 
 def _renewal(folder: Path, count: int) -> list[Row]:

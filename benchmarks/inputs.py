@@ -15,20 +15,25 @@ def enclaves_policy(enclaves: int, rules: int) -> str:
     """Return a policy with this number of enclaves, and of names in five groups of each."""
     parts = []
     for index in range(enclaves):
-        groups = []
-        for number, (opening, item) in enumerate(_GROUPS):
-            names = "".join(
-                f"<{item}>{item}_{rule}</{item}>"
-                for rule in range(rules)
-                if rule % len(_GROUPS) == number
-            )
-            groups.append(f"<{opening}>{names}</{opening.split()[0]}>")
         parts.append(
             f'<enclave path="/robot{index}/part"><profiles>'
-            f'<profile ns="/robot{index}" node="part">{"".join(groups)}</profile>'
+            f'<profile ns="/robot{index}" node="part">{_groups(rules)}</profile>'
             "</profiles></enclave>"
         )
     return _policy("".join(parts))
+
+
+def _groups(rules: int) -> str:
+    """Return this number of names in five groups."""
+    groups = []
+    for number, (opening, item) in enumerate(_GROUPS):
+        names = "".join(
+            f"<{item}>{item}_{rule}</{item}>"
+            for rule in range(rules)
+            if rule % len(_GROUPS) == number
+        )
+        groups.append(f"<{opening}>{names}</{opening.split()[0]}>")
+    return "".join(groups)
 
 
 def topics_policy(topics: int) -> str:
@@ -42,3 +47,20 @@ def topics_policy(topics: int) -> str:
 
 def _policy(enclaves: str) -> str:
     return f'<policy version="0.2.0"><enclaves>{enclaves}</enclaves></policy>'
+
+
+def fleet_policy(enclaves: int, rules: int) -> str:
+    """Return a policy with this number of enclaves, and of names in each, for every robot."""
+    parts = []
+    for index in range(enclaves):
+        parts.append(
+            f'<enclave path="/{{robot}}/part_{index}"><profiles>'
+            f'<profile ns="{{namespace}}" node="part_{index}">{_groups(rules)}</profile>'
+            "</profiles></enclave>"
+        )
+    return _policy("".join(parts))
+
+
+def fleet_file(robots: int) -> str:
+    """Return a fleet file with this number of robots, named r1 and so on."""
+    return "".join(f"[robots.r{number}]\n" for number in range(1, robots + 1))
