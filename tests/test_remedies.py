@@ -53,7 +53,8 @@ COMMANDS = dict(named_commands())
 def check_parses(command: str) -> None:
     """Fail unless the program takes a command's verb, options and arguments."""
     words = shlex.split(OPTIONAL.sub("", re.split(r" (?:\|\|?|&&) ", command)[0]))[1:]
-    with click.Context(program) as parent:
+    # The options of help are those that the first context of a verb has.
+    with program.make_context("sros", [words[0]], resilient_parsing=True) as parent:
         verb = program.get_command(parent, words[0]) if not words[0].startswith("-") else program
         assert verb is not None, f"there is no verb {words[0]}"
         if all(word.startswith("-") for word in words[1:]):  # the name of a verb, or of an option
