@@ -19,6 +19,8 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
 from sros_tool.dds.portable import mistaken_names, outside, some_pairs
 from sros_tool.errors import DocumentError, PolicyError, SrosError
+from sros_tool.fleet.expansion import read_policy_for
+from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.names import (
     ACTION_SERVICES,
@@ -681,13 +683,16 @@ def _policy_findings(policy: Policy, distribution: str) -> Iterator[Finding]:
         yield from check(checked)
 
 
-def policy_file_findings(path: Path, distribution: str = "") -> Iterator[Finding]:
+def policy_file_findings(
+    path: Path, distribution: str = "", fleet: Fleet | None = None
+) -> Iterator[Finding]:
     """Yield all findings in a policy file; a file that cannot be read is a finding too.
 
     ``distribution`` is the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
+    ``fleet`` has the robots that its placeholders stand for.
     """
     try:
-        policy = read_policy(path)
+        policy = read_policy_for(path, fleet)
     except SrosError as error:
         yield from _unreadable(path, error)
         return

@@ -12,6 +12,7 @@ from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.checks.zenoh import configuration_findings
 from sros_tool.errors import DocumentError, SrosError
+from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.layout import (
     KEY_URI_FILE,
     PERMISSIONS_FILE,
@@ -32,6 +33,7 @@ class Circumstances:
     """The moment, time zone and other conditions of a check; see `keystore_findings`.
 
     ``distribution`` is the ROS 2 distribution of the nodes of policies; "" is the latest.
+    ``fleet`` has the robots that placeholders in policies stand for.
     """
 
     now: datetime
@@ -39,6 +41,7 @@ class Circumstances:
     domain: int | None = None
     policies: tuple[Policy, ...] = ()
     distribution: str = ""
+    fleet: Fleet | None = None
 
 
 def path_findings(path: Path, at: Circumstances) -> list[Finding]:
@@ -57,21 +60,23 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     ):
         root, name = locate_enclave(enclave)
         return _keystore(root, at, name)
-    return policy_findings(path, at.distribution)
+    return policy_findings(path, at)
 
 
-def policy_findings(path: Path, distribution: str = "") -> list[Finding]:
+def policy_findings(path: Path, at: Circumstances) -> list[Finding]:
     """Return the findings at a policy, or in a folder of policies.
 
     Raises `DocumentError` if there is no file to read.
     """
     if not path.is_dir():
         read_bytes(path, "file")
-        return list(policy_file_findings(path, distribution))
+        return list(policy_file_findings(path, at.distribution, at.fleet))
     policies = list(_policies_below(path))
     if policies:
         return [
-            finding for each in policies for finding in policy_file_findings(each, distribution)
+            finding
+            for each in policies
+            for finding in policy_file_findings(each, at.distribution, at.fleet)
         ]
     refuse_earlier(path)
     raise DocumentError(

@@ -18,6 +18,7 @@ from sros_tool.cli.common import (
     check_one_format,
     coloured,
     domain_of,
+    fleet_option,
     json_option,
     json_text,
     keystore_from_environment,
@@ -104,6 +105,7 @@ severity or higher is shown, else 0.""",
     metavar="FILE",
     help="Compare the permissions of keystores with this policy.",
 )
+@fleet_option("The robots that the placeholders of policies stand for.")
 @click.option(
     "--vendor",
     type=click.Choice([each.value for each in MEASURED]),
@@ -148,6 +150,7 @@ def check(
     fail_on: str,
     strict: bool,
     policies: tuple[Path, ...],
+    fleet_file: Path | None,
     vendor: str | None,
     domain: str | None,
     distribution: str | None,
@@ -189,7 +192,8 @@ def check(
             "",
             f"`sros audit {policies[0]}` reports what a policy would deny to the running robot.",
         )
-    at = replace(_circumstances(domain, moment, policies), distribution=_distribution(distribution))
+    at = _circumstances(domain, moment, policies, fleet_file)
+    at = replace(at, distribution=_distribution(distribution))
     with progress("checking"):
         found = [_shown(each) for each in _findings(family, paths, at)]
     chosen = selection.choose(found)
@@ -213,14 +217,20 @@ def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
 
 
 def _circumstances(
-    domain: str | None, moment: str | None, policies: Sequence[Path]
+    domain: str | None,
+    moment: str | None,
+    policies: Sequence[Path],
+    fleet_file: Path | None = None,
 ) -> Circumstances:
     from sros_tool.checks.targets import Circumstances
     from sros_tool.cli.common import local_zone
-    from sros_tool.policy.document import read_policy
+    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.expansion import read_policy_for
 
-    read = tuple(read_policy(each) for each in policies)
-    return Circumstances(moment_of(moment), local_zone(os.environ), domain_of(domain), read)
+    fleet = read_fleet(fleet_file) if fleet_file else None
+    read = tuple(read_policy_for(each, fleet) for each in policies)
+    zone, wanted = local_zone(os.environ), domain_of(domain)
+    return Circumstances(moment_of(moment), zone, wanted, read, fleet=fleet)
 
 
 def _distribution(named: str | None) -> str:
@@ -248,7 +258,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
     if family == "policy":
         if not paths:
             raise UsageError("no policy is named", "", "Name a file, or a folder of policies.")
-        return [f for path in paths for f in policy_findings(path, at.distribution)]
+        return [f for path in paths for f in policy_findings(path, at)]
     if family == "keystore":
         roots = paths or (keystore_from_environment(),)
         return [

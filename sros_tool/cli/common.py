@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.fleet.model import Fleet
     from sros_tool.keystore.authorities.keyring import Keyring
     from sros_tool.keystore.issuing.zenoh import KeptZenoh
     from sros_tool.keystore.transaction.stage import Change
@@ -95,6 +96,29 @@ def robot_option(help_text: str) -> Callable[[Decorated], Decorated]:
 def fleet_option(help_text: str) -> Callable[[Decorated], Decorated]:
     """Add ``--fleet FILE`` to a verb that reads policies with placeholders."""
     return click.option("--fleet", "fleet_file", type=PATH, metavar="FILE", help=help_text)
+
+
+def fleets_option(function: Decorated) -> Decorated:
+    """Add ``--fleet FILE`` to a verb that reads two policies with placeholders."""
+    return click.option(
+        "--fleet",
+        "fleet_files",
+        type=PATH,
+        multiple=True,
+        metavar="FILE",
+        help="The robots that the placeholders of policies stand for; the second one is for the "
+        "second policy.",
+    )(function)
+
+
+def fleets_of(files: Sequence[Path]) -> tuple[Fleet | None, Fleet | None]:
+    """Return the fleets of two policies in the files that --fleet names."""
+    from sros_tool.fleet.document import read_fleet
+
+    if len(files) > 2:
+        raise UsageError("there are more than two fleets", "", "Name one, or one for each policy.")
+    fleets = [read_fleet(file) for file in files]
+    return (fleets[0], fleets[-1]) if fleets else (None, None)
 
 
 def fleet_policies(files: Sequence[Path], fleet_file: Path) -> list[FleetPolicy]:

@@ -24,6 +24,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     read_log,
+    robot_option,
     ros_domain,
     visible,
 )
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.reach import HopPath, Reach
     from sros_tool.explain.who import EnclaveOutcome
     from sros_tool.explain.zenoh import ZenohAnswer
+    from sros_tool.fleet.model import Fleet
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.model import Enclave, Source
 
@@ -122,13 +124,13 @@ def _complete_enclave(
 
 
 _IGNORED = {
-    "": ("infrastructure", "patterns"),
+    "": ("infrastructure", "patterns", "robots"),
     "--who": ("infrastructure", "policy", "all_vendors"),
-    "--reach": ("patterns", "kind", "all_vendors", "moment", "domain", "time_zone"),
-    "--log": ("infrastructure", "patterns", "kind", "policy", "vendor", "all_vendors"),
+    "--reach": ("patterns", "robots", "kind", "all_vendors", "moment", "domain", "time_zone"),
+    "--log": ("infrastructure", "patterns", "robots", "kind", "policy", "vendor", "all_vendors"),
 }
 """The parameters that have no effect, for each of the options that choose a mode."""
-_GOES_WITH = {"infrastructure": "--reach only", "patterns": "--who only"}
+_GOES_WITH = {"infrastructure": "--reach only", "patterns": "--who only", "robots": "--who only"}
 
 
 def _refuse_ignored(mode: str) -> None:
@@ -206,6 +208,7 @@ Example:
     metavar="PATTERN",
     help="With --who: only enclaves that match, such as '/arm/*'.  Can be repeated.",
 )
+@robot_option("With --who: only the enclaves of this robot of the fleet.")
 @click.option(
     "--reach",
     metavar="ENCLAVE",
@@ -232,6 +235,7 @@ def explain(
     time_zone: str | None,
     who: bool,
     patterns: tuple[str, ...],
+    robots: tuple[str, ...],
     reach: str | None,
     infrastructure: bool,
     log: str | None,
@@ -263,9 +267,9 @@ def explain(
         return _show_log(log, root, rest, context, as_json)
     zenoh = "" if all_vendors else _why_zenoh(vendor, root)
     if who and zenoh:
-        return _show_zenoh_who(root, rest, kind, zenoh, context, patterns, as_json)
+        return _show_zenoh_who(root, rest, kind, zenoh, context, (patterns, robots), as_json)
     if who:
-        return _show_who(root, rest, kind, vendor, context, patterns, as_json)
+        return _show_who(root, rest, kind, vendor, context, (patterns, robots), as_json)
     if zenoh:
         return _show_zenoh_answer(root, rest, kind, policy, zenoh, context, as_json)
     vendor = None if vendor == ZENOH else vendor
@@ -789,7 +793,7 @@ def _show_zenoh_who(
     kind: str | None,
     why: str,
     options: _ContextOptions,
-    patterns: tuple[str, ...],
+    only: tuple[tuple[str, ...], tuple[str, ...]],
     as_json: bool,
 ) -> int:
     """Print which enclaves Zenoh lets do something; return 0 if any, else 1."""
@@ -798,14 +802,13 @@ def _show_zenoh_who(
     from sros_tool.keystore.layout import check_keystore
     from sros_tool.keystore.reader import governance_of
     from sros_tool.keystore.rights import load_rights
-    from sros_tool.keystore.selection import select_enclaves
 
     question = _question_of_who(rest, kind)
     keystore = root or keystore_from_environment()
     check_keystore(keystore)
     context = options.context(governance_of(keystore).domains().closed())
     evaluator = ZenohEvaluator(keystore, at=context.at, domain=context.domain)
-    names = select_enclaves(keystore, (), patterns) if patterns else evaluator.names
+    names = _only_enclaves(keystore, *only) or evaluator.names
     taken: list[Note] = []
     with progress("asking"):
         found = evaluator.who(question, names)
@@ -1100,21 +1103,21 @@ def _show_who(
     kind: str | None,
     vendor: str | None,
     options: _ContextOptions,
-    patterns: tuple[str, ...],
+    only: tuple[tuple[str, ...], tuple[str, ...]],
     as_json: bool,
 ) -> int:
     """Print which enclaves of the keystore may do something; return 0 if any may, else 1."""
     from sros_tool.explain.question import about_action, ask
     from sros_tool.explain.who import who
+    from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.layout import check_keystore
     from sros_tool.keystore.rights import load_rights
-    from sros_tool.keystore.selection import select_enclaves
 
     question = _question_of_who(rest, kind)
     chosen, why = _vendor_of(vendor)
     keystore = root or keystore_from_environment()
     check_keystore(keystore)
-    names = select_enclaves(keystore, (), patterns) if patterns else None
+    names = _only_enclaves(keystore, *only)
     taken: list[Note] = []
     with progress("asking"):
         found = who(keystore, question, chosen, options.context, at=options.at, names=names)
@@ -1136,7 +1139,7 @@ def _show_who(
             }
         )
     else:
-        for line in _who_lines(found):
+        for line in _who_lines(found, load_fleet(keystore)):
             click.echo(line)
         documented = ", as documented" if chosen.documented_only else ""
         click.echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
@@ -1150,6 +1153,17 @@ def _show_who(
     return 0 if allowed else 1
 
 
+def _only_enclaves(
+    keystore: Path, patterns: tuple[str, ...], robots: tuple[str, ...]
+) -> tuple[str, ...] | None:
+    """Return the enclaves that --match and --robot name, or None: neither is given."""
+    from sros_tool.keystore.selection import select_enclaves
+
+    if not patterns and not robots:
+        return None
+    return select_enclaves(keystore, (), patterns, robots=robots)
+
+
 def _question_of_who(rest: tuple[str, ...], kind: str | None) -> Question:
     """Return the question in the words after the keystore: operation and name."""
     from sros_tool.explain.question import ask
@@ -1161,14 +1175,24 @@ def _question_of_who(rest: tuple[str, ...], kind: str | None) -> Question:
     return ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
 
 
-def _who_lines(found: Sequence[EnclaveOutcome]) -> Iterator[str]:
-    """Yield the allowed enclaves, those whose participant does not start now, and the counts."""
+def _who_lines(found: Sequence[EnclaveOutcome], fleet: Fleet | None) -> Iterator[str]:
+    """Yield the allowed enclaves, those whose participant does not start now, and the counts.
+
+    The enclaves of a fleet are folded by robot.
+    """
+    from sros_tool.fleet.folding import folded
+
     able = [each for each in found if each.outcome.ok]
-    for each in able:
-        yield each.enclave + (f"  by the wildcard {each.wildcard}" if each.wildcard else "")
+    wild = "  by the wildcard {}"
+    lines = [
+        (each.enclave, each.enclave + (wild.format(each.wildcard) if each.wildcard else ""))
+        for each in able
+    ]
     for each in found:
         if each.outcome in ("refused", "crashes"):
-            yield f"  not now: {each.enclave}  {each.text.partition(': ')[2]}"
+            text = f"  not now: {each.enclave}  {each.text.partition(': ')[2]}"
+            lines.append((each.enclave, text))
+    yield from folded(fleet, lines)
     yield f"{len(able)} of {len(found)} enclaves may"
 
 
@@ -1229,7 +1253,7 @@ def _show_reach(
             {"path": str(source.path), "left_out": [*without, *questions], **_reach_json(reach)}
         )
     else:
-        for line in _reach_lines(reach):
+        for line in _reach_lines(reach, source.fleet):
             click.echo(line)
     print_notes(source.notes)
     if without and not as_json:
@@ -1262,9 +1286,13 @@ def _uncontrolled(source: RightsSource) -> dict[str, Any]:
     }
 
 
-def _reach_lines(reach: Reach) -> Iterator[str]:
-    """Yield the enclaves that one influences and learns from, each with a shortest path."""
+def _reach_lines(reach: Reach, fleet: Fleet | None) -> Iterator[str]:
+    """Yield the enclaves that one influences and learns from, each with a shortest path.
+
+    The enclaves of a fleet are folded by robot.
+    """
     from sros_tool.explain.reach import path_text
+    from sros_tool.fleet.folding import folded
 
     for what, paths in (
         ("can influence", reach.influences),
@@ -1272,8 +1300,8 @@ def _reach_lines(reach: Reach) -> Iterator[str]:
     ):
         count = f"{len(paths)} enclave{'' if len(paths) == 1 else 's'}"
         yield f"{reach.enclave} {what} {count}"
-        for _, path in sorted(paths.items(), key=lambda item: (len(item[1]), item[0])):
-            yield f"  {path_text(path)}"
+        in_order = sorted(paths.items(), key=lambda item: (len(item[1]), item[0]))
+        yield from folded(fleet, ((name, f"  {path_text(path)}") for name, path in in_order))
 
 
 def _reach_json(reach: Reach) -> dict[str, Any]:

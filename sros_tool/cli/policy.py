@@ -16,6 +16,8 @@ from sros_tool.cli.common import (
     SeveralValues,
     check_output,
     dry_run_option,
+    fleets_of,
+    fleets_option,
     force_option,
     json_option,
     output_option,
@@ -31,6 +33,7 @@ from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
     from sros_tool.errors import Note
+    from sros_tool.fleet.model import Fleet
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.merge import Merged
     from sros_tool.policy.minimize import EnclaveUse, MinimizedPolicy, WildcardProposal
@@ -161,18 +164,21 @@ Example:
   + /talker ALLOW request service /add_two_ints  (A has it by request ...
   3 rights differ
   $ sros diff_policy robot.xml keystore/enclaves/talker/permissions.p7s
-  $ sros diff_policy keystore keystore/enclaves/router/router.json5""",
+  $ sros diff_policy keystore keystore/enclaves/router/router.json5
+  $ sros diff_policy robot.xml robot.xml --fleet old.toml --fleet new.toml""",
 )
 @click.argument("a", metavar="A", type=PATH)
 @click.argument("b", metavar="B", type=PATH)
+@fleets_option
 @json_option
-def diff_policy(a: Path, b: Path, as_json: bool) -> int:
+def diff_policy(a: Path, b: Path, fleet_files: tuple[Path, ...], as_json: bool) -> int:
     """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
     A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or
     configurations of Zenoh such as router.json5. Permissions and rules of Zenoh are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. If A or
-    B is only for some enclaves, these are compared.
+    B is only for some enclaves, these are compared. Of a fleet, lines that differ only in the robot
+    are one.
 
     The exit status is 1 if the rights differ, or if DDS would refuse A or B.
     """
@@ -180,7 +186,8 @@ def diff_policy(a: Path, b: Path, as_json: bool) -> int:
     from sros_tool.policy.rights import compare
 
     with progress("reading"):
-        first, second = load_rights(a), load_rights(b)
+        fleets = fleets_of(fleet_files)
+        first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])
     scope = None
     if first.scope is None or second.scope is None:
         scope = second.scope if first.scope is None else first.scope
@@ -188,7 +195,7 @@ def diff_policy(a: Path, b: Path, as_json: bool) -> int:
     if as_json:
         print_json(_difference_json(first, second, difference))
     else:
-        for line in _difference_lines(difference):
+        for line in _difference_lines(difference, first.fleet, second.fleet):
             click.echo(line)
         count = len(difference.only_first) + len(difference.only_second)
         of = f" of {', '.join(sorted(scope))}" if scope else ""
@@ -198,13 +205,25 @@ def diff_policy(a: Path, b: Path, as_json: bool) -> int:
     return 0 if not difference and first.sound and second.sound else 1
 
 
-def _difference_lines(difference: RightsDifference) -> list[str]:
-    lines = []
+def _difference_lines(
+    difference: RightsDifference, first: Fleet | None, second: Fleet | None
+) -> list[str]:
+    """Return the lines that are shown of a difference: those of a fleet folded by robot."""
+    from sros_tool.fleet.folding import folded
+
+    lines: list[tuple[str, str, str]] = []
     for sign, right in difference.lines():
         by = ", ".join(each.describe() for each in difference.covered.get(right, ()))
         remark = f"  ({'B' if sign == '-' else 'A'} has it by {by})" if by else ""
-        lines.append(f"{sign} {right}{remark}")
-    return lines
+        lines.append((sign, right.enclave, f"{sign} {right}{remark}"))
+    if first is None and second is None:
+        return [text for _, _, text in lines]
+    sides = (("-", first or second), ("+", second or first))
+    return [
+        text
+        for side, fleet in sides
+        for text in folded(fleet, [(name, text) for sign, name, text in lines if sign == side])
+    ]
 
 
 def _difference_json(

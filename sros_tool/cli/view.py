@@ -16,6 +16,8 @@ from sros_tool.cli.common import (
     check_output,
     complete_template,
     dry_run_option,
+    fleets_of,
+    fleets_option,
     force_option,
     json_text,
     now,
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from sros_tool.checks.kind import Finding as Checked
+    from sros_tool.fleet.model import Fleet
     from sros_tool.report.compose import PictureSource
     from sros_tool.report.picture import Picture, PicturedFinding
 
@@ -53,6 +56,7 @@ Examples:
   $ sros view robot.xml --observed learned.xml -o use.html
   $ sros view old.xml new.xml -o change.html
   $ sros view robot.xml keystore -o drift.html
+  $ sros view robot.xml --fleet fleet.toml -o fleet.html
   $ sros view keystore keystore/enclaves/router/router.json5 -o zenoh.html""",
 )
 @click.argument("sources", metavar="SOURCE...", type=PATH, nargs=-1, required=True)
@@ -87,6 +91,7 @@ Examples:
     metavar="HOST=ENCLAVE",
     help="Group ENCLAVE, and the enclaves below it, by the host they run on.",
 )
+@fleets_option
 @click.option("--all", "everything", is_flag=True, help="Also draw rights that every node needs.")
 @click.option("--graphviz", is_flag=True, help="Lay out the SVG with Graphviz.")
 @force_option
@@ -100,6 +105,7 @@ def view(
     observed: tuple[Path, ...],
     template: str | None,
     hosts: tuple[str, ...],
+    fleet_files: tuple[Path, ...],
     everything: bool,
     graphviz: bool,
     force: bool,
@@ -121,7 +127,7 @@ def view(
     if output:
         check_output(output, force=force or dry_run)
     with progress("drawing"):
-        picture = _picture(sources, observed, template, hosts, moment)
+        picture = _picture(sources, observed, template, hosts, moment, fleets_of(fleet_files))
         document = _rendered(picture, written, everything, graphviz, moment)
     if dry_run and as_json:
         changes = file_change(output, existed=output.exists()) if output else []
@@ -156,6 +162,7 @@ def _picture(
     template: str | None,
     hosts: tuple[str, ...],
     moment: datetime,
+    fleets: tuple[Fleet | None, Fleet | None],
 ) -> Picture:
     from dataclasses import replace
 
@@ -169,12 +176,18 @@ def _picture(
             "",
             "Name one SOURCE and --observed, or two SOURCEs.",
         )
-    read = [added(read_source(path, now=moment), path, _checked(path, moment)) for path in sources]
+    read = [
+        added(read_source(path, now=moment, fleet=fleet), path, _checked(path, moment, fleet))
+        for path, fleet in zip(sources, fleets, strict=False)
+    ]
     if template:
         _check_no_governance(sources, read)
         governance = template_governance(template)
         read = [each if each.governance else replace(each, governance=governance) for each in read]
-    context = Context(common_rights(), _hosts(hosts))
+    robots: dict[str, str] = {}
+    for path, fleet, source in zip(sources, fleets, read, strict=False):
+        robots |= _robots(path, fleet, source)
+    context = Context(common_rights(), robots | _hosts(hosts))
     if observed:
         seen = union([read_source(path, now=moment) for path in observed])
         return overlay(read[0], seen, "use", context)
@@ -205,7 +218,7 @@ def _check_no_governance(sources: tuple[Path, ...], read: list[PictureSource]) -
             )
 
 
-def _checked(path: Path, moment: datetime) -> list[PicturedFinding]:
+def _checked(path: Path, moment: datetime, fleet: Fleet | None) -> list[PicturedFinding]:
     """Return the findings of `sros check` for a source, or none if it cannot be checked."""
     from sros_tool.checks.targets import Circumstances, path_findings
     from sros_tool.cli.common import local_zone
@@ -213,7 +226,7 @@ def _checked(path: Path, moment: datetime) -> list[PicturedFinding]:
     from sros_tool.report.picture import PicturedFinding
 
     try:
-        found = path_findings(path, Circumstances(moment, local_zone(os.environ)))
+        found = path_findings(path, Circumstances(moment, local_zone(os.environ), fleet=fleet))
     except SrosError:
         return []
     return [
@@ -241,6 +254,24 @@ def _hosts(words: tuple[str, ...]) -> dict[str, str]:
             )
         found[enclave.rstrip("/") or "/"] = host
     return found
+
+
+def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str, str]:
+    """Map the enclaves of a source to their robots, by which they are grouped."""
+    from sros_tool.fleet.enclaves import robot_of
+    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.keystore.fleet import load_fleet
+    from sros_tool.policy.document import read_policy
+
+    if source.origin.kind == "keystore":
+        fleet = load_fleet(path)
+    elif fleet and source.origin.kind == "policy":
+        written = read_policy(path, placeholders=True)
+        fleet = fleet.with_enclaves(FleetPolicy(written, fleet).patterns)
+    if fleet is None:
+        return {}
+    found = ((name, robot_of(fleet, name)) for name in {each.enclave for each in source.rights})
+    return {name: robot.name for name, robot in found if robot}
 
 
 def _rendered(

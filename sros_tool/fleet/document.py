@@ -1,17 +1,21 @@
-"""Fleet files (TOML): the robots of a fleet, read with all checks, and written."""
+"""Fleet files: the robots of a fleet, read with all checks, and written as TOML."""
 
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from shlex import quote
+from types import MappingProxyType
 from typing import Any
 
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError
 from sros_tool.files import parse_toml
 from sros_tool.fleet.enclaves import pattern_problem
+from sros_tool.fleet.inventory import SHOWN, fleet_table, is_json
 from sros_tool.fleet.model import (
     MAX_ROBOTS,
     Fleet,
@@ -41,13 +45,35 @@ class FleetError(DocumentError):
 
 
 def read_fleet(path: Path) -> Fleet:
-    """Return the fleet in the TOML file ``path``.
+    """Return the fleet in a TOML file, or in an inventory of Ansible in YAML or JSON.
+
+    The end of the name tells which: .yml, .yaml and .json are inventories.
 
     Raises:
-        DocumentError: the file cannot be read, is not TOML, or a value in it is not valid; the
-            error names the key.
+        DocumentError: the file cannot be read, or a value in it is not valid; the error names the
+            key.
+        UnavailableError: an inventory in YAML is named, and PyYAML is not installed.
     """
-    return parse_fleet(read_bytes(path, "fleet file", most=MAX_BYTES), f"the fleet file '{path}'")
+    data, ending = read_bytes(path, "fleet file", most=MAX_BYTES), path.suffix.lower()
+    if ending in (".yml", ".yaml", ".json"):
+        what = f"the inventory '{path}'"
+        table = fleet_table(data, what, is_json=ending == ".json" or is_json(data))
+        return _Reader(what, SHOWN).fleet(table)
+    try:
+        return parse_fleet(data, f"the fleet file '{path}'")
+    except FleetError as error:
+        if ending == ".toml" or not _INI_HOST.search(data):
+            raise
+        raise FleetError(
+            f"'{path}' is not a fleet file in TOML",
+            "It looks like an inventory of Ansible in INI.",
+            f"Convert it with `ansible-inventory -i {quote(str(path))} --list > hosts.json`, and "
+            "name hosts.json.",
+        ) from error
+
+
+_INI_HOST = re.compile(rb"^[A-Za-z0-9_.-]+[ \t]*(?:$|[ \t][A-Za-z_]+=)", re.MULTILINE)
+"""A host on a line of its own, or with variables behind it."""
 
 
 def parse_fleet(data: bytes, what: str) -> Fleet:
@@ -65,8 +91,11 @@ def parse_fleet(data: bytes, what: str) -> Fleet:
 
 
 class _Reader:
-    def __init__(self, what: str) -> None:
+    """Reader of one file; ``words`` are the ones that it has in place of the keys."""
+
+    def __init__(self, what: str, words: Mapping[str, str] = MappingProxyType({})) -> None:
         self._what = what
+        self._words = words
 
     def fleet(self, table: Mapping[str, Any]) -> Fleet:
         self._known(table, ("groups", "robots", "enclaves"), "")
@@ -89,7 +118,7 @@ class _Reader:
     def _robot(
         self, name: str, values: Mapping[str, Any], groups: Mapping[str, Mapping[str, Any]]
     ) -> Robot:
-        at = f"robots.{name}"
+        at = f"{self._word('robots')}.{name}"
         self._known(values, ("groups", "domain", *_VALUES), at)
         member = tuple(sorted(set(self._texts(values, "groups", at, _MOST_GROUPS))))
         for group in member:
@@ -109,7 +138,7 @@ class _Reader:
                 given[key], origin[key] = value, here
         own = {key: value for key, value in values.items() if key != "groups"}
         given = self._values(given, origin, name) | self._values(
-            own, {key: f"{at}.{key}" for key in own}
+            own, {key: f"{at}.{self._word(key)}" for key in own}
         )
         usual = {"namespace": f"/{name}", "address": name, "user": "", "domain": None}
         return Robot(name, groups=member, **(usual | given))
@@ -132,6 +161,9 @@ class _Reader:
             if problem := _VALUES[key](checked[key]):
                 raise self._refused(places[key], value, problem)
         return checked
+
+    def _word(self, key: str) -> str:
+        return self._words.get(key, key)
 
     def _tables(self, table: Mapping[str, Any], key: str) -> Mapping[str, Mapping[str, Any]]:
         """Return the tables below ``key``, each by a name that is valid."""

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
 from sros_tool.fleet.enclaves import group_of, path_for
 from sros_tool.fleet.model import Fleet, Robot
 from sros_tool.names import check_enclave_name, check_namespace, expression_problem
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Group, Policy, Profile, Source
 from sros_tool.policy.placeholders import Parts, fill, has_placeholder, parts_of, placeholders_of
 
@@ -155,6 +157,17 @@ class FleetPolicy(Mapping[str, Enclave]):
             if problem := _name_problem(name):
                 raise _not_valid(name, problem, source)
             yield name
+
+
+def read_policy_for(path: Path, fleet: Fleet | None) -> Policy:
+    """Return the policy in a file, with its placeholders filled in for a fleet, if there is one.
+
+    Raises:
+        PolicyError: (or another `DocumentError`) as of `read_policy` and `FleetPolicy`.
+    """
+    if fleet is None:
+        return read_policy(path)
+    return FleetPolicy(read_policy(path, placeholders=True), fleet).policy()
 
 
 def _name_problem(name: str) -> str:

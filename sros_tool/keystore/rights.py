@@ -17,6 +17,9 @@ from cryptography import x509
 
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, Note, PolicyError, SrosError
+from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
+from sros_tool.fleet.model import Fleet
+from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
@@ -50,6 +53,7 @@ class RightsSource:
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh".  ``scope`` are the
     enclaves that it can give rights to; None for all.  ``sound`` is False if DDS would refuse a
     part of it: a signature that does not verify, or permissions that are missing or malformed.
+    ``fleet`` knows which enclave is whose, if the file or folder is for one.
     """
 
     path: Path
@@ -58,10 +62,11 @@ class RightsSource:
     scope: frozenset[str] | None
     sound: bool
     notes: tuple[Note, ...]
+    fleet: Fleet | None = None
 
 
-def load_rights(path: Path) -> RightsSource:
-    """Return the rights that ``path`` gives.
+def load_rights(path: Path, fleet: Fleet | None = None) -> RightsSource:
+    """Return the rights that ``path`` gives; a policy's are those for ``fleet``, if there is one.
 
     ``path`` is a policy file, ``permissions.p7s`` or ``permissions.xml``, an enclave folder, a
     keystore, or a configuration of Zenoh such as ``router.json5``.
@@ -85,8 +90,11 @@ def load_rights(path: Path) -> RightsSource:
     signed = b"multipart/signed" in data[:1000].lower()
     # read_policy says how a policy of an earlier format, with <profiles> at the top, is converted.
     if not signed and parse(data, f"'{path}'").tag in ("policy", "profiles"):
-        policy = read_policy(path)
-        return RightsSource(path, "policy", policy_rights(policy), None, True, ())
+        policy = read_policy_for(path, fleet)
+        if fleet:
+            written = read_policy(path, placeholders=True)
+            fleet = fleet.with_enclaves(FleetPolicy(written, fleet).patterns)
+        return RightsSource(path, "policy", policy_rights(policy), None, True, (), fleet)
     return _document_rights(path, "permissions", path)
 
 
@@ -181,6 +189,7 @@ def _keystore_rights(root: Path) -> RightsSource:
         None,
         reader.sound,
         tuple(reader.unverified[:1] + reader.notes),
+        load_fleet(root),
     )
 
 

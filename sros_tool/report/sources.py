@@ -19,6 +19,8 @@ from cryptography import x509
 from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, SrosError
+from sros_tool.fleet.expansion import read_policy_for
+from sros_tool.fleet.model import Fleet
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
 from sros_tool.keystore.layout import PUBLIC
@@ -53,11 +55,11 @@ _LINK = re.compile(r"(it is a broken link) \([^)]*\)")
 _AUTHORITY_FILES = "*_ca.cert.pem"
 
 
-def read_source(path: Path, *, now: datetime) -> PictureSource:
+def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> PictureSource:
     """Return the source at ``path``: a policy, permissions, an enclave, a keystore, an observation.
 
     An observation is a learned policy, or the output of ``sros generate_policy --json``.  Faults of
-    a keystore become findings.
+    a keystore become findings.  ``fleet`` has the robots that placeholders in a policy stand for.
 
     Raises:
         DocumentError: ``path`` is none of these.
@@ -65,13 +67,13 @@ def read_source(path: Path, *, now: datetime) -> PictureSource:
     data = read_bytes(path, "file") if path.is_file() else b""
     if data.lstrip()[:1] == b"{" and not is_zenoh(data):
         return _observation(path)
-    read = load_rights(path)
+    read = load_rights(path, fleet)
     findings = tuple(PicturedFinding(note.id, "warning", note.text) for note in read.notes)
     source = PictureSource(
         SourceTitle(_base_name(path), read.kind), read.rights, findings=findings, scope=read.scope
     )
     if read.kind == "policy":
-        source = replace(source, nodes=_nodes(read_policy(path)))
+        source = replace(source, nodes=_nodes(read_policy_for(path, fleet)))
     elif read.kind == "keystore":
         source = _with_keystore(source, path, now)
     elif read.kind == "enclave":

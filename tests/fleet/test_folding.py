@@ -1,0 +1,104 @@
+"""Answers folded by robot, and the verbs that read a policy for a fleet."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sros_tool.fleet.folding import folded
+from sros_tool.fleet.model import Fleet, Robot
+from tests.support.harness import policy_text, publish, sros
+
+FLEET = Fleet.of(
+    [
+        Robot("r1", "/hall/r1", groups=("carriers",)),
+        Robot("r10", "/hall/r10", groups=("carriers",)),
+        Robot("r2", "/r2"),
+        Robot("x", "/"),
+    ],
+    enclaves=["/{robot}/base"],
+)
+
+
+def lines(text: str, *robots: str) -> list[tuple[str, str]]:
+    spaces = {name: robot.namespace.rstrip("/") for name, robot in FLEET.robots.items()}
+    return [(f"/{name}/base", text.format(robot=name, namespace=spaces[name])) for name in robots]
+
+
+def test_what_differs_only_in_the_robot_is_one_line() -> None:
+    text = "- /{robot}/base ALLOW publish topic {namespace}/odom"
+    assert list(folded(FLEET, lines(text, "r1", "r10", "r2"))) == [
+        f"{text}  (3 robots: r1, r10, r2)"
+    ]
+    assert list(folded(FLEET, lines(text, "r1", "r10"))) == [f"{text}  (the 2 robots of carriers)"]
+    every = "/{robot}/base"
+    assert list(folded(FLEET, lines(every, *FLEET.robots))) == [f"{every}  (all 4 robots)"]
+
+
+def test_what_differs_stands_out_and_one_robot_stays_as_it_is() -> None:
+    found = [*lines("/{robot}/base may", "r1", "r10"), *lines("/{robot}/base may not", "r2"),
+             ("/d", "/d may")]  # fmt: skip
+    assert list(folded(FLEET, found)) == [
+        "/{robot}/base may  (the 2 robots of carriers)", "/r2/base may not", "/d may",
+    ]  # fmt: skip
+    assert list(folded(None, found)) == [text for _, text in found]
+
+
+def test_the_name_of_another_robot_is_no_placeholder() -> None:
+    found = [("/r1/base", "/r1/base to /r10/x r1_x"), ("/r10/base", "/r10/base to /r10/x r1_x")]
+    assert list(folded(FLEET, found)) == [text for _, text in found]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("folding")
+    wide = policy_text({"/{robot}/base": publish("{namespace}/odom"), "/d": publish("{robots}/go")})
+    (folder / "p.xml").write_text(wide)
+    (folder / "f.toml").write_text("[robots]\nr1 = {}\nr2 = {}\nr3 = {}\n")
+    (folder / "g.toml").write_text('[robots]\nr1 = {}\nr2 = {namespace = "/b"}\n')
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", "--fleet", "f.toml", cwd=folder).ok()
+    return folder
+
+
+def test_two_fleets_are_compared(made: Path) -> None:
+    same = sros("diff_policy", "p.xml", "ks", "--fleet", "f.toml", cwd=made).ok()
+    assert same.out == ""
+    ended = sros(
+        "diff_policy", "p.xml", "p.xml", "--fleet", "f.toml", "--fleet", "g.toml", cwd=made
+    )
+    assert ended.status == 1
+    assert ended.out.splitlines() == [
+        "- /d ALLOW publish topic /r3/go",
+        "- /{robot}/base ALLOW publish topic {namespace}/odom  (2 robots: r2, r3)",
+        "+ /r2/base ALLOW publish topic /b/odom",
+    ]
+
+
+def test_who_and_reach_are_folded(made: Path) -> None:
+    said = sros("explain", "ks", "--who", "join", cwd=made).ok().out
+    assert said.splitlines() == ["/d", "/{robot}/base  (all 3 robots)", "4 of 4 enclaves may"]
+    one = sros("explain", "ks", "--who", "join", "--robot", "r2", cwd=made).ok().out
+    assert one.splitlines() == ["/r2/base", "1 of 1 enclaves may"]
+    found = json.loads(sros("explain", "ks", "--who", "join", "--json", cwd=made).out)
+    assert [each["enclave"] for each in found["enclaves"]] == [
+        "/d",
+        "/r1/base",
+        "/r2/base",
+        "/r3/base",
+    ]
+
+
+def test_check_and_view_read_a_policy_for_a_fleet(made: Path) -> None:
+    without = sros("check", "p.xml", cwd=made)
+    assert "has a placeholder" in without.out and without.status == 1
+    found = sros("check", "p.xml", "--fleet", "f.toml", "--json", cwd=made)
+    assert {each["subject"] for each in json.loads(found.out)["findings"]} >= {
+        "/r1/base",
+        "/r3/base",
+    }
+    assert "placeholder" not in found.out
+    drawn = sros("view", "p.xml", "--fleet", "f.toml", "--format", "mermaid", cwd=made).ok().out
+    assert 'g1["r1"]' in drawn and "/r3/odom" in drawn
+    assert 'g1["r1"]' in sros("view", "ks", "--format", "mermaid", cwd=made).ok().out
