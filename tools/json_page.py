@@ -16,9 +16,10 @@ SHARED = "common"
 _BEGINNING = """\
 # What `--json` prints
 
-Every verb but `run`, `completion` and `fleet report` takes `--json`, and prints one JSON object \
-on standard output. Its first key is `version`, which is 1: it is raised when a key goes or \
-changes its meaning. Keys may be added without that, so ignore those that you do not know.
+Every verb but `run`, `completion`, `fleet inventory` and `fleet report` takes `--json`, and \
+prints one JSON object on standard output. Its first key is `version`, which is 1: it is raised \
+when a key goes or changes its meaning. Keys may be added without that, so ignore those that you \
+do not know.
 
 - The exit status is the same as without `--json`; look at it first. After an error, standard \
 output is empty, and standard error has one paragraph. Only `env` then prints variables with which \

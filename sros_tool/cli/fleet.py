@@ -1,4 +1,4 @@
-"""The verbs of a fleet: what each robot has, by what it confirmed."""
+"""The verbs of a fleet: its robots, and what each has, by what it confirmed."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from sros_tool.cli.common import (
     complete_robot,
     dry_run_option,
     json_option,
+    json_text,
     keystore_from_environment,
     now,
     output_option,
@@ -47,7 +48,42 @@ Example:
   50 robots: 48 current, 1 earlier, 1 never confirmed""",
 )
 def fleet() -> None:
-    """Show what the robots of a fleet have."""
+    """Show the robots of a fleet, and what they have."""
+
+
+# ── the robots ─────────────────────────────────────────────────────────────────────────────
+
+
+@fleet.command(
+    "inventory",
+    epilog="""\b
+Example:
+  $ sros fleet inventory keystore > hosts.json
+  $ ansible-playbook -i hosts.json sros.fleet.deliver""",
+)
+@click.argument("root", type=PATH, required=False)
+@click.option("--yaml", "as_yaml", is_flag=True, help="Print YAML in place of JSON.")
+@click.option(
+    "--list",
+    "as_list",
+    is_flag=True,
+    help="Print what Ansible takes from a program that it runs as an inventory.",
+)
+def _inventory(root: Path | None, as_yaml: bool, as_list: bool) -> None:
+    """Print the robots of the keystore ROOT as an inventory of Ansible.
+
+    Robots are hosts and groups are groups. Variables of a host are ansible_host, ansible_user,
+    sros_robot, sros_namespace and sros_domain.
+    """
+    from sros_tool.fleet.inventory import inventory, script_inventory
+    from sros_tool.keystore.fleet import recorded_fleet
+    from sros_tool.values import yaml_text
+
+    if as_yaml and as_list:
+        raise UsageError("--yaml and --list exclude each other", "", "Choose one.")
+    recorded = recorded_fleet(root or keystore_from_environment())
+    value = script_inventory(recorded) if as_list else inventory(recorded)
+    click.echo(yaml_text(value) if as_yaml else json_text(value), nl=not as_yaml)
 
 
 # ── on the robot ───────────────────────────────────────────────────────────────────────────

@@ -14,6 +14,7 @@ from tests.support.zenoh_configurations import denying, self_limiting
 WITHOUT_JSON = {
     "run": "it becomes the command that it runs, whose output is the result",
     "completion": "it prints the script of a shell",
+    "fleet inventory": "it prints an inventory, which is JSON of Ansible",
     "fleet report": "it prints a confirmation, which is JSON of a format of its own",
 }
 """The verbs without ``--json``, and why."""

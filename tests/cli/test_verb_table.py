@@ -24,10 +24,11 @@ NO_JSON = {
     "run": "its output is that of the command",
     "completion": "its output is a script",
     "fleet report": "its output is the JSON of a confirmation",
+    "fleet inventory": "its output is an inventory of Ansible",
 }
 READS = {
     "list_enclaves", "inspect", "verify", "diff_policy", "explain", "check", "doctor", "env",
-    "completion", "fleet report",
+    "completion", "fleet report", "fleet inventory",
 }  # fmt: skip
 RUNS = {"run", "demo"}
 NEW_NAMES = {("create_request", "name")}
@@ -148,6 +149,7 @@ STATUS: dict[str, tuple[str, str, str]] = {
     "metrics": ("damaged -o new.prom", NEVER, "nothing -o new.prom"),
     "units": ("ks /a new --dry-run", NEVER, "nothing /a new"),
     "env": ("ks /a", NEVER, "nothing /a"),
+    "fleet inventory": ("fleet", NEVER, "ks"),
     "fleet report": ("robot --robot a", NEVER, "nothing --robot a"),
     "fleet confirm": ("fleet b.json --robot b", NEVER, "fleet b.json --robot a"),
     "fleet status": ("fleet --robot a", "fleet", "ks"),
