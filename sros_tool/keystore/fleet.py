@@ -54,7 +54,7 @@ def checked_fleet(root: Path) -> Fleet | None:
     Raises:
         KeystoreError: the file is not the one that sros wrote last.
     """
-    if problem := edited_fleet(root, read_ledger(root)):
+    if problem := edited_fleet(root, read_ledger(root, having=("what", "fleet"))):
         raise KeystoreError(
             f"'{root / FLEET}' {problem}",
             "It decides which enclaves belong to a robot, and which domains they may join.",
@@ -158,7 +158,8 @@ def write_fleet(
     paths = dict.fromkeys(sorted(each for paths in known for each in paths))
     fleet = fleet.with_enclaves(tuple(paths))
     document = (_COMMENT + render_fleet(fleet)).encode()
-    if not _edited(read_ledger(transaction.root), document) and _read(transaction.root):
+    ledger = read_ledger(transaction.root, having=("what", "fleet"))
+    if not _edited(ledger, document) and _read(transaction.root):
         return fleet, ()
     transaction.write(FLEET, document)
     digest = hashlib.sha256(document).hexdigest()

@@ -140,7 +140,7 @@ def sign_request(
         issued = signer.certify(request, stated, renew=renew)
         kept = signer.keep_zenoh()
         files = _answer_files(root, issued, kept)
-        number = read_ledger(root).next_number()
+        number = read_ledger(root, having=("what", "answer")).next_number()
         sealed = seal(files, number, signer.authorities.permissions)
         _check_result(RequestAnswer(name, files, sealed), request, now)
         archive = pack({SEAL: sealed, **files})

@@ -206,7 +206,8 @@ def present_settings(root: Path) -> PresentSettings:
         DocumentError: its settings are malformed, and the ledger does not have those of before.
     """
     list_enclaves(root)
-    governance, ledger = governance_of(root), read_ledger(root)
+    governance = governance_of(root)
+    ledger = read_ledger(root, having=("what", "settings"))
     recorded = recorded_settings(ledger)
     missing = not (root / SETTINGS).exists()
     without_settings = missing and recorded is None
