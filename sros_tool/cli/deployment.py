@@ -16,6 +16,8 @@ from sros_tool.cli.common import (
     complete_keystore_and_enclave,
     domain_of,
     dry_run_option,
+    fleet_option,
+    fleet_policies,
     json_option,
     key_option,
     keyring,
@@ -51,6 +53,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.delivery.export import ExportSelection
     from sros_tool.keystore.delivery.request import Requested
     from sros_tool.keystore.delivery.signing import Certified, Signed
+    from sros_tool.policy.model import Policy
 
 _STREAM = Path("-")
 """The file argument that means standard input or output."""
@@ -417,6 +420,7 @@ Example:
     type=PATH,
     help="Policy with the enclave's rights. [default: the rights of the keystore's template]",
 )
+@fleet_option("The robots that the placeholders of the policy stand for, as in generate_artifacts.")
 @click.option(
     "-o",
     "--output",
@@ -439,6 +443,7 @@ Example:
 def sign_request(
     words: tuple[str, ...],
     policy_file: Path | None,
+    fleet_file: Path | None,
     output: Path | None,
     renew: bool,
     force: bool,
@@ -457,7 +462,6 @@ def sign_request(
     from sros_tool.keystore.layout import PERMISSIONS
     from sros_tool.keystore.reader import load_ca_certificate
     from sros_tool.pki.certificates import digest
-    from sros_tool.policy.document import read_policy
     from sros_tool.runtime.environment import domain_from
 
     root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
@@ -467,7 +471,8 @@ def sign_request(
     if no_answer:
         if output is not None or force:
             raise UsageError("--no-answer makes no file: leave out -o and --force")
-        _certify(root, request, policy_file, renew=renew, dry_run=dry_run, as_json=as_json)
+        policy = _policy(policy_file, fleet_file)
+        _certify(root, request, policy, renew=renew, dry_run=dry_run, as_json=as_json)
         return
     if output is None:
         output = _STREAM if request == _STREAM else Path(request.name).with_suffix(".answer.tar.gz")
@@ -480,7 +485,7 @@ def sign_request(
         root,
         read_named(request, "signing request"),
         now=now(),
-        policy=read_policy(policy_file) if policy_file else None,
+        policy=_policy(policy_file, fleet_file),
         renew=renew,
         answer=None if stream else output,
         force=force,
@@ -516,10 +521,24 @@ def sign_request(
     print_notes(signed.notes)
 
 
+def _policy(file: Path | None, fleet_file: Path | None) -> Policy | None:
+    """Return the policy in a file, for the robots of a fleet if one is named."""
+    from sros_tool.policy.document import read_policy
+
+    if file is None:
+        if fleet_file is not None:
+            raise UsageError("--fleet is for the placeholders of a policy: add -p POLICY_FILE")
+        return None
+    if fleet_file is None:
+        return read_policy(file)
+    (policy,) = fleet_policies([file], fleet_file)
+    return policy.policy()
+
+
 def _certify(
     root: Path,
     request: Path,
-    policy_file: Path | None,
+    policy: Policy | None,
     *,
     renew: bool,
     dry_run: bool,
@@ -527,14 +546,13 @@ def _certify(
 ) -> None:
     """Certify the keys of several requests, and print what was done."""
     from sros_tool.keystore.delivery.signing import certify_requests
-    from sros_tool.policy.document import read_policy
     from sros_tool.runtime.environment import domain_from
 
     done = certify_requests(
         root,
         read_named(request, "signing request"),
         now=now(),
-        policy=read_policy(policy_file) if policy_file else None,
+        policy=policy,
         renew=renew,
         domain=domain_from(os.environ),
         keyring=keyring(),

@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.runtime.netns import try_isolation
-from tests.support.children import Done, finish, run, wait_for
+from tests.support.children import PATIENCE, run, wait_for
 
 CHECKOUT = Path(__file__).parents[2]
 PORT = 22022
 SSHD = "/usr/sbin/sshd"
-FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
+FAKETIME = next(map(str, Path("/usr/lib").glob("*/faketime/libfaketime.so.1")), "")
+"""A library that gives a process another clock, or "" without it."""
 PROGRAM = [sys.executable, "-m", "sros_tool"]
 MISSING = [
     each
@@ -80,13 +81,18 @@ class Robot:
 
 @dataclass
 class Fleet:
-    """Robots by name, and how to run Ansible on them."""
+    """Robots by name, and how to run Ansible on them.
+
+    ``variables`` are those of the inventory for each robot and for "all", ``extra`` those of every
+    command line.
+    """
 
     folder: Path
     keystore: Path
     inside: list[str]
     robots: dict[str, Robot] = field(default_factory=dict)
     variables: dict[str, dict[str, Any]] = field(default_factory=dict)
+    extra: dict[str, Any] = field(default_factory=dict)
 
     def add(self, name: str, environment: Mapping[str, str] | None = None) -> Robot:
         """Make a robot whose sshd runs; ``environment`` holds for all that runs on it."""
@@ -170,7 +176,7 @@ class Fleet:
             *self.inside,
             str(Path(sys.executable).parent / "ansible-playbook"),
             *("-i", self.inventory(), f"sros.fleet.{play}"),
-            *("-e", json.dumps(variables)),
+            *("-e", json.dumps(self.extra | variables)),
             *words,
         ]
         return subprocess.Popen(
@@ -188,8 +194,16 @@ class Fleet:
         self, play: str, *words: object, status: int | None = 0, **variables: object
     ) -> Played:
         """Run a play of the collection to its end."""
-        done = finish(self.begin(play, *words, **variables), status=status)
-        return Played(done)
+        process = self.begin(play, *words, **variables)
+        try:
+            out, _ = process.communicate(timeout=len(self.robots) * PATIENCE)
+        except subprocess.TimeoutExpired:
+            end_all(process)
+            raise
+        assert status in (None, process.returncode), (
+            f"{play} ended with {process.returncode}: {out}"
+        )
+        return Played(out)
 
     def environment(self) -> dict[str, str]:
         """Return the environment of Ansible."""
@@ -207,11 +221,7 @@ class Fleet:
 class Played:
     """What a play printed, and its recap by host."""
 
-    done: Done
-
-    @property
-    def text(self) -> str:
-        return self.done.stdout
+    text: str
 
     @property
     def recap(self) -> dict[str, dict[str, int]]:

@@ -289,12 +289,18 @@ def _write_folder(
 
 
 def _stale(target: Path, files: dict[str, bytes]) -> list[str]:
-    """Return the Zenoh files and keys of earlier exports that the enclaves do not have now."""
+    """Return the Zenoh files and keys of earlier exports that the enclaves do not have now.
+
+    An enclave that is exported without a key keeps the one that is there: no other copy exists.
+    """
     folders = {path.rpartition("/")[0] for path in files}
+    keyed = {folder for folder in folders for file in KEY_FILES if f"{folder}/{file}" in files}
     return sorted(
         path
         for folder in folders
-        for path in (f"{folder}/{file}" for file in (*ZENOH_FILES, *KEY_FILES))
+        for path in (
+            f"{folder}/{file}" for file in (*ZENOH_FILES, *(KEY_FILES if folder in keyed else ()))
+        )
         if path not in files and os.path.lexists(target / path)
     )
 

@@ -5,6 +5,7 @@ Like everything that runs on a robot, this needs Python 3.8 and its standard lib
 
 from __future__ import annotations
 
+import base64
 import binascii
 import datetime
 import hashlib
@@ -15,6 +16,9 @@ import zlib
 from typing import Dict, Iterator
 
 KEY_FILE = "key.pem"
+KEY_URI_FILE = "key.p11"
+"""In place of the key: the PKCS#11 URI of a key on a token of the robot."""
+KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 REQUEST_FILE = "request.pem"
 CERTIFICATE_FILE = "cert.pem"
 AUTHORITY_FILES = ("identity_ca.cert.pem", "permissions_ca.cert.pem")
@@ -23,7 +27,7 @@ ZENOH_FILES = ("session.json5", "session.p7s", "router.json5", "router.p7s")
 REQUIRED_FILES = (CERTIFICATE_FILE, *AUTHORITY_FILES, *SIGNED_FILES)
 CONFIRMED_FILES = (*REQUIRED_FILES, "crl.pem", *ZENOH_FILES)
 """The files of an enclave that an export has besides the key, and that a confirmation names."""
-_LOCAL_FILES = (KEY_FILE, REQUEST_FILE, "answer.p7s", "permissions.xml", "governance.xml")
+_LOCAL_FILES = (*KEY_FILES, REQUEST_FILE, "answer.p7s", "permissions.xml", "governance.xml")
 """Other files that an enclave on a robot may have."""
 
 MOST_PACKED = 64 * 1024 * 1024
@@ -35,6 +39,7 @@ MOST_OF_FILE = 17 * 1024 * 1024
 _TOP = "enclaves"
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _LONGEST_NAME = 64
+_MOST_CERTIFICATES = 32
 _CERTIFICATE = re.compile(
     rb"-----BEGIN CERTIFICATE-----\s+([A-Za-z0-9+/=\s]+?)-----END CERTIFICATE-----"
 )
@@ -79,13 +84,14 @@ def check_enclave(name: str) -> str:
 def is_enclave_path(path: str) -> bool:
     """Return whether ``path`` is that of a file that an enclave on a robot may have."""
     folder, _, file = path.rpartition("/")
-    if folder.split("/")[0] != _TOP or file not in (*CONFIRMED_FILES, *_LOCAL_FILES):
-        return False
+    name = folder[len(_TOP) :] or "/"
     try:
-        check_enclave(folder[len(_TOP) :] or "/")
+        return folder == folder_of(check_enclave(name)) and file in (
+            *CONFIRMED_FILES,
+            *_LOCAL_FILES,
+        )
     except RefusedError:
         return False
-    return True
 
 
 def read_archive(packed: bytes) -> Files:
@@ -132,7 +138,7 @@ def _members(archive: tarfile.TarFile) -> Iterator[tuple]:
             continue
         if not entry.isreg() or entry.name in seen or not is_enclave_path(entry.name):
             raise ValueError(f"{entry.name[:200]!r} does not belong to an export")
-        if entry.name.rpartition("/")[2] not in (KEY_FILE, *CONFIRMED_FILES):
+        if entry.name.rpartition("/")[2] not in (*KEY_FILES, *CONFIRMED_FILES):
             raise ValueError(f"{entry.name[:200]!r} does not belong to an export")
         if entry.size > MOST_OF_FILE:
             raise ValueError(f"{entry.name!r} is larger than {MOST_OF_FILE} bytes")
@@ -164,49 +170,39 @@ def authorities(files: Files) -> frozenset[bytes]:
     )
 
 
-def authority_digests(files: Files) -> frozenset[str]:
-    """Return the SHA-256 of the certificates of all permissions CAs, in hexadecimal."""
-    found: set[str] = set()
-    for path, content in files.items():
-        if path.rpartition("/")[2] == AUTHORITY_FILES[1]:
-            found.update(_certificate_digests(content))
-    return frozenset(found)
+def certificate_digests(content: bytes) -> list[str]:
+    """Return the SHA-256 of the certificates (DER) in a file, in their order."""
+    found = []
+    for block in _CERTIFICATE.findall(content)[:_MOST_CERTIFICATES]:
+        try:
+            found.append(hashlib.sha256(base64.b64decode(b"".join(block.split()))).hexdigest())
+        except binascii.Error:
+            continue
+    return found
 
 
 def confirmation(robot: str, files: Files, now: float) -> dict:
-    """Return what a robot confirms that it has: the SHA-256 of each file but keys.
-
-    It also has those of the certificates (DER) in files, by which the ledger knows earlier ones.
+    """Return what a robot confirms that it has (sros_tool/schemas/confirmation.json).
 
     Args:
         robot: the name of the robot.
         files: the files of its keystore.
         now: seconds since 1970 by the clock of the robot.
     """
+    confirmed = {
+        path: content
+        for path, content in sorted(files.items())
+        if path.rpartition("/")[2] in CONFIRMED_FILES
+    }
     moment = datetime.datetime.fromtimestamp(int(now), datetime.timezone.utc)
     return {
         "format": 1,
         "robot": robot,
         "time": moment.strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "files": {
-            path: hashlib.sha256(content).hexdigest()
-            for path, content in sorted(files.items())
-            if path.rpartition("/")[2] in CONFIRMED_FILES
-        },
+        "files": {path: hashlib.sha256(each).hexdigest() for path, each in confirmed.items()},
         "certificates": {
-            path: _certificate_digests(content)
-            for path, content in sorted(files.items())
+            path: certificate_digests(each)
+            for path, each in confirmed.items()
             if path.rpartition("/")[2] in (CERTIFICATE_FILE, *AUTHORITY_FILES)
         },
     }
-
-
-def _certificate_digests(content: bytes) -> list[str]:
-    """Return the SHA-256 of each certificate in a PEM file; damaged ones are left out."""
-    found = []
-    for block in _CERTIFICATE.findall(content):
-        try:
-            found.append(hashlib.sha256(binascii.a2b_base64(block)).hexdigest())
-        except binascii.Error:
-            continue
-    return found[:32]

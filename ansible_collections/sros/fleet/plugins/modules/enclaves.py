@@ -119,7 +119,7 @@ verification:
   type: dict
   returned: unless something would change in check mode
 confirmation:
-  description: What the robot has, with the SHA-256 of each file but keys.
+  description: What the robot has, as SHA-256, for C(sros fleet confirm).
   type: dict
   returned: always
 clock_difference:
@@ -139,6 +139,7 @@ from ansible.module_utils.basic import AnsibleModule
 from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     CERTIFICATE_FILE,
     KEY_FILE,
+    KEY_FILES,
     REQUEST_FILE,
     Files,
     RefusedError,
@@ -156,6 +157,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.verification import (
     verify,
 )
 
+_MOST_PROBLEMS = 3
 _ARGUMENTS = {
     "keystore": {"type": "path"},
     "robot": {"type": "str", "required": True},
@@ -238,16 +240,15 @@ def _after(before: Files, sent: Files) -> Files:
     """
     after = dict(sent)
     for name in enclaves_in(sent):
-        own, request = (folder_of(name) + "/" + each for each in (KEY_FILE, REQUEST_FILE))
-        if own not in sent:
-            if own not in before:
+        keys = [folder_of(name) + "/" + each for each in KEY_FILES]
+        if not any(each in sent for each in keys):
+            if not any(each in before for each in keys):
                 raise RefusedError(
                     f"The key of enclave {name} is neither at home nor on this robot. Make another"
                     " one on the robot with the play sros.fleet.requests."
                 )
-            after[own] = before[own]
-            if request in before:
-                after[request] = before[request]
+            own = (*keys, folder_of(name) + "/" + REQUEST_FILE)
+            after.update((each, before[each]) for each in own if each in before)
     for name in set(enclaves_in(before)) - set(enclaves_in(sent)):
         waits = folder_of(name) + "/" + REQUEST_FILE in before
         if waits and folder_of(name) + "/" + CERTIFICATE_FILE not in before:
@@ -296,10 +297,11 @@ def _install(
         finally:
             place.discard()
     if not found["ok"]:
+        first, more = found["problems"][:_MOST_PROBLEMS], len(found["problems"]) - _MOST_PROBLEMS
         raise RefusedError(
             "The enclaves do not verify on this robot ({}): {}. {}".format(
                 found["by"],
-                "; ".join(found["problems"]),
+                "; ".join([*first, *([f"and {more} more"] if more > 0 else [])]),
                 "They are installed already." if present else "The earlier files stay.",
             )
         )

@@ -64,6 +64,7 @@ from ansible.module_utils.basic import AnsibleModule
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     KEY_FILE,
+    KEY_FILES,
     REQUEST_FILE,
     Files,
     RefusedError,
@@ -110,7 +111,11 @@ def main() -> None:
 
 
 def _lacking(files: Files, names: list) -> list:
-    return [each for each in names if folder_of(each) + "/" + KEY_FILE not in files]
+    return [
+        name
+        for name in names
+        if not any(folder_of(name) + "/" + each in files for each in KEY_FILES)
+    ]
 
 
 def _with_requests(files: Files, names: list, spare: str) -> Files:
@@ -120,11 +125,17 @@ def _with_requests(files: Files, names: list, spare: str) -> Files:
     for name in names:
         key, request = (folder_of(name) + "/" + each for each in (KEY_FILE, REQUEST_FILE))
         present = files.get(request, b"").decode(errors="replace")
-        if key in files and _PEM.search(present):
+        has_key = not _lacking(files, [name])
+        if has_key and _PEM.search(present):
             continue
         if not openssl:
             raise RefusedError("This robot lacks the program openssl. Install the package openssl.")
-        if key not in files:
+        if has_key and key not in files:
+            raise RefusedError(
+                f"The key of enclave {name} is on a token, and its request.pem is missing. Make it"
+                " again on the robot with `sros create_request --again`."
+            )
+        if not has_key:
             command = [openssl, "genpkey", "-algorithm", "EC"]
             new[key] = _run([*command, "-pkeyopt", "ec_paramgen_curve:P-256"], b"")
         settings = os.path.join(spare, "request.cnf")

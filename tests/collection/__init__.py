@@ -1,0 +1,1 @@
+"""The collection for Ansible: what its modules do, without Ansible."""

@@ -1,0 +1,106 @@
+"""The collection as Ansible reads it: documentation, syntax, and what robots need."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from ansible_collections.sros.fleet.plugins.filter.due_units import due_units, without_unit
+from sros_tool import __version__
+from tests.integration.robots import CHECKOUT
+from tests.support.children import run
+
+COLLECTION = CHECKOUT / "ansible_collections/sros/fleet"
+PLAYS = sorted(path.stem for path in (COLLECTION / "playbooks").glob("*.yml"))
+BIN = Path(sys.executable).parent
+FOR_ROBOTS = ("plugins/modules", "plugins/module_utils")
+_STANDARD = sys.stdlib_module_names
+
+needs_ansible = pytest.mark.skipif(
+    not (BIN / "ansible-playbook").exists(), reason="ansible-core is needed"
+)
+
+
+def ansible(program: str, *words: object, folder: Path) -> str:
+    environment = {
+        **os.environ,
+        "ANSIBLE_HOME": str(folder),
+        "ANSIBLE_COLLECTIONS_PATH": str(CHECKOUT),
+        "ANSIBLE_DEPRECATION_WARNINGS": "1",
+        "LC_ALL": "C.UTF-8",
+    }
+    done = run([BIN / program, *words], env=environment, cwd=folder)
+    assert "WARNING" not in done.stderr.replace("provided hosts list is empty", ""), done.stderr
+    return done.stdout
+
+
+@needs_ansible
+def test_the_syntax_of_each_play(tmp_path: Path) -> None:
+    assert {"deliver", "renew", "change", "revoke", "rotate", "requests", "status"} <= set(PLAYS)
+    plays = [f"sros.fleet.{each}" for each in PLAYS]
+    facts = json.dumps({"sros_stage": "reissue", "sros_revoke": ["r1"]})
+    (tmp_path / "inventory.json").write_text('{"all": {"hosts": {"r1": {}}}}')
+    words = ("-i", tmp_path / "inventory.json", "--syntax-check", "-e", facts)
+    said = ansible("ansible-playbook", *words, *plays, folder=tmp_path)
+    assert said.count("playbook:") == len(PLAYS)
+
+
+@needs_ansible
+def test_the_documentation_of_each_part(tmp_path: Path) -> None:
+    modules = sorted(path.stem for path in (COLLECTION / "plugins/modules").glob("*.py"))
+    names = [f"sros.fleet.{each}" for each in modules]
+    found = json.loads(ansible("ansible-doc", "--json", *names, folder=tmp_path))
+    for name, parts in found.items():
+        assert parts["examples"].strip(), name
+        assert parts["return"], name
+        assert all(each.get("description") for each in parts["doc"]["options"].values()), name
+        source = (COLLECTION / f"plugins/modules/{name.rpartition('.')[2]}.py").read_text()
+        given = set(re.findall(r'^\s+"(\w+)": \{"type"', source, re.MULTILINE))
+        assert given == set(parts["doc"]["options"]), name
+    filters = ("due_units", "without_unit", "stage_is_due")
+    words = ("--json", "-t", "filter", *(f"sros.fleet.{each}" for each in filters))
+    assert len(json.loads(ansible("ansible-doc", *words, folder=tmp_path))) == 3
+    words = ("--json", "-t", "role", "sros.fleet.robot")
+    (role,) = json.loads(ansible("ansible-doc", *words, folder=tmp_path)).values()
+    defaults = (COLLECTION / "roles/robot/defaults/main.yml").read_text()
+    known = set(re.findall(r"^(\w+):", defaults, re.MULTILINE)) | {"sros_keystore"}
+    assert known == set(role["entry_points"]["main"]["options"])
+
+
+def test_robots_need_an_old_python_and_nothing_else() -> None:
+    for folder in FOR_ROBOTS:
+        for path in (COLLECTION / folder).glob("*.py"):
+            tree = ast.parse(path.read_text(), feature_version=(3, 8))
+            for node in ast.walk(tree):
+                names = []
+                if isinstance(node, ast.Import):
+                    names = [each.name for each in node.names]
+                elif isinstance(node, ast.ImportFrom):
+                    names = [node.module or ""]
+                for name in names:
+                    own = name.startswith(("ansible_collections.sros", "ansible.module_utils"))
+                    assert own or name.partition(".")[0] in _STANDARD, (path, name)
+
+
+def test_the_version_is_that_of_sros() -> None:
+    assert f"\nversion: {__version__}\n" in (COLLECTION / "galaxy.yml").read_text()
+
+
+def test_units_to_restart_are_in_order() -> None:
+    units = [
+        {"name": "camera", "enclaves": ["/r1/camera"]},
+        {"name": "both", "enclaves": ["/r1/camera", "/r1/base"]},
+        {"name": "router", "enclaves": ["/r1/router"]},
+        {"name": "all"},
+    ]
+    assert due_units(units, []) == []
+    assert due_units(units, ["/r1/base"]) == ["both", "all"]
+    changed = ["/r1/camera", "/r1/router"]
+    assert due_units(units, changed, ["/r1/router"]) == ["router", "camera", "both", "all"]
+    assert without_unit(["/r1/x", "/r1/base"], units[:2]) == ["/r1/x"]

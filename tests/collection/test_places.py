@@ -1,0 +1,179 @@
+"""The folder of a robot's enclaves: replaced whole or not at all, and hostile until then."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+from pathlib import Path
+
+import pytest
+
+from ansible_collections.sros.fleet.plugins.module_utils import places
+from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
+from ansible_collections.sros.fleet.plugins.module_utils.places import Place
+
+OLD = {"enclaves/a/cert.pem": b"old", "enclaves/a/key.pem": b"key"}
+NEW = {"enclaves/a/cert.pem": b"new", "enclaves/b/c/cert.pem": b"other"}
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Place:
+    """A folder that has the files OLD, in /dev/shm or /tmp, where others may make files."""
+    made = Place(str(tmp_path / "etc/keystore"))
+    install(made, OLD)
+    return made
+
+
+def install(place: Place, files: dict[str, bytes]) -> None:
+    with place.locked():
+        place.prepare(files)
+        place.replace()
+        place.discard()
+
+
+def beside(place: Place) -> set[str]:
+    return set(os.listdir(Path(place.path).parent)) - {"keystore", ".keystore.sros-lock"}
+
+
+@pytest.mark.parametrize("exchange", [True, False])
+def test_a_folder_is_replaced_whole(
+    exchange: bool, place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not exchange:
+        monkeypatch.setattr(places, "_exchange", lambda *_: False)
+    assert place.read() == OLD
+    assert place.is_closed()
+    key = Path(place.path, "enclaves/a/key.pem")
+    assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    key.chmod(0o644)
+    assert not place.is_closed()
+    install(place, NEW)
+    assert place.read() == NEW
+    assert place.is_closed()
+    assert not beside(place)
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("exchange", [True, False])
+def test_killed_at_any_rename_it_is_old_or_new(
+    exchange: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And whoever comes next finds it whole, with nothing next to it."""
+    real_exchange, rename, remove = places._exchange, os.rename, shutil.rmtree
+    seen = set()
+    for number in range(8):
+        place = Place(str(tmp_path / str(number) / "keystore"))
+        install(place, OLD)
+        left = number
+
+        def step() -> bool:
+            nonlocal left
+            if left == 0:
+                raise Killed
+            left -= 1
+            return True
+
+        def exchanged(one: str, other: str) -> bool:
+            if not exchange:
+                return False
+            step()
+            return real_exchange(one, other)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(places, "_exchange", exchanged)
+            patch.setattr(os, "rename", lambda *names: rename(*names) if step() else None)
+            patch.setattr(shutil, "rmtree", lambda path: remove(path) if step() else None)
+            try:
+                with place.locked():
+                    place.prepare(NEW)
+                    place.replace()
+            except Killed:
+                seen.add("killed")
+        with place.locked():
+            found = place.read()
+        assert found in (OLD, NEW), number
+        assert not beside(place)
+        seen.add("new" if found == NEW else "old")
+    assert seen == {"killed", "old", "new"}
+
+
+def test_restarts_that_are_due_are_remembered(place: Place) -> None:
+    assert place.due() == []
+    place.set_due(["/b", "/a"])
+    assert Place(place.path).due() == ["/a", "/b"]
+    place.set_due([])
+    assert place.due() == []
+    assert not beside(place)
+    for bad in (b"", b"{", b"[1]", b'["a"]', b'["/a/../b"]', b"[" * 100_000):
+        Path(place.path).with_name(".keystore.sros-restart").write_bytes(bad)
+        with pytest.raises(RefusedError):
+            place.due()
+
+
+def test_what_is_no_enclave_is_refused(place: Place) -> None:
+    """The folder may have another purpose, and it would be removed."""
+    top = Path(place.path)
+    for path in ("README", "private/identity_ca.key.pem", "enclaves/a/id_rsa", "enclaves/x y/a"):
+        file = top / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("x")
+        with pytest.raises(RefusedError, match="not a file of an enclave"):
+            place.read()
+        file.unlink()
+        if file.parent not in (top, top / "enclaves/a"):
+            file.parent.rmdir()
+    (top / "enclaves/a/crl.pem").symlink_to("/etc/shadow")
+    with pytest.raises(RefusedError, match="not a file of an enclave"):
+        place.read()
+    (top / "enclaves/a/crl.pem").unlink()
+    (top / "enclaves/l").symlink_to("/etc")
+    with pytest.raises(RefusedError, match="not a file of an enclave"):
+        place.read()
+    (top / "enclaves/l").unlink()
+    os.mkfifo(top / "enclaves/a/crl.pem")
+    with pytest.raises(RefusedError, match="not a file of an enclave"):
+        place.read()
+
+
+def test_a_way_that_others_can_change_is_refused(tmp_path: Path) -> None:
+    real = tmp_path / "real"
+    real.mkdir()
+    (tmp_path / "link").symlink_to(real)
+    Place(str(tmp_path / "link/keystore"))  # a link of one's own
+    (real / "keystore").symlink_to(tmp_path)
+    with pytest.raises(RefusedError, match="symbolic link"):
+        Place(str(real / "keystore"))
+    with pytest.raises(RefusedError, match="cannot be '/'"):
+        Place("/")
+    (tmp_path / "file").touch()
+    with pytest.raises(RefusedError, match="not a folder"):
+        Place(str(tmp_path / "file/keystore"))
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(RefusedError, match="too many links"):
+        Place(str(tmp_path / "loop/keystore"))
+    real.chmod(0o777)
+    with pytest.raises(RefusedError, match="Others can write"):
+        Place(str(real / "other"))
+    real.chmod(0o755)
+    if os.getuid() == 0:
+        os.chown(real, 65534, 65534)
+        with pytest.raises(RefusedError, match="belongs to another user"):
+            Place(str(real / "other"))
+        real.chmod(0o1777)
+        with pytest.raises(RefusedError, match="belongs to another user"):
+            Place(str(real / "other"))
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")
+def test_the_owner_gets_the_files(tmp_path: Path) -> None:
+    place = Place(str(tmp_path / "keystore"), "nobody")
+    install(place, OLD)
+    assert place.is_closed()
+    assert {os.lstat(each).st_uid for each in Path(place.path).rglob("*")} == {65534}
+    assert not Place(place.path).is_closed()
+    with pytest.raises(RefusedError, match="no user"):
+        Place(place.path, "no such user")

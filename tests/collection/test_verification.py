@@ -1,0 +1,149 @@
+"""OpenSSL as the verifier of a robot without sros finds what sros finds."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
+from ansible_collections.sros.fleet.plugins.module_utils.verification import clock_remark, verify
+from sros_tool.checks.keystores.arrival import verify_arrival
+from sros_tool.keystore.delivery.export import distribute
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.template import load_template
+
+pytestmark = pytest.mark.skipif(not shutil.which("openssl"), reason="the program openssl is needed")
+
+NONE = ["no-such-program"]
+
+
+@pytest.fixture(scope="module")
+def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Exports of one keystore, by the moment or by what is special about them."""
+    folder = tmp_path_factory.mktemp("exports")
+    now, long_ago = datetime.now(UTC), datetime.now(UTC) - timedelta(days=360)
+    made = {}
+
+    def export(what: str, *names: str, keystore: str = "ks", at: datetime = now) -> None:
+        made[what] = folder / "exports" / what
+        distribute(folder / keystore, names, made[what], now=at)
+
+    for name, moment in (("ks", now), ("other", now), ("old", long_ago - timedelta(days=30))):
+        create_keystore(folder / name, template=load_template("production"), now=moment)
+        create_enclaves(folder / name, ["/a", "/b"], now=moment)
+        export(name, "/a", "/b", keystore=name, at=moment)
+    create_enclaves(folder / "ks", ["/c"], now=now)
+    export("c", "/c")
+    revoke(folder / "ks", ["/c"], now=now)
+    export("revoked", "/a", "/b")
+    for each in ("distribute", "reissue", "retire"):
+        rotate_ca(folder / "ks", now=now)
+        export(each, "/a", "/b")
+    return made
+
+
+def spoil(file: str, change: Callable[[bytes], bytes]) -> Callable[[Path, dict[str, Path]], None]:
+    def do(folder: Path, _: dict[str, Path]) -> None:
+        path = folder / "enclaves/a" / file
+        path.write_bytes(change(path.read_bytes()))
+
+    return do
+
+
+def take(file: str, source: str, name: str = "a") -> Callable[[Path, dict[str, Path]], None]:
+    def do(folder: Path, exports: dict[str, Path]) -> None:
+        shutil.copy(exports[source] / "enclaves" / name / file, folder / "enclaves/a" / file)
+
+    return do
+
+
+def revoked_one(folder: Path, exports: dict[str, Path]) -> None:
+    shutil.rmtree(folder / "enclaves/a")
+    shutil.copytree(exports["c"] / "enclaves/c", folder / "enclaves/c")
+    shutil.copy(exports["revoked"] / "enclaves/a/crl.pem", folder / "enclaves/c")
+
+
+BROKEN = {
+    "permissions of another enclave": take("permissions.p7s", "ks", "b"),
+    "the key of another enclave": take("key.pem", "ks", "b"),
+    "the certificate of another enclave": take("cert.pem", "ks", "b"),
+    "another identity CA": take("identity_ca.cert.pem", "other"),
+    "another permissions CA": take("permissions_ca.cert.pem", "other"),
+    "another governance": take("governance.p7s", "other"),
+    "changed permissions": spoil(
+        "permissions.p7s", lambda b: b.replace(b"allow_rule", b"deny_rule")
+    ),
+    "changed governance": spoil("governance.p7s", lambda b: b.replace(b"true", b"false")),
+    "an empty file": spoil("cert.pem", lambda _: b""),
+    "junk for a key": spoil("key.pem", lambda _: b"junk"),
+    "a revoked enclave": revoked_one,
+}
+
+
+def names_in(folder: Path) -> list[str]:
+    return [f"/{each.name}" for each in sorted((folder / "enclaves").iterdir())]
+
+
+@pytest.mark.parametrize("what", ["ks", "revoked", "distribute", "reissue", "retire"])
+def test_what_is_good(what: str, exports: dict[str, Path]) -> None:
+    found = verify(str(exports[what]), ["/a", "/b"], NONE)
+    assert (found["by"], found["ok"], found["problems"]) == ("openssl", True, [])
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_what_is_broken(what: str, exports: dict[str, Path], tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(exports["ks"], tmp_path / "robot"))
+    BROKEN[what](folder, exports)
+    names = names_in(folder)
+    found = verify(str(folder), names, NONE)
+    assert not found["ok"]
+    arrived = verify_arrival(folder, now=datetime.now(UTC)).enclaves
+    broken = [each.name for each in arrived if not each.loadable]
+    assert {each.partition(":")[0] for each in found["problems"]} == set(broken) == {names[-1]} or (
+        set(broken) == {"/a"} and all(each.startswith("/a:") for each in found["problems"])
+    )
+
+
+def test_what_has_expired(exports: dict[str, Path]) -> None:
+    found = verify(str(exports["old"]), ["/a", "/b"], NONE)
+    assert any("certificate has expired" in each for each in found["problems"])
+    assert any("permissions.p7s: it expired at" in each for each in found["problems"])
+
+
+def test_who_verifies(exports: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What sros says is taken apart; a program that says nothing is no verification."""
+    answer = (
+        '{"enclaves": [{"name": "/a", "loadable": false}, {"name": "/b", "loadable": true}],'
+        ' "findings": [{"enclave": "/a", "text": "bad"}, {"enclave": "/b", "text": "soon"},'
+        ' {"enclave": null, "text": "all"}]}'
+    )
+    folder = str(exports["ks"])
+    found = verify(folder, ["/a", "/b"], ["sh", "-c", f"echo '{answer}'"])
+    assert found == {
+        "by": "sros",
+        "ok": False,
+        "problems": ["/a: bad"],
+        "remarks": ["all", "/b: soon"],
+    }
+    assert verify(folder, ["/c"], ["sh", "-c", f"echo '{answer}'"])["problems"] == [
+        "/c: it is not loadable"
+    ]
+    for said in ("", "[]", "{}", "junk"):
+        with pytest.raises(RefusedError, match="no answer"):
+            verify(folder, ["/a"], ["sh", "-c", f"echo '{said}'; echo why >&2"])
+    monkeypatch.setenv("PATH", "/nonexistent")
+    with pytest.raises(RefusedError, match="neither sros nor openssl"):
+        verify(folder, ["/a"], NONE)
+
+
+def test_clocks() -> None:
+    assert clock_remark(100.0, None, 10) == ""
+    assert clock_remark(105.0, 100.0, 10) == ""
+    assert "0:01:40 ahead" in clock_remark(200.0, 100.0, 10)
+    assert "1 day, 0:00:00 behind" in clock_remark(0.0, 86400.0, 10)
