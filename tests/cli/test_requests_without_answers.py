@@ -82,9 +82,9 @@ def test_requests_of_a_fleet(keystore: Path, tmp_path: Path) -> None:
     for name, robot in robots.items():
         pattern = name.replace("arm", "*")
         sros("distribute_key", keystore, "--match", pattern, robot, "--keyless").ok()
-        key = (robot / f"enclaves{name}/key.pem").read_bytes()
+        kept = (robot / f"enclaves{name}/key.pem").read_bytes()
         sros("distribute_key", keystore, "--match", pattern, robot, "--keyless", "--force").ok()
-        assert (robot / f"enclaves{name}/key.pem").read_bytes() == key, "the only copy"
+        assert (robot / f"enclaves{name}/key.pem").read_bytes() == kept, "the only copy"
         assert f"{name}  loadable" in sros("verify", robot).ok().out
         assert not (keystore / f"enclaves{name}/key.pem").exists()
     assert topics_of(robots[B] / f"enclaves{B}") == {"rt/two", "ros_discovery_info"}
