@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -278,7 +278,7 @@ class _Home:
     def __init__(self, root: Path, folder: Folder) -> None:
         self._root = root
         self._folder = folder
-        self._shared: dict[str, _FileAtHome | None] = {}
+        self._shared: dict[tuple[str, str], _FileAtHome | None] = {}
 
     def files_of(self, name: str) -> Mapping[str, _FileAtHome | None]:
         """Map the paths of the files that an export has, without the key, to their digests.
@@ -289,23 +289,32 @@ class _Home:
         found: dict[str, _FileAtHome | None] = dict.fromkeys(
             f"{folder}/{file}" for file in REQUIRED_FILES if file != KEY_FILE
         )
-        with suppress(OSError), os.scandir(self._root / folder) as entries:
+        up = "../" * folder.count("/")
+        with suppress(OSError), os.scandir(f"{self._root}/{folder}") as entries:
             for each in entries:
                 if each.name in CONFIRMED_FILES:
                     path = f"{folder}/{each.name}"
-                    link = str(Path(each.path).readlink()) if each.is_symlink() else ""
-                    found[path] = self._linked(path, link) if link else self._read(path)
+                    found[path] = self._linked(path, up) if each.is_symlink() else self._file(path)
         return found
 
-    def _linked(self, path: str, link: str) -> _FileAtHome | None:
-        target = os.path.normpath(f"{path}/../{link}")
-        if target not in self._shared:
-            self._shared[target] = self._read(path)
-        return self._shared[target]
+    def _linked(self, path: str, up: str) -> _FileAtHome | None:
+        """Return what a link leads to; ``up`` leads from it to the folder of all enclaves."""
+        with suppress(SrosError, OSError):
+            link = self._folder.link_target(path) or ""
+            if not link.startswith(up):
+                return self._read(path, self._folder.read_inside)
+            place = (up, link)  # which is the same file for every enclave of this depth
+            if place not in self._shared:
+                self._shared[place] = self._read(path, self._folder.read_inside)
+            return self._shared[place]
+        return None
 
-    def _read(self, path: str) -> _FileAtHome | None:
+    def _file(self, path: str) -> _FileAtHome | None:
+        return self._read(path, self._folder.read)
+
+    def _read(self, path: str, read: Callable[[str], bytes]) -> _FileAtHome | None:
         try:
-            data = self._folder.read_inside(path)
+            data = read(path)
         except (SrosError, OSError):
             return None
         is_bundle = _kind_of(path) in _AUTHORITIES
