@@ -121,7 +121,7 @@ def _report(folder: Path | None, robot: str) -> None:
 Example:
   $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
         sros fleet confirm keystore --robot r7 -
-  r7: current, 18 files of 2 enclaves""",
+  kept what r7 has: 18 files of 2 enclaves""",
 )
 @click.argument(
     "words",
@@ -187,8 +187,8 @@ Example:
   $ sros fleet status keystore
   50 robots: 47 current, 1 earlier, 1 another's files, 1 never confirmed
   robot  state            confirmed   what
-  r7     earlier          3 d 4 h ago 1 permissions of 2027-05-01T06:05:29Z
-  r8     another's files  2 min ago   10 of r9
+  r7     earlier          3 d 4 h ago earlier permissions of 2027-05-01T06:...
+  r8     another's files  2 min ago   10 files of r9
   r31    never confirmed  -           2 enclaves
   $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
@@ -311,7 +311,7 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         yield f"{state} {', '.join(named)}{f' of {since}' if since else ''}"
     if len(groups) > _MOST_GROUPS:
         yield f"more, see --robot {robot.robot}"
-    if robot.received and robot.enclaves and robot.stage != stage:
+    if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"CA files of the stage {robot.stage}"
     yield from robot.notes
 
