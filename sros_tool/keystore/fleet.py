@@ -69,7 +69,11 @@ def edited_fleet(root: Path, ledger: Ledger) -> str:
 
 
 def _edited(ledger: Ledger, data: bytes | None) -> str:
-    last = next((each for each in reversed(ledger.entries) if each.what == "fleet"), None)
+    # What somebody else adds to the ledger is not among the entries that are certain.
+    last = next((each for each in reversed(ledger.certain) if each.what == "fleet"), None)
+    if last is None and any(each.what == "fleet" for each in ledger.entries):
+        state = "is missing" if data is None else "is not certainly the one that sros wrote"
+        return f"{state}, because the ledger was changed by something else"
     if last is None:
         return "" if data is None else "was not written by sros"
     if data is None:
@@ -157,6 +161,7 @@ def write_fleet(
     known = (before.enclaves if before else (), fleet.enclaves, patterns)
     paths = dict.fromkeys(sorted(each for paths in known for each in paths))
     fleet = fleet.with_enclaves(tuple(paths))
+    _refuse_shared(fleet)
     document = (_COMMENT + render_fleet(fleet)).encode()
     ledger = read_ledger(transaction.root, having=("what", "fleet"))
     if not _edited(ledger, document) and _read(transaction.root):
@@ -164,6 +169,23 @@ def write_fleet(
     transaction.write(FLEET, document)
     digest = hashlib.sha256(document).hexdigest()
     return fleet, (Entry(iso(now), "fleet", sha256=digest),)
+
+
+def _refuse_shared(fleet: Fleet) -> None:
+    """Raise `KeystoreError` if two robots have an enclave in common."""
+    owners: dict[str, str] = {}
+    for robot in fleet.robots.values():
+        for name in enclaves_of(fleet, robot):
+            if name in owners:
+                raise KeystoreError(
+                    f"the enclave {name} would belong to two robots, {owners[name]} and "
+                    f"{robot.name}",
+                    f"The keystore has the paths {', '.join(fleet.enclaves[:_SHOWN])}, perhaps from"
+                    " an earlier policy. An export for one of the robots would have the key of the "
+                    "other.",
+                    "Give the robot another name or namespace in the fleet file.",
+                )
+            owners[name] = robot.name
 
 
 def refuse_stale_domains(

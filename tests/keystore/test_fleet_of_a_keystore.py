@@ -1,0 +1,58 @@
+"""The fleet that a keystore records decides who gets which keys, so nobody else can change it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+
+from tests.support.harness import Ended, policy_text, publish, snapshot, sros
+
+FLEET = "[robots]\na = {}\na_arm = {}\n"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    sros("create_keystore", folder / "ks").ok()
+    generate(folder, "/{robot}").ok()
+    return folder
+
+
+def generate(folder: Path, path: str) -> Ended:
+    (folder / "fleet.toml").write_text(FLEET)
+    (folder / "policy.xml").write_text(policy_text({path: publish("x")}))
+    words = ("-p", folder / "policy.xml", "--fleet", folder / "fleet.toml")
+    return sros("generate_artifacts", "-k", folder / "ks", *words)
+
+
+def test_a_forged_record_does_not_hide_an_edit(made: Path, tmp_path: Path) -> None:
+    """A line that fits into the chain, but that no head signs, says nothing of the fleet."""
+    root = tmp_path / "ks"
+    shutil.copytree(made / "ks", root, symlinks=True)
+    sros("distribute_key", root, "--robot", "a", tmp_path / "before").ok()
+    file, ledger = root / "fleet.toml", root / "ledger.jsonl"
+    file.write_text(file.read_text().replace('"/{robot}"', '"/{robot}", "/{robot}_arm"'))
+    lines = ledger.read_bytes().splitlines()
+    forged = json.loads(next(each for each in lines if b'"what":"fleet"' in each))
+    forged["sha256"] = sha256(file.read_bytes()).hexdigest()
+    forged["previous"] = sha256(lines[-1]).hexdigest()
+    line = json.dumps(forged, separators=(",", ":")).encode()
+    ledger.write_bytes(b"\n".join([*lines, line]) + b"\n")
+    ended = sros("distribute_key", root, "--robot", "a", tmp_path / "out")
+    assert (ended.status, "is not certainly the one" in ended.err) == (2, True), ended
+    assert not (tmp_path / "out").exists()
+    file.unlink()
+    ended = sros("distribute_key", root, "--robot", "a", tmp_path / "out")
+    assert (ended.status, "is missing" in ended.err) == (2, True), ended
+
+
+def test_no_enclave_belongs_to_two_robots(made: Path) -> None:
+    """Paths of two policies can give one enclave to two robots; one would get the other's key."""
+    before = snapshot(made / "ks")
+    ended = generate(made, "/{robot}_arm")
+    assert (ended.status, "/a_arm would belong to two robots" in ended.err) == (2, True), ended
+    assert snapshot(made / "ks") == before
