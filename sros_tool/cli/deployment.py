@@ -438,6 +438,14 @@ Example:
     help="Make no answers, for delivery with `distribute_key --keyless`.  REQUEST may have several "
     "requests: all are signed, or none; those whose key has a certificate stay as they are.",
 )
+@click.option(
+    "--enclave",
+    "only",
+    multiple=True,
+    metavar="NAME",
+    help="With --no-answer: refuse a request for another enclave.  Once for each request, in their "
+    "order.",
+)
 @dry_run_option
 @json_option
 def sign_request(
@@ -448,6 +456,7 @@ def sign_request(
     renew: bool,
     force: bool,
     no_answer: bool,
+    only: tuple[str, ...],
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -472,8 +481,10 @@ def sign_request(
         if output is not None or force:
             raise UsageError("--no-answer makes no file: leave out -o and --force")
         policy = _policy(policy_file, fleet_file)
-        _certify(root, request, policy, renew=renew, dry_run=dry_run, as_json=as_json)
+        _certify(root, request, policy, only, renew=renew, dry_run=dry_run, as_json=as_json)
         return
+    if only:
+        raise UsageError("--enclave is for --no-answer")
     if output is None:
         output = _STREAM if request == _STREAM else Path(request.name).with_suffix(".answer.tar.gz")
     stream = output == _STREAM
@@ -539,6 +550,7 @@ def _certify(
     root: Path,
     request: Path,
     policy: Policy | None,
+    only: tuple[str, ...],
     *,
     renew: bool,
     dry_run: bool,
@@ -553,6 +565,7 @@ def _certify(
         read_named(request, "signing request"),
         now=now(),
         policy=policy,
+        only=only,
         renew=renew,
         domain=domain_from(os.environ),
         keyring=keyring(),

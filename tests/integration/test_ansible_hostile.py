@@ -84,3 +84,31 @@ def test_facts_of_a_robot_choose_no_command_and_no_keys(
     text = play(tmp_path, which, {"r1": robot}, sros_keystore=str(keystore))
     assert "names of settings (sros_program, sros_robot)" in text, text
     assert not trace.exists()
+
+
+def test_no_robot_gets_a_certificate_for_the_enclave_of_another(tmp_path: Path) -> None:
+    """A request says which enclave it is for, and who made it can choose that."""
+    keystore = tmp_path / "keystore"
+    sros("create_keystore", keystore).ok()
+    asked = tmp_path / "asked"
+    requests = {}
+    for name in ("/r1/own", "/r2/own"):
+        sros("create_request", name, asked).ok()
+        requests[name] = (asked / f"enclaves{name}/request.pem").read_text()
+    host = {"ansible_connection": "local", "sros_program": [sys.executable, "-m", "sros_tool"]}
+
+    def ask(returned: dict[str, object]) -> str:
+        made = {"changed": True, "made": ["/r1/own"], "requests": returned}
+        answers: dict[str, dict[str, Any]] = {"ping": {"ping": "pong"}, "requests": made}
+        python = str(hostile(tmp_path, "r1", answers))
+        robot = {**host, "ansible_python_interpreter": python, "sros_own_keys": ["/r1/own"]}
+        program = {"sros_program": host["sros_program"]}
+        return play(tmp_path, "requests", {"r1": robot}, sros_keystore=str(keystore), **program)
+
+    text = ask({"/r1/own": requests["/r2/own"]})
+    assert "is for enclave /r2/own, and should be for /r1/own" in " ".join(text.split()), text
+    text = ask({"/r2/own": requests["/r2/own"]})
+    assert "returned requests for other enclaves" in text, text
+    assert not (keystore / "enclaves/r2").exists()
+    ask({"/r1/own": requests["/r1/own"]})
+    assert (keystore / "enclaves/r1/own/cert.pem").exists()

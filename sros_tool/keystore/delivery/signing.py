@@ -183,6 +183,7 @@ def certify_requests(
     *,
     now: datetime,
     policy: Policy | None = None,
+    only: Sequence[str] = (),
     renew: bool = False,
     domain: int | None = None,
     keyring: Keyring = IN_KEYSTORE,
@@ -192,14 +193,19 @@ def certify_requests(
 
     As `sign_request`, but no answers are made: an export without keys brings the enclaves to their
     robots.  Unless ``renew`` is set, an enclave whose key is certified already stays as it is.
+    With ``only``, these are the enclaves that the requests have to be for, in their order: a robot
+    chooses what its request says.
 
     Raises:
         PkiError: a request is not valid.
-        KeystoreError: as for `sign_request`, or two requests are for one enclave or one key.
+        KeystoreError: as for `sign_request`, two requests are for one enclave or one key, or one is
+            for another enclave than ``only`` says.
     """
     requests = [load_request(each, f"number {at}") for at, each in enumerate(_each(data), 1)]
     if not requests:
         raise DocumentError("there is no signing request", "", "Give the request.pem of enclaves.")
+    if only:
+        _check_asked(requests, only)
     _check_distinct(requests)
     stated = {
         each.name: stated_enclave(policy, check_enclave_name(each.name)) if policy else None
@@ -237,6 +243,23 @@ def _each(data: bytes) -> list[bytes]:
     """Return the requests in a series of them; what is no request is left to the reader."""
     *parts, rest = data.split(_END)
     return [part + _END + b"\n" for part in parts] + ([rest] if rest.strip() else [])
+
+
+def _check_asked(requests: Sequence[SigningRequest], only: Sequence[str]) -> None:
+    """Refuse a request that is for another enclave than the one in its place of ``only``."""
+    if len(requests) != len(only):
+        raise KeystoreError(
+            f"there are {len(requests)} requests for {len(only)} enclaves",
+            "",
+            "Name the enclave of each request with --enclave, in their order.",
+        )
+    for number, (request, name) in enumerate(zip(requests, only, strict=True), 1):
+        if request.name != name:
+            raise KeystoreError(
+                f"request number {number} is for enclave {request.name}, and should be for {name}",
+                "Whoever made it asks for the identity of another enclave. Nothing was signed.",
+                "Look at the robot that it comes from.",
+            )
 
 
 def _check_distinct(requests: Sequence[SigningRequest]) -> None:
