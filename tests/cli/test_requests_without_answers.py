@@ -52,22 +52,22 @@ def test_requests_of_a_fleet(keystore: Path, tmp_path: Path) -> None:
         assert (ended.status, why in ended.err) == (2, True), ended
     ended = sros(*words, "-o", tmp_path / "x.tgz")
     assert "leave out -o and --force" in ended.err
-    for named in ([B, A], [A], [A, B, B]):  # a robot chooses what its request says
-        ended = sros(*words, *(word for each in named for word in ("--enclave", each)))
-        why = f"number 1 is for enclave {A}, and should be for {B}" if named[1:2] == [A] else "for "
+    for order in ([B, A], [A], [A, B, B]):  # a robot chooses what its request says
+        ended = sros(*words, *(word for each in order for word in ("--enclave", each)))
+        why = f"number 1 is for enclave {A}, and should be for {B}" if order[1:2] == [A] else "for "
         assert (ended.status, why in ended.err) == (2, True), ended
     sros(*words, "--dry-run").ok()
     assert snapshot(keystore) == before
 
-    words = (*words, "--enclave", A, "--enclave", B)
-    said = json.loads(sros(*words, "--json").ok().out)
+    named = (*words, "--enclave", A, "--enclave", B)
+    said = json.loads(sros(*named, "--json").ok().out)
     assert [(each["name"], each["outcome"]) for each in said["enclaves"]] == [
         (A, "created"),
         (B, "created"),
     ]
     assert said["answer"] is None
     after = snapshot(keystore)
-    said = json.loads(sros(*words, "--json").ok().out)
+    said = json.loads(sros(*named, "--json").ok().out)
     assert {each["outcome"] for each in said["enclaves"]} == {"kept"}
     assert snapshot(keystore) == after
 
