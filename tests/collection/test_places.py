@@ -168,6 +168,55 @@ def test_a_way_that_others_can_change_is_refused(tmp_path: Path) -> None:
             Place(str(real / "other"))
 
 
+def test_a_folder_to_which_others_can_add_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In /tmp somebody else could leave what looks like an interrupted change, or a parent."""
+    shared = tmp_path / "shared"
+    own = shared / "own"
+    own.mkdir(parents=True)
+    shared.chmod(0o1777)
+    for path in ("keystore", "new/keystore"):
+        with pytest.raises(RefusedError, match="Others can write to .*shared"):
+            Place(str(shared / path))
+    install(Place(str(own / "keystore")), OLD)  # nobody else can replace a folder of one's own
+
+    place = Place(str(own / "new/keystore"))
+    make = os.makedirs
+
+    def make_open(path: str, *words: object, **options: object) -> None:
+        make(path, exist_ok=True)
+        os.chmod(path, 0o1777)
+
+    monkeypatch.setattr(os, "makedirs", make_open)
+    with pytest.raises(RefusedError, match="Others can write to .*new"), place.locked():
+        pass
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root reads the files of others")
+def test_a_hard_link_to_a_file_of_somebody_else_is_not_read(tmp_path: Path) -> None:
+    """Its copy would be given to the owner of the enclaves."""
+    place = Place(str(tmp_path / "keystore"), "nobody")
+    install(place, OLD)
+    secret, link = tmp_path / "secret", Path(place.path, "enclaves/a/request.pem")
+    secret.write_text("secret")
+    secret.chmod(0o644)
+    link.hardlink_to(secret)
+    with pytest.raises(RefusedError, match=r"request.pem' may be a hard link"):
+        place.read()
+    secret.unlink()
+    assert place.read()["enclaves/a/request.pem"] == b"secret", "all users could read it"
+    link.chmod(0o600)
+    with pytest.raises(RefusedError, match=r"request.pem' may be a hard link"):
+        place.read()
+    link.unlink()
+    link.hardlink_to(Path(place.path, "enclaves/a/key.pem"))
+    assert place.read()["enclaves/a/request.pem"] == b"key", "a link of its owner's own"
+    link.parent.chmod(0o777)
+    with pytest.raises(RefusedError, match="may be a hard link"):
+        place.read()
+
+
 @pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")
 def test_the_owner_gets_the_files(tmp_path: Path) -> None:
     place = Place(str(tmp_path / "keystore"), "nobody")

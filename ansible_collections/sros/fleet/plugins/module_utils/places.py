@@ -28,6 +28,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_OF_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _EXCHANGE = 2
 _MOST_LINKS = 40
 _LONGEST_WAIT = 60.0
@@ -141,6 +142,7 @@ class Place:
             RefusedError: another process has it for a minute.
         """
         self._make_parents()
+        _check_way(self._parent)
         handle = os.open(
             self._beside("lock"), os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600
         )
@@ -287,7 +289,8 @@ def _check_way(path: str) -> None:
         try:
             state = os.lstat(here)
         except FileNotFoundError:
-            return
+            here = os.path.dirname(here)
+            break
         except OSError as error:
             raise RefusedError(f"'{here}' cannot be used: {error.strerror}.") from error
         if state.st_uid not in trusted:
@@ -304,11 +307,18 @@ def _check_way(path: str) -> None:
             rest += target.split("/")[::-1]
         elif not stat.S_ISDIR(state.st_mode):
             raise RefusedError(f"'{here}' is not a folder.")
-        elif state.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not state.st_mode & stat.S_ISVTX:
-            raise RefusedError(
-                f"Others can write to '{here}' (mode {stat.S_IMODE(state.st_mode):04o}), and could"
-                " lead the files elsewhere. Choose another folder, or take these rights away."
-            )
+        elif not state.st_mode & stat.S_ISVTX:
+            _check_closed(here, state)
+    # In a sticky folder like /tmp nobody can replace what is there, but anybody can add to it.
+    _check_closed(here, os.lstat(here))
+
+
+def _check_closed(folder: str, state: os.stat_result) -> None:
+    if state.st_mode & _OF_OTHERS:
+        raise RefusedError(
+            f"Others can write to '{folder}' (mode {stat.S_IMODE(state.st_mode):04o}), and could"
+            " lead the files elsewhere. Choose another folder, or take these rights away."
+        )
 
 
 def _fail(error: OSError) -> None:
@@ -320,7 +330,25 @@ def _read_file(folder: int, name: str, whole: str) -> bytes:
         state = os.fstat(file.fileno())
         if not stat.S_ISREG(state.st_mode) or state.st_size > MOST_OF_FILE:
             raise RefusedError(f"'{whole}' is not a regular file, or too large.")
+        if _may_be_linked(state, os.fstat(folder)):
+            raise RefusedError(
+                f"'{whole}' may be a hard link to a file of somebody else: it has another owner"
+                " than its folder, or another name, too. It was not read. Put a copy in its place"
+                " that belongs to the owner of the folder, or remove it."
+            )
         return file.read(MOST_OF_FILE)
+
+
+def _may_be_linked(file: os.stat_result, folder: os.stat_result) -> bool:
+    """Return whether somebody can have linked a file of another user into the folder.
+
+    Its content would become that of the owner of the enclaves.  What all users can read is no
+    secret; but a secret can have lost its other name since.
+    """
+    same = file.st_uid == folder.st_uid
+    if file.st_nlink > 1 and not (same and not folder.st_mode & _OF_OTHERS):
+        return True
+    return not same and not file.st_mode & stat.S_IROTH
 
 
 def _exchange(one: str, other: str) -> bool:
