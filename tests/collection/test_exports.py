@@ -38,7 +38,7 @@ def packed(*entries: tuple[str, bytes | str], after: bytes = b"") -> bytes:
             else:
                 entry.size = len(content)
                 tar.addfile(entry, io.BytesIO(content))
-    return gzip.compress(buffer.getvalue()) + after
+    return gzip.compress(buffer.getvalue(), mtime=0) + after
 
 
 def test_what_sros_packs_is_read(made_keystore: Path) -> None:
@@ -81,6 +81,7 @@ GOOD = "enclaves/a/cert.pem"
         (packed(("private/identity_ca.key.pem", b"x")), "does not belong"),
         (packed((GOOD, bytes(MOST_OF_FILE + 1))), "larger than"),
     ],
+    ids=lambda each: each if isinstance(each, str) else f"{len(each)} bytes",
 )
 def test_whatever_is_no_export_is_refused(data: bytes, why: str) -> None:
     with pytest.raises(RefusedError, match=why):
