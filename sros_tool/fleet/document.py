@@ -14,7 +14,7 @@ from typing import Any
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError
 from sros_tool.files import parse_toml
-from sros_tool.fleet.enclaves import pattern_problem
+from sros_tool.fleet.enclaves import MAX_PATTERNS, pattern_problem, size_problem
 from sros_tool.fleet.inventory import SHOWN, fleet_table, is_json
 from sros_tool.fleet.model import (
     MAX_ROBOTS,
@@ -29,7 +29,6 @@ from sros_tool.xml import read_bytes
 
 MAX_BYTES = 4 * 1024 * 1024
 _MOST_GROUPS = 32  # of one robot
-_MOST_PATTERNS = 10_000
 _VALUES: Mapping[str, Callable[[str], str]] = {
     "namespace": namespace_problem,
     "address": address_problem,
@@ -108,12 +107,21 @@ class _Reader:
         for name, values in groups.items():
             self._known(values, ("domain", *_VALUES), f"groups.{name}")
             self._values(values, {key: f"groups.{name}.{key}" for key in values}, "r")
-        enclaves = self._texts(table, "enclaves", "", _MOST_PATTERNS)
+        enclaves = self._texts(table, "enclaves", "", MAX_PATTERNS)
         for path in enclaves:
             if problem := pattern_problem(path):
                 raise self._refused("enclaves", path, problem)
         read = [self._robot(name, values, groups) for name, values in robots.items()]
-        return Fleet.of(read, groups, enclaves)
+        fleet = Fleet.of(read, groups, enclaves)
+        if both := sorted(fleet.robots.keys() & fleet.groups.keys()):
+            raise self._error(
+                f"{_short(both[0])} is a robot and a group",
+                "Ansible would take one for the other.",
+                "Give one of them another name.",
+            )
+        if problem := size_problem(fleet):
+            raise self._error("it is too large", problem, "Divide the fleet.")
+        return fleet
 
     def _robot(
         self, name: str, values: Mapping[str, Any], groups: Mapping[str, Mapping[str, Any]]

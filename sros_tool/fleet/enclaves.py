@@ -24,6 +24,10 @@ from sros_tool.policy.placeholders import (
 )
 
 _PART = r"[A-Za-z_][A-Za-z0-9_]*"
+MAX_ENCLAVES = 1_000_000
+MAX_PATTERNS = 1_000
+"""Most enclaves and most paths with a placeholder of one fleet."""
+
 _VALUES = {"robot": _PART, "namespace": f"(?:/{_PART})*"}
 
 
@@ -58,6 +62,16 @@ def enclaves_of(fleet: Fleet, robot: Robot) -> tuple[str, ...]:
         if group_of(parts) in ("", *robot.groups):
             found.add(path_for(parts, robot))
     return tuple(sorted(found))
+
+
+def size_problem(fleet: Fleet) -> str:
+    """Return why the robots cannot have all enclaves that the fleet names, or ""; a sentence."""
+    if len(fleet.enclaves) > MAX_PATTERNS:
+        return f"It has {len(fleet.enclaves)} paths with a placeholder, more than {MAX_PATTERNS}."
+    members = {name: len(robots) for name, robots in fleet.groups.items()}
+    members[""] = len(fleet.robots)
+    count = sum(members.get(group_of(parts_of(each)), 0) for each in fleet.enclaves)
+    return f"Its robots have {count} enclaves, more than {MAX_ENCLAVES}." * (count > MAX_ENCLAVES)
 
 
 def robot_of(fleet: Fleet, enclave: str) -> Robot | None:

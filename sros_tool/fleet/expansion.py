@@ -11,14 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
-from sros_tool.fleet.enclaves import group_of, path_for
+from sros_tool.fleet.enclaves import MAX_ENCLAVES, group_of, path_for
 from sros_tool.fleet.model import Fleet, Robot
 from sros_tool.names import check_enclave_name, check_namespace, expression_problem
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Group, Policy, Profile, Source
 from sros_tool.policy.placeholders import Parts, fill, has_placeholder, parts_of, placeholders_of
 
-_MOST_ENCLAVES = 1_000_000
 _MOST_NAMES = 200_000  # of one enclave: a signed document cannot have more
 
 
@@ -49,9 +48,9 @@ class FleetPolicy(Mapping[str, Enclave]):
                 if path in self._of:
                     raise _twice(path, enclave, self._of[path][0])
                 self._of[path] = enclave, robot
-            if len(self._of) > _MOST_ENCLAVES:
+            if len(self._of) > MAX_ENCLAVES:
                 raise PolicyError(
-                    f"{enclave.source}: the policy gives more than {_MOST_ENCLAVES} enclaves",
+                    f"{enclave.source}: the policy gives more than {MAX_ENCLAVES} enclaves",
                     "",
                     "Divide the fleet or the policy.",
                 )
@@ -103,15 +102,19 @@ class FleetPolicy(Mapping[str, Enclave]):
             ns, node = (self._one(text, robot) for text in (each.ns, each.node))
             if has_placeholder(each.ns):
                 ns = check_namespace(ns)  # in the root namespace it can be empty
-            groups = tuple(group for one in each.groups if (group := self._group(one, robot)).names)
-            count += sum(len(group.names) for group in groups)
-            if count > _MOST_NAMES:
-                raise PolicyError(
-                    f"{each.source}: the enclave {path} has more than {_MOST_NAMES} names",
-                    "",
-                    "Divide it, or name fewer robots, such as a group.",
-                )
-            return replace(each, ns=ns, node=node, groups=groups)
+            groups = []
+            for one in each.groups:
+                group = self._group(one, robot, _MOST_NAMES - count)
+                count += len(group.names)
+                if count > _MOST_NAMES:
+                    raise PolicyError(
+                        f"{each.source}: the enclave {path} has more than {_MOST_NAMES} names",
+                        "",
+                        "Divide it, or name fewer robots, such as a group.",
+                    )
+                if group.names:
+                    groups.append(group)
+            return replace(each, ns=ns, node=node, groups=tuple(groups))
 
         blocks = tuple(
             replace(block, profiles=tuple(map(profile, block.profiles)))
@@ -124,8 +127,11 @@ class FleetPolicy(Mapping[str, Enclave]):
             return text
         return "".join(map(str, fill(parts_of(text), robot.name, robot.namespace)))
 
-    def _group(self, group: Group, robot: Robot | None) -> Group:
-        """Return the group with its names filled in; it may be left without any."""
+    def _group(self, group: Group, robot: Robot | None, most: int) -> Group:
+        """Return the group with its names filled in; it may be left without any.
+
+        Once it has more than ``most`` names, the rest is left out.
+        """
         if not any(map(has_placeholder, group.names)):
             return group
         names: list[str] = []
@@ -134,6 +140,8 @@ class FleetPolicy(Mapping[str, Enclave]):
             filled = self._several(self._one(name, robot), name, group.source_of(index))
             names += filled
             lines += group.lines[index : index + 1] * len(filled)
+            if len(names) > most:
+                break
         return replace(group, names=tuple(names), lines=tuple(lines))
 
     def _several(self, name: str, written: str, source: Source) -> tuple[str, ...]:

@@ -23,6 +23,9 @@ __MAX_NAMESPACE = 245
 _MAX_HOST = 253
 """Longest host name (RFC 1035)."""
 
+_OF_ANSIBLE = frozenset({"all", "ungrouped", "_meta", "localhost"})
+"""Names with a meaning of their own in an inventory; "localhost" is the machine at home."""
+
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?\.?", re.ASCII)
 _USER = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?", re.ASCII)
@@ -124,6 +127,8 @@ def name_problem(name: str) -> str:
             "A name is one part of a ROS name: letters, digits and single underscores, and no "
             "digit at its start, such as r7."
         )
+    if name in _OF_ANSIBLE:
+        return "In an inventory of Ansible this name means something else."
     return ""
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note
 from sros_tool.fleet.document import MAX_BYTES, parse_fleet, render_fleet
-from sros_tool.fleet.enclaves import enclaves_of, robot_of
+from sros_tool.fleet.enclaves import enclaves_of, robot_of, size_problem
 from sros_tool.fleet.model import Fleet, Robot
 from sros_tool.keystore.layout import FLEET, check_keystore, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger, read_ledger
@@ -161,6 +161,12 @@ def write_fleet(
     known = (before.enclaves if before else (), fleet.enclaves, patterns)
     paths = dict.fromkeys(sorted(each for paths in known for each in paths))
     fleet = fleet.with_enclaves(tuple(paths))
+    if problem := size_problem(fleet):
+        raise KeystoreError(
+            f"the fleet of keystore '{transaction.root}' would be too large",
+            f"{problem} Those of earlier policies count, too.",
+            "Divide the fleet between keystores.",
+        )
     _refuse_shared(fleet)
     document = (_COMMENT + render_fleet(fleet)).encode()
     ledger = read_ledger(transaction.root, having=("what", "fleet"))
@@ -215,13 +221,14 @@ def refuse_stale_domains(
 
 
 def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
-    """Yield a note for each robot that has enclaves in the keystore which are no longer its own."""
+    """Yield a note for each robot that has enclaves in the keystore which are no longer its own.
+
+    No two robots of ``after`` have an enclave in common, as `write_fleet` makes sure.
+    """
     for robot in before.robots.values():
-        names = [
-            name
-            for name in enclaves_of(before, robot)
-            if (owner := robot_of(after, name)) is None or owner.name != robot.name
-        ]
+        same = after.robots.get(robot.name)
+        kept = frozenset(enclaves_of(after, same) if same else ())
+        names = (name for name in enclaves_of(before, robot) if name not in kept)
         left = [name for name in names if has_enclave(root, name)]
         if left:
             is_there = robot.name in after.robots

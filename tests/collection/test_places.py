@@ -177,7 +177,7 @@ def test_a_folder_to_which_others_can_add_is_refused(
     own.mkdir(parents=True)
     shared.chmod(0o1777)
     for path in ("keystore", "new/keystore"):
-        with pytest.raises(RefusedError, match="Others can write to .*shared"):
+        with pytest.raises(RefusedError, match=r"Others can write to .*shared"):
             Place(str(shared / path))
     install(Place(str(own / "keystore")), OLD)  # nobody else can replace a folder of one's own
 
@@ -189,7 +189,7 @@ def test_a_folder_to_which_others_can_add_is_refused(
         os.chmod(path, 0o1777)
 
     monkeypatch.setattr(os, "makedirs", make_open)
-    with pytest.raises(RefusedError, match="Others can write to .*new"), place.locked():
+    with pytest.raises(RefusedError, match=r"Others can write to .*new"), place.locked():
         pass
 
 

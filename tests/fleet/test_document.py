@@ -53,6 +53,16 @@ def test_a_name_is_one_part_of_a_ros_name(name: str, of: str) -> None:
         fleet(f'[robots.r]\n[{of}."{name}"]\n')
 
 
+@pytest.mark.parametrize("name", ["all", "ungrouped", "_meta", "localhost"])
+@pytest.mark.parametrize("of", ["robots", "groups"])
+def test_a_name_means_nothing_else_in_an_inventory(name: str, of: str) -> None:
+    """In every play, a robot `localhost` would be the machine at home."""
+    with pytest.raises(DocumentError, match=rf"{of} has '{name}'.*means something else"):
+        fleet(f"[robots.r]\n[{of}.{name}]\n")
+    with pytest.raises(DocumentError, match=rf"r\.groups has '{name}'.*means something else"):
+        fleet(f"[robots.r]\ngroups = ['{name}']\n")
+
+
 @pytest.mark.parametrize("name", ["r7", "_", "a" * 64])
 def test_names(name: str) -> None:
     assert list(fleet(f"[robots.{name}]").robots) == [name]
@@ -117,6 +127,11 @@ def test_a_value_that_is_not_valid(line: str, problem: str) -> None:
          "more than 245"),
         ("[groups.g]\ndomain = 1\n[groups.h]\ndomain = 2\n[robots.r]\ngroups = ['h', 'g']",
          "gets its domain from two groups"),
+        ("[robots.r]\n[groups.r]", "'r' is a robot and a group"),
+        ("[robots.r]\n[robots.a]\ngroups = ['r']", "'r' is a robot and a group"),
+        ("enclaves = [\n" + '"/{robot}",\n' * 1001 + "]\n[robots.r]", "more than 1000 names"),
+        (f"enclaves = {[f'/{{robot}}/e{i}' for i in range(101)]}\n[robots]\n"
+         + "".join(f"r{i} = {{}}\n" for i in range(10_000)), "1010000 enclaves, more than 1000000"),
         ('enclaves = ["/base"]\n[robots.r]', "no placeholder"),
         ('enclaves = ["/{robots}"]\n[robots.r]', "write {robot}"),
         ('enclaves = ["/{robot:a}/{robot:b}"]\n[robots.r]', "different groups"),

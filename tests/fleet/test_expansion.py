@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from string import ascii_letters, digits
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -153,11 +154,22 @@ def test_two_robots_in_one_enclave() -> None:
         expanded(enclave("{namespace}/base", "/y"), fleet)
 
 
-def test_too_many_names_are_refused_before_they_are_made() -> None:
+def test_too_many_names_are_refused_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
     fleet = Fleet.of(Robot(f"r{i}", f"/r{i}") for i in range(1000))
-    text = enclave("/d", " ".join(f"{{robots}}/t{i}" for i in range(201)))
+    text = enclave("/d", " ".join(f"{{robots}}/t{i}" for i in range(300)))
+    made = FleetPolicy._several
+    count = 0
+
+    def counted(*arguments: Any) -> tuple[str, ...]:
+        nonlocal count
+        names = made(*arguments)
+        count += len(names)
+        return names
+
+    monkeypatch.setattr(FleetPolicy, "_several", counted)
     with pytest.raises(PolicyError, match="more than 200000 names"):
         expanded(text, fleet)
+    assert count == 201_000
 
 
 # ── no value adds a right ──────────────────────────────────────────────────────────────────

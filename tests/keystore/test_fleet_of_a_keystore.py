@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from sros_tool.fleet import enclaves
+from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.keystore.fleet import left_enclaves
 from tests.support.harness import Ended, policy_text, publish, snapshot, sros
 
 FLEET = "[robots]\na = {}\na_arm = {}\n"
@@ -56,3 +61,33 @@ def test_no_enclave_belongs_to_two_robots(made: Path) -> None:
     ended = generate(made, "/{robot}_arm")
     assert (ended.status, "/a_arm would belong to two robots" in ended.err) == (2, True), ended
     assert snapshot(made / "ks") == before
+
+
+def test_paths_of_earlier_policies_count(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is written can be read again."""
+    monkeypatch.setattr(enclaves, "MAX_PATTERNS", 1)
+    before = snapshot(made / "ks")
+    ended = generate(made, "/{robot}/other")
+    assert (ended.status, "2 paths with a placeholder" in ended.err) == (2, True), ended
+    assert snapshot(made / "ks") == before
+
+
+def test_enclaves_that_are_left_are_found_in_one_pass(
+    made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not every name is compared with every path."""
+    looked = 0
+    candidates = enclaves._candidates
+
+    def counted(*arguments: Any) -> Iterator[Robot]:
+        nonlocal looked
+        looked += 1
+        return candidates(*arguments)
+
+    monkeypatch.setattr(enclaves, "_candidates", counted)
+    paths = [f"/e{number}/{{robot}}" for number in range(30)]
+    before = Fleet.of([Robot("a", "/a"), Robot("b", "/b")], enclaves=["/{robot}", *paths])
+    assert not list(left_enclaves(made / "ks", before, before))
+    (note,) = left_enclaves(made / "ks", before, Fleet.of([Robot("b", "/b")], enclaves=paths))
+    assert "the robot a is no longer in the fleet: /a stay" in note.text
+    assert looked <= 2 * len(before.enclaves)
