@@ -123,7 +123,7 @@ def render_rights(remote: RemoteRights) -> RenderedRights:
     ids = [f"{name}#{number}" for number in range(len(remote.rules))]
     rules = (
         f'   {{"id": {_list([each])[1:-1]}, "permission": "allow", "flows": ["{rule.flow}"], '
-        f'"messages": {_list(rule.messages)}, "key_exprs": {_list(rule.key_expressions)}}}'
+        f'"messages": {_known(rule.messages)}, "key_exprs": {_known(rule.key_expressions)}}}'
         for each, rule in zip(ids, remote.rules, strict=True)
     )
     own = _list([name])
@@ -132,6 +132,11 @@ def render_rights(remote: RemoteRights) -> RenderedRights:
         f'   {{"id": {own[1:-1]}, "cert_common_names": {own}}}',
         f'   {{"rules": {_list(ids)}, "subjects": {own}}}',
     )
+
+
+@lru_cache(maxsize=64)  # several rules have the same
+def _known(texts: tuple[str, ...]) -> str:
+    return _list(texts)
 
 
 def _list(texts: Iterable[str]) -> str:

@@ -58,12 +58,12 @@ class KeyExpressions:
     """Key expressions, with a fast search for those that include another one."""
 
     def __init__(self, expressions: Iterable[str]) -> None:
-        self._all = frozenset(expressions)
+        self.all = frozenset(expressions)
 
     @cached_property
     def _by_begin(self) -> Mapping[str, list[str]]:
         found: dict[str, list[str]] = {}
-        for each in self._all:
+        for each in self.all:
             if (begin := _fixed_begin(each)) != each:
                 found.setdefault(begin, []).append(each)
         return found
@@ -74,21 +74,21 @@ class KeyExpressions:
 
     def include(self, narrow: str) -> bool:
         """Return whether one of the expressions includes all of ``narrow``."""
-        if narrow in self._all:
+        if narrow in self.all:
             return True
         return any(_includes(wide, narrow) for wide in self._wider(narrow))
 
     def needed(self) -> list[str]:
         """Return the expressions that no other one includes, sorted; all if they are too alike."""
-        ends = {each[len(_fixed_begin(each)) :] for each in self._all}
+        ends = {each[len(_fixed_begin(each)) :] for each in self.all}
         if len(ends) == 1 and _SAME_DEPTH.fullmatch(ends.pop()):
-            return sorted(self._all)
-        compared = sum(len(self._wider(each)) for each in self._all)
+            return sorted(self.all)
+        compared = sum(len(self._wider(each)) for each in self.all)
         if compared > _MOST_COMPARED:
-            return sorted(self._all)
+            return sorted(self.all)
         return sorted(
             each
-            for each in self._all
+            for each in self.all
             if not any(wide != each and _includes(wide, each) for wide in self._wider(each))
         )
 
