@@ -104,6 +104,7 @@ def test_a_fleet_that_has_all_it_should_have(field: Field) -> None:
     (field.root / "confirmed/notes.txt").write_text("mine")
     said = field.run("check", "keystore", "ks", "--severity", "note").out
     assert "confirmed/notes.txt" in said and "r1.json" not in said
+    assert "fleet.toml" not in said
 
 
 def test_a_robot_that_was_not_reached(field: Field) -> None:

@@ -17,6 +17,7 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
     CONFIRMED,
     ENCLAVES,
+    FLEET,
     KEY_FILE,
     KEY_URI_FILE,
     LEDGER,
@@ -183,7 +184,7 @@ _KNOWN = (
     SEAL,
     "governance.xml",
 )
-_TOP = (SETTINGS, LEDGER, LEDGER_HEAD, ROTATION)
+_TOP = (SETTINGS, FLEET, LEDGER, LEDGER_HEAD, ROTATION)
 _KNOWN_ANYWHERE = re.compile(
     r".*\.(?:cert|key|crl)\.pem\Z|.*\.p11\Z|.*\.srl\Z|index\.txt.*|serial.*"
 )
