@@ -38,12 +38,20 @@ def hostile(folder: Path, name: str, answers: dict[str, dict[str, Any]]) -> Path
     return program
 
 
-def play(folder: Path, which: str, hosts: dict[str, Any], **variables: object) -> str:
+def play(folder: Path, which: str, hosts: dict[str, Any], *words: str, **variables: object) -> str:
     """Run a play of the collection on hosts of this machine; return what it prints."""
     (folder / "inventory.json").write_text(json.dumps({"all": {"hosts": hosts}}))
     playbook = CHECKOUT / f"ansible_collections/sros/fleet/playbooks/{which}.yml"
     done = subprocess.run(
-        [str(PLAYBOOK), "-i", folder / "inventory.json", playbook, "-e", json.dumps(variables)],
+        [
+            str(PLAYBOOK),
+            "-i",
+            folder / "inventory.json",
+            playbook,
+            *words,
+            "-e",
+            json.dumps(variables),
+        ],
         env={
             "PATH": "/usr/local/bin:/usr/bin:/bin",
             "HOME": str(folder),
@@ -112,3 +120,15 @@ def test_no_robot_gets_a_certificate_for_the_enclave_of_another(tmp_path: Path) 
     assert not (keystore / "enclaves/r2").exists()
     ask({"/r1/own": requests["/r1/own"]})
     assert (keystore / "enclaves/r1/own/cert.pem").exists()
+
+
+def test_a_limit_that_leaves_out_the_home_is_refused(tmp_path: Path) -> None:
+    """Otherwise a play would revoke nothing and say that all is well."""
+    robot = {
+        "ansible_connection": "local",
+        "ansible_python_interpreter": str(hostile(tmp_path, "r1", {"ping": {"ping": "pong"}})),
+    }
+    hosts = {"r1": robot, "r5": robot}
+    said = play(tmp_path, "revoke", hosts, "--limit", "r1", sros_keystore="/k", sros_revoke=["r5"])
+    assert "--limit leaves out localhost" in said
+    assert "failed=1" in said
