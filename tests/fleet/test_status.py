@@ -186,7 +186,8 @@ def test_a_changed_policy(field: Field) -> None:
 
 def test_a_rotation_goes_on_when_every_robot_has_confirmed_its_stage(field: Field) -> None:
     for now, then in (("distribute", "before"), ("reissue", "distribute"), ("complete", "reissue")):
-        field.run("rotate_ca", "ks", "--next")
+        said = field.run("rotate_ca", "ks", "--next").err
+        assert ("/dispatcher belongs to no robot" in said) == (now != "complete")
         found = field.status()
         assert found["stage"] == now
         assert {each["stage"] for each in found["robots"].values()} == {then}

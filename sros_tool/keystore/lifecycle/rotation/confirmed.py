@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from sros_tool.keystore.fleet import checked_fleet
+from sros_tool.errors import Note
+from sros_tool.fleet.enclaves import robot_of
+from sros_tool.keystore.fleet import checked_fleet, load_fleet
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.layout import IDENTITY
 from sros_tool.keystore.lifecycle.rotation.state import Rotation, RotationStage
 from sros_tool.keystore.reader import authority_files
 
+_SHOWN = 5
 _ISSUED = {IDENTITY: ("certificate",), "permissions": ("permissions", "governance")}
 """What the CA of each role issues, by the kinds of `fleet_status`."""
 
@@ -40,3 +44,17 @@ def robots_cut_off(root: Path, rotation: Rotation, to: RotationStage) -> tuple[s
         if each.received is None
         or any(file.kind in needed and not file.surplus for file in each.pending)
     )
+
+
+def of_no_robot(root: Path, names: Iterable[str]) -> Iterator[Note]:
+    """Yield a note on enclaves that belong to no robot of a fleet, so that nobody confirms them."""
+    fleet = load_fleet(root)
+    found = [each for each in names if robot_of(fleet, each) is None] if fleet else []
+    if found:
+        more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+        verb = "belongs" if len(found) == 1 else "belong"
+        yield Note(
+            "keystore.of-no-robot",
+            f"{', '.join(found[:_SHOWN])}{more} {verb} to no robot, so nothing says whether this "
+            "stage is there: see to it before the next one.",
+        )

@@ -58,7 +58,7 @@ from sros_tool.keystore.ledger import (
     read_ledger,
 )
 from sros_tool.keystore.lifecycle.revocation_list import sign_list
-from sros_tool.keystore.lifecycle.rotation.confirmed import robots_cut_off
+from sros_tool.keystore.lifecycle.rotation.confirmed import of_no_robot, robots_cut_off
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     Rotation,
@@ -171,6 +171,8 @@ def rotate_ca(
             if cut_off and not allow_unconfirmed:
                 raise _would_cut_off(root, rotation, cut_off)
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
+            if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
+                rotator.notes += tuple(of_no_robot(root, names))
             transaction.commit()
     return RotationStep(
         root,
