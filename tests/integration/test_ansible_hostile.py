@@ -94,32 +94,47 @@ def test_facts_of_a_robot_choose_no_command_and_no_keys(
     assert not trace.exists()
 
 
-def test_no_robot_gets_a_certificate_for_the_enclave_of_another(tmp_path: Path) -> None:
+def test_bad_requests_of_robots_get_no_certificate_and_stop_no_other(tmp_path: Path) -> None:
     """A request says which enclave it is for, and who made it can choose that."""
     keystore = tmp_path / "keystore"
     sros("create_keystore", keystore).ok()
     asked = tmp_path / "asked"
     requests = {}
-    for name in ("/r1/own", "/r2/own"):
+    for name in ("/r2/own", "/spare"):
         sros("create_request", name, asked).ok()
         requests[name] = (asked / f"enclaves{name}/request.pem").read_text()
-    host = {"ansible_connection": "local", "sros_program": [sys.executable, "-m", "sros_tool"]}
-
-    def ask(returned: dict[str, object]) -> str:
-        made = {"changed": True, "made": ["/r1/own"], "requests": returned}
-        answers: dict[str, dict[str, Any]] = {"ping": {"ping": "pong"}, "requests": made}
-        python = str(hostile(tmp_path, "r1", answers))
-        robot = {**host, "ansible_python_interpreter": python, "sros_own_keys": ["/r1/own"]}
-        program = {"sros_program": host["sros_program"]}
-        return play(tmp_path, "requests", {"r1": robot}, sros_keystore=str(keystore), **program)
-
-    text = ask({"/r1/own": requests["/r2/own"]})
-    assert "is for enclave /r2/own, and should be for /r1/own" in " ".join(text.split()), text
-    text = ask({"/r2/own": requests["/r2/own"]})
-    assert "returned requests for other enclaves" in text, text
-    assert not (keystore / "enclaves/r2").exists()
-    ask({"/r1/own": requests["/r1/own"]})
-    assert (keystore / "enclaves/r1/own/cert.pem").exists()
+    returned: dict[str, dict[str, Any]] = {
+        "r1": {"requests": {"/r1/own": requests["/spare"]}},
+        "r2": {"requests": {"/r2/own": requests["/r2/own"]}},
+        "r3": {"requests": {"/spare": requests["/spare"]}},
+        "r4": {"failed": True, "msg": "openssl is missing"},
+    }
+    hosts: dict[str, Any] = {}
+    for name, answer in returned.items():
+        answers: dict[str, dict[str, Any]] = {
+            "ping": {"ping": "pong"},
+            "requests": {"changed": True, "made": [f"/{name}/own"], **answer},
+            "enclaves": INSTALLED,
+        }
+        hosts[name] = {
+            "ansible_connection": "local",
+            "ansible_python_interpreter": str(hostile(tmp_path, name, answers)),
+            "sros_own_keys": [f"/{name}/own"],
+            "sros_patterns": [f"/{name}/*"],
+            "sros_confirm": False,
+        }
+    program = [sys.executable, "-m", "sros_tool"]
+    printed = play(tmp_path, "requests", hosts, sros_keystore=str(keystore), sros_program=program)
+    text = " ".join(printed.split())
+    assert "is for enclave /spare, and should be for /r1/own" in text, text
+    assert "r3 returned requests for other enclaves" in text, text
+    assert "openssl is missing" in text, text
+    assert "Left out, because of what they answered (see above): r1, r3, r4." in text, text
+    names = [each.name for each in (keystore / "enclaves").iterdir() if each.is_dir()]
+    assert names == ["r2"], text
+    assert (keystore / "enclaves/r2/own/cert.pem").exists()
+    _, _, delivered = text.partition("Install and verify the enclaves]")
+    assert "ok: [r2]" in delivered, text
 
 
 def test_a_limit_that_leaves_out_the_home_is_refused(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ description:
     M(sros.fleet.requests) returned as C(sros_requests).
   - A robot that returned anything else is refused by name. Which enclave a request is really for
     is left to C(sros sign_request --enclave).
+  - A robot with C(sros_refused) is left out.
 options:
   _input:
     description: The variables of all robots (C(hostvars)).
@@ -53,6 +54,8 @@ def made_requests(hosts: Mapping[str, Any]) -> list[dict[str, str]]:
         returned = variables.get("sros_requests")
         if not isinstance(returned, Mapping) or "requests" not in returned:
             continue  # nobody asked this robot
+        if variables.get("sros_refused"):
+            continue
         try:
             check_facts(variables)
         except RefusedError as error:
@@ -61,14 +64,14 @@ def made_requests(hosts: Mapping[str, Any]) -> list[dict[str, str]]:
         if not isinstance(made, Mapping) or not set(made) <= set(own):
             raise AnsibleFilterError(
                 f"{host} returned requests for other enclaves than those in its sros_own_keys."
-                " Nothing was signed. Look at that robot."
+                " Nothing was signed for it. Look at that robot."
             )
         for enclave, request in sorted(made.items()):
             text = str(request)
             if len(text) > _LONGEST or not _REQUEST.fullmatch(text):
                 raise AnsibleFilterError(
                     f"{host} returned something else than one signing request for {enclave}."
-                    " Nothing was signed. Look at that robot."
+                    " Nothing was signed for it. Look at that robot."
                 )
             found.append({"enclave": str(enclave), "request": text.strip()})
     return found
