@@ -229,20 +229,15 @@ def load_der_certificate(data: bytes) -> x509.Certificate:
 
 def _read_in_full(certificate: x509.Certificate) -> x509.Certificate:
     """Return ``certificate`` after parsing every part that sros uses."""
-    _read_name_in_full.__wrapped__(certificate.subject)
-    _read_name_in_full(certificate.issuer)
+    for name in (certificate.subject, certificate.issuer):
+        read_name(name)
+        subject_text(name)
     certificate.public_key()
     authority_identifier(certificate)
     _ = certificate.signature_hash_algorithm, certificate.serial_number
     if certificate.not_valid_after_utc <= certificate.not_valid_before_utc:
         raise ValueError("it expires before its validity begins")
     return certificate
-
-
-@lru_cache(maxsize=16)  # most certificates have the issuer of the one before
-def _read_name_in_full(name: x509.Name) -> None:
-    read_name(name)
-    subject_text(name)
 
 
 def same_key(certificate: x509.Certificate, key: PrivateKey) -> bool:

@@ -75,6 +75,9 @@ def replace_file_system(text: str, keep: Sequence[Path]) -> None:
     checked(libc.unshare(_NEWNS), "unshare")
     mount("none", Path("/"), "", _REC | _PRIVATE)
     shown = [Path(each) for each in values(text, "BindReadOnlyPaths") if each[0] != "-"]
+    # The program itself may be in a checkout below /tmp.
+    own = [Path(each) for each in (Path(__file__).parents[2], sys.prefix)]
+    shown += [each for each in own if each.is_relative_to("/tmp")]
     opened = {each: os.open(each, os.O_PATH) for each in (*keep, *shown)}
     mount("none", Path("/"), "", _REMOUNT | _BIND | _RDONLY)
     hidden = [Path(each.removesuffix(":ro")) for each in values(text, "TemporaryFileSystem")]

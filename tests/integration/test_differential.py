@@ -96,8 +96,9 @@ NOT_OF_DOCUMENTS = {
     "verifies_authorities",
     "hashes",
     "keys",
+    "reads_tokens",
 }
-"""Rules about what is around the documents: `test_signers_on_dds` tells these."""
+"""Rules about what is around the documents: `test_signers_on_dds` and `test_key_on_token` tell."""
 
 
 @pytest.mark.parametrize("vendor", ASK)
