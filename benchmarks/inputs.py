@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 _GROUPS = (
     ('topics publish="ALLOW"', "topic"),
     ('topics subscribe="ALLOW"', "topic"),
@@ -13,14 +15,9 @@ _GROUPS = (
 
 def enclaves_policy(enclaves: int, rules: int) -> str:
     """Return a policy with this number of enclaves, and of names in five groups of each."""
-    parts = []
-    for index in range(enclaves):
-        parts.append(
-            f'<enclave path="/robot{index}/part"><profiles>'
-            f'<profile ns="/robot{index}" node="part">{_groups(rules)}</profile>'
-            "</profiles></enclave>"
-        )
-    return _policy("".join(parts))
+    return _enclaves(
+        ((f"/robot{index}/part", f"/robot{index}", "part") for index in range(enclaves)), rules
+    )
 
 
 def _groups(rules: int) -> str:
@@ -51,14 +48,20 @@ def _policy(enclaves: str) -> str:
 
 def fleet_policy(enclaves: int, rules: int) -> str:
     """Return a policy with this number of enclaves, and of names in each, for every robot."""
-    parts = []
-    for index in range(enclaves):
-        parts.append(
-            f'<enclave path="/{{robot}}/part_{index}"><profiles>'
-            f'<profile ns="{{namespace}}" node="part_{index}">{_groups(rules)}</profile>'
-            "</profiles></enclave>"
+    return _enclaves(
+        ((f"/{{robot}}/part_{i}", "{namespace}", f"part_{i}") for i in range(enclaves)), rules
+    )
+
+
+def _enclaves(named: Iterable[tuple[str, str, str]], rules: int) -> str:
+    """Return a policy of enclaves, each with its path, namespace and node."""
+    return _policy(
+        "".join(
+            f'<enclave path="{path}"><profiles><profile ns="{ns}" node="{node}">{_groups(rules)}'
+            "</profile></profiles></enclave>"
+            for path, ns, node in named
         )
-    return _policy("".join(parts))
+    )
 
 
 def fleet_file(robots: int) -> str:

@@ -131,6 +131,22 @@ def fleet_policies(files: Sequence[Path], fleet_file: Path) -> list[FleetPolicy]
     return [FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files]
 
 
+def only_enclaves(when: str = "Only") -> Callable[[Decorated], Decorated]:
+    """Add ``--match PATTERN`` and ``--robot NAME`` to a verb that is for all enclaves otherwise."""
+
+    def add(function: Decorated) -> Decorated:
+        function = robot_option(f"{when} the enclaves of this robot of the fleet.")(function)
+        return click.option(
+            "--match",
+            "patterns",
+            multiple=True,
+            metavar="PATTERN",
+            help=f"{when} enclaves that match, such as '/arm/*'.  Can be repeated.",
+        )(function)
+
+    return add
+
+
 def several_enclaves(function: Decorated) -> Decorated:
     """Add ``--all``, ``--match PATTERN`` and ``--robot NAME`` to a verb for several enclaves."""
     function = robot_option("All enclaves of this robot of the fleet.")(function)

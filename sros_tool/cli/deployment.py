@@ -24,13 +24,13 @@ from sros_tool.cli.common import (
     keystore_from_environment,
     moment_of,
     now,
+    only_enclaves,
     print_closed,
     print_json,
     print_notes,
     print_plan,
     print_restart,
     read_named,
-    robot_option,
     secrets,
     several_enclaves,
     split_root,
@@ -257,14 +257,7 @@ Example:
 @click.option(
     "--at", metavar="MOMENT", help="Check as of a date (2027-06-01) or time from now (90d)."
 )
-@click.option(
-    "--match",
-    "patterns",
-    multiple=True,
-    metavar="PATTERN",
-    help="Only enclaves that match, such as '/arm/*'.  Can be repeated.",
-)
-@robot_option("Only the enclaves of this robot of the fleet.")
+@only_enclaves()
 @click.option(
     "--tokens", is_flag=True, help="Also have each token prove that it has its key: needs the PIN."
 )

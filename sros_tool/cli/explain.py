@@ -21,10 +21,10 @@ from sros_tool.cli.common import (
     json_option,
     keystore_from_environment,
     moment_of,
+    only_enclaves,
     print_json,
     print_notes,
     read_log,
-    robot_option,
     ros_domain,
     visible,
 )
@@ -201,14 +201,7 @@ Example:
     "[default: this machine's]",
 )
 @click.option("--who", is_flag=True, help="Show which enclaves of the keystore may do it.")
-@click.option(
-    "--match",
-    "patterns",
-    multiple=True,
-    metavar="PATTERN",
-    help="With --who: only enclaves that match, such as '/arm/*'.  Can be repeated.",
-)
-@robot_option("With --who: only the enclaves of this robot of the fleet.")
+@only_enclaves("With --who: only")
 @click.option(
     "--reach",
     metavar="ENCLAVE",

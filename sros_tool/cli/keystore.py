@@ -23,13 +23,13 @@ from sros_tool.cli.common import (
     keyring,
     keystore_from_environment,
     now,
+    only_enclaves,
     print_closed,
     print_json,
     print_notes,
     print_plan,
     print_remarks,
     print_restart,
-    robot_option,
     ros_domain,
     several_enclaves,
     split_root,
@@ -336,14 +336,7 @@ Example:
   /talker""",
 )
 @click.argument("root", type=PATH, required=False)
-@click.option(
-    "--match",
-    "patterns",
-    multiple=True,
-    metavar="PATTERN",
-    help="Only enclaves that match, such as '/arm/*'.  Can be repeated.",
-)
-@robot_option("Only the enclaves of this robot of the fleet.")
+@only_enclaves()
 @json_option
 def list_enclaves(
     root: Path | None, patterns: tuple[str, ...], robots: tuple[str, ...], as_json: bool
