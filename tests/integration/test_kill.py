@@ -16,7 +16,7 @@ from tests.support.harness import check_whole, policy_text, publish, remains, to
 
 __all__ = ["server"]
 
-KILLS = 30
+KILLS = 12
 
 
 def write_policy(path: Path, version: str, enclaves: list[str]) -> Path:
@@ -73,7 +73,7 @@ def test_killed_while_signing_with_every_core(
     length = server.run("generate_artifacts", "-k", keystore, "-p", policies[0])
     moments = random.Random(5)
     current = "v1"
-    for _ in range(40 if LONG else 4):
+    for _ in range(40 if LONG else 2):
         wanted = "v2" if current == "v1" else "v1"
         pause = moments.uniform(0.1, 1.0) * length
         server.kill(pause, "generate_artifacts", "-k", keystore, "-p", policies[wanted == "v2"])
@@ -101,7 +101,7 @@ def verify_with_openssl(keystore: Path) -> None:
 @pytest.mark.parametrize("root", ["missing", "empty", "in a missing folder"])
 def test_bug_17_of_eight_at_once_one_makes_the_keystore(root: str, tmp_path: Path) -> None:
     keystore = tmp_path / ("deep/er/ks" if "folder" in root else "ks")
-    for _ in range(5 if LONG else 2):
+    for _ in range(5 if LONG else 1):
         if root == "empty":
             keystore.mkdir()
         ended = python("-c", _STARTER, keystore)

@@ -21,13 +21,14 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import open_enclave, read_crl
 from tests.integration.kills import Moments, Server, server
+from tests.support.children import some_steps
 from tests.support.harness import check_whole, remains
 
 __all__ = ["server"]
 
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(hours=1)
-KILLS = 12
+KILLS = 5
 
 
 @dataclass(frozen=True)
@@ -156,11 +157,6 @@ def in_child(verb: Callable[[], object], at: int = 0) -> tuple[int, int]:
     return os.waitstatus_to_exitcode(ended), int(said or 0)
 
 
-def to_try(steps: int) -> range:
-    """Before which of so many steps to die: before each."""
-    return range(1, steps + 1)
-
-
 def copy(source: Path, target: Path) -> Path:
     if target.exists():
         shutil.rmtree(target)
@@ -180,7 +176,7 @@ def test_death_at_every_step(
     assert status == 0
     check_end(verb, before, settled(work))
     outcomes = set()
-    for step in to_try(steps):
+    for step in some_steps(range(1, steps + 1)):
         copy(life, work)
         assert in_child(lambda: VERBS[verb](work), step) == (DIED, 0), step
         now = see(work)

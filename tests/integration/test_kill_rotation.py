@@ -21,7 +21,8 @@ from sros_tool.keystore.lifecycle.rotation.state import (
 from sros_tool.keystore.reader import open_enclave, read_lists
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server
-from tests.integration.test_kill_life import DIED, copy, in_child, to_try
+from tests.integration.test_kill_life import DIED, copy, in_child
+from tests.support.children import some_steps
 from tests.support.harness import check_enclave_whole, remains
 
 __all__ = ["server"]
@@ -91,7 +92,7 @@ def test_death_at_every_step_of_revoking_between_stages(
     assert status == 0
     expected = settled(work)
     outcomes = set()
-    for step in to_try(steps):
+    for step in some_steps(range(1, steps + 1)):
         copy(life, work)
         assert in_child(lambda: revoke_once(work), step) == (DIED, 0), step
         now = see(work)

@@ -8,7 +8,7 @@ import os
 import shutil
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -36,6 +36,7 @@ from sros_tool.keystore.transaction.stage import Change, Changes
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
+from tests.support.children import some_steps
 from tests.support.harness import check_whole, policy_text, publish, remains, snapshot, topics_of
 
 NOW = datetime.now(UTC)
@@ -110,10 +111,10 @@ def in_child(
     verb: Callable[[], object],
     at: int = 0,
     instead: Callable[[str, tuple[Any, ...]], object] = die,
-) -> tuple[int, list[int]]:
+) -> tuple[int, Sequence[int]]:
     """Run a verb in a forked process; its exit status, and the steps that are worth a look.
 
-    All from the end of the staging on are, and of those before it every third.
+    All from the end of the staging on are, and of those before it every third (`some_steps`).
     """
     reader, writer = os.pipe()
     child = os.fork()
@@ -139,7 +140,7 @@ def in_child(
     _, status = os.waitpid(child, 0)
     staged, count = map(int, said.split() or (0, 0))
     steps_of_interest = [*range(1, staged, 3), *range(max(staged, 1), count + 1)]
-    return os.waitstatus_to_exitcode(status), steps_of_interest
+    return os.waitstatus_to_exitcode(status), some_steps(steps_of_interest)
 
 
 # ── scenarios ──────────────────────────────────────────────────────────────────────────────

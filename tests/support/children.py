@@ -27,6 +27,11 @@ Done = subprocess.CompletedProcess[str]
 _Value = TypeVar("_Value")
 
 
+def some_steps(steps: Sequence[int]) -> Sequence[int]:
+    """Return the steps at which to stop a process: if many, every third; all in the long form."""
+    return steps if LONG or len(steps) < 50 else steps[::3]
+
+
 def run(
     command: Sequence[object],
     *,
