@@ -20,13 +20,13 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.evaluator import JoinContext
     from sros_tool.explain.question import ask
-    from sros_tool.explain.reach import Network
     from sros_tool.explain.who import who
     from sros_tool.keystore.issuing.proof import prove
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
     from sros_tool.keystore.rights import load_rights
     from sros_tool.keystore.template import load_template
     from sros_tool.policy.document import read_policy
+    from sros_tool.reach import Network
     from sros_tool.translate import permissions_for
     from sros_tool.validity import window
 

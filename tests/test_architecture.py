@@ -20,7 +20,7 @@ LAYERS = {
     | {"xml", "files", "folders", "parallel", "resources", "prometheus"},
     2: {"pki", "policy", "dds", "zenoh"},
     3: {"fleet", "translate", "translate_zenoh", "translate_zenoh_back"},
-    4: {"translate_from_zenoh", "keystore", "graph", "runtime"},
+    4: {"translate_from_zenoh", "reach", "keystore", "graph", "runtime"},
     5: {"checks", "explain", "demo", "report"},
     6: {"api", "cli"},
     7: {"__init__", "__main__"},

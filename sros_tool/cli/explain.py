@@ -55,12 +55,12 @@ if TYPE_CHECKING:
     from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave
     from sros_tool.explain.log import LogFinding
     from sros_tool.explain.question import Part, Question
-    from sros_tool.explain.reach import HopPath, Reach
     from sros_tool.explain.who import EnclaveOutcome
     from sros_tool.explain.zenoh import ZenohAnswer
     from sros_tool.fleet.model import Fleet
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.model import Enclave, Source
+    from sros_tool.reach import HopPath, Reach
 
 _WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
 _KINDS = {
@@ -1214,9 +1214,9 @@ def _show_reach(
     zenoh: bool,
 ) -> int:
     """Print which enclaves one enclave can influence and learn from; return 0."""
-    from sros_tool.explain.reach import OF_EVERY_NODE, QUESTIONS, Network
     from sros_tool.keystore.missing import likely_names
     from sros_tool.keystore.rights import load_rights, load_zenoh_rights
+    from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network
 
     if root is None and len(rest) == 1:
         root, rest = Path(rest[0]), ()
@@ -1269,9 +1269,9 @@ def _uncontrolled(source: RightsSource) -> dict[str, Any]:
     """Return arguments for `Network`: the topics that a governance leaves open to all enclaves."""
     if source.kind != "keystore":
         return {}
-    from sros_tool.explain.reach import unguarded
     from sros_tool.keystore.layout import enclave_names
     from sros_tool.keystore.reader import governance_of
+    from sros_tool.reach import unguarded
 
     return {
         "unguarded": unguarded(governance_of(source.path)),
@@ -1284,8 +1284,8 @@ def _reach_lines(reach: Reach, fleet: Fleet | None) -> Iterator[str]:
 
     The enclaves of a fleet are folded by robot.
     """
-    from sros_tool.explain.reach import path_text
     from sros_tool.fleet.folding import folded
+    from sros_tool.reach import path_text
 
     for what, paths in (
         ("can influence", reach.influences),

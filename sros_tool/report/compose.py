@@ -442,7 +442,7 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
 
     The protection of whole RTPS messages protects every topic in them.  A topic without a rule
     counts as not protected: vendors refuse it.  Access counts as controlled if all domain rules
-    control it for all of these topics, as in `sros_tool.explain.reach`.
+    control it for all of these topics, as in `sros_tool.reach`.
     """
     if governance is None or not governance.domain_access_rules:
         return UNKNOWN

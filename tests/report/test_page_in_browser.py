@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sros_tool.explain.reach import OF_EVERY_NODE, Network, unguarded
 from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.reader import governance_of
 from sros_tool.keystore.rights import load_rights
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
+from sros_tool.reach import OF_EVERY_NODE, Network, unguarded
 from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.layout import scenes_of
 from sros_tool.report.page import render_page

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.explain.reach import OF_EVERY_NODE, QUESTIONS, Network, Unguarded, path_text
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, Rules
+from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network, Unguarded, path_text
 
 
 def rights(*lines: str) -> list[Right]:
