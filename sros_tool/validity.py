@@ -51,6 +51,17 @@ class Window:
         """Return the part of this window that is in ``outer``."""
         return Window(max(self.not_before, outer.not_before), min(self.not_after, outer.not_after))
 
+    def lasts(self, new: Window, now: datetime) -> bool:
+        """Return whether something with this validity can stay instead of one with a ``new`` one.
+
+        So it is until two thirds of the new one would be over, and never after the new one.
+        """
+        return (
+            self.not_before <= max(now, new.not_before)
+            and self.not_after <= new.not_after
+            and self.not_after - now > (new.not_after - now) / 3
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Lifespan:

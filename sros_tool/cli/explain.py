@@ -530,8 +530,8 @@ def _provenance_notes(answer: Answer, policy: Path | None) -> list[Note]:
     match answer.provenance:
         case Provenance.CHANGED:
             text = (
-                f"the permissions were not made from '{policy}' in its current form: it has "
-                "changed since, or it is another file. The lines are from the current file."
+                f"the permissions were not made from '{policy}' in its current form: it states "
+                "other rights than they have. The lines are from the current file."
             )
         case Provenance.UNKNOWN:
             text = f"whether the permissions were made from '{policy}' is not recorded."

@@ -203,8 +203,10 @@ def generate_artifacts(
 ) -> None:
     """Create enclaves, with the permissions that policies state for them: all or nothing.
 
-    The permissions in a policy replace the current permissions of an enclave; what --revoke-old
-    does then is described at `sros create_permission --help`.
+    The permissions in a policy replace the current permissions of an enclave, unless these state
+    the same and more than a third of their validity is left. To sign them again in any case, use
+    `sros create_permission` or `sros renew`. What --revoke-old does is described at `sros
+    create_permission --help`.
     """
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.layout import is_keystore
@@ -273,8 +275,9 @@ def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
         ):
             for name in names:
                 click.echo(text.format(name))
-    for name in result.kept:
-        click.echo(f"enclave {name} already exists: not changed", err=True)
+    if result.kept:
+        number = "1 enclave" if len(result.kept) == 1 else f"{len(result.kept)} enclaves"
+        click.echo(visible(f"unchanged: {number}: {_shown_names(result.kept)}"), err=True)
     if not dry_run:
         print_closed(result.root, result.changes)
     _show_rights(result.replaced, dry_run, err=True)  # stdout is that of ros2/sros2

@@ -30,8 +30,10 @@ class Provenance(StrEnum):
 
     SAME = "same"
     """They were made from the file as it is now."""
+    EQUAL = "equal"
+    """The file has changed since then, or it is another one, and it states the same rights."""
     CHANGED = "changed"
-    """They were made from another file, or the file has changed since then."""
+    """The file states other rights than they have."""
     UNKNOWN = "unknown"
     """The ledger does not have the file that they were made from."""
     PLANNED = "planned"

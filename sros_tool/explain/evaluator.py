@@ -22,7 +22,7 @@ from sros_tool.dds.governance import (
     parse_governance,
     render_governance,
 )
-from sros_tool.dds.permissions import Permissions, render_permissions
+from sros_tool.dds.permissions import Permissions, parse_permissions, render_permissions
 from sros_tool.errors import SrosError
 from sros_tool.explain.answer import (
     Answer,
@@ -327,7 +327,25 @@ class Evaluator:
             return Provenance.PLANNED
         if not recorded:
             return Provenance.UNKNOWN
-        return Provenance.SAME if recorded == self.enclave.policy.digest else Provenance.CHANGED
+        if not self._states(self.enclave.policy):
+            return Provenance.CHANGED
+        return Provenance.SAME if recorded == self.enclave.policy.digest else Provenance.EQUAL
+
+    def _states(self, policy: Enclave) -> bool:
+        """Return whether the grant that DDS reads has the rules of a policy on its domains."""
+        from sros_tool.translate import permissions_for
+
+        with suppress(SrosError):
+            found = parse_permissions(self.enclave.permissions).grant_of(self.enclave.subject)
+            if found and found.rules and not found.default_allow:
+                meant = permissions_for(
+                    policy,
+                    subject=found.subject,
+                    validity=found.validity,
+                    domains=found.rules[0].domains,
+                )
+                return meant.grants[0].rules == found.rules
+        return False
 
     def _lines(self, answer: Answer) -> tuple[PolicyLine, ...]:
         return deciding_lines(self.enclave.policy, answer) if self.enclave.policy else ()

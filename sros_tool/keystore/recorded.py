@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
@@ -49,6 +50,16 @@ class RecordedRights:
         ``grant`` are the rights; otherwise as `policy`.
         """
         return EarlierRights(grant, self.policy(name, digest))
+
+    def is_latest(self, name: str, digest: str) -> bool:
+        """Return whether permissions are certainly the last ones that were signed for an enclave.
+
+        ``name`` and ``digest`` are as for `policy`; permissions without a line are not.
+        """
+        with suppress(KeystoreError):
+            self.policy(name, digest)
+            return name in self._last
+        return False
 
     def policy(self, name: str, digest: str) -> str:
         """Return the SHA-256 of the policy of an enclave's permissions, or "".

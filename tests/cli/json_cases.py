@@ -127,7 +127,8 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
     "create_permission": (Case("ks /a policy.xml"), Case("ks /a policy.xml --dry-run")),
     "generate_artifacts": (
-        Case("-k ks -p policy.xml -e /spare"),
+        Case("-k ks -p other.xml -e /spare"),
+        Case("-k ks -p policy.xml"),
         Case("-k ks -e /a"),
         Case("-k partial -e /a"),
         Case("-k new -p policy.xml"),

@@ -184,6 +184,20 @@ def test_a_changed_policy(field: Field) -> None:
     assert field.pending("r1") == {"permissions": ("earlier", "deliver")}
 
 
+def test_a_policy_that_changes_for_others_leaves_a_robot_current(field: Field) -> None:
+    """Another comment, another robot, other rights of an enclave that is on none of them."""
+    robots = field.folder / "fleet.toml"
+    for text, fleet in (
+        (f"<!-- comment -->{POLICY}", robots.read_text()),
+        (POLICY.replace("/y", "/z"), f"{robots.read_text()}[robots.r4]\n"),
+    ):
+        (field.folder / "policy.xml").write_text(text)
+        robots.write_text(fleet)
+        field.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+        assert {field.states()[each] for each in ROBOTS} == {"current"}
+    assert field.states()["r4"] == "never"
+
+
 def test_a_rotation_goes_on_when_every_robot_has_confirmed_its_stage(field: Field) -> None:
     for now, then in (("distribute", "before"), ("reissue", "distribute"), ("complete", "reissue")):
         said = field.run("rotate_ca", "ks", "--next").err

@@ -43,10 +43,10 @@ def test_killed_at_random_moments(server: Server, keystore: Path, tmp_path: Path
     enclaves = ["/a", "/b", "/a/inner", "/c/d/e"]
     policies = [write_policy(tmp_path / f"{name}.xml", name, enclaves) for name in ("v1", "v2")]
     server.run("generate_artifacts", "-k", keystore, "-p", policies[0])
-    length = server.run("generate_artifacts", "-k", keystore, "-p", policies[0])
-    assert versions(keystore, enclaves) == {"v1"}
+    length = server.run("generate_artifacts", "-k", keystore, "-p", policies[1])
+    assert versions(keystore, enclaves) == {"v2"}
     moments = Moments(KILLS, 4, length)
-    current = "v1"
+    current = "v2"
     for number, pause in enumerate(moments):
         wanted = "v2" if current == "v1" else "v1"
         words: list[object] = ["-e", f"/new{number}"] if number % 10 == 0 else []

@@ -213,6 +213,24 @@ class EnclaveWriter:
         short = self._template.longest_validity(name) is not None
         return Issued(issuance, certificate, permissions, message, short_lived=short)
 
+    def would_only_date(
+        self, rights: StatedRights, certificate: x509.Certificate, signed: Grant, text: bytes
+    ) -> bool:
+        """Return whether `write` would sign a document again only to change its dates, too early.
+
+        ``text`` is the document, with LF line ends, and ``signed`` its grant.  The dates last until
+        two thirds of what new ones would have are over (`Window.lasts`).
+
+        Raises:
+            KeystoreError: the permissions would not decide as the policy does.
+        """
+        name = rights.enclave.path
+        new = self._validity(name, self._permissions_validity).within(validity_of(certificate))
+        if not signed.validity.lasts(new, self._now):
+            return False
+        permissions = _permissions(rights, subject_text(certificate.subject), signed.validity)
+        return render_permissions(permissions) == text
+
     def _validity(self, name: str, usual: Window) -> Window:
         """Return the validity of what is issued for an enclave; shorter if it is short-lived."""
         longest = self._template.longest_validity(name)

@@ -7,6 +7,7 @@ import hashlib
 import os
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import Enum
@@ -67,6 +68,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry
 from sros_tool.keystore.lifecycle.replaced import (
+    EarlierPermissions,
     ReplacedRights,
     earlier_permissions,
     replaced_rights,
@@ -260,8 +262,9 @@ def generate_artifacts(
     """Create the named enclaves and the enclaves of policies, with permissions, all or nothing.
 
     If a policy names an existing enclave, the enclave's permissions are replaced, and with
-    ``revoke_old`` its certificate, as by `create_permission`.  If the keystore does not exist and
-    ``create`` is given, it is created from that template.
+    ``revoke_old`` its certificate, as by `create_permission`.  Without it, permissions are kept
+    that state the same and do not expire soon (`EnclaveWriter.would_only_date`).  If the keystore
+    does not exist and ``create`` is given, it is created from that template.
 
     With policies for a fleet, which have to be for the same one, the keystore records it, and a
     keystore that is created is for the domains of the robots.
@@ -416,7 +419,7 @@ class _Keystore:
 
     ``known`` are its keys.  ``entries`` are the ledger entries of what is staged already, ``notes``
     remarks on files that were edited by hand and on the fleet.  ``is_new`` says that all of it is
-    staged.
+    staged.  With ``recorded``, permissions that state the rights of a policy already are kept.
     """
 
     authorities: Authorities
@@ -428,6 +431,7 @@ class _Keystore:
     notes: tuple[Note, ...] = ()
     fleet: Fleet | None = None
     is_new: bool = False
+    recorded: RecordedRights | None = None
 
 
 def open_to_issue(
@@ -442,7 +446,7 @@ def open_to_issue(
     """Return an existing keystore; ``domain``, if given, has to be one of its governance.
 
     A ``fleet`` is staged as that of the keystore, with its enclaves' paths ``patterns``; the
-    enclaves ``stated`` get new permissions.
+    enclaves ``stated`` get the permissions of a policy, unless they have them.
     """
     root = transaction.root
     template = load_settings(root)
@@ -468,6 +472,7 @@ def open_to_issue(
         entries,
         notes,
         fleet,
+        recorded=RecordedRights(root) if stated else None,
     )
 
 
@@ -686,7 +691,7 @@ def _write_enclave(
     *,
     revoke_old: bool,
 ) -> _Written:
-    """Stage the missing files of an enclave, and new permissions if ``policy`` is given."""
+    """Stage the missing files of an enclave, and permissions that state ``policy`` if given."""
     root = transaction.root
     present = present_files(root, name)
     before = len(transaction.changes)
@@ -705,6 +710,8 @@ def _write_enclave(
     if policy or PERMISSIONS_FILE not in present:
         enclave = policy or _default_rights(keystore.template, name)
         rights = StatedRights(enclave, EnclaveDomains(keystore.domains, keystore.fleet).of(name))
+    if earlier and rights and _is_kept(writer, keystore, root, identity, rights, earlier):
+        rights = None
     issued = writer.write(Issuance(name, identity, rights))
     link_shared_files(transaction, name, present)
     notes = tuple(issued.notes())
@@ -712,7 +719,7 @@ def _write_enclave(
         notes += tuple(token_notes(identity.new_key))
     if not present & _OF_KEY:
         return _Written(_Outcome.CREATED, notes)
-    if PERMISSIONS_FILE in present and policy:
+    if PERMISSIONS_FILE in present and rights:
         (grant,) = issued.permissions.grants
         replaced = replaced_rights(name, earlier, grant, now) if earlier else None
         if old is None:
@@ -722,6 +729,39 @@ def _write_enclave(
         return _Written(_Outcome.CHANGED, notes, replaced, superseded)
     completed = len(transaction.changes) > before
     return _Written(_Outcome.COMPLETED if completed else _Outcome.KEPT, notes)
+
+
+def _is_kept(
+    writer: EnclaveWriter,
+    keystore: _Keystore,
+    root: Path,
+    identity: NewIdentity | x509.Certificate,
+    rights: StatedRights,
+    earlier: EarlierPermissions,
+) -> bool:
+    """Return whether the permissions of an enclave stay as they are, because they state ``rights``.
+
+    Raises:
+        KeystoreError: the key of the enclave was revoked, so nobody would accept them.
+    """
+    name = rights.enclave.path
+    if keystore.recorded is None or isinstance(identity, NewIdentity):
+        return False
+    public: PublicKey = identity.public_key()  # type: ignore[assignment]
+    remedy = f"Give it another key with `sros renew {quote(str(root))} {name} --new-key`."
+    keystore.known.refuse_revoked(public, f"enclave {name}", remedy, identity)
+    return (
+        keystore.recorded.is_latest(name, earlier.digest)
+        and writer.would_only_date(rights, identity, earlier.grant, earlier.text)
+        and _is_file(enclave_path(root, name) / "permissions.xml", earlier.text)
+    )
+
+
+def _is_file(path: Path, content: bytes) -> bool:
+    """Return whether there is a file with this content."""
+    with suppress(SrosError):
+        return read_bytes(path, "permissions document") == content
+    return False
 
 
 def _default_rights(template: Template, name: str) -> Enclave:
