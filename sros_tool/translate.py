@@ -29,7 +29,7 @@ from sros_tool.policy.rights import ACTION_PARTS, GOAL, Right
 from sros_tool.validity import Window
 
 if TYPE_CHECKING:
-    from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
+    from sros_tool.policy.protection import DomainProtection, TopicProtection
 
 SERVICE_ENDS = {"rq": "Request", "rr": "Reply"}
 """Prefix and suffix of the DDS topics of a service: requests and replies."""
@@ -173,7 +173,7 @@ def governance_for(protection: DomainProtection, domains: DomainSet) -> Governan
     rules = [
         _topic_rule(expression, named.protection)
         for named in protection.named
-        for expression in _expressions(named)
+        for expression in protected_topics(named.kind, named.name)
     ]
     rules = _narrow_first(rules)
     rules.append(_topic_rule("*", protection.default))
@@ -197,7 +197,7 @@ def hidden_protections(protection: DomainProtection) -> list[tuple[str, str]]:
     found = []
     earlier: list[tuple[str, str]] = []
     for named in protection.named:
-        own = _expressions(named)
+        own = protected_topics(named.kind, named.name)
         by = [
             next((at for one, at in earlier if covers(one, each) and covers(each, one)), "")
             for each in own
@@ -208,11 +208,11 @@ def hidden_protections(protection: DomainProtection) -> list[tuple[str, str]]:
     return found
 
 
-def _expressions(named: NamedProtection) -> list[str]:
-    """Return the DDS topics of a ROS name, for both sides of a service or action."""
+def protected_topics(kind: str, name: str) -> list[str]:
+    """Return the DDS topics of a topic, service or action, of both sides; ``kind`` is plural."""
     expressions: dict[str, None] = {}
-    for right in RIGHTS[named.kind]:
-        names = dds_names(right, expand(named.name, "/", ""))
+    for right in RIGHTS[kind]:
+        names = dds_names(right, expand(name, "/", ""))
         expressions.update(dict.fromkeys(names.publish + names.subscribe))
     return list(expressions)
 
@@ -235,16 +235,19 @@ def _values(
 def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:
     """Return ``rules``, reordered as little as needed so that no rule follows a wider one."""
     ordered: list[TopicRule] = []
+    wide: list[TopicRule] = []  # those of them with wildcards, in the same order
     for rule in rules:
-        place = next(
+        place, among = next(
             (
-                index
-                for index, earlier in enumerate(ordered)
+                (next(at for at, each in enumerate(ordered) if each is earlier), number)
+                for number, earlier in enumerate(wide)
                 if covers(earlier.topic_expression, rule.topic_expression)
                 and not covers(rule.topic_expression, earlier.topic_expression)
             ),
-            len(ordered),
+            (len(ordered), None),
         )
+        if is_expression(rule.topic_expression):
+            wide.insert(len(wide) if among is None else among, rule)
         ordered.insert(place, rule)
     return ordered
 
@@ -277,7 +280,9 @@ def protection_for(governance: Governance) -> DomainProtection | None:
         places = dict.fromkeys((each.kind, each.name) for each in found)
         named += [NamedProtection(kind, name, values) for kind, name in places]
     order = [each.topic_expression for each in narrow if each is not None]
-    named.sort(key=lambda each: min(order.index(one) for one in _expressions(each)))
+    named.sort(
+        key=lambda each: min(order.index(one) for one in protected_topics(each.kind, each.name))
+    )
     protection = DomainProtection(
         **_terms(rule), default=TopicProtection(**_terms(last)), named=tuple(named)
     )

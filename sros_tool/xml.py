@@ -23,7 +23,7 @@ _MAX_MARKUP = 400_000
 
 
 @cache
-def _parser() -> etree.XMLParser:
+def _parser(instructions: bool) -> etree.XMLParser:
     return etree.XMLParser(
         resolve_entities=False,
         no_network=True,
@@ -31,7 +31,7 @@ def _parser() -> etree.XMLParser:
         dtd_validation=False,
         huge_tree=False,
         remove_comments=True,
-        remove_pis=True,
+        remove_pis=not instructions,
     )
 
 
@@ -91,11 +91,14 @@ def open_at_once(path: Path) -> BinaryIO:
 _UTF_8 = ("UTF-8", "UTF8", "US-ASCII", "ASCII")
 
 
-def parse(data: bytes, name: str, *, as_bytes: bool = False) -> etree._Element:
+def parse(
+    data: bytes, name: str, *, as_bytes: bool = False, instructions: bool = False
+) -> etree._Element:
     """Return the root element of an XML document, without comments and processing instructions.
 
     ``name`` names the document in errors.  ``as_bytes`` is for documents that DDS reads: vendors
-    read bytes whatever the declared encoding is, so that only UTF-8 means the same to all.
+    read bytes whatever the declared encoding is, so that only UTF-8 means the same to all.  With
+    ``instructions``, the document keeps its processing instructions.
 
     Raises:
         DocumentError: the document is not well-formed, too large, or has a document type
@@ -108,7 +111,7 @@ def parse(data: bytes, name: str, *, as_bytes: bool = False) -> etree._Element:
             f"{name} is too large", f"It has more than {_MAX_MARKUP} tags and attributes."
         )
     try:
-        root = etree.fromstring(data, _parser())
+        root = etree.fromstring(data, _parser(instructions))
     except (etree.XMLSyntaxError, ValueError) as error:
         why = getattr(error, "msg", "") or str(error)
         raise DocumentError(f"{name} is not well-formed XML", f"{why}.") from error

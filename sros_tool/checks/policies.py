@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
+from itertools import islice
 from pathlib import Path
 
 from lxml import etree
@@ -22,6 +23,7 @@ from sros_tool.errors import DocumentError, PolicyError, SrosError
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
+from sros_tool.keystore.protection import contradictions
 from sros_tool.names import (
     ACTION_SERVICES,
     ACTION_TOPICS,
@@ -37,6 +39,7 @@ from sros_tool.policy.document import IncludedFile, Includer, read_policy
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Policy, Profile, Source
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
 from sros_tool.policy.rights import GOAL, WHOLE, Right, Rules, parts, policy_rights
+from sros_tool.policy.stated import stated_protections
 from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
@@ -177,6 +180,16 @@ NO_COUNTERPART = FindingKind(
     "Compare the names on both sides, after remapping.",
 )
 
+CONTRADICTING_PROTECTION = FindingKind(
+    "policy.protection-contradicts",
+    ERROR,
+    "a name that is said with different protection",
+    "A keystore has one governance for all enclaves, so a name has one protection; a wildcard "
+    "says it of all names that it matches. No keystore can be made from this.",
+    "DDS-Security 1.1, 9.4.1.2 (topic rules); sros: protect= in a policy.",
+    "Say the same in both places, or in one of them only.",
+)
+
 _LONGEST = 247
 _DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
 _DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
@@ -216,6 +229,14 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
             if action_part(name)[1]:
                 continue  # the other side may name the whole action
             yield each.found(NO_COUNTERPART, f"no enclave may {other} {name}")
+
+
+def _check_protection(checked: _CheckedPolicy) -> Iterator[Finding]:
+    """Yield findings about names whose protection is said differently."""
+    for one, other in islice(contradictions(stated_protections(checked.policy.enclaves)), _MANY):
+        text = f"{other} is said with {other.word}, and {one} with {one.word} at {one.source}"
+        place = other.source
+        yield CONTRADICTING_PROTECTION.found(other.enclave, text, place.file, place.line)
 
 
 def _never(name: str) -> str:
@@ -667,6 +688,7 @@ _CHECKS = (
     _check_nodes,
     _check_names,
     _check_counterparts,
+    _check_protection,
     _check_root_enclave,
     _check_portability,
 )

@@ -508,18 +508,21 @@ def _name_of(folder: Path, options: _ContextOptions) -> str:
 def _planned_enclave(policy: Enclave, root: Path | None, options: _ContextOptions) -> LoadedEnclave:
     """Return the enclave as the policy would create it, with the keystore's governance.
 
-    Without a keystore, the governance is that of the default template.
+    Without a keystore, the governance is that of the default template, raised as the enclave says.
     """
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.evaluator import plan_enclave
+    from sros_tool.keystore.protection import with_stated
     from sros_tool.keystore.reader import governance_of
     from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
+    from sros_tool.policy.stated import stated_protections
     from sros_tool.translate import governance_for
 
     if root is not None:
         return plan_enclave(policy, governance_of(root), at=options.at)
     domain = options.context(None).domain
-    protection = load_template(DEFAULT_TEMPLATE).protection
+    stated = stated_protections([policy])
+    protection = with_stated(load_template(DEFAULT_TEMPLATE).protection, stated)
     governance = governance_for(protection, DomainSet.of((domain, domain)))
     return plan_enclave(policy, governance, at=options.at)
 

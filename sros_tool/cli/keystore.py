@@ -206,7 +206,8 @@ def generate_artifacts(
     The permissions in a policy replace the current permissions of an enclave, unless these state
     the same and more than a third of their validity is left. To sign them again in any case, use
     `sros create_permission` or `sros renew`. What --revoke-old does is described at `sros
-    create_permission --help`.
+    create_permission --help`. Where a policy demands more protection of a name than the keystore
+    gives, the governance of all enclaves is signed again.
     """
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.layout import is_keystore

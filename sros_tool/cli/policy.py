@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from sros_tool.policy.minimize import EnclaveUse, MinimizedPolicy, WildcardProposal
     from sros_tool.policy.model import Group, Policy
     from sros_tool.policy.rights import Right, RightsDifference
+    from sros_tool.policy.stated import StatedProtection
 
 
 # ── merge_policy ────────────────────────────────────────────────────────────────────────
@@ -178,9 +179,9 @@ def diff_policy(a: Path, b: Path, fleet_files: tuple[Path, ...], as_json: bool) 
     configurations of Zenoh such as router.json5. Permissions and rules of Zenoh are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. If A or
     B is only for some enclaves, these are compared. Of a fleet, lines that differ only in the robot
-    are one.
+    are one. Of two policies, the protection that they demand is compared, too.
 
-    The exit status is 1 if the rights differ, or if DDS would refuse A or B.
+    The exit status is 1 if they differ, or if DDS would refuse A or B.
     """
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.rights import compare
@@ -192,17 +193,34 @@ def diff_policy(a: Path, b: Path, fleet_files: tuple[Path, ...], as_json: bool) 
     if first.scope is None or second.scope is None:
         scope = second.scope if first.scope is None else first.scope
     difference = compare(first.rights, second.rights, scope)
+    protections = _protection_differences(first, second)
     if as_json:
-        print_json(_difference_json(first, second, difference))
+        print_json(_difference_json(first, second, difference, protections))
     else:
         for line in _difference_lines(difference, first.fleet, second.fleet):
             click.echo(line)
+        for sign, each in protections:
+            click.echo(f"{sign} {each.enclave} protect {each} with {each.word}")
         count = len(difference.only_first) + len(difference.only_second)
         of = f" of {', '.join(sorted(scope))}" if scope else ""
         differ = f"1 right{of} differs" if count == 1 else f"{count} rights{of} differ"
         click.echo(differ if count else f"the rights{of} are the same", err=True)
+        if protections:
+            click.echo("what the policies say about protection differs", err=True)
     print_notes((*first.notes, *second.notes))
-    return 0 if not difference and first.sound and second.sound else 1
+    return 0 if not difference and not protections and first.sound and second.sound else 1
+
+
+def _protection_differences(
+    first: RightsSource, second: RightsSource
+) -> list[tuple[str, StatedProtection]]:
+    """Return what only one of two policies says about protection, with "-" or "+"."""
+    if first.protections is None or second.protections is None:
+        return []
+    one, other = set(first.protections), set(second.protections)
+    found = [("-", each) for each in first.protections if each not in other]
+    found += [("+", each) for each in second.protections if each not in one]
+    return sorted(found, key=lambda line: (line[1].enclave, line[1].name, line[0] == "+"))
 
 
 def _difference_lines(
@@ -227,10 +245,13 @@ def _difference_lines(
 
 
 def _difference_json(
-    first: RightsSource, second: RightsSource, difference: RightsDifference
+    first: RightsSource,
+    second: RightsSource,
+    difference: RightsDifference,
+    protections: Sequence[tuple[str, StatedProtection]],
 ) -> dict[str, Any]:
     return {
-        "equal": not difference,
+        "equal": not difference and not protections,
         **{
             side: {
                 "path": str(source.path),
@@ -248,6 +269,9 @@ def _difference_json(
                 "covered_by": as_plain(difference.covered.get(right, ())),
             }
             for sign, right in difference.lines()
+        ],
+        "protections": [
+            {"only": "a" if sign == "-" else "b", **as_plain(each)} for sign, each in protections
         ],
     }
 

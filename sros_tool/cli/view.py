@@ -182,8 +182,12 @@ def _picture(
     ]
     if template:
         _check_no_governance(sources, read)
-        governance = template_governance(template)
-        read = [each if each.governance else replace(each, governance=governance) for each in read]
+        read = [
+            each
+            if each.governance
+            else replace(each, governance=template_governance(template, each.protections))
+            for each in read
+        ]
     robots: dict[str, str] = {}
     for path, fleet, source in zip(sources, fleets, read, strict=False):
         robots |= _robots(path, fleet, source)

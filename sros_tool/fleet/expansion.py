@@ -25,6 +25,7 @@ class FleetPolicy(Mapping[str, Enclave]):
     """The enclaves of a policy for a fleet, by their paths; each is expanded when it is asked for.
 
     ``fleet`` has the robots.  ``patterns`` are the paths with a placeholder, as `Fleet` has them.
+    ``protects`` says whether it states the protection of a name.
     """
 
     def __init__(self, policy: Policy, fleet: Fleet) -> None:
@@ -43,6 +44,12 @@ class FleetPolicy(Mapping[str, Enclave]):
         self._of: dict[str, tuple[Enclave, Robot | None]] = {}
         self._names: dict[tuple[str, Source], tuple[str, ...]] = {}
         self.patterns = tuple(each.path for each in policy.enclaves if has_placeholder(each.path))
+        self.protects = any(
+            group.protect
+            for each in policy.enclaves
+            for profile in each.all_profiles()
+            for group in profile.groups
+        )
         for enclave in policy.enclaves:
             for path, robot in self._paths(enclave):
                 if path in self._of:

@@ -36,6 +36,7 @@ from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, RIGHTS, Source
 from sros_tool.policy.rights import Right, order, parts, policy_rights
+from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh import StatedRight
 from sros_tool.translate_zenoh_back import rights_in_rules
@@ -53,7 +54,8 @@ class RightsSource:
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh".  ``scope`` are the
     enclaves that it can give rights to; None for all.  ``sound`` is False if DDS would refuse a
     part of it: a signature that does not verify, or permissions that are missing or malformed.
-    ``fleet`` knows which enclave is whose, if the file or folder is for one.
+    ``fleet`` knows which enclave is whose, if the file or folder is for one.  ``protections`` are
+    what a policy says about the protection of names; None for anything else.
     """
 
     path: Path
@@ -63,6 +65,7 @@ class RightsSource:
     sound: bool
     notes: tuple[Note, ...]
     fleet: Fleet | None = None
+    protections: tuple[StatedProtection, ...] | None = None
 
 
 def load_rights(path: Path, fleet: Fleet | None = None) -> RightsSource:
@@ -94,7 +97,8 @@ def load_rights(path: Path, fleet: Fleet | None = None) -> RightsSource:
         if fleet:
             written = read_policy(path, placeholders=True)
             fleet = fleet.with_enclaves(FleetPolicy(written, fleet).patterns)
-        return RightsSource(path, "policy", policy_rights(policy), None, True, (), fleet)
+        stated = stated_protections(policy.enclaves)
+        return RightsSource(path, "policy", policy_rights(policy), None, True, (), fleet, stated)
     return _document_rights(path, "permissions", path)
 
 

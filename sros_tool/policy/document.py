@@ -9,6 +9,11 @@ does not allow is an error, because its author relies on that right or denial.
 Includes (``xi:include``) are read only from the folder of the policy and the folders below.  They
 give what the XInclude of libxml2 gives, or are refused.  Nodes of included documents are never
 moved into another document: a moved lxml node can crash Python.
+
+How messages of a name have to be protected is said by a processing instruction behind the name:
+``<topic>scan<?sros protect="encrypt"?></topic>``.  The schema of ros2/sros2 allows no attribute and
+no element there, but processing instructions everywhere; its XSLT does not translate them, and
+writes them again.
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
+from typing import Any
 from urllib.parse import unquote
 
 from lxml import etree
@@ -45,6 +51,7 @@ from sros_tool.policy.placeholders import (
     parts_of,
     sample,
 )
+from sros_tool.policy.protection import PROTECT, Level
 from sros_tool.xml import parse, read_bytes, serialize, tag_of
 
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
@@ -107,7 +114,9 @@ class Includer:
 
     def use_content(self, file: Path, content: bytes) -> None:
         """Use ``content`` in place of the file with this real path, wherever it is included."""
-        self._documents[file] = parse(content, f"the policy file '{file}'")
+        root = parse(content, f"the policy file '{file}'", instructions=True)
+        _keep_instructions_of_names(root, file)
+        self._documents[file] = root
         self._sizes[file] = len(content)
         self._digests.append(hashlib.sha256(content).digest())
 
@@ -165,6 +174,8 @@ class Includer:
         self, elements: Iterable[etree._Element], place: IncludedFile
     ) -> Iterator[tuple[etree._Element, IncludedFile]]:
         for each in elements:
+            if isinstance(each, etree._ProcessingInstruction):
+                continue
             if each.tag in _INCLUDES:
                 yield from self._included(each, place)
                 continue
@@ -237,6 +248,42 @@ class Includer:
                 "Write the path from the root element of the included file.",
             )
         return list(found)
+
+
+_ITEMS = frozenset(kind.removesuffix("s") for kind in RIGHTS)
+_INSTRUCTION = "sros"
+_EXAMPLE = 'Write for example <topic>scan<?sros protect="encrypt"?></topic>.'
+_PROTECT = re.compile(r"""protect\s*=\s*(?:"(?P<one>[^"]*)"|'(?P<other>[^']*)')\s*\Z""")
+
+
+def _keep_instructions_of_names(root: etree._Element, file: Path) -> None:
+    """Remove the processing instructions that stand in no name; raise if one was for sros.
+
+    A name keeps even those of others: it has to be free of them, because a misspelt one would
+    leave it unprotected.
+    """
+    around = (*root.itersiblings(preceding=True), *root.itersiblings())
+    for each in (*around, *root.iter(etree.PI)):
+        if not isinstance(each, etree._ProcessingInstruction):
+            continue
+        parent: Any = each.getparent()
+        if parent is not None and parent.tag in _ITEMS:
+            continue
+        if (each.target or "").lower() == _INSTRUCTION:
+            raise PolicyError(
+                f"{file}:{each.sourceline}: <?{_INSTRUCTION} ...?> is not in a name",
+                "Protection is said for a topic, service or action, in its element.",
+                _EXAMPLE,
+            )
+        if parent is None:
+            continue
+        before = each.getprevious()
+        if before is not None:
+            before.tail = (before.tail or "") + (each.tail or "")
+        else:
+            parent.text = (parent.text or "") + (each.tail or "")
+        each.tail = None
+        parent.remove(each)
 
 
 def _fits(element: etree._Element, step: re.Match[str]) -> bool:
@@ -421,10 +468,15 @@ class _Reader:
                 expression_problem(sampled)
                 or "A node name has no '/' and no '~'; its namespace goes into ns=.",
             )
-        groups = tuple(self._group(child, at, node) for child, at in self._children(element, place))
+        groups = tuple(
+            group
+            for child, at in self._children(element, place)
+            for group in self._groups(child, at, node)
+        )
         return Profile(ns, node, groups, self._source(element, place))
 
-    def _group(self, element: etree._Element, place: IncludedFile, node: str) -> Group:
+    def _groups(self, element: etree._Element, place: IncludedFile, node: str) -> Iterator[Group]:
+        """Yield the names of a group together with those that have the same protection."""
         kind = tag_of(element)
         if kind not in RIGHTS:
             raise PolicyError(
@@ -451,17 +503,49 @@ class _Reader:
             )
         item = kind.removesuffix("s")
         items = self._children(element, place)
-        names = tuple(self._name(*self._expect(child, at, item), node) for child, at in items)
-        if not names:
+        named: dict[Level | None, list[tuple[str, int]]] = {}
+        for child, at in items:
+            name = self._name(*self._expect(child, at, item), node)
+            named.setdefault(self._protect(child, at), []).append((name, child.sourceline or 0))
+        if not named:
             raise PolicyError(
                 f"{self._where(element, place)}: <{kind}> names no {item}",
                 "",
                 f"Remove the element, or name one: <{item}>NAME</{item}>.",
             )
-        lines: tuple[int, ...] = ()
-        if all(at.file == place.file for _, at in items):  # names can be included one by one
-            lines = tuple(child.sourceline or 0 for child, _ in items)
-        return Group(kind, tuple(rights), names, self._source(element, place), lines)
+        whole = all(at.file == place.file for _, at in items)  # names can be included one by one
+        for level, found in named.items():
+            names, lines = tuple(name for name, _ in found), tuple(line for _, line in found)
+            source = self._source(element, place)
+            yield Group(kind, tuple(rights), names, level, source, lines if whole else ())
+
+    def _protect(self, element: etree._Element, place: IncludedFile) -> Level | None:
+        """Return the protection that a name demands, or None."""
+        if not len(element):
+            return None
+        where = self._where(element, place)
+        only = element[0]
+        if (
+            len(element) > 1
+            or not isinstance(only, etree._ProcessingInstruction)
+            or only.target != _INSTRUCTION
+            or only.tail
+        ):
+            raise PolicyError(
+                f"{where}: the processing instructions of a name are not valid",
+                "There can be one of sros, directly between the name and its end tag. A misspelt "
+                "one would leave the name without protection.",
+                _EXAMPLE,
+            )
+        found = _PROTECT.match((only.text or "")[:_MAX_LENGTH].lstrip())
+        word = (found["one"] or found["other"] or "") if found else ""
+        if word not in PROTECT:
+            raise PolicyError(
+                f"{where}: <?sros {_short(only.text or '')[1:-1]}?> is not a protection",
+                "It can be " + " or ".join(f'protect="{each}"' for each in PROTECT) + ".",
+                _EXAMPLE,
+            )
+        return PROTECT[word]
 
     def _name(self, element: etree._Element, place: IncludedFile, node: str) -> str:
         name = self._written(element)
@@ -471,7 +555,7 @@ class _Reader:
             problem = "A name with ~ is private to a node, and the profile has an empty node name."
         if not problem and name == "/":
             problem = "It is a namespace, not a name."
-        if not problem and len(element):
+        if not problem and any(isinstance(child.tag, str) for child in element):
             problem = "It contains other elements."
         if problem:
             where = self._where(element, place)
@@ -639,7 +723,7 @@ def with_node_rights(policy: Policy, folder: Path) -> Policy:
                 )
             )
             if lacking:
-                added.append(Group(group.kind, group.rights, lacking))
+                added.append(Group(group.kind, group.rights, lacking, group.protect))
         return replace(profile, groups=(*profile.groups, *added))
 
     return replace(
@@ -746,11 +830,20 @@ class _EarlierReader(_Reader):
         return f"~/{text[1:]}"
 
 
+_WORDS = {level: word for word, level in PROTECT.items()}
+
+
+def instruction_text(protect: Level | None) -> str:
+    """Return what stands behind a name with this protection, or "" for None."""
+    return f'<?{_INSTRUCTION} protect="{_WORDS[protect]}"?>' if protect else ""
+
+
 def write_policy(policy: Policy) -> bytes:
     """Return the policy as XML in UTF-8; `read_policy` reads the same value from it."""
     root = etree.Element("policy", version=policy.version)
     enclaves = etree.SubElement(root, "enclaves")
     metadata: list[tuple[etree._Element, str]] = []
+    protected: list[tuple[etree._Element, Level]] = []
     for enclave in policy.enclaves:
         element = etree.SubElement(enclaves, "enclave", path=enclave.path)
         for block in enclave.profiles:
@@ -758,22 +851,31 @@ def write_policy(policy: Policy) -> bytes:
             if block.type:
                 profiles.set("type", block.type)
             for profile in block.profiles:
-                _write_profile(profiles, profile)
+                protected += _write_profile(profiles, profile)
             if block.metadata:
                 metadata.append((profiles, block.metadata))
     etree.indent(root, space="  ")
-    for profiles, text in metadata:  # after the indentation, which would otherwise change its text
+    # After the indentation, which would otherwise change texts and names.
+    for item, level in protected:
+        item.append(etree.PI(_INSTRUCTION, f'protect="{_WORDS[level]}"'))
+    for profiles, text in metadata:
         last, element = profiles[-1], parse(text.encode(), "metadata")
         last.tail, element.tail = profiles.text, last.tail
         profiles.append(element)
     return serialize(root, indent=False)
 
 
-def _write_profile(parent: etree._Element, profile: Profile) -> None:
+def _write_profile(
+    parent: etree._Element, profile: Profile
+) -> Iterator[tuple[etree._Element, Level]]:
+    """Append a profile; yield the elements of its names that have a protection."""
     element = etree.SubElement(parent, "profile", ns=profile.ns, node=profile.node)
     for group in profile.groups:
         child = etree.SubElement(element, group.kind)
         for right, qualifier in group.rights:
             child.set(right, qualifier)
         for name in group.names:
-            etree.SubElement(child, group.kind.removesuffix("s")).text = name
+            item = etree.SubElement(child, group.kind.removesuffix("s"))
+            item.text = name
+            if group.protect:
+                yield item, group.protect

@@ -22,8 +22,9 @@ from lxml import etree
 
 from sros_tool.errors import DocumentError, Note, PolicyError
 from sros_tool.names import check_namespace, expand
-from sros_tool.policy.document import read_policy
+from sros_tool.policy.document import instruction_text, read_policy
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier
+from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import (
     RIGHT_ORDER,
     GroupRights,
@@ -34,6 +35,7 @@ from sros_tool.policy.rights import (
     order,
     policy_rights,
 )
+from sros_tool.policy.stated import stated_protections
 from sros_tool.xml import parse, read_bytes, tag_of
 
 _SHOWN = 3
@@ -54,11 +56,12 @@ class Contradiction:
 
 @dataclass(frozen=True, slots=True)
 class AddedName:
-    """A name to add to a profile, as written there, with its rights."""
+    """A name to add to a profile, as written there, with its rights and its protection."""
 
     kind: str
     name: str
     rights: GroupRights
+    protect: Level | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +111,7 @@ class _Planner:
                         for right, qualifier in group.rights:
                             if self._is_wanted(Right(enclave.path, qualifier, right, fqn)):
                                 entry = here.setdefault((group.kind, fqn), _Name(name, {}))
+                                entry.protect = entry.protect or group.protect
                                 entry.rights[right, qualifier] = None
         entries = {
             place: tuple(sorted(_entries(found), key=_entry_order))
@@ -137,18 +141,19 @@ class _Planner:
         return not (self._file.cover(right) or self._file.cover(denial))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Name:
-    """A name as first written, and the rights to add to it."""
+    """A name as first written, the rights to add to it, and its protection."""
 
     written: str
     rights: dict[tuple[str, Qualifier], None]
+    protect: Level | None = None
 
 
 def _entries(found: dict[tuple[str, str], _Name]) -> Iterable[AddedName]:
     for (kind, _), name in found.items():
         for qualifiers in groupable(name.rights):
-            yield AddedName(kind, name.written, qualifiers)
+            yield AddedName(kind, name.written, qualifiers, name.protect)
 
 
 def _place_order(place: ProfileKey) -> tuple[str, str, str]:
@@ -357,11 +362,11 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
     for additions in policies:
         plan = plan_merge(before, additions)
         contradictions += plan.contradictions
-        if not plan.added:
-            continue
-        document = _Editor(document, path, before).add(plan.entries)
-        before = _proven(path, document, before, plan.added)
-        added += plan.added
+        if plan.added:
+            document = _Editor(document, path, before).add(plan.entries)
+            before = _proven(path, document, before, plan.added)
+            added += plan.added
+        _check_protection(path, before, additions)
     return Merged(document, tuple(added), tuple(contradictions))
 
 
@@ -387,6 +392,24 @@ def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right])
     return after
 
 
+def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
+    """Raise `PolicyError` unless ``merged`` says of names what ``additions`` say of them.
+
+    A name that the file already has is not edited: which of its places should say it is the
+    author's choice.
+    """
+    present = {(e.kind, e.name): e for e in stated_protections(merged.enclaves)}
+    for each in stated_protections(additions.enclaves):
+        own = present.get((each.kind, each.name))
+        if own is None or own.level is not each.level:
+            says = f'says protect="{own.word}" at {own.source}' if own else "does not say it"
+            raise PolicyError(
+                f"{each.source}: {each} has protect=\"{each.word}\", and '{path}' {says}",
+                "A merge adds rights, and changes no name that is there.",
+                "Say the same of the name in both files, and merge again.",
+            )
+
+
 # ── new elements ───────────────────────────────────────────────────────────────────────────
 
 
@@ -399,19 +422,19 @@ class _New:
     children: list[_New] = field(default_factory=list)
 
 
-def _item(kind: str, name: str) -> _New:
-    return _New(kind.removesuffix("s"), name)
+def _item(entry: AddedName) -> _New:
+    return _New(entry.kind.removesuffix("s"), entry.name + instruction_text(entry.protect))
 
 
-def _group(kind: str, rights: GroupRights, names: Iterable[str]) -> _New:
+def _group(kind: str, rights: GroupRights, entries: Iterable[AddedName]) -> _New:
     attributes = "".join(f' {right}="{qualifier.value}"' for right, qualifier in rights)
-    return _New(kind + attributes, children=[_item(kind, name) for name in names])
+    return _New(kind + attributes, children=[_item(entry) for entry in entries])
 
 
 def _groups(entries: Sequence[AddedName]) -> list[_New]:
     """Return the groups for names that come sorted by kind and rights."""
     return [
-        _group(kind, rights, [entry.name for entry in same])
+        _group(kind, rights, same)
         for (kind, rights), same in groupby(entries, key=lambda each: (each.kind, each.rights))
     ]
 
@@ -482,15 +505,15 @@ class _Editor:
             self._append(profiles[0], new)
         for (kind, rights), same in groupby(entries, key=lambda each: (each.kind, each.rights)):
             if group := groups.get((kind, rights)):
-                self._add_names(group, kind, [entry.name for entry in same])
+                self._add_names(group, kind, list(same))
 
-    def _add_names(self, group: PlacedElement, kind: str, names: Sequence[str]) -> None:
+    def _add_names(self, group: PlacedElement, kind: str, entries: Sequence[AddedName]) -> None:
         """Insert names into a group: in order if it is sorted, otherwise at its end."""
         present = [child.xml.text or "" for child in group.named(kind.removesuffix("s"))]
         is_sorted = len(present) == len(group.children) and present == sorted(present)
-        for name in names:
-            new = _item(kind, name)
-            place = bisect_left(present, name) if is_sorted else len(present)
+        for entry in entries:
+            new = _item(entry)
+            place = bisect_left(present, entry.name) if is_sorted else len(present)
             if not is_sorted:
                 self._append(group, new)
             elif place:

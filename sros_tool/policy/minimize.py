@@ -18,8 +18,18 @@ from dataclasses import dataclass, replace
 
 from sros_tool.errors import PolicyError
 from sros_tool.names import expand, is_expression
-from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Qualifier
-from sros_tool.policy.patterns import compiled, covers, literal_prefix, matches
+from sros_tool.policy.model import (
+    ALLOW,
+    DENY,
+    Enclave,
+    Group,
+    Policy,
+    Profile,
+    Qualifier,
+    with_groups,
+)
+from sros_tool.policy.patterns import Names, compiled, covers, literal_prefix, matches
+from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import (
     KIND_OF,
     GroupRights,
@@ -32,6 +42,7 @@ from sros_tool.policy.rights import (
     policy_rights,
     unfolded,
 )
+from sros_tool.policy.stated import stated_protections
 
 _Pair = tuple[str, str]
 
@@ -103,7 +114,40 @@ def minimize(
         ).result()
         enclaves.append(enclave)
         uses.append(use)
-    return MinimizedPolicy(Policy(tuple(enclaves), policy.version, policy.file), tuple(uses))
+    narrowed = replace(policy, enclaves=tuple(enclaves))
+    return MinimizedPolicy(_protected_as_before(policy, narrowed), tuple(uses))
+
+
+def _protected_as_before(before: Policy, after: Policy) -> Policy:
+    """Return ``after`` with the protection that only removed names stated, where it still applies.
+
+    One enclave states it for all: those that keep a right to the name need it, too.
+    """
+    known = {(e.kind, e.name, e.level) for e in stated_protections(after.enclaves)}
+    gone = {(e.kind, e.name, e.level) for e in stated_protections(before.enclaves)} - known
+    if not gone:
+        return after
+    left: dict[str, set[str]] = defaultdict(set)
+    for right in policy_rights(after):
+        left[right.kind].add(right.name)
+    names = {kind: Names(sorted(found)) for kind, found in left.items()}
+    levels: dict[tuple[str, str], Level] = {}
+    for kind, name, level in sorted(gone):
+        met = list(names[kind].meeting(name)) if kind in names else []
+        # A wildcard of others gets it only if nobody has the right to the name itself.
+        for each in [e for e in met if covers(name, e)] or met:
+            levels[kind, each] = max(level, levels.get((kind, each), level), key=list(Level).index)
+
+    def groups(group: Group, profile: Profile) -> Iterator[Group]:
+        found: dict[Level | None, list[str]] = {}
+        for name in group.names:
+            fqn = expand(name, profile.ns, profile.node)
+            level = group.protect or levels.get((group.kind, fqn))
+            found.setdefault(level, []).append(name)
+        for level, same in found.items():
+            yield replace(group, names=tuple(same), protect=level, lines=())
+
+    return with_groups(after, groups)
 
 
 class _KnownNames:
@@ -327,26 +371,27 @@ def _profile(
     path: str, profile: Profile, kept: Set[Right], pending: dict[Right, Sequence[Right]]
 ) -> Profile:
     """Return the narrowed profile; remove the replacements that it contains from ``pending``."""
-    said: dict[tuple[str, str], dict[tuple[str, Qualifier], None]] = {}
+    said: dict[tuple[str, str, Level | None], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
+        level = group.protect
         for name in group.names:
             fqn = expand(name, profile.ns, profile.node)
             for right, qualifier in group.rights:
                 whole = Right(path, qualifier, right, fqn)
                 if qualifier is DENY or whole in kept:
-                    said.setdefault((group.kind, name), {})[right, qualifier] = None
+                    said.setdefault((group.kind, name, level), {})[right, qualifier] = None
                 for each in pending.pop(whole, ()):
                     written = _written(each.name, name, profile)
-                    said.setdefault((each.kind, written), {})[each.right, ALLOW] = None
-    groups: dict[tuple[str, GroupRights], list[str]] = {}
-    for (kind, name), rights in said.items():
+                    said.setdefault((each.kind, written, level), {})[each.right, ALLOW] = None
+    groups: dict[tuple[str, GroupRights, Level | None], list[str]] = {}
+    for (kind, name, level), rights in said.items():
         for together in groupable(rights):
-            groups.setdefault((kind, together), []).append(name)
+            groups.setdefault((kind, together, level), []).append(name)
     return replace(
         profile,
         groups=tuple(
-            Group(kind, rights, tuple(dict.fromkeys(names)))
-            for (kind, rights), names in groups.items()
+            Group(kind, rights, tuple(dict.fromkeys(names)), level)
+            for (kind, rights, level), names in groups.items()
         ),
     )
 

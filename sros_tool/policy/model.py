@@ -6,8 +6,11 @@ Names follow SROS2 policy XML 0.2.0.  Values are equal if they state the same; t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+
+from sros_tool.policy.protection import Level
 
 VERSION = "0.2.0"
 
@@ -46,16 +49,18 @@ _NOWHERE = Source("", 0)
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Names of one kind (topics, services or actions) that share the same rights.
+    """Names of one kind (topics, services or actions) that share the same rights and protection.
 
     ``rights`` are pairs of a right and its qualifier, in the order of `RIGHTS`; ``names`` are as
-    written: relative, private or absolute, perhaps with wildcards.  ``lines`` are the lines of
-    the names in the file of ``source``, if read from one.
+    written: relative, private or absolute, perhaps with wildcards.  ``protect`` is how messages of
+    these names have to be protected at least, or None if the policy does not say it.  ``lines`` are
+    the lines of the names in the file of ``source``, if read from one.
     """
 
     kind: str
     rights: tuple[tuple[str, Qualifier], ...]
     names: tuple[str, ...]
+    protect: Level | None = None
     source: Source = field(default=_NOWHERE, compare=False)
     lines: tuple[int, ...] = field(default=(), compare=False)
 
@@ -113,3 +118,17 @@ class Policy:
     def enclave(self, path: str) -> Enclave | None:
         """Return the enclave with this path, or None."""
         return next((each for each in self.enclaves if each.path == path), None)
+
+
+def with_groups(policy: Policy, change: Callable[[Group, Profile], Iterable[Group]]) -> Policy:
+    """Return the policy with every group replaced by those that ``change`` returns for it."""
+
+    def profile(each: Profile) -> Profile:
+        groups = tuple(new for group in each.groups for new in change(group, each))
+        return replace(each, groups=groups)
+
+    def enclave(each: Enclave) -> Enclave:
+        blocks = (replace(b, profiles=tuple(map(profile, b.profiles))) for b in each.profiles)
+        return replace(each, profiles=tuple(blocks))
+
+    return replace(policy, enclaves=tuple(map(enclave, policy.enclaves)))

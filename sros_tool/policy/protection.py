@@ -18,6 +18,10 @@ class Level(StrEnum):
     ENCRYPT_WITH_ORIGIN_AUTHENTICATION = "ENCRYPT_WITH_ORIGIN_AUTHENTICATION"
 
 
+PROTECT: dict[str, Level] = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
+"""The levels that a policy can demand of a name, by their words in it."""
+
+
 @dataclass(frozen=True, slots=True)
 class TopicProtection:
     """The protection of a topic: its payload, its submessages, and its access control."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.names import ACTION_SEPARATOR, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Qualifier
-from sros_tool.policy.patterns import covers, literal_prefix, matches, overlap
+from sros_tool.policy.patterns import Names, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import (
     KIND_OF,
     RIGHT_ORDER,
@@ -26,6 +26,7 @@ from sros_tool.policy.rights import (
     parts,
     unfolded,
 )
+from sros_tool.policy.stated import StatedProtection
 from sros_tool.report.picture import (
     UNKNOWN,
     Edge,
@@ -42,7 +43,7 @@ from sros_tool.report.picture import (
     Validity,
     WireLevel,
 )
-from sros_tool.translate import dds_names
+from sros_tool.translate import dds_names, protected_topics
 
 _OVERLAYS = {
     "use": Overlay("use", "allowed, never observed", "observed, not allowed"),
@@ -58,7 +59,8 @@ class PictureSource:
     """The content of one source of a picture.
 
     ``nodes`` maps enclaves to their nodes; ``enclaves`` has the enclaves with their certificates;
-    ``scope`` has the enclaves that the source is about, or None for all.
+    ``scope`` has the enclaves that the source is about, or None for all.  ``protections`` are what
+    a policy says about the protection of names.
     """
 
     origin: SourceTitle
@@ -69,6 +71,7 @@ class PictureSource:
     validities: tuple[Validity, ...] = ()
     findings: tuple[PicturedFinding, ...] = ()
     scope: frozenset[str] | None = None
+    protections: tuple[StatedProtection, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +151,8 @@ def _picture(
 ) -> Picture:
     edges = tuple(sorted(edges, key=_edge_order))
     governance = next((each.governance for each in reversed(sources) if each.governance), None)
+    said = next((each.protections for each in reversed(sources) if each.protections), ())
+    demanded = _Demanded(() if governance else said)
     names = sorted({(edge.kind, edge.name) for edge in edges})
     return Picture(
         title=" and ".join(each.origin.title for each in sources),
@@ -158,7 +163,7 @@ def _picture(
                 kind,
                 name,
                 _namespace_of(name),
-                protection_of(governance, kind, name),
+                demanded.protection(kind, name) or protection_of(governance, kind, name),
                 is_expression(name),
             )
             for kind, name in names
@@ -466,6 +471,26 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
 
 
 _ORDER = list(WireLevel)
+
+
+class _Demanded:
+    """The protection that a policy demands, for pictures without a governance."""
+
+    def __init__(self, stated: Iterable[StatedProtection]) -> None:
+        found: dict[WireLevel, list[str]] = defaultdict(list)
+        for each in stated:
+            found[WireLevel(each.word)] += protected_topics(each.kind, each.name)
+        self._names = {level: Names(topics) for level, topics in found.items()}
+
+    def protection(self, kind: str, name: str) -> Protection | None:
+        """Return the least that is demanded of all topics of a name, or None."""
+        levels = [self._level(topic) for topic in _topics(kind, name)] if self._names else []
+        least = min(levels, key=_ORDER.index, default=WireLevel.UNKNOWN)
+        return None if least is WireLevel.UNKNOWN else Protection(least)
+
+    def _level(self, topic: str) -> WireLevel:
+        covering = [level for level, names in self._names.items() if names.cover(topic)]
+        return max(covering, key=_ORDER.index, default=WireLevel.UNKNOWN)
 
 
 def _topics(kind: str, name: str) -> tuple[str, ...]:

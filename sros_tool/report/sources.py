@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Set
+from collections.abc import Iterable, Iterator, Sequence, Set
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -24,6 +24,7 @@ from sros_tool.fleet.model import Fleet
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
 from sros_tool.keystore.layout import PUBLIC
+from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.reader import (
     OpenedEnclave,
     OpenedKeystore,
@@ -43,6 +44,7 @@ from sros_tool.pki.keys import algorithm
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.policy.stated import StatedProtection
 from sros_tool.report.compose import PictureSource
 from sros_tool.report.picture import PicturedEnclave, PicturedFinding, SourceTitle, Validity
 from sros_tool.resources import policies_dir
@@ -73,7 +75,8 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
         SourceTitle(_base_name(path), read.kind), read.rights, findings=findings, scope=read.scope
     )
     if read.kind == "policy":
-        source = replace(source, nodes=_nodes(read_policy_for(path, fleet)))
+        nodes = _nodes(read_policy_for(path, fleet))
+        source = replace(source, nodes=nodes, protections=read.protections or ())
     elif read.kind == "keystore":
         source = _with_keystore(source, path, now)
     elif read.kind == "enclave":
@@ -113,11 +116,15 @@ def common_rights() -> tuple[Right, ...]:
     return tuple(sorted(policy_rights(policy)))
 
 
-def template_governance(choice: str) -> Governance:
-    """Return the governance of a keystore made from the template ``choice``."""
+def template_governance(choice: str, stated: Sequence[StatedProtection] = ()) -> Governance:
+    """Return the governance of a keystore made from the template ``choice`` and a policy.
+
+    ``stated`` is what the policy says about the protection of names.
+    """
     from sros_tool.dds.domains import DomainSet
 
-    return governance_for(load_template(choice).protection, DomainSet.of((0, 0)))
+    protection = with_stated(load_template(choice).protection, stated)
+    return governance_for(protection, DomainSet.of((0, 0)))
 
 
 def _nodes(policy: Policy) -> dict[str, tuple[str, ...]]:

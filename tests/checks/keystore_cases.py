@@ -475,7 +475,13 @@ def _policy(bench: Bench, *changes: tuple[str, str]) -> None:
     bench.options["policies"] = (read_policy(file),)
 
 
+def _demanding_policy(bench: Bench) -> None:
+    _policy(bench, ("status</topic>", 'status<?sros protect="encrypt"?></topic>'))
+    bench.governance(("ENCRYPT", "SIGN"))
+
+
 CASES |= {
+    "governance.less-than-policy": _demanding_policy,
     "keystore.not-in-ledger": lambda b: b.issue(),
     "enclave.stale-permissions": lambda b: _policy(b, ("status", "state")),
     "enclave.not-in-policy": lambda b: _policy(b, ('path="/arm"', 'path="/other"')),

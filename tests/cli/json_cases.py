@@ -42,6 +42,7 @@ _OLD = """<policy version="0.1.0"><profiles><profile ns="/" node="n">
 POLICIES = {
     "policy.xml": policy_text({"/a": publish("/x"), "/b": publish("/y") + _SUBSCRIBE}),
     "other.xml": policy_text({"/a": publish("/x", "/z"), "/new": publish("/x")}),
+    "protected.xml": policy_text({"/a": publish('/x<?sros protect="sign"?>')}),
     "denied.xml": policy_text({"/a": _DENIED, "/b": publish("/x")}),
     "wild.xml": policy_text({"/a": _WILD, "/b": publish("/x")}),
     "large.xml": policy_text({"/a": publish(*(f"/{'n' * 60}/x{i}" for i in range(900)))}),
@@ -256,6 +257,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("policy.xml ks", 1),
         Case("ks/enclaves/a/permissions.xml ks/enclaves/a", 0),
         Case("wild.xml policy.xml", 1),
+        Case("protected.xml policy.xml", 1),
     ),
     "minimize_policy": (
         Case("policy.xml --observed other.xml"),

@@ -140,8 +140,9 @@ def test_a_linked_policy_includes_from_where_it_really_is(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("comment", ["<!-- c -->", "<?pi x?>"])
 def test_comments_count_for_nothing(comment: str, tmp_path: Path) -> None:
+    inside = "" if comment.startswith("<?") else comment  # a name has only those of sros
     text = f"""{comment}<policy version="0.2.0">{comment}<enclaves><enclave path="/a"><profiles>
-    <profile ns="/" node="n"><topics publish="ALLOW">{comment}<topic>ch{comment}atter</topic>
+    <profile ns="/" node="n"><topics publish="ALLOW">{comment}<topic>ch{inside}atter</topic>
     </topics></profile></profiles></enclave></enclaves></policy>{comment}"""
     (tmp_path / "p.xml").write_text(text)
     assert read_policy(tmp_path / "p.xml").enclaves[0].all_profiles()[0].groups[0].names == (

@@ -16,6 +16,7 @@ from sros_tool.checks.keystores.enclaves import grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.policies import ENCLAVE_NAMES, within_root
+from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.portable import mistaken_names, some_pairs
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
@@ -26,10 +27,13 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     enclave_path,
 )
+from sros_tool.keystore.protection import less_protected
 from sros_tool.keystore.rights import load_rights
+from sros_tool.pki import smime
 from sros_tool.pki.certificates import fingerprints, load_certificates
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy.rights import Right, compare, policy_rights
+from sros_tool.policy.stated import stated_protections
 from sros_tool.translate import grant_rights
 from sros_tool.xml import read_bytes
 
@@ -77,6 +81,15 @@ STALE = FindingKind(
     "sros: the rights of policy and permissions, in ROS terms.",
     "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`; `sros diff_policy` shows all "
     "differences.",
+)
+LESS_PROTECTED = FindingKind(
+    "governance.less-than-policy",
+    ERROR,
+    "names that are protected less than the policy demands",
+    "The governance of the keystore decides, and was not made from this policy or changed since.",
+    "DDS-Security 1.1, 9.4.1.2 (topic rules); sros: protect= in a policy.",
+    "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`, which raises the protection; all "
+    "processes have to be restarted with the new governance.",
 )
 NOT_IN_POLICY = FindingKind(
     "enclave.not-in-policy",
@@ -239,6 +252,21 @@ def check_issued(
             yield NOT_IN_KEYSTORE.found(
                 name, "the keystore does not have this enclave", str(keystore.root)
             )
+        yield from _less_protected(keystore)
+
+
+def _less_protected(keystore: CheckedKeystore) -> Iterator[Finding]:
+    """Yield findings about names that the governance protects less than a policy demands."""
+    stated = stated_protections(each for policy in keystore.policies for each in policy.enclaves)
+    if not stated:
+        return
+    try:
+        governance = parse_governance(smime.parse(keystore.governance).document)
+    except SrosError:
+        return  # another check reports it
+    for each, level in less_protected(governance, stated):
+        text = f"{each} has {level.lower()}, and the policy says {each.word}"
+        yield LESS_PROTECTED.found(each.enclave, text, each.source.file, each.source.line)
 
 
 def _twice(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, list[str]]]:

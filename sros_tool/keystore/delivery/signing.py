@@ -50,6 +50,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import Entry, append, document_entry, read_ledger
+from sros_tool.keystore.lifecycle.governed import refuse_less_protected
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
     earlier_permissions,
@@ -76,6 +77,7 @@ from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import holds_private_key, load_key
 from sros_tool.pki.requests import SigningRequest, key_digest, load_request
 from sros_tool.policy.model import Enclave, Policy
+from sros_tool.policy.stated import stated_protections
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
@@ -318,6 +320,8 @@ class _Signer:
         """Write all files of an enclave except its key; its rights are ``stated``, or kept."""
         root, name = self._root, request.name
         _check_name(root, name, renew, name in self._existing)
+        if stated is not None:
+            refuse_less_protected(root, self._governance, stated_protections([stated]))
         _check_key(root, request, self._known, renew)
         if renew:
             note = _new_key_note(root, request)

@@ -67,6 +67,7 @@ from sros_tool.keystore.layout import (
     refuse_earlier,
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry
+from sros_tool.keystore.lifecycle.governed import Governed, protected_as_stated
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
     ReplacedRights,
@@ -75,6 +76,7 @@ from sros_tool.keystore.lifecycle.replaced import (
 )
 from sros_tool.keystore.lifecycle.revoke import Superseded, revoke_superseded
 from sros_tool.keystore.missing import no_such_enclave
+from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.reader import (
     check_domain,
     load_governance,
@@ -108,6 +110,7 @@ from sros_tool.pki.keys import PublicKey, generate_key, load_key
 from sros_tool.pki.token import TokenKey, open_enclave_key
 from sros_tool.pki.token_uri import TokenUri
 from sros_tool.policy.model import Enclave, Policy
+from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso, window
 from sros_tool.xml import read_bytes
@@ -237,8 +240,9 @@ def create_permission(
             raise no_such_enclave(root, name, existing)
     stated = {each.path: each for each in policy.enclaves}
     wanted = {name: stated.get(name) or stated_enclave(policy, name) for name in names}
+    protections = stated_protections(wanted.values())
     with Transaction(root, dry_run=dry_run) as transaction:
-        keystore = open_to_issue(transaction, domain, keyring, now)
+        keystore = open_to_issue(transaction, domain, keyring, now, protections=protections)
         return write_enclaves(
             transaction, keystore, dict(wanted), now, revoke_old=revoke_old, keyring=keyring
         )
@@ -263,8 +267,9 @@ def generate_artifacts(
 
     If a policy names an existing enclave, the enclave's permissions are replaced, and with
     ``revoke_old`` its certificate, as by `create_permission`.  Without it, permissions are kept
-    that state the same and do not expire soon (`EnclaveWriter.would_only_date`).  If the keystore
-    does not exist and ``create`` is given, it is created from that template.
+    that state the same and do not expire soon (`EnclaveWriter.would_only_date`).  The keystore
+    protects each name at least as the policies say.  If the keystore does not exist and ``create``
+    is given, it is created from that template.
 
     With policies for a fleet, which have to be for the same one, the keystore records it, and a
     keystore that is created is for the domains of the robots.
@@ -274,6 +279,7 @@ def generate_artifacts(
             is in a domain that the keystore is not for.
     """
     wanted = _rights_by_enclave(enclaves, policies)
+    protections = stated_protections(_protecting(policies))
     of_fleet = [each for each in policies if isinstance(each, FleetPolicy)]
     fleet = of_fleet[0].fleet if of_fleet else None
     patterns = [pattern for each in of_fleet for pattern in each.patterns]
@@ -283,7 +289,9 @@ def generate_artifacts(
     if create is None or is_keystore(root):
         check_keystore(root)
         with Transaction(root, dry_run=dry_run) as transaction:
-            keystore = open_to_issue(transaction, domain, keyring, now, fleet, patterns, wanted)
+            keystore = open_to_issue(
+                transaction, domain, keyring, now, fleet, patterns, wanted, protections
+            )
             again = _revoked_before(keystore, wanted, enclaves, root)
             creation = write_enclaves(
                 transaction,
@@ -300,6 +308,7 @@ def generate_artifacts(
     check_free(root)
     domains = domains or _domains_of(fleet, domain)
     check_domain(domains, domain, root)
+    create = replace(create, protection=with_stated(create.protection, protections))
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         keystore = _write_keystore(transaction, create, domains, keyring, now, _NONE_IMPORTED)
         if fleet:
@@ -309,6 +318,15 @@ def generate_artifacts(
             transaction, keystore, wanted, now, progress, keyring=keyring, places=places
         )
     return replace(creation, notes=(*creation.notes, *place_notes(root)))
+
+
+def _protecting(policies: Sequence[Policy | FleetPolicy]) -> Iterator[Enclave]:
+    """Yield the enclaves of the policies that say something about protection."""
+    for policy in policies:
+        if not isinstance(policy, FleetPolicy):
+            yield from policy.enclaves
+        elif policy.protects:
+            yield from policy.values()
 
 
 def _domains_of(fleet: Fleet | None, domain: int | None) -> DomainSet:
@@ -420,6 +438,7 @@ class _Keystore:
     ``known`` are its keys.  ``entries`` are the ledger entries of what is staged already, ``notes``
     remarks on files that were edited by hand and on the fleet.  ``is_new`` says that all of it is
     staged.  With ``recorded``, permissions that state the rights of a policy already are kept.
+    ``restart`` and ``remarks`` are of a governance that changes.
     """
 
     authorities: Authorities
@@ -432,6 +451,8 @@ class _Keystore:
     fleet: Fleet | None = None
     is_new: bool = False
     recorded: RecordedRights | None = None
+    restart: tuple[str, ...] = ()
+    remarks: tuple[Note, ...] = ()
 
 
 def open_to_issue(
@@ -442,11 +463,14 @@ def open_to_issue(
     fleet: Fleet | None = None,
     patterns: Sequence[str] = (),
     stated: Collection[str] = (),
+    protections: Sequence[StatedProtection] = (),
 ) -> _Keystore:
     """Return an existing keystore; ``domain``, if given, has to be one of its governance.
 
     A ``fleet`` is staged as that of the keystore, with its enclaves' paths ``patterns``; the
-    enclaves ``stated`` get the permissions of a policy, unless they have them.
+    enclaves ``stated`` get the permissions of a policy, unless they have them.  If the keystore
+    protects names less than the ``protections`` of policies, a governance that protects them is
+    staged.
     """
     root = transaction.root
     template = load_settings(root)
@@ -463,16 +487,24 @@ def open_to_issue(
         fleet, entries = write_fleet(transaction, fleet, patterns, now)
         refuse_stale_domains(root, EnclaveDomains(domains, before), fleet, stated)
         notes = (*notes, *(left_enclaves(root, before, fleet) if before else ()))
+    names = enclave_names(root)
+    governed = Governed(template)
+    if protections:
+        governed = protected_as_stated(
+            transaction, template, governance, protections, authorities.permissions, names, now
+        )
     return _Keystore(
         authorities,
-        template,
+        governed.template,
         domains,
         KnownKeys(root),
-        enclave_names(root),
-        entries,
+        names,
+        (*entries, *governed.entries),
         notes,
         fleet,
         recorded=RecordedRights(root) if stated else None,
+        restart=governed.restart,
+        remarks=governed.remarks,
     )
 
 
@@ -660,8 +692,8 @@ def write_enclaves(
             *kept.notes,
         ),
         tuple(each.replaced for each in done.values() if each.replaced),
-        keystore.names if revoked else kept.restart,
-        revoked.remarks if revoked else (),
+        keystore.names if revoked else keystore.restart or kept.restart,
+        (*(revoked.remarks if revoked else ()), *keystore.remarks),
         kept,
     )
 

@@ -24,7 +24,6 @@ from sros_tool.keystore.authorities.authority import Authorities, load_authoriti
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.comparison import (
     Effect,
-    Mismatch,
     SettingChange,
     compare_governance,
     compare_settings,
@@ -57,11 +56,11 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     ca_key,
     enclave_path,
-    key_on_robot,
     list_enclaves,
     waits_for_answer,
 )
 from sros_tool.keystore.ledger import append, read_ledger
+from sros_tool.keystore.lifecycle.governed import exports_note, restart_note
 from sros_tool.keystore.lifecycle.renew import checked_rights
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
@@ -584,9 +583,8 @@ class _Updater:
         remarks = [*(revoked.remarks if revoked else ())]
         if restart:
             disturbed = mismatch(self._present.governance, governance)
-            text = _restart_remark(disturbed, revoked=bool(revoked))
-            remarks.append(Note("keystore.restart", text))
-            remarks.append(Note("keystore.export-again", self._exports(names)))
+            remarks.append(restart_note(disturbed, revoked=bool(revoked)))
+            remarks.append(exports_note(self._root, names))
         remarks += self._still_open()
         remarks += self._open_tasks(settings)
         ends = [each.works_until for each in rights if each.works_until]
@@ -758,16 +756,6 @@ class _Updater:
 
     # ── remarks ────────────────────────────────────────────────────────────────────────────
 
-    def _exports(self, names: Sequence[str]) -> str:
-        root = quote(str(self._root))
-        text = "Robots have the files of before: export them again (`sros distribute_key "
-        text += f"{root} NAME TARGET --force`)"
-        remote = [each for each in names if key_on_robot(enclave_path(self._root, each))]
-        if remote:
-            text += f"; for {', '.join(remote)}, answer the request again (`sros sign_request "
-            text += f"{root} REQUEST --renew`)"
-        return f"{text}."
-
     def _still_open(self) -> list[Note]:
         if not self._kept_open:
             return []
@@ -809,26 +797,3 @@ class _Updater:
         if read_rotation(self._root).stage is RotationStage.NONE:
             return f"`{command}{role} --next` begins that"
         return f"`{command} --next` goes on with the rotation that is under way"
-
-
-def _restart_remark(disturbed: Mismatch, *, revoked: bool) -> str:
-    """Return which processes to restart in which order; the vendors agree (measured)."""
-    if revoked and not disturbed.everything:
-        return (
-            "All vendors: restart all processes together; processes after the restart refuse the "
-            "revoked certificates of processes before it. Until then, running processes "
-            "communicate as before."
-        )
-    if disturbed:
-        which, what = "all processes", "do not communicate"
-        if not disturbed.everything:
-            which = "the processes that use these names"
-            what += f" on {', '.join(disturbed.names)}, and do on everything else"
-        return (
-            f"Cyclone DDS and Fast DDS: restart {which} together; processes before and after the "
-            f"restart {what}. Until then, running processes communicate as before."
-        )
-    return (
-        "All vendors: restart the processes one by one, at any time; processes before and after "
-        "the restart communicate. Until its restart, a process has what it had before."
-    )

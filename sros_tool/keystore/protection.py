@@ -1,0 +1,229 @@
+"""What policies say about the protection of names, as the protection of a keystore.
+
+A keystore has one governance, so what one enclave says about a name holds for all.  The levels are
+the least that a name needs: what the keystore protects better stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
+from sros_tool.errors import PolicyError
+from sros_tool.policy.patterns import ComparisonLimit, Names, covers
+from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
+from sros_tool.policy.rights import ACTION_PARTS, KIND_OF
+from sros_tool.policy.stated import StatedProtection
+from sros_tool.translate import governance_for, protected_topics
+
+
+def contradictions(
+    stated: Sequence[StatedProtection],
+) -> Iterator[tuple[StatedProtection, StatedProtection]]:
+    """Yield pairs that state different levels for some name, each pair once, in their order."""
+    limit = ComparisonLimit()
+    signed: dict[str, list[StatedProtection]] = {}
+    for each in stated:
+        if each.level is Level.SIGN:
+            for topic in protected_topics(each.kind, each.name):
+                signed.setdefault(topic, []).append(each)
+    names = Names(signed, limit)
+    place = {each: number for number, each in enumerate(stated)}
+    for each in stated:
+        if each.level is Level.SIGN:
+            continue
+        met = {
+            other: None
+            for topic in protected_topics(each.kind, each.name)
+            for meeting in names.meeting(topic)
+            for other in signed[meeting]
+        }
+        for other in met:
+            first, second = sorted((each, other), key=place.__getitem__)
+            yield first, second
+
+
+# ── from statements to the protection of a keystore ────────────────────────────────────────
+
+
+def with_stated(
+    protection: DomainProtection, stated: Sequence[StatedProtection]
+) -> DomainProtection:
+    """Return ``protection``, raised where it is less than policies state; never lowered.
+
+    Raises:
+        PolicyError: statements contradict each other, or the settings have a wildcard that meets a
+            statement in some names only, so that it is unclear which of the two decides.
+    """
+    for one, other in contradictions(stated):
+        raise PolicyError(
+            f'{other.source}: {other} has protect="{other.word}", and {one} has '
+            f'protect="{one.word}" at {one.source}',
+            "A keystore has one governance for all enclaves, so each name has one protection; a "
+            "wildcard says it of all names that it matches.",
+            "Say the same in both places, or in one of them only.",
+        )
+    raised = _Raising(protection)
+    for each in {(each.kind, each.name, each.level): each for each in stated}.values():
+        raised.state(each)
+    result = raised.result()
+    missing = next(less_protected(governance_for_all(result), stated), None)
+    assert missing is None, f"{missing} is not protected as stated"
+    return result
+
+
+def governance_for_all(protection: DomainProtection) -> Governance:
+    """Return the governance of a protection for any domain."""
+    from sros_tool.dds.domains import DomainSet
+
+    return governance_for(protection, DomainSet.of((0, 0)))
+
+
+class _Raising:
+    """The protection of a keystore while statements raise it."""
+
+    def __init__(self, protection: DomainProtection) -> None:
+        self._protection = protection
+        self._named = list(protection.named)
+        self._added: list[NamedProtection] = []
+        self._owner: dict[str, int] = {}
+        for number, each in enumerate(self._named):
+            for topic in protected_topics(each.kind, each.name):
+                self._owner.setdefault(topic, number)
+        rules = governance_for_all(protection).domain_access_rules[0].topic_access_rules
+        self._rank = {rule.topic_expression: place for place, rule in enumerate(rules)}
+        self._topics = Names(self._owner)
+
+    def result(self) -> DomainProtection:
+        named = (*self._added, *self._named)
+        return replace(self._protection, named=named)
+
+    def state(self, stated: StatedProtection) -> None:
+        topics = protected_topics(stated.kind, stated.name)
+        deciding = {topic: self._deciding(topic, stated) for topic in topics}
+        if len({self._value(number) for number in deciding.values()}) > 1:
+            for part in _parts(stated):
+                self.state(part)
+            return
+        base = self._value(deciding[topics[0]])
+        needed = self._raised(base, stated.level)
+        if needed == base:
+            return
+        for topic in topics:
+            self._refuse_parted(topic, stated)
+        same = set(deciding.values())
+        number = same.pop()
+        if number is not None and not same and self._means(number, topics):
+            self._named[number] = replace(self._named[number], protection=needed)
+        else:
+            self._added.append(NamedProtection(stated.kind, stated.name, needed))
+
+    def _means(self, number: int, topics: Sequence[str]) -> bool:
+        """Return whether an entry of the settings is for just these topics."""
+        own = protected_topics(self._named[number].kind, self._named[number].name)
+        return len(own) == len(topics) and all(
+            any(covers(one, other) and covers(other, one) for other in own) for one in topics
+        )
+
+    def _deciding(self, topic: str, stated: StatedProtection) -> int | None:
+        """Return the entry that decides on all of a topic, or None; raise those for parts of it."""
+        wide: list[str] = []
+        for each in self._topics.meeting(topic):
+            number = self._owner[each]
+            if covers(each, topic):
+                wide.append(each)
+            elif covers(topic, each):
+                value = self._raised(self._value(number), stated.level)
+                self._named[number] = replace(self._named[number], protection=value)
+            elif self._raised(self._value(number), stated.level) != self._value(number):
+                raise self._parted(each, stated)
+        return self._owner[min(wide, key=self._rank.__getitem__)] if wide else None
+
+    def _refuse_parted(self, topic: str, stated: StatedProtection) -> None:
+        for each in self._topics.meeting(topic):
+            if not covers(each, topic) and not covers(topic, each):
+                raise self._parted(each, stated)
+
+    def _parted(self, topic: str, stated: StatedProtection) -> PolicyError:
+        other = self._named[self._owner[topic]]
+        return PolicyError(
+            f'{stated.source}: {stated} has protect="{stated.word}", and the settings of the '
+            f"keystore protect {other} in their own way",
+            "Some names match both wildcards, and it is unclear which of the two decides.",
+            "Say it in the policy of names that only one of the wildcards matches, or change the "
+            "settings with `sros update_keystore ROOT --rule` or --drop-rule.",
+        )
+
+    def _value(self, number: int | None) -> TopicProtection:
+        return self._protection.default if number is None else self._named[number].protection
+
+    def _raised(self, protection: TopicProtection, level: Level) -> TopicProtection:
+        kinds = (protection.data, protection.metadata, self._protection.rtps)
+        if max(map(_strength, kinds)) >= _strength(level):
+            return protection
+        if level is Level.ENCRYPT:
+            return replace(protection, data=Level.ENCRYPT)
+        # With data=SIGN, Fast DDS loses messages; the submessage has the payload in it.
+        return replace(protection, metadata=Level.SIGN)
+
+
+def _parts(stated: StatedProtection) -> Iterator[StatedProtection]:
+    """Yield the services and topics of an action."""
+    for right, end in ACTION_PARTS["call"]:
+        yield replace(stated, kind=KIND_OF[right], name=stated.name + end)
+
+
+def _strength(level: str) -> int:
+    """Return 0 for no protection, 1 for a signature, 2 for encryption."""
+    return ("NONE", "SIGN", "ENCRYPT").index(str(level).partition("_")[0])
+
+
+# ── from a governance back to statements ───────────────────────────────────────────────────
+
+
+def less_protected(
+    governance: Governance, stated: Iterable[StatedProtection]
+) -> Iterator[tuple[StatedProtection, Level]]:
+    """Yield the statements that a governance does not keep for every name, with what it gives.
+
+    Of a name, the least counts that any of its DDS topics has in any domain.  A topic without a
+    rule does not count: no vendor lets it be used.
+    """
+    domains = [_DomainRules(rule) for rule in governance.domain_access_rules]
+    for each in stated:
+        found = [
+            level
+            for topic in protected_topics(each.kind, each.name)
+            for rules in domains
+            for level in rules.levels(topic)
+        ]
+        least = min(found, key=_strength, default=each.level)
+        if _strength(least) < _strength(each.level):
+            yield each, least
+
+
+class _DomainRules:
+    """The topic rules of a domain, and a fast search for those that decide on a topic."""
+
+    def __init__(self, rule: DomainRule) -> None:
+        self._rtps = rule.rtps_protection_kind
+        self._rules: Mapping[str, tuple[int, TopicRule]] = {
+            each.topic_expression: (number, each)
+            for number, each in reversed(list(enumerate(rule.topic_access_rules)))
+        }
+        self._names = Names(self._rules)
+
+    def levels(self, topic: str) -> Iterator[Level]:
+        """Yield what the rules give that may decide on some name of a topic expression."""
+        for _, rule in sorted(
+            (self._rules[each] for each in self._names.meeting(topic)), key=lambda each: each[0]
+        ):
+            kinds: tuple[ProtectionKind, ...] = (
+                rule.data_protection_kind,
+                rule.metadata_protection_kind,
+                self._rtps,
+            )
+            yield Level(max(kinds, key=_strength).partition("_")[0])
+            if covers(rule.topic_expression, topic):
+                return
