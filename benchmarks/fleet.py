@@ -16,10 +16,12 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from benchmarks.floor import make_enclaves, sizes_of
 from benchmarks.inputs import fleet_file, fleet_policy
+from sros_tool.keystore.confirmation import Confirmation, Received, keep, make_confirmation
 
 PER_ROBOT = 100
 _MADE = 1.5
@@ -67,21 +69,43 @@ def fleet(folder: Path, enclaves: int, rules: int) -> Iterator[Figure]:
     )
     yield ("... CPU of all processes", made.cpu, floor.cpu, "-", True, "s")
     yield ("... peak memory, in MB", made.memory, floor.memory, "-", True, "MB")
+    one_changed = folder / "changed.toml"
+    one_changed.write_text(f'{fleet_file(enclaves // PER_ROBOT)}namespace = "/elsewhere"\n')
     for task, words in (
-        ("... again without a change of rights", make),
+        ("... again without a change", make),
+        ("... again, one robot changed", (*make[:-1], one_changed)),
         ("... list_enclaves", ("list_enclaves", root)),
         ("... explain of one right", ("explain", root, "/r1/part_3", "publish", "/r1/topic_0")),
         ("... explain --who", ("explain", root, "--who", "publish", "/r1/topic_0")),
         ("... check", ("check", "keystore", root)),
+        ("... metrics", ("metrics", root)),
         ("... distribute_key --robot", ("distribute_key", root, "--robot", "r1", folder / "r1")),
+        ("... fleet status", ("fleet", "status", root)),
         ("... revoke --robot", ("revoke", root, "--robot", "r2")),
         ("... revoke --robot, of a second robot", ("revoke", root, "--robot", "r3")),
         ("... renew --all-expiring, all of them", ("renew", root, "--all-expiring", "100y")),
     ):
+        if words[0] == "fleet":
+            _confirm(root, enclaves // PER_ROBOT)
         cost = _cost(*words)
         yield (task, cost.passed, None, "-", True, "s")
         yield (f"{task}: CPU", cost.cpu, None, "-", True, "s")
         yield (f"{task}: peak memory, in MB", cost.memory, None, "-", True, "MB")
+
+
+def _confirm(root: Path, robots: int) -> None:
+    """Have all robots but the last one confirm that they have the present files."""
+    now = datetime.now(UTC)
+    whole = make_confirmation(root, "r1", now=now)
+    files: dict[str, dict[str, str]] = {}
+    for path, digest in whole.files.items():
+        files.setdefault(path.split("/")[1], {})[path] = digest
+    for number in range(1, robots):
+        own = files[f"r{number}"]
+        certificates = {
+            path: whole.certificates[path] for path in own if path in whole.certificates
+        }
+        keep(root, Received(Confirmation(f"r{number}", now, own, certificates), now))
 
 
 def _words(sizes: Sequence[tuple[str, int | str]]) -> list[str]:

@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, pkcs7
 
 from sros_tool.pki.certificates import common_name, issue_ca, pem
 from sros_tool.pki.keys import generate_key, key_pem
@@ -23,7 +23,7 @@ def sizes_of(folder: Path) -> list[tuple[str, int | str]]:
 
 
 def make_enclaves(folder: Path, files: list[tuple[str, int | str]], count: int) -> None:
-    """Make for each enclave a key, its PEM, a certificate, two signatures, and ``files``."""
+    """Make for each enclave a key, its PEM, a certificate, a signed message, and ``files``."""
     key = generate_key()
     validity = window(datetime.now(UTC), timedelta(days=365))
     ca = issue_ca(key, common_name("floor"), validity)
@@ -31,14 +31,14 @@ def make_enclaves(folder: Path, files: list[tuple[str, int | str]], count: int) 
 
     issuer = Issuer(ca, key)
     name = common_name("/floor/enclave")
-    algorithm = ec.ECDSA(hashes.SHA256())
     payload = {file: b"x" * size for file, size in files if isinstance(size, int)}
     for index in range(count):
         own = generate_key()
         key_pem(own)
         pem(issuer.issue(name, own.public_key(), validity))
-        key.sign(b"x" * 2000, algorithm)
-        key.sign(b"x" * 200, algorithm)
+        pkcs7.PKCS7SignatureBuilder().set_data(b"x" * 2000).add_signer(
+            ca, key, hashes.SHA256()
+        ).sign(Encoding.DER, [pkcs7.PKCS7Options.DetachedSignature])
         place = folder / str(index)
         place.mkdir()
         for file, size in files:

@@ -109,10 +109,9 @@ def permissions_for(
     for profile in enclave.all_profiles():
         ns, node = profile.ns, profile.node
         for group in profile.groups:
+            names = [expand(name, ns, node) for name in group.names]
             for right, qualifier in group.rights:
-                topics = allowed if qualifier is ALLOW else denied
-                for name in group.names:
-                    topics.add(right, expand(name, ns, node))
+                (allowed if qualifier is ALLOW else denied).add(right, names)
     allowed.publish.add(ROS_DISCOVERY_TOPIC)
     allowed.subscribe.add(ROS_DISCOVERY_TOPIC)
     if allowed.text_bytes() + denied.text_bytes() >= LARGE_BYTES:
@@ -130,10 +129,12 @@ class _Topics:
         self.publish: set[str] = set()
         self.subscribe: set[str] = set()
 
-    def add(self, right: str, fqn: str) -> None:
-        names = dds_names(right, fqn)
-        self.publish.update(names.publish)
-        self.subscribe.update(names.subscribe)
+    def add(self, right: str, names: Iterable[str]) -> None:
+        written, read = _DDS_NAMES[right]
+        for begin, end in written:
+            self.publish.update([f"{begin}{name}{end}" for name in names])
+        for begin, end in read:
+            self.subscribe.update([f"{begin}{name}{end}" for name in names])
 
     def is_empty(self) -> bool:
         return not (self.publish or self.subscribe)

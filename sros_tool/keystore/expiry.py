@@ -19,6 +19,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.reader import read_certificate, read_signed_grant
+from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.validity import BACKDATE, Window, iso, parse_duration
@@ -110,14 +111,20 @@ def _lifetimes(root: Path) -> tuple[Lifetime, ...]:
 
 
 def survey(root: Path) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
-    """Return the lifetimes of the readable enclaves, and the unreadable enclaves."""
-    found, unreadable = [], []
-    for name in list_enclaves(root):
+    """Return the lifetimes of the readable enclaves, and the unreadable enclaves, on all cores."""
+
+    def read(name: str) -> Lifetime | UnreadableEnclave:
         try:
-            found.append(read_credentials(root, name).lifetime())
+            return read_credentials(root, name).lifetime()
         except SrosError as error:
-            unreadable.append(UnreadableEnclave(name, error))
-    return tuple(found), tuple(unreadable)
+            return UnreadableEnclave(name, error)
+
+    slices = map_slices(list_enclaves(root), lambda names: list(map(read, names)))
+    found = [each for _, part in slices for each in part]
+    return (
+        tuple(each for each in found if isinstance(each, Lifetime)),
+        tuple(each for each in found if isinstance(each, UnreadableEnclave)),
+    )
 
 
 def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> None:

@@ -111,7 +111,7 @@ def test_the_life_of_a_key_that_is_on_a_token(token: dict[str, str], tmp_path: P
     assert secret_files(root / "enclaves") == {"key.pem"}
     uri = (root / "enclaves/a/key.p11").read_text()
     assert uri == f"pkcs11:token=robot;object=%2Fa;type=private?pin-source=file:{pin}\n"
-    assert "not changed" in done("create_enclave", root, "/a", "--key", place)
+    assert "unchanged" in done("create_enclave", root, "/a", "--key", place)
     taken = place.replace("robot?", "robot;object=%2Fa?")
     for name in ("/c", "/file"):  # the key of another enclave
         assert "key" in done("create_enclave", root, name, "--key", taken, status=2)

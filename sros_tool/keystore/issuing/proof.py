@@ -153,6 +153,8 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
 
 def _matched_anyway(left_out: set[str], present: set[str]) -> bool:
     """Return whether all of ``left_out`` are names that wildcards in ``present`` match."""
+    if not left_out:
+        return True
     wildcards = list(filter(is_expression, present))
     index = ExpressionIndex(Style.FNMATCH, wildcards)
     return all(

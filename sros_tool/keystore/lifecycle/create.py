@@ -731,9 +731,10 @@ def _write_enclave(
     earlier, old = None, None
     if policy and PERMISSIONS_FILE in present:
         authority = keystore.authorities.permissions.certificate
-        earlier = earlier_permissions(root, name, authority)
-        if revoke_old and isinstance(identity, x509.Certificate):
-            old = identity
+        certificate = identity if isinstance(identity, x509.Certificate) else None
+        earlier = earlier_permissions(root, name, authority, certificate)
+        if revoke_old and certificate:
+            old = certificate
             public: PublicKey = old.public_key()  # type: ignore[assignment]
             remedy = f"Give it another key with `sros renew {quote(str(root))} {name} --new-key`."
             keystore.known.refuse_revoked(public, f"enclave {name}", remedy, old)

@@ -60,15 +60,15 @@ class ReplacedRights:
 
 
 def earlier_permissions(
-    root: Path, name: str, authority: x509.Certificate
+    root: Path, name: str, authority: x509.Certificate, certificate: x509.Certificate | None = None
 ) -> EarlierPermissions | None:
     """Return the present permissions of an enclave; None if DDS would refuse them.
 
-    ``authority`` is the permissions CA.
+    ``authority`` is the permissions CA, ``certificate`` that of the enclave if it was read already.
     """
     folder = enclave_path(root, name)
     with suppress(SrosError):
-        certificate = read_certificate(folder / CERTIFICATE_FILE)
+        certificate = certificate or read_certificate(folder / CERTIFICATE_FILE)
         found = read_signed_grant(folder / PERMISSIONS_FILE, subject_text(certificate.subject))
         found.signed.verify(authority)
         if found.grant:
