@@ -17,7 +17,7 @@ PACKAGE = PROJECT / "sros_tool"
 
 LAYERS = {
     1: {"errors", "faults", "names", "owners", "validity", "values"}
-    | {"xml", "files", "folders", "parallel", "resources", "prometheus"},
+    | {"xml", "files", "folders", "parallel", "resources", "prometheus", "markdown"},
     2: {"pki", "policy", "dds", "zenoh"},
     3: {"fleet", "translate", "translate_zenoh", "translate_zenoh_back"},
     4: {"translate_from_zenoh", "reach", "keystore", "graph", "runtime"},

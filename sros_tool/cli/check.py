@@ -129,10 +129,10 @@ severity or higher is shown, else 0.""",
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["text", "json", "sarif"]),
+    type=click.Choice(["text", "json", "sarif", "markdown"]),
     default="text",
     show_default=True,
-    help="Output for people, programs, or code hosts.",
+    help="Output for people, programs, code hosts, or a comment on a pull request.",
 )
 @json_option
 @click.option("--sarif", "as_sarif", is_flag=True, help="The same as --format sarif.")
@@ -179,11 +179,11 @@ def check(
         at = _circumstances(domain, moment, ())
         if form == "sarif":
             raise UsageError("--needs-renewal has no SARIF output", "", "Use --json.")
-        return _needs_renewal(root, needs_renewal, at.now, form == "json")
+        return _needs_renewal(root, needs_renewal, at.now, form)
     selection = FindingFilter(include, exclude, Severity[severity.upper()], strict, vendor or "")
     if as_list:
-        if form == "sarif":
-            raise UsageError("--list has no SARIF output", "", "Use --json.")
+        if form in ("sarif", "markdown"):
+            raise UsageError(f"--list has no {form} output", "", "Use --json.")
         _print_kinds(selection, form)
         return 0
     if family == "runtime" and policies:
@@ -313,7 +313,7 @@ def _shown(finding: Finding) -> Finding:
     return finding
 
 
-def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> int:
+def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     from sros_tool.keystore.expiry import describe_lifetime, parse_threshold, survey
     from sros_tool.keystore.reader import load_settings
     from sros_tool.validity import iso
@@ -323,7 +323,7 @@ def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> in
     settings = load_settings(root)
     lasting = (each for each in found if settings.longest_validity(each.name) is None)
     due = [each for each in lasting if each.due(threshold, moment)]
-    if as_json:
+    if form == "json":
         print_json(
             {
                 "enclaves": [
@@ -340,17 +340,34 @@ def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> in
             }
         )
     else:
-        for each in due:
-            click.echo(describe_lifetime(each, moment))
-        for other in unreadable:
-            click.echo(f"{other.name}  unknown: {other.error}")
-        if not due and not unreadable:
-            one = len(found) == 1
-            enclaves = (
-                "the 1 enclave does not need" if one else f"none of {len(found)} enclaves needs"
-            )
-            click.echo(f"{enclaves} to be renewed ({text})", err=True)
+        lines = [describe_lifetime(each, moment) for each in due]
+        lines += [f"{other.name}  unknown: {other.error}" for other in unreadable]
+        none = "the 1 enclave does not need" if len(found) == 1 else ""
+        none = f"{none or f'none of {len(found)} enclaves needs'} to be renewed ({text})"
+        if form == "markdown":
+            click.echo(_renewal_markdown(lines, none, text))
+            return NOT_DONE if unreadable else 1 if due else 0
+        for line in lines:
+            click.echo(visible_line(line))
+        if not lines:
+            click.echo(none, err=True)
     return NOT_DONE if unreadable else 1 if due else 0
+
+
+def _renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:
+    from sros_tool.markdown import bounded, code, plain
+
+    if not lines:
+        return f"### Certificates: {plain(none)}\n"
+    count = "1 enclave needs" if len(lines) == 1 else f"{len(lines)} enclaves need"
+    listed = bounded(map(code, lines), 4000, "which `sros check --needs-renewal` shows")
+    return f"### Certificates: {count} to be renewed {plain(f'({text})')}\n\n{listed}\n"
+
+
+def _print_markdown(chosen: ChosenFindings, _selection: FindingFilter) -> None:
+    from sros_tool.checks.markdown import findings_markdown
+
+    click.echo(findings_markdown(chosen, _summary(chosen)))
 
 
 def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
@@ -435,6 +452,7 @@ _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "text": _print_text,
     "json": _print_json,
     "sarif": _print_sarif,
+    "markdown": _print_markdown,
 }
 """The function that prints findings, for each value of --format."""
 

@@ -14,6 +14,7 @@ import click
 from sros_tool.cli.common import (
     PATH,
     SeveralValues,
+    check_one_format,
     check_output,
     dry_run_option,
     fleets_of,
@@ -171,8 +172,16 @@ Example:
 @click.argument("a", metavar="A", type=PATH)
 @click.argument("b", metavar="B", type=PATH)
 @fleets_option
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["text", "json", "markdown"]),
+    default="text",
+    show_default=True,
+    help="Output for people, programs, or a comment on a pull request, with a picture.",
+)
 @json_option
-def diff_policy(a: Path, b: Path, fleet_files: tuple[Path, ...], as_json: bool) -> int:
+def diff_policy(a: Path, b: Path, fleet_files: tuple[Path, ...], form: str, as_json: bool) -> int:
     """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
     A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or
@@ -186,6 +195,8 @@ def diff_policy(a: Path, b: Path, fleet_files: tuple[Path, ...], as_json: bool) 
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.rights import compare
 
+    check_one_format()
+    form = "json" if as_json else form
     with progress("reading"):
         fleets = fleets_of(fleet_files)
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])
@@ -194,8 +205,11 @@ def diff_policy(a: Path, b: Path, fleet_files: tuple[Path, ...], as_json: bool) 
         scope = second.scope if first.scope is None else first.scope
     difference = compare(first.rights, second.rights, scope)
     protections = _protection_differences(first, second)
-    if as_json:
+    if form == "json":
         print_json(_difference_json(first, second, difference, protections))
+    elif form == "markdown":
+        drawn = _drawn_difference(first, second, difference)
+        click.echo(_difference_markdown(first, second, difference, protections, drawn))
     else:
         for line in _difference_lines(difference, first.fleet, second.fleet):
             click.echo(line)
@@ -209,6 +223,73 @@ def diff_policy(a: Path, b: Path, fleet_files: tuple[Path, ...], as_json: bool) 
             click.echo("what the policies say about protection differs", err=True)
     print_notes((*first.notes, *second.notes))
     return 0 if not difference and not protections and first.sound and second.sound else 1
+
+
+_MOST_LINES, _MOST_PICTURE, _MOST_LINKS = 12_000, 25_000, 250
+"""Characters of a difference in Markdown, and characters and arrows of its picture.
+
+A comment on GitHub has at most 65,536 characters; Mermaid draws at most 50,000, and 500 arrows.
+"""
+
+
+def _difference_markdown(
+    first: RightsSource,
+    second: RightsSource,
+    difference: RightsDifference,
+    protections: Sequence[tuple[str, StatedProtection]],
+    drawn: str,
+) -> str:
+    """Return a difference as Markdown: what is added and removed, and the picture ``drawn``."""
+    from sros_tool.markdown import bounded, code, plain
+
+    lines = _difference_lines(difference, first.fleet, second.fleet)
+    lines += [f"{sign} {e.enclave} protect {e} with {e.word}" for sign, e in protections]
+    parts = []
+    rest = "which `sros diff_policy` shows"
+    for sign, title in (("+", "added"), ("-", "removed")):
+        found = [line.removeprefix(f"{sign} ") for line in lines if line.startswith(sign)]
+        if found:
+            parts.append(f"**{len(found)} {title}**")
+            parts.append(bounded(map(code, found), _MOST_LINES, rest))
+    notes = [f"{each.id}: {each.text}" for each in (*first.notes, *second.notes)]
+    if notes:
+        parts += ["**Notes**", bounded(map(code, notes), 4000, rest)]
+    differ = "1 difference" if len(lines) == 1 else f"{len(lines)} differences"
+    title = f"### Rights: {plain(differ if lines else 'no difference')}"
+    return "\n\n".join((title, *parts, *([drawn] if drawn and lines else []))) + "\n"
+
+
+def _drawn_difference(
+    first: RightsSource, second: RightsSource, difference: RightsDifference
+) -> str:
+    """Return the picture of what differs, with who else uses these names, as Markdown, or ""."""
+    from sros_tool.markdown import fenced
+    from sros_tool.policy.patterns import Names
+    from sros_tool.report.compose import Context, PictureSource, overlay
+    from sros_tool.report.dot_mermaid import render_mermaid
+    from sros_tool.report.layout import scenes_of
+    from sros_tool.report.picture import SourceTitle
+    from sros_tool.report.sources import common_rights
+
+    if first.kind != second.kind or not difference:
+        return ""
+    changed: dict[str, set[str]] = {}
+    for right in (*difference.only_first, *difference.only_second):
+        changed.setdefault(right.kind, set()).add(right.name)
+    names = {kind: Names(sorted(found)) for kind, found in changed.items()}
+
+    def side(title: str, of: RightsSource) -> PictureSource:
+        used = (e for e in of.rights if e.kind in names and names[e.kind].meets(e.name))
+        return PictureSource(SourceTitle(title, of.kind), frozenset(used), scope=of.scope)
+
+    context = Context(common_rights())
+    picture = overlay(side("before", first), side("after", second), "change", context)
+    scenes = scenes_of(picture, placed=False)
+    scene = next((each for each in scenes if each.id == "all"), scenes[0])
+    text = render_mermaid(picture, scene)
+    if len(text) > _MOST_PICTURE or len(scene.links) > _MOST_LINKS:
+        return "The picture is too large for a comment: `sros view BEFORE AFTER -o change.html`"
+    return fenced(text, "mermaid")
 
 
 def _protection_differences(

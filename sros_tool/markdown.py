@@ -1,0 +1,62 @@
+"""Text as Markdown of code hosts: bounded, and with names of others that stay text.
+
+A name in a policy or the path of a file can be anything that whoever opened the pull request wants
+to be seen: a link, an image, a mention of a user, the end of a comment.  As a code span or in a
+fenced block it is none of these (CommonMark 0.31, 6.1 and 4.5; GitHub Flavored Markdown 0.29).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+_LONGEST = 400
+_RUNS = re.compile(r"`+")
+_PUNCTUATION = re.compile(r"([\\`*_\[\]<>#~|!&@])")
+
+
+def code(text: str) -> str:
+    """Return ``text`` as a code span on one line, cut if it is long."""
+    shown = _shown(text if len(text) <= _LONGEST else f"{text[:_LONGEST]}...")
+    ticks = "`" * _ticks(shown)
+    return f"{ticks} {shown or ' '} {ticks}" if len(ticks) > 1 or not shown else f"`{shown}`"
+
+
+def plain(text: str) -> str:
+    """Return words of sros with what could be markup escaped."""
+    return _PUNCTUATION.sub(r"\\\1", _shown(text))
+
+
+def fenced(text: str, language: str = "text") -> str:
+    """Return ``text`` as a fenced block, whose fence is longer than any in it."""
+    fence = "`" * max(3, _ticks(text))
+    lines = "\n".join(map(_shown, text.rstrip("\n").split("\n")))
+    return f"{fence}{language}\n{lines}\n{fence}"
+
+
+def bounded(items: Iterable[str], most: int, rest: str) -> str:
+    """Return a list of items with at most ``most`` characters.
+
+    Items that do not fit are counted in a last one; ``rest`` says where they are, as a clause.
+    """
+    lines: list[str] = []
+    left, out = most, 0
+    for each in items:
+        left -= len(each) + 3
+        if left < 0:
+            out += 1
+        else:
+            lines.append(f"- {each}")
+    if out:
+        lines.append(f"- and {out} more, {rest}")
+    return "\n".join(lines)
+
+
+def _ticks(text: str) -> int:
+    """Return how many backticks delimit a text that may have backticks."""
+    return max((len(run) for run in _RUNS.findall(text)), default=0) + 1
+
+
+def _shown(text: str) -> str:
+    """Return ``text`` without line ends and characters that are not printable."""
+    return "".join(each if each.isprintable() else f"\\x{ord(each):02x}" for each in text)
