@@ -25,7 +25,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
-from typing import Any
 from urllib.parse import unquote
 
 from lxml import etree
@@ -115,7 +114,7 @@ class Includer:
     def use_content(self, file: Path, content: bytes) -> None:
         """Use ``content`` in place of the file with this real path, wherever it is included."""
         root = parse(content, f"the policy file '{file}'", instructions=True)
-        _keep_instructions_of_names(root, file)
+        _check_instructions(root, file)
         self._documents[file] = root
         self._sizes[file] = len(content)
         self._digests.append(hashlib.sha256(content).digest())
@@ -201,14 +200,15 @@ class Includer:
                 "It would put any readable file into a signed document.",
                 "Include policy XML, without parse=.",
             )
-        if len(element) > 1 or (len(element) and element[0].tag not in _FALLBACKS):
+        inside = [each for each in element if isinstance(each.tag, str)]
+        if len(inside) > 1 or (inside and inside[0].tag not in _FALLBACKS):
             raise PolicyError(
                 f"{where}: an include can contain only one <fallback>", "", "Remove the rest."
             )
         href, pointer = element.get("href", ""), element.get("xpointer", "")
         file = self.target(element, place)
-        if len(element) and not file.exists():
-            yield from self.children(element[0], place)
+        if inside and not file.exists():
+            yield from self.children(inside[0], place)
             return
         step = (file, pointer)
         if step in place.trail:
@@ -256,34 +256,20 @@ _EXAMPLE = 'Write for example <topic>scan<?sros protect="encrypt"?></topic>.'
 _PROTECT = re.compile(r"""protect\s*=\s*(?:"(?P<one>[^"]*)"|'(?P<other>[^']*)')\s*\Z""")
 
 
-def _keep_instructions_of_names(root: etree._Element, file: Path) -> None:
-    """Remove the processing instructions that stand in no name; raise if one was for sros.
-
-    A name keeps even those of others: it has to be free of them, because a misspelt one would
-    leave it unprotected.
-    """
+def _check_instructions(root: etree._Element, file: Path) -> None:
+    """Raise `PolicyError` if a processing instruction for sros stands in no name."""
     around = (*root.itersiblings(preceding=True), *root.itersiblings())
     for each in (*around, *root.iter(etree.PI)):
         if not isinstance(each, etree._ProcessingInstruction):
             continue
-        parent: Any = each.getparent()
-        if parent is not None and parent.tag in _ITEMS:
-            continue
-        if (each.target or "").lower() == _INSTRUCTION:
+        parent = each.getparent()
+        named = parent is not None and tag_of(parent) in _ITEMS
+        if not named and (each.target or "").lower() == _INSTRUCTION:
             raise PolicyError(
                 f"{file}:{each.sourceline}: <?{_INSTRUCTION} ...?> is not in a name",
                 "Protection is said for a topic, service or action, in its element.",
                 _EXAMPLE,
             )
-        if parent is None:
-            continue
-        before = each.getprevious()
-        if before is not None:
-            before.tail = (before.tail or "") + (each.tail or "")
-        else:
-            parent.text = (parent.text or "") + (each.tail or "")
-        each.tail = None
-        parent.remove(each)
 
 
 def _fits(element: etree._Element, step: re.Match[str]) -> bool:
@@ -444,6 +430,7 @@ class _Reader:
             if metadata:
                 raise PolicyError(f"{self._where(child, at)}: nothing may follow <metadata>")
             if child.tag == "metadata":
+                etree.strip_tags(child, etree.ProcessingInstruction)
                 metadata = etree.tostring(child, encoding="unicode", with_tail=False)
             else:
                 profiles.append(self._profile(*self._expect(child, at, "profile")))
