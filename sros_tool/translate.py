@@ -6,7 +6,6 @@ Names are mapped as in ros2/sros2, so that both tools give the same rights for a
 from __future__ import annotations
 
 from collections.abc import Iterable, Set
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sros_tool.dds.decision.matching import ExpressionIndex
@@ -304,8 +303,7 @@ def _terms(rule: DomainRule | TopicRule) -> dict[str, Any]:
 # ── DDS → ROS ──────────────────────────────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True, slots=True)
-class RosRight:
+class RosRight(NamedTuple):
     """One right or denial in ROS terms.
 
     ``kind`` is "topics", "services", "actions", or "dds" for a DDS topic without a ROS name.
@@ -329,12 +327,10 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
     rights: list[RosRight] = []
     for kind, right, found in _candidates(publish, subscribe):
         names = dds_names(right, found)
-        uses = [publish.get(topic) for topic in names.publish]
-        uses += [subscribe.get(topic) for topic in names.subscribe]
-        if all(uses):
+        if all(map(publish.get, names.publish)) and all(map(subscribe.get, names.subscribe)):
             continue  # all topics already belong to an action
-        if all(topic in publish for topic in names.publish) and all(
-            topic in subscribe for topic in names.subscribe
+        if all(map(publish.__contains__, names.publish)) and all(
+            map(subscribe.__contains__, names.subscribe)
         ):
             rights.append(RosRight(qualifier, right, kind, found))
             if kind != "topics":
@@ -397,8 +393,10 @@ def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tu
 
     The caller checks that the other topics of the action or service are in the rule, too.
     """
-    requests_out = [name for name, begin in map(service_of, publish) if begin == "rq"]
-    requests_in = [name for name, begin in map(service_of, subscribe) if begin == "rq"]
+    requests_out, requests_in = (
+        [name for name, _ in map(service_of, requests) if name]
+        for requests in ([each for each in of if each[:2] == "rq"] for of in (publish, subscribe))
+    )
     for kind, end in (("actions", GOAL), ("services", "")):
         for right, services in zip(RIGHTS[kind], (requests_out, requests_in), strict=True):
             for service in services:

@@ -6,8 +6,9 @@ rmw_zenoh (ros2/rmw_zenoh, docs/design.md).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from sros_tool.errors import PolicyError
 from sros_tool.names import expand, is_expression
@@ -32,8 +33,9 @@ from sros_tool.zenoh.access import (
 )
 from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical
 
-_ANY_TYPE = ("*", "*")
+_ANY_TYPE = "/*/*"
 """The type and its hash, with which the keys of topics and services end: rules do not check it."""
+_TYPE_CHUNKS = _ANY_TYPE[1:].split("/")
 _ADVANCED = f"@adv/{ANY_CHUNKS}"
 """What belongs to a topic with history (TRANSIENT_LOCAL), below its key."""
 _GRAPH = "@ros2_lv"
@@ -77,8 +79,7 @@ Each on the key of the name, or on the keys of its history below.
 """
 
 
-@dataclass(frozen=True, slots=True)
-class StatedRight:
+class StatedRight(NamedTuple):
     """A right to one topic or service, or its denial, and where the policy states it."""
 
     right: Right
@@ -116,8 +117,7 @@ def remote_of(enclave: str, stated: Mapping[int, Iterable[StatedRight]]) -> Remo
     rules: list[AccessRule] = []
     for domain, rights in stated.items():
         rules += _graph_rules(enclave, domain)
-        for right, names in _allowed_chunks(rights):
-            keys = tuple([canonical((str(domain), *each, *_ANY_TYPE)) for each in names])
+        for right, keys in _allowed_keys(domain, rights):
             below = tuple([f"{each}/{_ADVANCED}" for each in keys])
             rules += [
                 AccessRule(flow, messages, below if history else keys)
@@ -173,7 +173,7 @@ def _name_in(key: str) -> str:
     """Return the name in the key expression of a right, without domain, type and hash."""
     chunks = key.split("/")[1:]
     last = chunks[-1:] if chunks[-1] == ANY_CHUNKS else []  # canonical: behind type and hash
-    name = chunks[: len(chunks) - len(last) - len(_ANY_TYPE)]
+    name = chunks[: len(chunks) - len(last) - len(_TYPE_CHUNKS)]
     return "/".join(["", *name, *last])
 
 
@@ -188,20 +188,32 @@ def as_router(router: str, own: RemoteRights) -> RemoteRights:
 # ── names and denials ──────────────────────────────────────────────────────────────────────
 
 
-def _allowed_chunks(
-    stated: Iterable[StatedRight],
-) -> Iterator[tuple[str, list[tuple[str, ...]]]]:
-    """Yield each right with the chunks of all names that are allowed and not denied, in order.
+_EXACT_NAMES = re.compile(r"(?:/[^/#$*?\[]+)+")
+"""Names in a row, none with a wildcard, and all of them keys of Zenoh."""
+_NO_KEY = re.compile(r"[#$]|//|/\Z")
+"""What only names have that others than sros wrote: `IN_PART` and `ANY_PART`, and empty parts."""
+
+
+def _allowed_keys(
+    domain: int, stated: Iterable[StatedRight]
+) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield each right with the key expressions of all names that are allowed and not denied.
 
     Raises:
         PolicyError: a name, or what a denial leaves of it, cannot be said.
     """
     allowed: dict[str, dict[str, Source]] = {}
     denied: dict[str, dict[str, Source]] = {}
-    for each in stated:
-        side = allowed if each.right.qualifier is ALLOW else denied
-        side.setdefault(each.right.right, {}).setdefault(each.right.name, each.source)
+    for (_, qualifier, right, name), source in stated:
+        side = allowed if qualifier is ALLOW else denied
+        side.setdefault(right, {}).setdefault(name, source)
     for right, places in sorted(allowed.items()):
+        if right not in denied and _EXACT_NAMES.fullmatch("".join(places)):
+            yield right, tuple([f"{domain}{name}{_ANY_TYPE}" for name in places])
+            continue
+        for name, place in (*places.items(), *denied.get(right, {}).items()):
+            if _NO_KEY.search(name):
+                raise _no_key(name, place)
         denials = _Denials(right, denied[right]) if right in denied else _NONE_DENIED
         found: set[tuple[str, ...]] = set()
         left = _MOST_KEYS
@@ -212,7 +224,8 @@ def _allowed_chunks(
             chunks = denials.taken_from(name, place, left)
             left -= len(chunks)
             found |= chunks
-        yield right, sorted(_with_what_is_below(found))
+        names = _with_what_is_below(found)
+        yield right, tuple([canonical((str(domain), *each, *_TYPE_CHUNKS)) for each in names])
 
 
 class _Denials:
@@ -293,6 +306,14 @@ def _listed(name: str, place: Source, most: int) -> list[str]:
         return listed(name, most)
     except CannotSubtract:
         raise _too_many(name, place) from None
+
+
+def _no_key(name: str, place: Source) -> PolicyError:
+    return PolicyError(
+        f"{place}: the name {name} cannot be said to Zenoh",
+        "A key of Zenoh has no '#' and no '$', and no empty part.",
+        "Name it as ROS does.",
+    )
 
 
 def _too_many(name: str, place: Source) -> PolicyError:

@@ -14,14 +14,15 @@ from sros_tool.dds.permissions import Permissions
 from sros_tool.errors import PolicyError
 from sros_tool.names import expression_problem
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW, Enclave, Group, Profile, Profiles
+from sros_tool.policy.model import ALLOW, Enclave, Group, Profile, Profiles, Qualifier, Source
 from sros_tool.policy.model import DENY as DENY_
 from sros_tool.policy.model import RIGHTS as RIGHTS_OF
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.rights import Rules
+from sros_tool.policy.rights import Right, Rules
 from sros_tool.resources import policies_dir
 from sros_tool.translate import dds_names, permissions_for
 from sros_tool.translate_zenoh import (
+    StatedRight,
     as_router,
     chunks_of,
     remote_of,
@@ -127,6 +128,19 @@ def test_a_right_is_exactly_these_messages(right: str, tmp_path: Path) -> None:
     for other in (f"0/y/{TYPE}", f"0/x/y/{TYPE}", f"1/x/{TYPE}", "0/**", "0/*/*/*", "0/x/**"):
         assert not any(control.allows("/robot/n", *each[:2], other) for each in NAMED), other
     assert not any(control.allows("/robot", *each[:2], key) for each in NAMED)
+
+
+@pytest.mark.parametrize("name", ["/a#b", "/a$b", "/a//b", "/a/", "/#*"])
+@pytest.mark.parametrize("qualifier", [ALLOW, DENY_])
+def test_a_name_that_is_no_key_of_zenoh_is_refused(name: str, qualifier: Qualifier) -> None:
+    place = Source("permissions of others", 0)
+    stated = [
+        StatedRight(Right("/n", each, "publish", text), place)
+        for each, text in ((ALLOW, "/c"), (qualifier, name))
+    ]
+    assert remote_of("/n", {0: stated[:1]})
+    with pytest.raises(PolicyError, match="cannot be said to Zenoh"):
+        remote_of("/n", {0: stated})
 
 
 def test_an_action_is_its_services_and_topics(tmp_path: Path) -> None:

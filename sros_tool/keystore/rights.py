@@ -35,7 +35,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, RIGHTS, Source
-from sros_tool.policy.rights import Right, order, parts, policy_rights
+from sros_tool.policy.rights import Right, parts, policy_rights
 from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh import StatedRight
@@ -322,4 +322,4 @@ def recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRigh
             Right(enclave, ALLOW, right, "/*") for right in (*RIGHTS["topics"], *RIGHTS["services"])
         }
     parted = (part for each in rights - raw for part in parts(each))
-    return tuple(StatedRight(each, source) for each in sorted(set(parted), key=order))
+    return tuple([StatedRight(each, source) for each in sorted(set(parted))])

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
+from typing import NamedTuple
 
 from sros_tool.zenoh.key_expressions import KeyExpressions, includes
 
@@ -42,8 +43,7 @@ class Flow(StrEnum):
         return Flow.EGRESS if self is Flow.INGRESS else Flow.INGRESS
 
 
-@dataclass(frozen=True, slots=True)
-class AccessRule:
+class AccessRule(NamedTuple):
     """Messages that are allowed in one direction, on keys that ``key_expressions`` include."""
 
     flow: Flow
@@ -131,14 +131,14 @@ def _needed(keys: frozenset[str]) -> tuple[str, ...]:
     return tuple(KeyExpressions(keys).needed())
 
 
+def in_order(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
+    """Return rules of different directions and messages in the order of `joined`."""
+    return tuple(sorted(rules, key=lambda each: _place(each.flow, each.messages)))
+
+
 _ORDER = {message: number for number, message in enumerate(Message)}
 
 
-def in_order(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
-    """Return rules of different directions and messages in the order of `joined`."""
-    return tuple(
-        sorted(
-            rules,
-            key=lambda each: (each.flow is Flow.EGRESS, [_ORDER[one] for one in each.messages]),
-        )
-    )
+@lru_cache(maxsize=64)  # the rules of all enclaves have the same few
+def _place(flow: Flow, messages: tuple[Message, ...]) -> tuple[bool, list[int]]:
+    return flow is Flow.EGRESS, [_ORDER[each] for each in messages]

@@ -80,7 +80,7 @@ class KeyExpressions:
 
     def needed(self) -> list[str]:
         """Return the expressions that no other one includes, sorted; all if they are too alike."""
-        ends = {each[len(_fixed_begin(each)) :] for each in self.all}
+        ends = {each[len(_without_wildcards(each)) :] for each in self.all}
         if len(ends) == 1 and _SAME_DEPTH.fullmatch(ends.pop()):
             return sorted(self.all)
         compared = sum(len(self._wider(each)) for each in self.all)
@@ -103,11 +103,13 @@ class KeyExpressions:
         return found
 
 
-@lru_cache(maxsize=_MANY)
-def _fixed_begin(expression: str) -> str:
+def _without_wildcards(expression: str) -> str:
     """Return what every included key begins with; "/**" may stand for nothing."""
     begin, wildcard, _ = expression.partition("*")
     return begin.rstrip("$/") if wildcard else expression
+
+
+_fixed_begin = lru_cache(maxsize=_MANY)(_without_wildcards)
 
 
 @lru_cache(maxsize=_MANY)

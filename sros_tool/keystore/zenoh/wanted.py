@@ -367,9 +367,10 @@ def _are_exactly(
     """
     keys: dict[str, set[str]] = {right: set() for right in _PROOF}
     for domain, rights in stated.items():
-        for each in rights:
-            _, qualifier, right, name = each.right
-            if qualifier is not ALLOW or is_expression(name):
+        if is_expression("".join([each.right.name for each in rights])):
+            return False
+        for (_, qualifier, right, name), _ in rights:
+            if qualifier is not ALLOW:
                 return False
             keys[right].add(f"{domain}{name}/*/*")
     return all(
