@@ -50,6 +50,8 @@ _OPAQUE = (b"application/pkcs7-mime", b"application/x-pkcs7-mime")
 _SIGNATURE = (b"application/pkcs7-signature", b"application/x-pkcs7-signature")
 
 _SHORT = 1024
+_PARTS = 4
+"""What the marks of a signed message separate: a preamble, two parts, and an epilogue."""
 _VERSION = b"\x02\x01\x01"
 _NULL = b"\x05\x00"
 _SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
@@ -190,7 +192,7 @@ class SignedDocument:
         if self._signed_attributes and not self.digest_matches():
             return False
         signed = self._signed_attributes or self.content
-        key, digest = signer.public_key(), self._digest_algorithm
+        key, digest = _public_key(signer), self._digest_algorithm
         try:
             if isinstance(key, ec.EllipticCurvePublicKey):
                 if _algorithm(self._signature_algorithm) != digest.ecdsa:
@@ -285,16 +287,18 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
             "A signed document begins with MIME headers of the type multipart/signed; "
             "this may be the unsigned XML.",
         )
-    mark, lines = b"--" + boundary, body.split(b"\n")
     # Also inside of lines: OpenSSL reads a long line in pieces, each of which may begin a part.
-    marks = [number for number, line in enumerate(lines) if mark in line]
-    if [lines[number] for number in marks] != [mark, mark, mark + b"--"]:
+    parts = (b"\n" + body + b"\n").split(b"--" + boundary)
+    if len(parts) != _PARTS or not (
+        parts[0].endswith(b"\n")
+        and all(part.startswith(b"\n") and part.endswith(b"\n") for part in parts[1:-1])
+        and parts[-1].startswith(b"--\n")
+    ):
         raise PkiError("it is not one signed part followed by one signature")
-    begin, middle, end = marks
-    header, _, encoded = b"\n".join(lines[middle + 1 : end]).partition(b"\n\n")
+    header, _, encoded = parts[2][1:-1].partition(b"\n\n")
     if _media_type(header)[0] not in _SIGNATURE or not encoded:
         raise PkiError("it has no signature")
-    return b"\r\n".join(lines[begin + 1 : middle]), _decoded(encoded)
+    return parts[1][1:-1].replace(b"\n", b"\r\n"), _decoded(encoded)
 
 
 def _decoded(encoded: bytes) -> bytes:
@@ -305,6 +309,7 @@ def _decoded(encoded: bytes) -> bytes:
 
 # All documents of a keystore embed the certificate of the permissions CA.
 _certificate = lru_cache(maxsize=16)(load_der_certificate)
+_public_key = lru_cache(maxsize=16)(x509.Certificate.public_key)
 
 
 def _parts(value: der.Value, *tags: int) -> list[der.Value]:
