@@ -7,7 +7,7 @@ first one.  Fast DDS 2.9.1 trusts all CAs in the file, and also reads a revocati
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -70,11 +70,36 @@ class Authority:
         Raises:
             PkiError: the message does not contain ``document`` with a correct digest.
         """
-        message = smime.sign(document, self.certificate, self.key)
-        signed = smime.parse(message)
-        meant = document.replace(b"\r\n", b"\n")
-        check_meaning((signed.digest_matches(), signed.text), (True, meant), what)
-        return message
+        return self.sign_all((document,), what)[0]
+
+    def sign_all(self, documents: Sequence[bytes], what: str) -> list[bytes]:
+        """Return each of some documents as `sign` does.
+
+        Small ones take less time, because each step is done for several of them in a row.
+        """
+        messages: list[bytes] = []
+        for some in _in_a_row(documents):
+            signed = [smime.sign(each, self.certificate, self.key) for each in some]
+            parsed = [smime.parse(each) for each in signed]
+            for document, found in zip(some, parsed, strict=True):
+                meant = document.replace(b"\r\n", b"\n")
+                check_meaning((found.digest_matches(), found.text), (True, meant), what)
+            messages += signed
+        return messages
+
+
+_BYTES_IN_A_ROW = 1 << 18
+
+
+def _in_a_row(documents: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
+    """Yield the documents in order, several small ones together and each large one alone."""
+    begin = size = 0
+    for end, each in enumerate(documents):
+        size += len(each)
+        if size > _BYTES_IN_A_ROW and end > begin:
+            yield documents[begin:end]
+            begin, size = end, len(each)
+    yield documents[begin:]
 
 
 @dataclass(frozen=True, slots=True)

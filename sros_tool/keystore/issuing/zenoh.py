@@ -105,22 +105,24 @@ def _stage(
 ) -> dict[str, bytes]:
     """Stage changed configurations and their signed documents on all cores; map them to content."""
 
-    def stage(part: Sequence[Drifted]) -> dict[str, bytes]:
-        written: dict[str, bytes] = {}
-        for each in part:
-            document = files[each.path]
+    def stage(part: Sequence[Drifted]) -> list[bytes]:
+        documents = [files[each.path] for each in part]
+        messages = [b""] * len(part)
+        if not transaction.dry_run:
+            messages = authority.sign_all(documents, "a Zenoh configuration")
+        for each, document, message in zip(part, documents, messages, strict=True):
             if each.kind is not Drift.UNSIGNED:
-                written[each.path] = document
-            data = b"" if transaction.dry_run else authority.sign(document, "a Zenoh configuration")
-            written[signed_path(each.path)] = data
-        for path, data in written.items():
-            transaction.write(path, data)
-        return written
+                transaction.write(each.path, document)
+            transaction.write(signed_path(each.path), message)
+        return messages
 
-    found: dict[str, bytes] = {}
-    for _, written in transaction.on_all_cores(changed, stage, alone=authority.on_token):
-        found |= written
-    return found
+    written: dict[str, bytes] = {}
+    for part, signed in transaction.on_all_cores(changed, stage, alone=authority.on_token):
+        for each, message in zip(part, signed, strict=True):
+            if each.kind is not Drift.UNSIGNED:
+                written[each.path] = files[each.path]
+            written[signed_path(each.path)] = message
+    return written
 
 
 def remove_zenoh(transaction: Transaction) -> tuple[str, ...]:
