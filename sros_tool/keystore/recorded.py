@@ -10,7 +10,7 @@ from shlex import quote
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.layout import SETTINGS
-from sros_tool.keystore.ledger import Ledger, read_ledger
+from sros_tool.keystore.ledger import Entry, Ledger, read_ledger
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,15 +51,15 @@ class RecordedRights:
         """
         return EarlierRights(grant, self.policy(name, digest))
 
-    def is_latest(self, name: str, digest: str) -> bool:
-        """Return whether permissions are certainly the last ones that were signed for an enclave.
+    def latest(self, name: str, digest: str) -> Entry | None:
+        """Return the entry of permissions if they are certainly the last ones of an enclave.
 
-        ``name`` and ``digest`` are as for `policy`; permissions without a line are not.
+        ``name`` and ``digest`` are as for `policy`.
         """
         with suppress(KeystoreError):
             self.policy(name, digest)
-            return name in self._last
-        return False
+            return self._last.get(name)
+        return None
 
     def policy(self, name: str, digest: str) -> str:
         """Return the SHA-256 of the policy of an enclave's permissions, or "".

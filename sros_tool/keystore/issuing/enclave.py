@@ -214,21 +214,21 @@ class EnclaveWriter:
         return Issued(issuance, certificate, permissions, message, short_lived=short)
 
     def would_only_date(
-        self, rights: StatedRights, certificate: x509.Certificate, signed: Grant, text: bytes
+        self, rights: StatedRights, certificate: x509.Certificate, validity: Window, text: bytes
     ) -> bool:
         """Return whether `write` would sign a document again only to change its dates, too early.
 
-        ``text`` is the document, with LF line ends, and ``signed`` its grant.  The dates last until
-        two thirds of what new ones would have are over (`Window.lasts`).
+        ``text`` is the document, with LF line ends, and ``validity`` its own, which lasts until two
+        thirds of what a new one would have are over (`Window.lasts`).
 
         Raises:
             KeystoreError: the permissions would not decide as the policy does.
         """
         name = rights.enclave.path
         new = self._validity(name, self._permissions_validity).within(validity_of(certificate))
-        if not signed.validity.lasts(new, self._now):
+        if not validity.lasts(new, self._now):
             return False
-        permissions = _permissions(rights, subject_text(certificate.subject), signed.validity)
+        permissions = _permissions(rights, subject_text(certificate.subject), validity)
         return render_permissions(permissions) == text
 
     def _validity(self, name: str, usual: Window) -> Window:
@@ -362,7 +362,8 @@ def present_files(root: Path, name: str) -> set[str]:
     """Return the names of the files of an enclave; a broken link counts as missing."""
     folder = enclave_path(root, name)
     try:
-        return {file for file in os.listdir(folder) if (folder / file).exists()}
+        names = os.listdir(folder)
+        return {each for each in names if os.path.exists(f"{folder}/{each}")}  # noqa: PTH110
     except FileNotFoundError:
         return set()
 

@@ -69,7 +69,6 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry, append, certificate_entry
 from sros_tool.keystore.lifecycle.governed import Governed, protected_as_stated
 from sros_tool.keystore.lifecycle.replaced import (
-    EarlierPermissions,
     ReplacedRights,
     earlier_permissions,
     replaced_rights,
@@ -112,7 +111,7 @@ from sros_tool.pki.token_uri import TokenUri
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.translate import governance_for
-from sros_tool.validity import iso, window
+from sros_tool.validity import Window, iso, parse_iso, window
 from sros_tool.xml import read_bytes
 
 _NONE_IMPORTED: Mapping[str, bytes] = MappingProxyType({})
@@ -729,9 +728,15 @@ def _write_enclave(
     before = len(transaction.changes)
     identity = _identity(root, keystore, name, present, now, keys, replaced=bool(policy))
     earlier, old = None, None
-    if policy and PERMISSIONS_FILE in present:
+    certificate = identity if isinstance(identity, x509.Certificate) else None
+    rights = None
+    if policy or PERMISSIONS_FILE not in present:
+        enclave = policy or _default_rights(keystore.template, name)
+        rights = StatedRights(enclave, EnclaveDomains(keystore.domains, keystore.fleet).of(name))
+    if rights and certificate and PERMISSIONS_FILE in present and not revoke_old:
+        rights = None if _is_kept(writer, keystore, root, certificate, rights) else rights
+    if rights and PERMISSIONS_FILE in present:
         authority = keystore.authorities.permissions.certificate
-        certificate = identity if isinstance(identity, x509.Certificate) else None
         earlier = earlier_permissions(root, name, authority, certificate)
         if revoke_old and certificate:
             old = certificate
@@ -739,12 +744,6 @@ def _write_enclave(
             remedy = f"Give it another key with `sros renew {quote(str(root))} {name} --new-key`."
             keystore.known.refuse_revoked(public, f"enclave {name}", remedy, old)
             identity = NewIdentity(enclave_subject(name, unique=True), public)
-    rights = None
-    if policy or PERMISSIONS_FILE not in present:
-        enclave = policy or _default_rights(keystore.template, name)
-        rights = StatedRights(enclave, EnclaveDomains(keystore.domains, keystore.fleet).of(name))
-    if earlier and rights and _is_kept(writer, keystore, root, identity, rights, earlier):
-        rights = None
     issued = writer.write(Issuance(name, identity, rights))
     link_shared_files(transaction, name, present)
     notes = tuple(issued.notes())
@@ -768,9 +767,8 @@ def _is_kept(
     writer: EnclaveWriter,
     keystore: _Keystore,
     root: Path,
-    identity: NewIdentity | x509.Certificate,
+    certificate: x509.Certificate,
     rights: StatedRights,
-    earlier: EarlierPermissions,
 ) -> bool:
     """Return whether the permissions of an enclave stay as they are, because they state ``rights``.
 
@@ -778,15 +776,25 @@ def _is_kept(
         KeystoreError: the key of the enclave was revoked, so nobody would accept them.
     """
     name = rights.enclave.path
-    if keystore.recorded is None or isinstance(identity, NewIdentity):
+    if keystore.recorded is None:
         return False
-    public: PublicKey = identity.public_key()  # type: ignore[assignment]
+    public: PublicKey = certificate.public_key()  # type: ignore[assignment]
     remedy = f"Give it another key with `sros renew {quote(str(root))} {name} --new-key`."
-    keystore.known.refuse_revoked(public, f"enclave {name}", remedy, identity)
-    return (
-        keystore.recorded.is_latest(name, earlier.digest)
-        and writer.would_only_date(rights, identity, earlier.grant, earlier.text)
-        and _is_file(enclave_path(root, name) / "permissions.xml", earlier.text)
+    keystore.known.refuse_revoked(public, f"enclave {name}", remedy, certificate)
+    folder = enclave_path(root, name)
+    try:
+        message = read_bytes(folder / PERMISSIONS_FILE, "permissions document")
+        entry = keystore.recorded.latest(name, hashlib.sha256(message).hexdigest())
+        if entry is None:
+            return False
+        signed = smime.parse(message)
+        signed.verify(keystore.authorities.permissions.certificate)
+        validity = Window(parse_iso(entry.not_before), parse_iso(entry.not_after))
+    except (SrosError, ValueError):  # not what `write` would leave
+        return False
+    text = signed.text
+    return writer.would_only_date(rights, certificate, validity, text) and _is_file(
+        folder / "permissions.xml", text
     )
 
 

@@ -28,16 +28,10 @@ from sros_tool.validity import iso
 
 @dataclass(frozen=True, slots=True)
 class EarlierPermissions:
-    """The permissions of an enclave before they are replaced, and its certificate.
-
-    ``text`` is the signed document with LF line ends, ``digest`` the SHA-256 of its
-    ``permissions.p7s``; both are "" where nobody asks for them.
-    """
+    """The permissions of an enclave before they are replaced, and its certificate."""
 
     certificate: x509.Certificate
     grant: Grant
-    text: bytes = b""
-    digest: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +66,7 @@ def earlier_permissions(
         found = read_signed_grant(folder / PERMISSIONS_FILE, subject_text(certificate.subject))
         found.signed.verify(authority)
         if found.grant:
-            return EarlierPermissions(certificate, found.grant, found.signed.text, found.digest)
+            return EarlierPermissions(certificate, found.grant)
     return None
 
 

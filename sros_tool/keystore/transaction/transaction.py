@@ -82,6 +82,7 @@ class Transaction:
         self._staged: dict[str, tuple[str, ...]] = {}  # the names in each folder
         self._names: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._folders: dict[str, bool] = {}  # whether the folder exists in the keystore
+        self._parents: set[str] = set()  # of folders that are staged
         self._moves: list[Move] = []
         self._undo: list[Callable[[], None]] = []
 
@@ -306,7 +307,10 @@ class Transaction:
     def _stage_folder(self, path: str) -> None:
         parts = path.split("/")
         for length in range(1, len(parts)):
-            self._make_folder(self._added + "/".join(parts[:length]), 0o700)
+            parent = "/".join(parts[:length])
+            if parent not in self._parents:
+                self._make_folder(f"{self._added}{parent}", 0o700)
+                self._parents.add(parent)
         self._make_folder(f"{self._added}{path}", folder_mode(path))
 
     def _make_folder(self, path: str, mode: int) -> None:
