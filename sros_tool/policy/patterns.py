@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_left
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import translate
-from functools import cached_property, lru_cache
-from string import ascii_letters, digits
+from functools import cached_property, lru_cache, reduce
+from operator import and_
 
+from sros_tool.automata import Automaton, Letters, NameSet
 from sros_tool.errors import DocumentError
 from sros_tool.names import is_expression
 
@@ -383,12 +384,32 @@ def _grams(run: str) -> Iterator[str]:
 # ── names that expressions have in common ──────────────────────────────────────────────────
 
 
-_LETTERS = ascii_letters + digits + "_/"
-_MOST_STATES = 5_000
-_START, _SLASH, _TOKEN = range(3)
-"""Positions in a ROS name: before its start, after a "/", or within one of its parts."""
+_WORD = Letters.between([("A", "Z"), ("a", "z"), ("_", "_")])
+_SLASH = Letters.of("/")
+_DIGITS = Letters.between([("0", "9")])
+_PARTS = ((1, _WORD, 2), (2, _WORD | _DIGITS, 2))
+_ABSOLUTE_NAMES = NameSet(
+    (), [Automaton(((0, _SLASH, 1), *_PARTS, (2, _SLASH, 1)), frozenset((2,)))]
+)
+_RELATIVE_NAMES = NameSet(
+    (), [Automaton(((0, _WORD, 2), *_PARTS, (2, _SLASH, 1)), frozenset((2,)))]
+)
 
-_State = tuple[int, tuple[frozenset[int], ...]]
+
+@lru_cache(maxsize=_MANY)
+def _names_of(expression: str) -> NameSet:
+    """Return the names that an expression matches."""
+    if not is_expression(expression):
+        return NameSet([expression])
+    pieces = _pieces(expression)
+    return NameSet(
+        (), [Automaton.sequence(None if each is _ANY else _as_letters(each) for each in pieces)]
+    )
+
+
+@lru_cache(maxsize=_MANY)
+def _as_letters(piece: frozenset[str]) -> Letters:
+    return Letters.of("".join(piece))
 
 
 def common_name(
@@ -397,8 +418,10 @@ def common_name(
     """Return the shortest absolute ROS name that all of ``wanted`` and none of ``unwanted`` match.
 
     Without ``absolute``, the name has no leading "/", like DDS topics.  Returns None if there is no
-    such name.  If the search gets too large (many ``?`` after ``*``), ``unwanted`` is ignored, so
-    that no overlap is missed.
+    such name.
+
+    Raises:
+        DocumentError: there are too many ``?`` after ``*`` to decide it.
     """
     inner, outer = tuple(dict.fromkeys(wanted)), tuple(dict.fromkeys(unwanted))
     for name in inner:
@@ -406,88 +429,11 @@ def common_name(
             others = (each for each in inner if each != name)
             fits = all(matches(each, name) for each in others)
             return name if fits and not any(matches(each, name) for each in outer) else None
-    return _search(inner, outer, _START if absolute else _SLASH)
+    return _search(inner, outer, absolute)
 
 
 @lru_cache(maxsize=4096)
-def _search(wanted: tuple[str, ...], unwanted: tuple[str, ...], begin: int) -> str | None:
-    patterns = [_form(each).pieces for each in (*wanted, *unwanted)]
-    alphabet = _representatives(patterns)
-    start: _State = (begin, tuple(_closed({0}, each) for each in patterns))
-    before: dict[_State, tuple[_State, str] | None] = {start: None}
-    queue = deque([start])
-    while queue:
-        state = queue.popleft()
-        if len(before) > _MOST_STATES:
-            return _search(wanted, (), begin) if unwanted else wanted[0]
-        place, reached = state
-        if place == _TOKEN and _fits(reached, patterns, len(wanted)):
-            return _spelt(state, before)
-        for letter in alphabet:
-            following = _after(place, letter)
-            if following is None:
-                continue
-            moved = tuple(
-                _step(at, letter, pattern) for at, pattern in zip(reached, patterns, strict=True)
-            )
-            new = (following, moved)
-            if all(moved[: len(wanted)]) and new not in before:
-                before[new] = (state, letter)
-                queue.append(new)
-    return None
-
-
-def _fits(reached: tuple[frozenset[int], ...], patterns: list[_Pieces], wanted: int) -> bool:
-    ended = [len(pattern) in at for at, pattern in zip(reached, patterns, strict=True)]
-    return all(ended[:wanted]) and not any(ended[wanted:])
-
-
-def _spelt(state: _State, before: dict[_State, tuple[_State, str] | None]) -> str:
-    letters = []
-    while (step := before[state]) is not None:
-        state, letter = step
-        letters.append(letter)
-    return "".join(reversed(letters))
-
-
-def _representatives(patterns: list[_Pieces]) -> str:
-    """Return one letter for each set of letters that patterns and ROS names treat alike."""
-    special = {piece for pattern in patterns for piece in pattern if piece is not _ANY}
-    kinds: dict[tuple[object, ...], str] = {}
-    for letter in _LETTERS:
-        kind = (letter == "/", letter in digits, *(letter in piece for piece in special))
-        kinds.setdefault(kind, letter)
-    return "".join(kinds.values())
-
-
-def _after(place: int, letter: str) -> int | None:
-    """Return the position in a name after the letter; None if the letter is not allowed."""
-    if letter == "/":
-        return None if place == _SLASH else _SLASH
-    if place == _START or (place == _SLASH and letter in digits):
-        return None
-    return _TOKEN
-
-
-def _step(reached: frozenset[int], letter: str, pattern: _Pieces) -> frozenset[int]:
-    following = set()
-    for at in reached:
-        if at == len(pattern):
-            continue
-        if pattern[at] is _ANY:
-            following.add(at)
-        elif letter in pattern[at]:
-            following.add(at + 1)
-    return _closed(following, pattern)
-
-
-def _closed(reached: set[int], pattern: _Pieces) -> frozenset[int]:
-    """Return the ``reached`` positions and the positions after stars that match nothing."""
-    return frozenset(place for at in reached for place in _onward(at, pattern))
-
-
-def _onward(at: int, pattern: _Pieces) -> Iterator[int]:
-    yield at
-    while at < len(pattern) and pattern[at] is _ANY:
-        at += 1
-        yield at
+def _search(wanted: tuple[str, ...], unwanted: tuple[str, ...], absolute: bool) -> str | None:
+    valid = _ABSOLUTE_NAMES if absolute else _RELATIVE_NAMES
+    both = reduce(and_, map(_names_of, wanted), valid)
+    return (both - NameSet.union(map(_names_of, unwanted))).example()

@@ -8,8 +8,11 @@ Source: zenoh.io "Key Expressions"; measured with the wheel 1.10.2.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
+from itertools import count
+
+from sros_tool.automata import Automaton, Letters, NameSet
 
 ANY_PART, ANY_CHUNKS = "$*", "**"
 _ANY_CHUNK = "*"
@@ -243,6 +246,77 @@ def _sequences_intersect(
                 following.add(at if other[at] == many else at + 1)
         reached = following
     return len(other) in reached
+
+
+_SLASH = Letters.of("/")
+_IN_CHUNK = ~_SLASH
+_BEGINS_CHUNK = ~Letters.of("/@")
+
+
+@lru_cache(maxsize=_MANY)
+def _automaton(expression: str) -> Automaton | None:
+    """Return an automaton for the keys that are included; None if it is only the one key."""
+    if "*" not in expression:
+        return None
+    edges: list[tuple[int, Letters, int]] = []
+    number = count(1)
+    between = [0]  # the positions where a chunk may end
+    for chunk in _chunks(expression):
+        begin = next(number)
+        edges += [(each, _SLASH, begin) for each in between]
+        if chunk in (_ANY_CHUNK, ANY_CHUNKS):
+            inside = next(number)
+            edges += [(begin, _BEGINS_CHUNK, inside), (inside, _IN_CHUNK, inside)]
+            if chunk == ANY_CHUNKS:
+                edges.append((inside, _SLASH, begin))
+                between.append(inside)
+                continue
+            between = [inside]
+        else:
+            between = [_chunk(chunk, begin, number, edges)]
+    # The edges begin as if there was a "/" before the key.
+    first = {to for at, _, to in edges if at == 0}
+    edges = [each for each in edges if each[0]]
+    edges += [(0, letters, to) for at, letters, to in edges if at in first]
+    return Automaton(tuple(edges), frozenset(between) - {0})
+
+
+def _chunk(
+    chunk: str, begin: int, number: Iterator[int], edges: list[tuple[int, Letters, int]]
+) -> int:
+    """Add the edges of a chunk, and return the position at its end.
+
+    With a wildcard in it, no chunk that begins with "@" is included.
+    """
+    parts = chunk.split(ANY_PART)
+    at, wild = begin, len(parts) > 1
+    for index, part in enumerate(parts):
+        if index and at == begin:  # "$*" at the beginning
+            gap = next(number)
+            edges += [(begin, _BEGINS_CHUNK, gap), (gap, _IN_CHUNK, gap)]
+            if part:
+                after = next(number)
+                edges += [(gap, Letters.of(part[0]), after)]
+                edges += [(begin, Letters.of(part[0]) & _BEGINS_CHUNK, after)]
+                part, at = part[1:], after
+            else:
+                at = gap
+        elif index:
+            edges.append((at, _IN_CHUNK, at))
+        for letter in part:
+            letters = Letters.of(letter)
+            to = next(number)
+            edges.append((at, letters & _BEGINS_CHUNK if wild and at == begin else letters, to))
+            at = to
+    return at
+
+
+def names_of(expressions: Iterable[str]) -> NameSet:
+    """Return the keys that any of the expressions includes."""
+    made = {each: _automaton(each) for each in expressions}
+    return NameSet(
+        (each for each, wild in made.items() if wild is None), filter(None, made.values())
+    )
 
 
 @lru_cache(maxsize=_MANY)

@@ -70,5 +70,9 @@ def test_what_shares_a_name_overlaps(one: str, other: str) -> None:
         assert overlap(one, other)
 
 
-def test_a_search_without_end_is_given_up_on_the_safe_side() -> None:
-    assert common_name(["/*a" + "?" * 17], ["/*b" + "?" * 17, "/*c" + "?" * 16]) is not None
+def test_many_question_marks_after_a_star_are_decided() -> None:
+    unwanted = ["/*b" + "?" * 17, "/*c" + "?" * 16]
+    name = common_name(["/*a" + "?" * 17], unwanted)
+    assert name is not None
+    assert matches("/*a" + "?" * 17, name)
+    assert not any(matches(each, name) for each in unwanted)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
+from sros_tool.automata import ANY_LETTER, Automaton, Letters, NameSet
 from sros_tool.dds.decision.vendors import Style
 
 _Matcher = Callable[[str], object]
@@ -15,23 +16,61 @@ _SPECIAL = frozenset("*?[")
 """An expression without any of these means itself, for every vendor."""
 
 _BEFORE_SPECIAL = re.compile(r"[^*?\[]*")
-_NEVER = "(?!)"
 _CLASS = re.compile(r"\[:([a-y]*):\]")
 _EQUIVALENT = re.compile(r"\[=(.)=\]", re.DOTALL)
+_NOTHING = Letters(())
+_OPENING = Letters.of("[")
+_DIGIT, _LOWER, _UPPER = (Letters.between([ends]) for ends in (("0", "9"), ("a", "z"), ("A", "Z")))
 _CLASSES = {
-    "alnum": "0-9A-Za-z",
-    "alpha": "A-Za-z",
-    "blank": " \\t",
-    "cntrl": "\\x00-\\x1f\\x7f",
-    "digit": "0-9",
-    "graph": "!-~",
-    "lower": "a-z",
-    "print": " -~",
-    "punct": "!-/:-@\\[-`{-~",
-    "space": " \\t-\\r",
-    "upper": "A-Z",
-    "xdigit": "0-9A-Fa-f",
+    "alnum": _DIGIT | _LOWER | _UPPER,
+    "alpha": _LOWER | _UPPER,
+    "blank": Letters.of(" \t"),
+    "cntrl": Letters.between([("\0", "\x1f"), ("\x7f", "\x7f")]),
+    "digit": _DIGIT,
+    "graph": Letters.between([("!", "~")]),
+    "lower": _LOWER,
+    "print": Letters.between([(" ", "~")]),
+    "punct": Letters.between([("!", "/"), (":", "@"), ("[", "`"), ("{", "~")]),
+    "space": Letters.between([(" ", " "), ("\t", "\r")]),
+    "upper": _UPPER,
+    "xdigit": Letters.between([("0", "9"), ("A", "F"), ("a", "f")]),
 }
+
+
+def _pieces(style: Style, expression: str) -> list[Letters | None]:
+    """Return the letters of an expression in a row, with None where any text may be."""
+    take_set = _FnmatchSets(expression).take if style is Style.FNMATCH else _cyclone_set
+    pieces: list[Letters | None] = []
+    index = 0
+    while index < len(expression):
+        char = expression[index]
+        index += 1
+        if char == "*":
+            pieces.append(None)
+        elif char == "?":
+            pieces.append(ANY_LETTER)
+        elif char == "[":
+            letters, index = take_set(expression, index)
+            pieces.append(letters)
+        else:
+            pieces.append(Letters.of(char))
+    return pieces
+
+
+@lru_cache(maxsize=65536)
+def _automaton(style: Style, expression: str) -> Automaton | None:
+    """Return an automaton for the same names; None if ``expression`` matches only itself."""
+    if _SPECIAL.isdisjoint(expression):
+        return None
+    return Automaton.sequence(_pieces(style, expression))
+
+
+def names_of(style: Style, expressions: Iterable[str]) -> NameSet:
+    """Return the names that any of the expressions matches."""
+    made = {each: _automaton(style, each) for each in expressions}
+    return NameSet(
+        (each for each, wild in made.items() if wild is None), filter(None, made.values())
+    )
 
 
 @lru_cache(maxsize=65536)
@@ -39,23 +78,23 @@ def _matcher(style: Style, expression: str) -> _Matcher | None:
     """Return a function that matches names; None if ``expression`` matches only itself."""
     if _SPECIAL.isdisjoint(expression):
         return None
-    take_set = _FnmatchSets(expression).take if style is Style.FNMATCH else _cyclone_set
     segments = [""]  # the text between stars
-    index = 0
-    while index < len(expression):
-        char = expression[index]
-        index += 1
-        if char == "*":
-            if segments[-1] or len(segments) == 1:
-                segments.append("")
-        elif char == "?":
-            segments[-1] += "."
-        elif char == "[":
-            part, index = take_set(expression, index)
-            segments[-1] += part
-        else:
-            segments[-1] += re.escape(char)
+    for piece in _pieces(style, expression):
+        if piece is not None:
+            segments[-1] += _pattern(piece)
+        elif segments[-1] or len(segments) == 1:
+            segments.append("")
     return re.compile(_joined(segments) + r"\Z", re.DOTALL).match
+
+
+def _pattern(letters: Letters) -> str:
+    """Return a regular expression for one of some letters."""
+    if letters == ANY_LETTER:
+        return "."
+    if single := letters.single():
+        return re.escape(single)
+    ranges = "".join(f"\\U{low:08x}-\\U{high:08x}" for low, high in letters.ranges)
+    return f"[{ranges}]" if ranges else "(?!)"
 
 
 def _joined(segments: list[str]) -> str:
@@ -124,12 +163,6 @@ class ExpressionIndex:
         ]
 
 
-def _set_of(members: list[str], negated: bool) -> str:
-    if not members:
-        return "." if negated else _NEVER
-    return f"[{'^' if negated else ''}{''.join(members)}]"
-
-
 class _FnmatchSets:
     """Reads the sets of an expression as glibc does, in linear time."""
 
@@ -137,7 +170,7 @@ class _FnmatchSets:
         self._text = text
         self._known: dict[int, tuple[bool, bool]] = {}
 
-    def take(self, text: str, start: int) -> tuple[str, int]:
+    def take(self, text: str, start: int) -> tuple[Letters, int]:
         """Return the set after ``[``, and the index after the set.
 
         After an unknown class or symbol, and after a range without its end, no further character
@@ -149,25 +182,25 @@ class _FnmatchSets:
         index += negated
         closed, plain = self._end_of(index, first=True)
         if not closed:
-            return (re.escape("[") if plain else _NEVER), start
-        members: list[str] = []
+            return (_OPENING if plain else _NOTHING), start
+        members: list[Letters] = []
         goes_on = first = True
         while first or text[index] != "]":
             first = False
-            low, high, index = _token(text, index)
-            goes_on = goes_on and low is not None and high is not None
-            if goes_on and low is high:
-                members.append(low or "")
-            elif goes_on and low and high and low[-1] <= high[-1]:
-                members.append(f"{low}-{high}")
-        return (_set_of(members, negated) if goes_on or not negated else _NEVER), index + 1
+            letters, _, index = _token(text, index)
+            goes_on = goes_on and letters is not None
+            if goes_on and letters:
+                members.append(letters)
+        if negated and not goes_on:
+            return _NOTHING, index + 1
+        return _set_of(members, negated), index + 1
 
     def _end_of(self, index: int, *, first: bool) -> tuple[bool, bool]:
         """Return whether a set whose members go on at ``index`` is closed, and plain if not.
 
         What was found for an index is kept: many unclosed sets would take quadratic time.
         """
-        text, opening = self._text, re.escape("[")
+        text = self._text
         path: list[tuple[int, bool | None]] = []
         closed, plain = False, True
         while index < len(text):
@@ -177,11 +210,11 @@ class _FnmatchSets:
             if not first and index in self._known:
                 closed, plain = self._known[index]
                 break
-            low, high, after = _token(text, index)
+            letters, a_range, after = _token(text, index)
             decided = None
-            if low is None or high is None:
+            if letters is None:
                 decided = False
-            elif low is high and low == opening:
+            elif letters == _OPENING and not a_range:
                 decided = True
             path.append((index, decided))
             index, first = after, False
@@ -192,35 +225,41 @@ class _FnmatchSets:
         return closed, plain
 
 
-def _token(text: str, index: int) -> tuple[str | None, str | None, int]:
-    """Return the first and the last member of a class, a range or a character, and what follows.
+def _set_of(members: list[Letters], negated: bool) -> Letters:
+    letters = Letters.union(members)
+    return ~letters if negated else letters
+
+
+def _token(text: str, index: int) -> tuple[Letters | None, bool, int]:
+    """Return the letters of a class, a range or a character, whether it is a range, and what
+    follows.
 
     None stands for a member that glibc does not know.
     """
     if found := _CLASS.match(text, index):
-        known = _CLASSES.get(found[1])
-        return known, known, found.end()
+        return _CLASSES.get(found[1]), False, found.end()
     if found := _EQUIVALENT.match(text, index):
-        equivalent = re.escape(found[1])
-        return equivalent, equivalent, found.end()
+        return Letters.of(found[1]), False, found.end()
     low, index = _member(text, index)
-    high = low
-    if text[index : index + 1] == "-" and text[index + 1 : index + 2] != "]":
-        high, index = _member(text, index + 1)
-    return low, high, index
+    if text[index : index + 1] != "-" or text[index + 1 : index + 2] == "]":
+        return (None if low is None else Letters.of(low)), False, index
+    high, index = _member(text, index + 1)
+    if low is None or high is None:
+        return None, True, index
+    return Letters.between([(low, high)]), True, index
 
 
 def _member(text: str, index: int) -> tuple[str | None, int]:
-    """Return one character of a set, also if written ``[.a.]``, for a pattern; None without one."""
+    """Return one character of a set, also if written ``[.a.]``; None without one."""
     if text[index : index + 2] != "[.":
-        return (re.escape(text[index]) if index < len(text) else None), index + 1
+        return (text[index] if index < len(text) else None), index + 1
     end = text.find(".]", index + 2)
     if end < 0:
         return None, len(text)
-    return (re.escape(text[index + 2]) if end == index + 3 else None), end + 2
+    return (text[index + 2] if end == index + 3 else None), end + 2
 
 
-def _cyclone_set(text: str, start: int) -> tuple[str, int]:
+def _cyclone_set(text: str, start: int) -> tuple[Letters, int]:
     """Return the set after ``[`` as Cyclone DDS 0.10 reads it, and the index after the set.
 
     Its loop takes the closing bracket for a member before it ends, and looks for a range there,
@@ -229,20 +268,20 @@ def _cyclone_set(text: str, start: int) -> tuple[str, int]:
     index = start
     negated = text[index : index + 1] == "!"
     index += negated
-    members: list[str] = []
+    members: list[tuple[str, str]] = []
     last = text[index : index + 1]
     while last != "]":
         last = text[index : index + 1]
         if not last:
-            return _NEVER, len(text)
+            return _NOTHING, len(text)
         if text[index + 1 : index + 2] == "-":
             high = text[index + 2 : index + 3]
             if high in ("", "]"):
-                return _NEVER, len(text)
-            if last <= high:
-                members.append(f"{re.escape(last)}-{re.escape(high)}")
+                return _NOTHING, len(text)
+            members.append((last, high))
             index += 2
         else:
-            members.append(re.escape(last))
+            members.append((last, last))
         index += 1
-    return _set_of(members, negated), index
+    letters = Letters.between(members)
+    return (~letters if negated else letters), index

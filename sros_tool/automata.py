@@ -1,0 +1,722 @@
+"""Exact sets of names: union, difference and first match of names and of expressions.
+
+A set holds names as they are, and finite automata for expressions with wildcards, whose makers know
+the meaning of these: `sros_tool.policy.patterns`, `sros_tool.dds.decision` and `sros_tool.zenoh`.
+`NameSet.example` finds the shortest name of a set, or proves that there is none.  Nothing is
+sampled or approximated: a set that takes too many steps raises an error.
+
+Names are texts of any characters but NUL, which no DDS and no file can have in a name.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import accumulate, count, groupby, pairwise
+from string import ascii_lowercase, ascii_uppercase, digits, punctuation
+from typing import NamedTuple
+
+from sros_tool.errors import DocumentError
+
+# ── letters ────────────────────────────────────────────────────────────────────────────────
+
+_LAST = 0x10FFFF
+_NO_LETTERS = ((0, 0), (0xD800, 0xDFFF))
+"""NUL and halves of characters, which have no encoding."""
+_PREFERRED = ascii_lowercase + ascii_uppercase + digits + "_/" + punctuation + " "
+"""The letters for examples, best first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Letters:
+    """A set of characters, as ranges of code points that neither touch nor overlap, in order."""
+
+    ranges: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, text: str) -> Letters:
+        """Return the characters of a text."""
+        return cls.between((letter, letter) for letter in text)
+
+    @classmethod
+    def between(cls, ends: Iterable[tuple[str, str]]) -> Letters:
+        """Return the characters of ranges, each with its last one; one that goes back is empty."""
+        return cls._joined((ord(low), ord(high)) for low, high in ends)
+
+    @classmethod
+    def _joined(cls, ranges: Iterable[tuple[int, int]]) -> Letters:
+        found: list[tuple[int, int]] = []
+        for low, high in sorted(each for each in ranges if each[0] <= each[1]):
+            if found and low <= found[-1][1] + 1:
+                found[-1] = found[-1][0], max(high, found[-1][1])
+            else:
+                found.append((low, high))
+        return cls(tuple(found))
+
+    @classmethod
+    def union(cls, sets: Iterable[Letters]) -> Letters:
+        """Return the characters of any of some sets."""
+        return cls._joined(each for some in sets for each in some.ranges)
+
+    def __or__(self, other: Letters) -> Letters:
+        return self.union((self, other))
+
+    def __and__(self, other: Letters) -> Letters:
+        return ~(~self | ~other)
+
+    def __invert__(self) -> Letters:
+        """Return all other characters."""
+        ends = [-1, *(end for each in self.ranges for end in each), _LAST + 1]
+        between = zip(ends[::2], ends[1::2], strict=True)
+        return Letters(tuple((a + 1, b - 1) for a, b in between if a + 1 < b))
+
+    def __bool__(self) -> bool:
+        return bool(self.ranges)
+
+    def __contains__(self, letter: str) -> bool:
+        return any(low <= ord(letter) <= high for low, high in self.ranges)
+
+    def single(self) -> str:
+        """Return the character if it is the only one, else ""."""
+        if len(self.ranges) == 1 and self.ranges[0][0] == self.ranges[0][1]:
+            return chr(self.ranges[0][0])
+        return ""
+
+
+ANY_LETTER = Letters(((0, _LAST),))
+_USABLE = ~Letters(_NO_LETTERS)
+
+
+# ── automata ───────────────────────────────────────────────────────────────────────────────
+
+_Moves = Mapping[int, int]
+"""By distance (0 stays): the positions, as bits, that a letter moves by so many."""
+
+
+@dataclass(frozen=True)
+class Automaton:
+    """A finite automaton: positions from 0, edges between them with letters, and where it ends.
+
+    There may be several edges from a position with the same letter.  Equal expressions should have
+    equal automata: then nothing is searched where both are compared.
+    """
+
+    edges: tuple[tuple[int, Letters, int], ...]
+    ends: frozenset[int]
+
+    @classmethod
+    def sequence(cls, pieces: Iterable[Letters | None]) -> Automaton:
+        """Return an automaton for letters in a row, where None stands for any text."""
+        at = 0
+        loops: set[int] = set()
+        edges: list[tuple[int, Letters, int]] = []
+        for piece in pieces:
+            if piece is not None:
+                edges.append((at, piece, at + 1))
+                at += 1
+            elif at not in loops:
+                loops.add(at)
+                edges.append((at, ANY_LETTER, at))
+        return cls(tuple(edges), frozenset((at,)))
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash((self.edges, self.ends))
+
+    def matches(self, name: str) -> bool:
+        """Return whether the automaton accepts ``name``."""
+        if not name.startswith(self.prefix) or not name.endswith(self.suffix):
+            return False
+        reached = 1
+        for letter in name:
+            if letter not in self._moves:
+                self._moves[letter] = _moves(
+                    (start, stop) for start, letters, stop in self.edges if letter in letters
+                )
+            reached = _moved(reached, self._moves[letter])
+            if not reached:
+                return False
+        return bool(reached & self.end_bits)
+
+    @cached_property
+    def _moves(self) -> dict[str, _Moves]:
+        return {}
+
+    @cached_property
+    def end_bits(self) -> int:
+        """The positions where it accepts, as bits."""
+        return sum(1 << each for each in self.ends)
+
+    @cached_property
+    def endless_bits(self) -> int:
+        """The positions, as bits, from which it accepts whatever follows."""
+        loops = {at for at, letters, to in self.edges if at == to and letters == ANY_LETTER}
+        return sum(1 << each for each in self.ends & loops)
+
+    @cached_property
+    def size(self) -> int:
+        """The number of positions."""
+        return 1 + max((max(at, to) for at, _, to in self.edges), default=0)
+
+    @cached_property
+    def levels(self) -> tuple[tuple[int, int], ...]:
+        """The positions, as bits, from which so many letters at least lead to an end."""
+        before: dict[int, list[int]] = {}
+        for at, letters, to in self.edges:
+            if letters:
+                before.setdefault(to, []).append(at)
+        levels: list[int] = []
+        known, row = self.ends, self.ends
+        while row:
+            levels.append(sum(1 << each for each in row))
+            row = frozenset(at for to in row for at in before.get(to, ())) - known
+            known |= row
+        return tuple(enumerate(levels))
+
+    @cached_property
+    def prefix(self) -> str:
+        """The text that every accepted name begins with."""
+        after: dict[int, list[tuple[Letters, int]]] = {}
+        for at, letters, to in self.edges:
+            after.setdefault(at, []).append((letters, to))
+        return _only_way(after, 0, self.ends)
+
+    @cached_property
+    def suffix(self) -> str:
+        """The text that every accepted name ends with."""
+        if len(self.ends) != 1:
+            return ""
+        before: dict[int, list[tuple[Letters, int]]] = {}
+        for at, letters, to in self.edges:
+            before.setdefault(to, []).append((letters, at))
+        return _only_way(before, next(iter(self.ends)), frozenset((0,)))[::-1]
+
+    def may_meet(self, other: Automaton) -> bool:
+        """Return False only if no name is accepted by both: beginnings or ends differ."""
+        return _agree(self.prefix, other.prefix) and _agree(self.suffix[::-1], other.suffix[::-1])
+
+
+def _only_way(
+    edges: Mapping[int, Sequence[tuple[Letters, int]]], at: int, stops: frozenset[int]
+) -> str:
+    """Return the letters of the edges from ``at`` on, as long as there is only one way."""
+    found = ""
+    while at not in stops:
+        ways = edges.get(at, ())
+        if len(ways) != 1 or not (letter := ways[0][0].single()):
+            break
+        found += letter
+        at = ways[0][1]
+    return found
+
+
+def _agree(one: str, other: str) -> bool:
+    return one.startswith(other) or other.startswith(one)
+
+
+def _moves(edges: Iterable[tuple[int, int]]) -> _Moves:
+    found: dict[int, int] = {}
+    for at, to in edges:
+        found[to - at] = found.get(to - at, 0) | 1 << at
+    return found
+
+
+def _moved(reached: int, moves: _Moves) -> int:
+    following = 0
+    for by, places in moves.items():
+        some = reached & places
+        following |= some << by if by >= 0 else some >> -by
+    return following
+
+
+# ── sets ───────────────────────────────────────────────────────────────────────────────────
+
+_Truth = bool | None
+"""Whether a name is in a set; None as long as it depends on how the name goes on."""
+_Ask = Callable[["_Some"], _Truth]
+
+
+@dataclass(frozen=True)
+class _Some:
+    """The names of ``exact``, and all that one of the ``automata`` accepts."""
+
+    exact: frozenset[str] = frozenset()
+    automata: frozenset[Automaton] = frozenset()
+
+    def parts(self) -> tuple[_Node, ...]:
+        return ()
+
+    def truth(self, ask: _Ask) -> _Truth:
+        return ask(self)
+
+
+@dataclass(frozen=True)
+class _Not:
+    of: _Node
+
+    def parts(self) -> tuple[_Node, ...]:
+        return (self.of,)
+
+    def truth(self, ask: _Ask) -> _Truth:
+        inner = self.of.truth(ask)
+        return None if inner is None else not inner
+
+
+@dataclass(frozen=True)
+class _Every:
+    """The names that are in each of ``of``."""
+
+    of: tuple[_Node, ...]
+
+    def parts(self) -> tuple[_Node, ...]:
+        return self.of
+
+    def truth(self, ask: _Ask) -> _Truth:
+        result: _Truth = True
+        for each in self.of:
+            inner = each.truth(ask)
+            if inner is False:
+                return False
+            result = result if inner else None
+        return result
+
+
+@dataclass(frozen=True)
+class _First:
+    """The first set of ``of`` that has a name decides whether it belongs here, else ``last``."""
+
+    of: tuple[tuple[_Node, bool], ...]
+    last: bool
+
+    def parts(self) -> tuple[_Node, ...]:
+        return tuple(each for each, _ in self.of)
+
+    def truth(self, ask: _Ask) -> _Truth:
+        possible: set[bool] = set()
+        for each, kept in self.of:
+            inner = each.truth(ask)
+            if inner is not False:
+                possible.add(kept)
+            if inner or len(possible) > 1:
+                break
+        else:
+            possible.add(self.last)
+        return possible.pop() if len(possible) == 1 else None
+
+
+_Node = _Some | _Not | _Every | _First
+
+
+class SearchLimit:
+    """A limit for the steps of one question, so that nobody waits without end."""
+
+    def __init__(self, most: int = 600_000) -> None:
+        """Allow ``most`` steps: some ten seconds."""
+        self._left = most
+
+    def spend(self, steps: int) -> None:
+        """Count steps.
+
+        Raises:
+            DocumentError: there were too many.
+        """
+        self._left -= steps
+        if self._left < 0:
+            raise DocumentError(
+                "it cannot be decided which names so many wildcards match",
+                "The names that they have in common, and not in common, are too many to be told "
+                "apart, such as with many '?' after a '*'.",
+                "Replace wildcards by the names that they stand for, or by fewer wildcards.",
+            )
+
+
+class NameSet:
+    """An immutable set of names, perhaps endless.
+
+    ``|`` and ``&`` and ``-`` and ``~`` make other sets; a large set of exact names costs look-ups.
+    """
+
+    __slots__ = ("_node",)
+
+    def __init__(self, exact: Iterable[str] = (), automata: Iterable[Automaton] = ()) -> None:
+        """Hold the names of ``exact``, and all that one of the ``automata`` accepts."""
+        self._node: _Node = _Some(frozenset(exact), frozenset(automata))
+
+    @classmethod
+    def _of(cls, node: _Node) -> NameSet:
+        made = cls()
+        made._node = node
+        return made
+
+    @classmethod
+    def first(cls, rules: Iterable[tuple[NameSet, bool]], otherwise: bool = False) -> NameSet:
+        """Return the names for which the first rule that has them says True, else ``otherwise``."""
+        joined = tuple(
+            (cls.union(names for names, _ in same)._node, kept)
+            for kept, same in groupby(rules, key=lambda each: each[1])
+        )
+        return cls._of(_First(joined, otherwise))
+
+    @classmethod
+    def union(cls, sets: Iterable[NameSet]) -> NameSet:
+        """Return the names that are in one of several sets."""
+        others: list[_Node] = []
+        exact: set[str] = set()
+        automata: set[Automaton] = set()
+        for each in sets:
+            if isinstance(each._node, _Some):
+                exact |= each._node.exact
+                automata |= each._node.automata
+            else:
+                others.append(each._node)
+        plain = _Some(frozenset(exact), frozenset(automata))
+        if not others:
+            return cls._of(plain)
+        return cls._of(_First(tuple((each, True) for each in (plain, *others)), False))
+
+    def __or__(self, other: NameSet) -> NameSet:
+        return NameSet.union((self, other))
+
+    def __and__(self, other: NameSet) -> NameSet:
+        for one, two in ((self, other), (other, self)):
+            if isinstance(one._node, _Some) and not one._node.automata:
+                return NameSet(name for name in one._node.exact if name in two)
+        return NameSet._of(_Every((self._node, other._node)))
+
+    def __sub__(self, other: NameSet) -> NameSet:
+        if isinstance(self._node, _Some) and not self._node.automata:
+            return NameSet(name for name in self._node.exact if name not in other)
+        return NameSet._of(_Every((self._node, _Not(other._node))))
+
+    def __invert__(self) -> NameSet:
+        return NameSet._of(_Not(self._node))
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the sets were made alike; sets of the same names may differ."""
+        return isinstance(other, NameSet) and self._node == other._node
+
+    def __hash__(self) -> int:
+        return hash(self._node)
+
+    def __contains__(self, name: str) -> bool:
+        def ask(some: _Some) -> bool:
+            return name in some.exact or any(each.matches(name) for each in some.automata)
+
+        return bool(self._node.truth(ask))
+
+    def stated(self) -> Iterator[str]:
+        """Yield the names of this set that were given as they are, the shortest first."""
+        exact = {name for each in _leaves(self._node) for name in each.exact}
+        return (name for name in sorted(exact, key=_length) if name in self)
+
+    def example(
+        self, limit: SearchLimit | None = None, *, longest: int | None = None
+    ) -> str | None:
+        """Return a name of this set, always the same one, or None if there is none.
+
+        Names that were given as they are come first, then short ones.  ``longest`` is the length
+        of names, in bytes of UTF-8, above which they do not count.
+
+        Raises:
+            DocumentError: the search takes more steps than ``limit`` allows.
+        """
+        for name in self.stated():
+            if longest is None or len(name.encode()) <= longest:
+                return name
+        limit = limit or SearchLimit()
+        best: str | None = None
+        for search in _searches(self._node):
+            found = search.shortest(limit, longest)
+            if found is not None and (best is None or _length(found) < _length(best)):
+                best = found
+        return best
+
+    def is_empty(self, limit: SearchLimit | None = None) -> bool:
+        """Return whether no name is in this set; raises what `example` raises."""
+        if next(self.stated(), None) is not None:
+            return False
+        limit = limit or SearchLimit()
+        return all(each.shortest(limit, None) is None for each in _searches(self._node))
+
+    def issubset(self, other: NameSet, limit: SearchLimit | None = None) -> bool:
+        """Return whether ``other`` has every name of this set; raises what `example` raises."""
+        return (self - other).is_empty(limit)
+
+
+def _length(name: str) -> tuple[int, str]:
+    return len(name.encode(errors="surrogatepass")), name
+
+
+def _leaves(node: _Node) -> Iterator[_Some]:
+    if isinstance(node, _Some):
+        yield node
+    for each in node.parts():
+        yield from _leaves(each)
+
+
+# ── searching ──────────────────────────────────────────────────────────────────────────────
+
+
+def _reduced(node: _Node, known: Mapping[Automaton, bool]) -> _Node | bool:
+    """Return the part of a set that matters to names that are not ``exact`` in it.
+
+    ``known`` says of automata whether they accept these names.
+    """
+    if isinstance(node, _Some):
+        if any(known.get(each) for each in node.automata):
+            return True
+        left = node.automata.difference(known)
+        return _Some(automata=left) if left else False
+    if isinstance(node, _Not):
+        inner = _reduced(node.of, known)
+        return not inner if isinstance(inner, bool) else _Not(inner)
+    if isinstance(node, _Every):
+        kept: list[_Node] = []
+        for each in node.of:
+            inner = _reduced(each, known)
+            if inner is False:
+                return False
+            if not isinstance(inner, bool):
+                kept.append(inner)
+        return (kept[0] if len(kept) == 1 else _Every(tuple(kept))) if kept else True
+    rules: list[tuple[_Node, bool]] = []
+    last = node.last
+    for each, says in node.of:
+        inner = _reduced(each, known)
+        if inner is True:
+            last = says
+            break
+        if not isinstance(inner, bool):
+            rules.append((inner, says))
+    while rules and rules[-1][1] is last:
+        rules.pop()
+    return _First(tuple(rules), last) if rules else last
+
+
+def _searches(node: _Node) -> Iterator[_Search]:
+    """Yield searches that together find every name of a set that is not exact in it.
+
+    Each considers the names of one automaton, and only the other automata that may have names in
+    common with it; the last one considers the names that no automaton accepts.
+    """
+    leaves = tuple(_leaves(node))
+    automata = sorted({each for leaf in leaves for each in leaf.automata}, key=_order)
+    exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
+    for own in automata:
+        known = {each: False for each in automata if not own.may_meet(each)}
+        left = _reduced(node, {**known, own: True})
+        if left is not False:
+            yield _Search(_within(own, left), frozenset(filter(own.matches, exact)))
+    if _reduced(node, dict.fromkeys(automata, False)):
+        left = _reduced(node, {})
+        yield _Search(_Not(_Some()) if isinstance(left, bool) else left, exact)
+
+
+def _within(own: Automaton, left: _Node | bool) -> _Node:
+    node = _Some(automata=frozenset((own,)))
+    return node if isinstance(left, bool) else _Every((node, left))
+
+
+def _order(automaton: Automaton) -> tuple[str, str, str]:
+    return automaton.prefix, automaton.suffix, repr(automaton.edges)
+
+
+class _Search:
+    """The search for the shortest name of a set without exact names, and not one of ``taken``.
+
+    It goes through the sets of positions that all automata together can reach (A*): first those
+    from which the automata that must accept have the fewest letters to go.
+    """
+
+    def __init__(self, node: _Node, taken: frozenset[str]) -> None:
+        self._node = node
+        found = {each for leaf in _leaves(node) for each in leaf.automata}
+        self._machine = _machine(tuple(sorted(found, key=_order)))
+        self._needed = [each for each in found if _reduced(node, {each: False}) is False]
+        self._taken = _Taken(name for name in taken if node.truth(_asked_of(name)))
+
+    def shortest(self, limit: SearchLimit, longest: int | None) -> str | None:
+        """Return the shortest name, and of these the first one to be found, or None."""
+        machine, taken = self._machine, self._taken
+        start = machine.start, 0
+        costs = {start: 0}
+        before: dict[tuple[int, int], tuple[tuple[int, int], str]] = {}
+        left = self._left(machine.start)
+        if left is None:
+            return None
+        number = count()
+        row = [(left, 0, next(number), start)]
+        while row:
+            _, minus, _, state = heapq.heappop(row)
+            cost = -minus
+            if cost > costs[state]:
+                continue
+            reached, place = state
+            if place not in taken.ends and self._node.truth(machine.ended(reached)):
+                return _spelt(state, before)
+            ways = taken.ways(place, machine.classes)
+            limit.spend(len(ways) * (1 + machine.size // 1024))
+            for letter, moves, there in ways:
+                to = _moved(reached, moves) & machine.useful
+                new, paid = (to, there), cost + len(letter.encode())
+                if costs.get(new, paid + 1) <= paid or (left := self._left(to)) is None:
+                    continue
+                if longest is None or paid + left <= longest:
+                    costs[new] = paid
+                    before[new] = state, letter
+                    heapq.heappush(row, (paid + left, -paid, next(number), new))
+        return None
+
+    def _left(self, reached: int) -> int | None:
+        """Return the letters to go at least, or None if no name can begin so."""
+        left = 0
+        for each in self._needed:
+            some = self._machine.left(each, reached)
+            if some is None:
+                return None
+            left = max(left, some)
+        return None if self._node.truth(self._machine.going_on(reached)) is False else left
+
+
+def _asked_of(name: str) -> _Ask:
+    return lambda some: any(each.matches(name) for each in some.automata)
+
+
+def _spelt(
+    state: tuple[int, int], before: Mapping[tuple[int, int], tuple[tuple[int, int], str]]
+) -> str:
+    letters = []
+    while state in before:
+        state, letter = before[state]
+        letters.append(letter)
+    return "".join(reversed(letters))
+
+
+@lru_cache(maxsize=1024)
+def _machine(automata: tuple[Automaton, ...]) -> _Machine:
+    return _Machine(automata)
+
+
+class _Class(NamedTuple):
+    """Letters that every automaton treats alike, the best one for examples, and its moves."""
+
+    letters: Letters
+    best: str
+    moves: _Moves
+
+
+class _Machine:
+    """Several automata with their positions one after the other, as the bits of one integer."""
+
+    def __init__(self, automata: tuple[Automaton, ...]) -> None:
+        sizes = [each.size for each in automata]
+        begins = dict(zip(automata, accumulate((0, *sizes)), strict=False))
+        self.size = sum(sizes)
+        self._span = {a: ((1 << a.size) - 1) << begin for a, begin in begins.items()}
+        self._ends = {a: a.end_bits << begin for a, begin in begins.items()}
+        self._endless = {a: a.endless_bits << begin for a, begin in begins.items()}
+        self._levels = {
+            a: [(distance, places << begin) for distance, places in a.levels]
+            for a, begin in begins.items()
+        }
+        self.useful = sum(places for levels in self._levels.values() for _, places in levels)
+        self.start = sum(1 << begin for begin in begins.values()) & self.useful
+        self.classes = _classes(
+            (at + begin, letters, to + begin)
+            for a, begin in begins.items()
+            for at, letters, to in a.edges
+        )
+
+    def ended(self, reached: int) -> _Ask:
+        """Return what to ask about a name that ends at positions."""
+        return lambda some: any(reached & self._ends[each] for each in some.automata)
+
+    def going_on(self, reached: int) -> _Ask:
+        """Return what to ask about a name that goes on from positions."""
+
+        def ask(some: _Some) -> _Truth:
+            if any(reached & self._endless[each] for each in some.automata):
+                return True
+            return None if any(reached & self._span[each] for each in some.automata) else False
+
+        return ask
+
+    def left(self, automaton: Automaton, reached: int) -> int | None:
+        """Return how many letters an automaton needs at least to accept; None if it cannot."""
+        for distance, places in self._levels[automaton]:
+            if reached & places:
+                return distance
+        return None
+
+
+def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
+    """Return the classes of letters that edges treat alike, best letters first."""
+    by_letters: dict[Letters, list[tuple[int, int]]] = {}
+    for at, letters, to in edges:
+        by_letters.setdefault(letters, []).append((at, to))
+    kinds = list(by_letters)
+    borders = {low for low, _ in _NO_LETTERS} | {high + 1 for _, high in _NO_LETTERS} | {0}
+    borders |= {end for kind in kinds for low, high in kind.ranges for end in (low, high + 1)}
+    alike: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
+    ordered = sorted(borders | {_LAST + 1})
+    for low, after in pairwise(ordered):
+        if (letter := chr(low)) in _USABLE:
+            key = tuple(letter in kind for kind in kinds)
+            alike.setdefault(key, []).append((low, after - 1))
+    found = []
+    for key, ranges in alike.items():
+        letters = Letters(tuple(ranges))
+        of = (by_letters[kind] for kind, has in zip(kinds, key, strict=True) if has)
+        found.append(_Class(letters, _best(letters), _moves(each for some in of for each in some)))
+    return tuple(sorted(found, key=lambda each: _rank(each.best)))
+
+
+def _best(letters: Letters, without: Container[str] = ()) -> str:
+    """Return the best letter for an example, or "" if all of them are excluded."""
+    for letter in _PREFERRED:
+        if letter in letters and letter not in without:
+            return letter
+    # Control characters come last.
+    ranges = sorted(letters.ranges, key=lambda each: (each[1] < ord(" "), each))
+    every = (chr(number) for low, high in ranges for number in range(low, high + 1))
+    return next((letter for letter in every if letter not in without), "")
+
+
+def _rank(letter: str) -> tuple[int, str]:
+    at = _PREFERRED.find(letter)
+    return (at if at >= 0 else len(_PREFERRED)), letter
+
+
+class _Taken:
+    """Names that are no answer, as a tree of their letters; outside of it, the place is -1."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._tree: list[dict[str, int]] = [{}]
+        self.ends: set[int] = set()
+        for name in names:
+            at = 0
+            for letter in name:
+                at = self._tree[at].setdefault(letter, len(self._tree))
+                if at == len(self._tree):
+                    self._tree.append({})
+            self.ends.add(at)
+        self._ways: dict[int, list[tuple[str, _Moves, int]]] = {}
+
+    def ways(self, place: int, classes: Sequence[_Class]) -> list[tuple[str, _Moves, int]]:
+        """Return the letters to go on with from a place, their moves, and the places there."""
+        if place not in self._ways:
+            children = self._tree[place] if place >= 0 else {}
+            found = []
+            for letters, best, moves in classes:
+                other = _best(letters, children) if best in children else best
+                if other:
+                    found.append((other, moves, -1))
+                inner = ((letter, to) for letter, to in children.items() if letter in letters)
+                found += [(letter, moves, to) for letter, to in inner]
+            self._ways[place] = found
+        return self._ways[place]
