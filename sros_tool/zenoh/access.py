@@ -13,7 +13,8 @@ from enum import StrEnum
 from functools import lru_cache
 from typing import NamedTuple
 
-from sros_tool.zenoh.key_expressions import KeyExpressions, includes
+from sros_tool.automata import NameSet
+from sros_tool.zenoh.key_expressions import KeyExpressions, includes, names_of
 
 
 class Message(StrEnum):
@@ -87,6 +88,10 @@ class AccessControl:
         """Return the key expressions of all rules for a message, to ask about many keys."""
         rules = self._rules(common_name, flow, message)
         return KeyExpressions(each for rule in rules for each in rule.key_expressions)
+
+    def keys(self, common_name: str, flow: Flow, message: Message) -> NameSet:
+        """Return the set of all keys with which a message passes."""
+        return names_of(self.passing(common_name, flow, message).all)
 
     def _rules(self, common_name: str, flow: Flow, message: Message) -> Iterator[AccessRule]:
         for remote in self.remotes:

@@ -8,14 +8,18 @@ control that the governance requires (`_GovernedDomain`, `_decide_join`, `Access
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
+from enum import Enum, auto
 from functools import cached_property
+from itertools import groupby, takewhile
+from string import ascii_letters, digits
 
+from sros_tool.automata import Automaton, Letters, NameSet
 from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.matching import ExpressionIndex, matches
+from sros_tool.dds.decision.matching import ExpressionIndex, matches, names_of
 from sros_tool.dds.decision.moments import read_moment
 from sros_tool.dds.decision.subjects import escaped, same_subject
 from sros_tool.dds.decision.vendors import (
@@ -224,6 +228,36 @@ class _GrantRules:
             return self._otherwise
         return entries[position].verdict(fits=True)
 
+    def names(self) -> NameSet:
+        """Return the topics that `ask` allows in the default partition."""
+        entries, _ = self._index
+        rules: list[tuple[NameSet, bool]] = []
+        for _, some in groupby(entries, key=lambda each: each.criteria):
+            group = list(some)
+            fits = self._fits(group[0], _DEFAULT_PARTITION)
+            if fits or self._traits.topic_decides:
+                rules += [(names, allowed and fits) for names, allowed in self._deciding(group)]
+                continue
+            # Only the first matching topic of a criteria counts: one without text crashes the
+            # process if no other one of the criteria stands before it and matches.
+            before = list(takewhile(lambda each: each.expression, group))
+            if len(before) < len(group):
+                passed = self._names_of(before)
+                rules.append((_EVERY_TOPIC - passed, False))
+        return NameSet.first(rules, self._otherwise.allowed)
+
+    def topic_names(self) -> NameSet:
+        """Return the topics that `ask_topic` allows."""
+        return NameSet.first(self._deciding(self._index[0]), self._otherwise.allowed)
+
+    def _deciding(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
+        for each in entries:
+            yield self._names_of((each,)), each.allow and bool(each.expression)
+
+    def _names_of(self, entries: Iterable[_Entry]) -> NameSet:
+        texts = (_usable_expression(self._traits, each.expression) for each in entries)
+        return names_of(self._traits.style, texts)
+
     def _fits(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
         style, named = self._traits.style, entry.partitions
         if entry.allow:
@@ -266,6 +300,7 @@ class _GovernedDomain:
     """The first domain rule that lists the domain (``rule``, or None), and its topic rules."""
 
     def __init__(self, traits: VendorTraits, governance: Governance, domain: int) -> None:
+        self._traits = traits
         self.rule: DomainRule | None = None
         for rule in governance.domain_access_rules:
             if holds_for(traits.open_range, rule.domains, domain):
@@ -282,6 +317,12 @@ class _GovernedDomain:
         """Return the first topic rule that matches; None if no rule does."""
         position = self._topics.first(topic)
         return None if position is None else self._topic_rules[position]
+
+    def names_by_rule(self) -> Iterator[tuple[NameSet, TopicRule]]:
+        """Yield the topic rules in order, each with all topics that its expression matches."""
+        for rule in self._topic_rules:
+            text = _usable_expression(self._traits, rule.topic_expression)
+            yield names_of(self._traits.style, (text,)), rule
 
     def all_controlled(self) -> bool:
         """Return whether every topic rule controls reading and writing."""
@@ -367,6 +408,27 @@ def _decide_join(
     )
 
 
+class _Kind(Enum):
+    """What decides on the topics of a rule of the governance."""
+
+    NOTHING = auto()
+    """They are denied."""
+    EVERYTHING = auto()
+    """They are allowed."""
+    RULES = auto()
+    """The rules of the grant in the direction that is asked about."""
+    BOTH_WAYS = auto()
+    """These, and the rules for the topic itself."""
+
+
+_EVERY_TOPIC = ~NameSet()
+_PLAIN_TOPICS = NameSet((), [Automaton(((0, ~Letters.of("*?["), 0),), frozenset((0,)))])
+_IN_TOPIC = Letters.of(f"{ascii_letters}_/")
+_VALID_TOPICS = NameSet(
+    (),
+    [Automaton(((0, _IN_TOPIC, 1), (1, _IN_TOPIC | Letters.of(digits), 1)), frozenset((1,)))],
+)
+"""The topics that `_is_topic_name` accepts."""
 _TOPIC_NAME = re.compile(r"[A-Za-z_/][A-Za-z0-9_/]*\Z")
 _ENDPOINTS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
@@ -441,6 +503,46 @@ class Access:
     def subscribe(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
         """Return the decision on a DataReader: whether it is created, and peers match it."""
         return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
+
+    def topics(self, verb: AccessVerb) -> NameSet:
+        """Return the topics without wildcard characters on which `decide` allows ``verb``.
+
+        That is in the default partition, and whatever the length of their names.
+        """
+        if self._join.outcome in (Outcome.REFUSED, Outcome.CRASHES) or self._grant is None:
+            return NameSet()
+        rules = list(self._governed.names_by_rule())
+        kinds = [self._kind_of(verb, rule) for _, rule in rules]
+        found = (
+            NameSet.first(
+                (names, each is kind) for (names, _), each in zip(rules, kinds, strict=True)
+            )
+            & self._allowed_in(verb, kind)
+            for kind in dict.fromkeys(kinds)
+            if kind is not _Kind.NOTHING
+        )
+        usable = _VALID_TOPICS if self._traits.creates_topics else _PLAIN_TOPICS
+        return NameSet.union(found) & usable
+
+    def _kind_of(self, verb: AccessVerb, rule: TopicRule) -> _Kind:
+        """Return what decides on the topics of a rule, as `_ruled` does."""
+        if self._traits.crashes_on_empty_texts and not rule.topic_expression.strip():
+            return _Kind.NOTHING
+        writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
+        refused = self._join.outcome is Outcome.PEER_DENIES
+        if not (writes if verb is AccessVerb.PUBLISH else reads):
+            return _Kind.NOTHING if refused and not self._in_the_open(rule) else _Kind.EVERYTHING
+        if refused:
+            return _Kind.NOTHING
+        return _Kind.BOTH_WAYS if self._traits.creates_topics and writes and reads else _Kind.RULES
+
+    def _allowed_in(self, verb: AccessVerb, kind: _Kind) -> NameSet:
+        if kind is _Kind.EVERYTHING:
+            return _EVERY_TOPIC
+        allowed = self._own[verb].names()
+        if self._peers is not self._own:
+            allowed &= self._peers[verb].names()
+        return allowed & self._either.topic_names() if kind is _Kind.BOTH_WAYS else allowed
 
     def _prepare(self, grant: Grant) -> None:
         traits = self._traits
