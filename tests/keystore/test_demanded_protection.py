@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -140,3 +141,18 @@ def test_a_picture_shows_what_is_demanded(folder: Path) -> None:
     words = ("--format", "mermaid", "--template", "open.toml")
     drawn = sros("view", "p.xml", *words, cwd=folder).ok().out
     assert "topic, encrypted<br/>/cmd_vel" in drawn
+
+
+def test_a_keystore_with_zenoh_says_what_protection_is_there(folder: Path) -> None:
+    """The permissions state the same and are kept; only the governance changes."""
+    plain = re.sub(r"<\?sros.*?\?>", "", POLICY)
+    (folder / "plain.xml").write_text(plain)
+    words = ("generate_artifacts", "-k", "zenoh", "-p")
+    sros(*words, "plain.xml", "--template", "open.toml", cwd=folder).ok()
+    sros("zenoh", "zenoh", cwd=folder).ok()
+    done = sros(*words, "p.xml", cwd=folder).ok()
+    assert "restart the processes of 3 enclaves" in done.err
+    assert "unchanged: 2 enclaves" in done.err
+    assert "Zenoh has no protection of single names" in done.err
+    assert missing(folder / "zenoh", folder / "p.xml") == []
+    check_whole(folder / "zenoh")
