@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
@@ -12,6 +12,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.errors import UsageError
 from sros_tool.keystore.template import EVERYTHING, Template
+from sros_tool.names import is_expression
 from sros_tool.policy.patterns import common_name, covers, overlap
 from sros_tool.translate import service_of
 from sros_tool.validity import Span, duration_text, span_text, window
@@ -151,22 +152,35 @@ def _topic_pairs(
     """Yield topic expressions with the different rules that decide on them before and after."""
     rules = (*old.topic_access_rules, *new.topic_access_rules)
     expressions = list(dict.fromkeys(each.topic_expression for each in rules))
-    for one, other in combinations(expressions, 2):
+    # A name without wildcards is covered by what it overlaps with.
+    for one, other in combinations(filter(is_expression, expressions), 2):
         parted = overlap(one, other) and not covers(one, other) and not covers(other, one)
         # Which of the two decides depends on their order, so ask for a topic of both.
         if parted and (name := common_name((one, other), absolute=False)):
             expressions.append(name)
+    before_of, after_of = _deciding(old), _deciding(new)
     for each in expressions:
-        before, after = _deciding(old, each), _deciding(new, each)
+        before, after = before_of(each), after_of(each)
         if (before is None) != (after is None) or (before and after and not _equal(before, after)):
             yield each, before, after
 
 
-def _deciding(rule: DomainRule, expression: str) -> TopicRule | None:
-    return next(
-        (each for each in rule.topic_access_rules if covers(each.topic_expression, expression)),
-        None,
-    )
+def _deciding(domain: DomainRule) -> Callable[[str], TopicRule | None]:
+    """Return the function that returns the first rule that covers a topic expression."""
+    numbered = list(enumerate(domain.topic_access_rules))
+    own = {each.topic_expression: (number, each) for number, each in reversed(numbered)}
+    wide = [(number, each) for number, each in numbered if is_expression(each.topic_expression)]
+
+    def rule_for(expression: str) -> TopicRule | None:
+        place, found = own.get(expression, (len(numbered), None))
+        for number, each in wide:
+            if number > place:
+                break
+            if covers(each.topic_expression, expression):
+                return each
+        return found
+
+    return rule_for
 
 
 def _equal(one: TopicRule, other: TopicRule) -> bool:
