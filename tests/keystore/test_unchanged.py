@@ -117,6 +117,13 @@ def remove(folder: Path, file: str) -> None:
     (folder / "ks/enclaves/a" / file).unlink()
 
 
+def link(folder: Path, file: str) -> None:
+    """The file is elsewhere, where others may change it."""
+    path = folder / "ks/enclaves/a" / file
+    path.rename(folder / file)
+    path.symlink_to(folder / file)
+
+
 def put_back(folder: Path) -> None:
     """The same rights, but of a document before the latest one."""
     signed = folder / "ks/enclaves/a/permissions.p7s", folder / "ks/enclaves/a/permissions.xml"
@@ -151,11 +158,24 @@ def of_another(folder: Path) -> None:
         lambda folder: edit(folder, "permissions.p7s", lambda _: b""),
         lambda folder: edit(folder, "permissions.xml", lambda data: data.replace(b"a/x", b"a/w")),
         lambda folder: remove(folder, "permissions.xml"),
+        lambda folder: link(folder, "permissions.p7s"),
+        lambda folder: link(folder, "permissions.xml"),
         put_back,
         forget,
         of_another,
     ],
-    ids=["edited", "cut", "empty", "edited-xml", "no-xml", "put-back", "forgotten", "foreign"],
+    ids=[
+        "edited",
+        "cut",
+        "empty",
+        "edited-xml",
+        "no-xml",
+        "link",
+        "xml-link",
+        "put-back",
+        "forgotten",
+        "foreign",
+    ],
 )
 def test_what_is_not_the_latest_sound_document_is_signed_again(
     spoil: Callable[[Path], None], folder: Path
@@ -165,6 +185,7 @@ def test_what_is_not_the_latest_sound_document_is_signed_again(
     assert changed >= {"enclaves/a/permissions.p7s", *LEDGER}
     assert topics_of(folder / "ks/enclaves/a") == {"rt/a/x", "rt/a/y", "ros_discovery_info"}
     check_whole(folder / "ks")
+    assert not (folder / "ks/enclaves/a/permissions.p7s").is_symlink()
     assert state(folder).kept == NAMES
 
 

@@ -82,6 +82,20 @@ def test_the_files_follow_and_exactly_what_changed_is_restarted(
         assert {"/" + each.parent.name for each in changed} == set(expected)
 
 
+def test_a_missing_file_comes_back_without_new_permissions(folder: Path) -> None:
+    root = folder / "client"
+    words = ("generate_artifacts", "-k", "client", "-p", "first.xml")
+    before = snapshot(root)
+    assert "unchanged: 2 enclaves" in sros(*words, cwd=folder).ok().err
+    assert snapshot(root) == before
+    (root / "enclaves/a/session.json5").unlink()
+    sros(*words, cwd=folder).ok()
+    in_step(root)
+    after = snapshot(root)
+    changed = {path for path in after if before[path] != after[path]}
+    assert changed <= {"enclaves/a/session.p7s"}
+
+
 def test_a_revoked_enclave_has_no_rights_any_more(folder: Path) -> None:
     for mode in ("client", "peer"):
         shown = sros("revoke", mode, "/a", "--json", cwd=folder).ok()

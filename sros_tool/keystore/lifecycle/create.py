@@ -781,9 +781,13 @@ def _is_kept(
     public: PublicKey = certificate.public_key()  # type: ignore[assignment]
     remedy = f"Give it another key with `sros renew {quote(str(root))} {name} --new-key`."
     keystore.known.refuse_revoked(public, f"enclave {name}", remedy, certificate)
-    folder = enclave_path(root, name)
+    signed_path, xml = (
+        enclave_path(root, name) / file for file in (PERMISSIONS_FILE, "permissions.xml")
+    )
+    if signed_path.is_symlink() or xml.is_symlink():  # to what others may change
+        return False
     try:
-        message = read_bytes(folder / PERMISSIONS_FILE, "permissions document")
+        message = read_bytes(signed_path, "permissions document")
         entry = keystore.recorded.latest(name, hashlib.sha256(message).hexdigest())
         if entry is None:
             return False
@@ -793,9 +797,7 @@ def _is_kept(
     except (SrosError, ValueError):  # not what `write` would leave
         return False
     text = signed.text
-    return writer.would_only_date(rights, certificate, validity, text) and _is_file(
-        folder / "permissions.xml", text
-    )
+    return writer.would_only_date(rights, certificate, validity, text) and _is_file(xml, text)
 
 
 def _is_file(path: Path, content: bytes) -> bool:
