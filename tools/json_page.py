@@ -34,6 +34,7 @@ by `python -m tools.json_page`; it is closed, and fits the sros that it ships wi
 by `?` is left out where it has nothing to say; \
 `[]` stands for each element of a list, `*` for each key of an object.
 
+<!-- not run: jq is not part of sros; tests/cli/test_json.py compares outputs and schemas -->
 ```sh
 sros create_enclave keystore /talker --json | jq -r '.enclaves[] | .folder + " " + .valid_until'
 sros check keystore --json | jq -r '.findings[] | select(.severity == "error") | .text'

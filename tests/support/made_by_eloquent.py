@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 from collections.abc import Mapping
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from cryptography import x509
@@ -171,3 +172,11 @@ def age(nodes: Mapping[str, Topics], root: Path, now: datetime) -> None:
         earlier = now - timedelta(days=4000)
         certificate, own = issue(name, earlier, (authority, key))  # type: ignore[arg-type]
         write(folder / "cert.pem", certificate, folder / "key.pem", own)
+
+
+if __name__ == "__main__":
+    make_eloquent(
+        Path(sys.argv[1]),
+        {"/talker": EVERYTHING, "/listener": EVERYTHING},
+        now=datetime(2023, 5, 1, tzinfo=UTC),
+    )

@@ -1,0 +1,64 @@
+"""The site builds without a warning, and every command of a page does what the page shows."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.support.children import python
+from tests.support.pages import PROJECT, PageError, alike, blocks, fits, outcome_of
+
+PAGES = sorted(
+    path.relative_to(PROJECT)
+    for path in (
+        *PROJECT.glob("*.md"),
+        *PROJECT.glob("docs/**/*.md"),
+        *PROJECT.glob("policies/*.md"),
+    )
+    if any(block.commands for block in blocks(path.read_text("utf-8")))
+)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_the_commands_of_a_page_do_what_it_shows(page: Path, tmp_path: Path) -> None:
+    wrong = outcome_of(PROJECT / page, tmp_path)
+    assert not wrong, wrong
+
+
+def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
+    pytest.importorskip("furo")
+    python("-m", "sphinx", "-q", "-W", "--keep-going", "-d", tmp_path / "trees", "-c", "docs", ".",
+           tmp_path / "site", cwd=PROJECT)  # fmt: skip
+    page = (tmp_path / "site" / "docs" / "zenoh.html").read_text("utf-8")
+    assert "sros zenoh" in page
+    assert (tmp_path / "site" / "index.html").exists()
+    loaded = subprocess.run(
+        ["grep", "-rlE", r"(src|href)=\"https?://[^\"]+\.(js|css|woff2?)", tmp_path / "site"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert loaded.stdout == ""
+
+
+def test_a_page_that_shows_something_else_is_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("```\n$ sros completion bash\nsomething else\n```\n", "utf-8")
+    assert "expected:\nsomething else" in outcome_of(page, tmp_path)
+
+
+def test_what_may_differ_between_two_runs_and_what_may_not() -> None:
+    assert alike("until 2027-05-21T05:21:15Z") == alike("until 2031-01-01T00:00:00Z")
+    assert fits(
+        ("created 'a'", "...", "SHA-256 0123456789abcdef"),
+        "created 'a'\nx\ny\nSHA-256 ffff0000ffff0000\n",
+    )
+    assert not fits(("created enclave /a",), "created enclave /b\n")
+    assert not fits(("created enclave /a",), "created enclave /a\nand a note\n")
+
+
+def test_a_comment_that_is_not_understood_is_refused() -> None:
+    with pytest.raises(PageError, match="not understood"):
+        list(blocks("<!-- not-run: mistyped -->\n"))
