@@ -190,6 +190,7 @@ def test_what_robots_confirm(three: Fleet) -> None:
     """A robot without sros says exactly what sros would say of its folder."""
     done = three.play("status", sros_hosts="r1:r2", sros_confirm=True)
     assert not done.changed
+    assert "3 robots: 2 current, 1 no enclave" in done.text
     status = json.loads(sros("fleet", "status", three.keystore, "--json").ok().out)
     states = {each["robot"]: each["state"] for each in status["robots"]}
     assert states == {"r1": "current", "r2": "current", "r3": "none"}
