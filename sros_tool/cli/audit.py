@@ -13,6 +13,7 @@ from sros_tool.cli.common import (
     PATH,
     check_output,
     dry_run_option,
+    fleet_option,
     force_option,
     json_option,
     keystore_from_environment,
@@ -73,6 +74,7 @@ asked.""",
     metavar="FILE",
     help="Write the rights to add as a policy, for merge_policy.",
 )
+@fleet_option("The robots that the placeholders of POLICY stand for.")
 @force_option
 @dry_run_option
 @json_option
@@ -85,6 +87,7 @@ def audit(
     keystore: Path | None,
     vendor: str | None,
     patch: Path | None,
+    fleet_file: Path | None,
     force: bool,
     dry_run: bool,
     as_json: bool,
@@ -105,7 +108,7 @@ def audit(
         raise UsageError("--force is for --patch only", "", "Leave it out.")
     if patch is not None:
         check_output(patch, force=force)
-    enclaves = _enclaves(source, vendor, environment)
+    enclaves = _enclaves(source, fleet_file, vendor, environment)
     reported: set[str] = set()
 
     def report(observation: Observation) -> None:
@@ -150,7 +153,9 @@ def audit(
 _NO_PATCH = "no patch was written: no right that could be added would allow it"
 
 
-def _enclaves(source: Path, vendor: str | None, environment: dict[str, str]) -> AuditedEnclaves:
+def _enclaves(
+    source: Path, fleet_file: Path | None, vendor: str | None, environment: dict[str, str]
+) -> AuditedEnclaves:
     """Return the enclaves of the policy or keystore at ``source``.
 
     Raises:
@@ -159,10 +164,11 @@ def _enclaves(source: Path, vendor: str | None, environment: dict[str, str]) -> 
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.audit import keystore_enclaves, policy_enclaves
     from sros_tool.explain.evaluator import JoinContext
+    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.expansion import read_policy_for
     from sros_tool.keystore.layout import enclave_names
     from sros_tool.keystore.rights import load_rights
     from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
-    from sros_tool.policy.document import read_policy
     from sros_tool.runtime.environment import domain_from
     from sros_tool.runtime.rmw import vendor_here
     from sros_tool.translate import governance_for
@@ -171,7 +177,12 @@ def _enclaves(source: Path, vendor: str | None, environment: dict[str, str]) -> 
     chosen = Vendor(vendor) if vendor else vendor_here(everything)[0]
     domain = domain_from(everything) or 0
     context = JoinContext(domain, now(), local_zone(os.environ))
-    rights = load_rights(source)
+    fleet = read_fleet(fleet_file) if fleet_file else None
+    rights = load_rights(source, fleet)
+    if fleet and rights.kind != "policy":
+        raise UsageError(
+            "--fleet is for the placeholders of a policy", f"'{source}' is none.", "Leave it out."
+        )
     if rights.kind == "keystore":
         return keystore_enclaves(rights, enclave_names(source), chosen, context)
     if rights.kind != "policy":
@@ -182,7 +193,7 @@ def _enclaves(source: Path, vendor: str | None, environment: dict[str, str]) -> 
         )
     protection = load_template(DEFAULT_TEMPLATE).protection
     governance = governance_for(protection, DomainSet.of((domain, domain)))
-    return policy_enclaves(read_policy(source), governance, chosen, context)
+    return policy_enclaves(read_policy_for(source, fleet), governance, chosen, context)
 
 
 def _write_patch(found: Audit, patch: Path | None, *, dry_run: bool) -> str:

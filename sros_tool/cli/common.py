@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.authorities.keyring import Keyring
     from sros_tool.keystore.issuing.zenoh import KeptZenoh
     from sros_tool.keystore.transaction.stage import Change
+    from sros_tool.policy.model import Policy
 
 
 # ── arguments ───────────────────────────────────────────────────────────────────────────
@@ -129,6 +130,14 @@ def fleet_policies(files: Sequence[Path], fleet_file: Path) -> list[FleetPolicy]
 
     fleet = read_fleet(fleet_file)
     return [FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files]
+
+
+def policy_for(file: Path, fleet_file: Path | None) -> Policy:
+    """Return the policy in a file, for the fleet in the file that --fleet names, if it does."""
+    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.expansion import read_policy_for
+
+    return read_policy_for(file, read_fleet(fleet_file) if fleet_file else None)
 
 
 def only_enclaves(when: str = "Only") -> Callable[[Decorated], Decorated]:

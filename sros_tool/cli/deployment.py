@@ -17,7 +17,6 @@ from sros_tool.cli.common import (
     domain_of,
     dry_run_option,
     fleet_option,
-    fleet_policies,
     json_option,
     key_option,
     keyring,
@@ -25,6 +24,7 @@ from sros_tool.cli.common import (
     moment_of,
     now,
     only_enclaves,
+    policy_for,
     print_closed,
     print_json,
     print_notes,
@@ -527,16 +527,11 @@ def sign_request(
 
 def _policy(file: Path | None, fleet_file: Path | None) -> Policy | None:
     """Return the policy in a file, for the robots of a fleet if one is named."""
-    from sros_tool.policy.document import read_policy
-
     if file is None:
         if fleet_file is not None:
             raise UsageError("--fleet is for the placeholders of a policy: add -p POLICY_FILE")
         return None
-    if fleet_file is None:
-        return read_policy(file)
-    (policy,) = fleet_policies([file], fleet_file)
-    return policy.policy()
+    return policy_for(file, fleet_file)
 
 
 def _certify(

@@ -24,6 +24,7 @@ from sros_tool.cli.common import (
     keystore_from_environment,
     now,
     only_enclaves,
+    policy_for,
     print_closed,
     print_json,
     print_notes,
@@ -103,7 +104,8 @@ _revoke_old_option = click.option(
 Example:
   $ sros create_permission keystore /talker_listener/talker policy.xml
   replaced the permissions of enclave /talker_listener/talker
-  $ sros create_permission keystore --match '/arm/*' policy.xml""",
+  $ sros create_permission keystore --match '/arm/*' policy.xml
+  $ sros create_permission keystore --robot r7 robot.xml --fleet fleet.toml""",
 )
 @click.argument(
     "words",
@@ -113,6 +115,7 @@ Example:
     shell_complete=complete_keystore_and_enclave,
 )
 @several_enclaves
+@fleet_option("The robots that the placeholders of the policy stand for.")
 @_revoke_old_option
 @dry_run_option
 @json_option
@@ -121,6 +124,7 @@ def create_permission(
     every: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
+    fleet_file: Path | None,
     revoke_old: bool,
     dry_run: bool,
     as_json: bool,
@@ -131,7 +135,6 @@ def create_permission(
     them until they expire. With --revoke-old, processes that load the new crl.pem refuse them.
     """
     from sros_tool.keystore.lifecycle.create import create_permission as create
-    from sros_tool.policy.document import read_policy
 
     root, rest = split_root(words)
     if len(rest) < (1 if every or patterns or robots else 2):
@@ -140,7 +143,7 @@ def create_permission(
     result = create(
         root,
         chosen_enclaves(root, given, patterns, robots, every=every),
-        read_policy(PATH.convert(file, None, None)),
+        policy_for(PATH.convert(file, None, None), fleet_file),
         now=now(),
         domain=ros_domain(),
         revoke_old=revoke_old,

@@ -11,11 +11,13 @@ from sros_tool.cli.common import (
     PATH,
     check_output,
     dry_run_option,
+    fleet_option,
     json_option,
     keystore_from_environment,
     local_zone,
     now,
     output_option,
+    policy_for,
     print_json,
     save,
 )
@@ -52,6 +54,7 @@ The exit status is 0 whatever is found. If the keystore cannot be examined it is
     metavar="FILE",
     help="Also count where the keystore differs from this policy.  Can be repeated.",
 )
+@fleet_option("The robots that the placeholders of the policies stand for.")
 @dry_run_option
 @json_option
 def metrics(
@@ -59,6 +62,7 @@ def metrics(
     output: Path | None,
     earliest: bool,
     policies: tuple[Path, ...],
+    fleet_file: Path | None,
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -69,14 +73,15 @@ def metrics(
     """
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.keystores.metrics import keystore_metrics
-    from sros_tool.policy.document import read_policy
     from sros_tool.prometheus import render_metrics
 
     root, moment = root or keystore_from_environment(), now()
     if output:
         check_suffix(output)
         check_output(output, force=True)
-    wanted = tuple(read_policy(each) for each in policies)
+    if fleet_file and not policies:
+        raise UsageError("--fleet is for the placeholders of a policy: add --policy FILE")
+    wanted = tuple(policy_for(each, fleet_file) for each in policies)
     with progress("examining"):
         findings = keystore_findings(root, now=moment, zone=local_zone(os.environ), policies=wanted)
         found = keystore_metrics(root, findings, now=moment, each_enclave=not earliest)

@@ -594,7 +594,8 @@ class _Reader:
         raise PolicyError(
             f"{where}: {_short(text)} has a placeholder for the robots of a fleet",
             "Without a fleet it stands for nothing.",
-            "Name the fleet's file with --fleet FILE.",
+            "Name the fleet's file with --fleet FILE, or the robot in place of the placeholder "
+            "where the verb has no --fleet.",
         )
 
     def _children(

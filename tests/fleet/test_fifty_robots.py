@@ -179,6 +179,14 @@ def test_a_policy_with_placeholders_needs_a_fleet(made: Path) -> None:
     assert ended.status == 2
     assert "robot.xml:2: '/{robot}/base' has a placeholder" in ended.err
     assert "--fleet FILE" in ended.err
+    for line, said in (
+        ("create_permission ks --robot r7 robot.xml --dry-run", "would replace"),
+        ("metrics ks --policy robot.xml --earliest", "sros_findings"),
+    ):
+        assert "has a placeholder" in sros(*line.split(), cwd=made).err
+        done = sros(*line.split(), "--fleet", "fleet.toml", cwd=made).ok()
+        assert said in done.out
+        assert "policy" not in done.err
 
 
 def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
