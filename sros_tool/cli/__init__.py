@@ -10,8 +10,13 @@ import warnings
 from types import FrameType
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Run ``sros`` and exit with 0 (yes or done), 1 (no, or findings) or 2 (not asked or done)."""
+def main(arguments: list[str] | None = None, *, name: str = "sros") -> None:
+    """Run ``sros`` and exit with 0 (yes or done), 1 (no, or findings) or 2 (not asked or done).
+
+    ``arguments`` are those of the process by default; ``name`` is what usage and help call it.
+    """
+    if arguments is None:
+        arguments = sys.argv[1:]
     # SIGTERM raises SystemExit, so that clean-up code runs and no partial files remain.
     signal.signal(signal.SIGTERM, _terminate)
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -29,14 +34,14 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         with secrets_taken():
             colour = False if os.environ.get("NO_COLOR") else None
-            status = program.main(arguments, prog_name="sros", standalone_mode=False, color=colour)
+            status = program.main(arguments, prog_name=name, standalone_mode=False, color=colour)
         if sys.stdout:  # None where it was closed
             sys.stdout.flush()
     except BrokenPipeError:
         _give_up_stdout()
         sys.exit(NOT_DONE)
     except BaseException as error:
-        status = report_error(error)
+        status = report_error(error, arguments)
         try:
             if sys.stdout:
                 sys.stdout.flush()

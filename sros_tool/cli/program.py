@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import sys
 import traceback
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -251,8 +254,11 @@ _PHRASES = {
 }
 
 
-def report_error(error: BaseException) -> int:
-    """Print what is wrong, why, and what to do; return the exit status."""
+def report_error(error: BaseException, arguments: Sequence[str]) -> int:
+    """Print what is wrong, why, and what to do; return the exit status.
+
+    ``arguments`` are the words of the command line: messages begin with what its verb does.
+    """
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else 1
     if isinstance(error, click.exceptions.Exit):
@@ -266,10 +272,10 @@ def report_error(error: BaseException) -> int:
     if isinstance(error, click.UsageError):
         return _usage(error)
     if isinstance(error, SrosError):
-        return _print_error(_prefixed(str(error)))
+        return _print_error(_prefixed(str(error), arguments))
     if isinstance(error, OSError):
-        return _print_error(_prefixed(_os_problem(error)))
-    return _defect(error)
+        return _print_error(_prefixed(_os_problem(error), arguments))
+    return _defect(error, arguments)
 
 
 def _usage(error: click.UsageError) -> int:
@@ -283,15 +289,15 @@ def _print_error(text: str) -> int:
     return NOT_DONE
 
 
-def _prefixed(text: str) -> str:
-    verb = _verb()
+def _prefixed(text: str, arguments: Sequence[str]) -> str:
+    verb = _verb(arguments)
     if verb is None:
         return f"sros: {text}"
     return f"Unable to {_PHRASES.get(verb, verb.replace('_', ' '))}: {text}"
 
 
-def _verb() -> str | None:
-    for word in sys.argv[1:]:
+def _verb(arguments: Sequence[str]) -> str | None:
+    for word in arguments:
         if not word.startswith("-"):
             return _NAMES.get(word.replace("-", "_"))
     return None
@@ -308,12 +314,44 @@ def _os_problem(error: OSError) -> str:
     return f"the operating system refuses '{path}': {error.strerror or error}. Nothing was changed."
 
 
-def _defect(error: BaseException) -> int:
+def _outdated_dependency() -> str:
+    """Return which package that sros needs is missing or too old, and what to do; else "".
+
+    colcon installs sros next to packages of the system, which nobody has compared.
+    """
+    from importlib.metadata import PackageNotFoundError, requires, version
+
+    with suppress(PackageNotFoundError):
+        for each in requires("sros_tool") or ():
+            name, mark, least = each.partition(">=")
+            if not mark or ";" in each:  # of an extra
+                continue
+            try:
+                found = version(name)
+            except PackageNotFoundError:
+                found = ""
+            if not found or _numbers(found) < _numbers(least):
+                here = f"version {found} is" if found else "none is"
+                return (
+                    f"sros needs the Python package {name} {least} or newer, and {here} installed "
+                    f"for {sys.executable}. Install it with the pip of that Python."
+                )
+    return ""
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(each) for each in re.findall(r"\d+", version)[:2]]
+
+
+def _defect(error: BaseException, arguments: Sequence[str]) -> int:
+    if isinstance(error, (ImportError, AttributeError)) and (problem := _outdated_dependency()):
+        return _print_error(_prefixed(problem, arguments))
     if os.environ.get("SROS_DEBUG"):
         print(visible("".join(traceback.format_exception(error))), end="", file=sys.stderr)
     return _print_error(
         _prefixed(
             f"this is a defect of sros: {type(error).__name__}: {error}. Please report it; "
-            "SROS_DEBUG=1 prints a traceback."
+            "SROS_DEBUG=1 prints a traceback.",
+            arguments,
         )
     )

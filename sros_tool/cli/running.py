@@ -8,11 +8,13 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import click
 
 from sros_tool.cli.common import (
+    PATH,
     check_one_format,
     complete_keystore_and_enclave,
     json_option,
@@ -256,15 +258,22 @@ class WithCommand(click.Command):
 Example:
   $ sros run keystore /talker_listener/talker -- \\
         python3 -m sros_tool.demo.nodes.ros talker
-  [INFO] [talker]: Publishing: 'Hello World: 1'""",
+  [INFO] [talker]: Publishing: 'Hello World: 1'
+  $ ros2 launch --launch-prefix 'sros run keystore --policy policy.xml --' \\
+        demo_nodes_cpp talker_listener_launch.py""",
 )
 @click.argument(
     "words",
     metavar="[ROOT] NAME -- COMMAND...",
     nargs=-1,
-    required=True,
     type=click.UNPROCESSED,
     shell_complete=complete_keystore_and_enclave,
+)
+@click.option(
+    "--policy",
+    metavar="FILE",
+    type=PATH,
+    help="Take the enclave in which FILE has the node that COMMAND starts, in place of NAME.",
 )
 @DOMAIN
 @RMW
@@ -274,6 +283,7 @@ Example:
 def run(
     ctx: click.Context,
     words: tuple[str, ...],
+    policy: Path | None,
     domain: str | None,
     rmw: str | None,
     accept_readable_key: bool,
@@ -285,13 +295,23 @@ def run(
     of the middleware. A COMMAND that is known to start a ROS node (`ros2 run`, or an executable of
     a ROS package) gets the arguments `--ros-args --enclave NAME`, so that the ROS graph shows the
     enclave; with rmw_zenoh_cpp nobody accepts a node in the graph without it.
+
+    With --policy, COMMAND gives its node a name: `--ros-args -r __node:=NAME -r __ns:=NAMESPACE`,
+    as launch files do.
     """
     from sros_tool.runtime.environment import enclave_argument, with_enclave
 
     root, rest = split_root(words)
-    name, command = rest[0] if rest else "", [*rest[1:], *ctx.meta[COMMAND]]
+    if policy and rest and ctx.meta[COMMAND]:
+        raise UsageError(
+            f"--policy and the enclave {rest[0]} exclude each other",
+            "The policy says in which enclave the node is.",
+            "Leave one of both out.",
+        )
+    command = [*rest[0 if policy else 1 :], *ctx.meta[COMMAND]]
     if not command:
         raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
+    name = _enclave_of_node(policy, command) if policy else rest[0] if rest else ""
     found = loadable_environment(root, name, domain, rmw, accept_key=accept_readable_key)
     program = shutil.which(command[0])
     if program is None:
@@ -321,6 +341,39 @@ def run(
     for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them, and COMMAND would too
         signal.signal(ignored, signal.SIG_DFL)
     os.execve(program, command, environment)
+
+
+def _enclave_of_node(file: Path, command: Sequence[str]) -> str:
+    """Return the enclave in which a policy has the node that a command starts.
+
+    Raises:
+        UsageError: the command names no node, or the policy has it in none or several enclaves.
+        PolicyError: the policy cannot be read.
+    """
+    from sros_tool.policy.document import read_policy
+    from sros_tool.runtime.environment import node_argument
+
+    node = node_argument(command)
+    if node is None:
+        raise UsageError(
+            f"the command '{command[0]}' names no node",
+            "Its enclave is that of the node's name in the policy, which `--ros-args -r "
+            "__node:=NAME` gives.",
+            "Give the node a name in the launch file, or start this command in an enclave of its "
+            "own: `sros run ROOT NAME -- COMMAND`.",
+        )
+    ns, name = node
+    full = f"/{ns.strip('/')}/{name}".replace("//", "/")
+    found = read_policy(file).enclaves_of_node(ns, name)
+    if len(found) != 1:
+        names = ", ".join(each.path for each in found[:3])
+        what = f"in {len(found)} enclaves, such as {names}" if found else "in no enclave"
+        raise UsageError(
+            f"the policy '{file}' has the node {full} {what}",
+            "A process runs in one enclave.",
+            f'Give it a profile in one enclave: `<profile ns="{ns}" node="{name}">`.',
+        )
+    return found[0].path
 
 
 @click.command(

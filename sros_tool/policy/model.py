@@ -119,6 +119,15 @@ class Policy:
         """Return the enclave with this path, or None."""
         return next((each for each in self.enclaves if each.path == path), None)
 
+    def enclaves_of_node(self, ns: str, node: str) -> tuple[Enclave, ...]:
+        """Return the enclaves with a profile for the node ``node`` in the namespace ``ns``."""
+        wanted = (ns.strip("/"), node)
+        return tuple(
+            enclave
+            for enclave in self.enclaves
+            if any((each.ns.strip("/"), each.node) == wanted for each in enclave.all_profiles())
+        )
+
 
 def with_groups(policy: Policy, change: Callable[[Group, Profile], Iterable[Group]]) -> Policy:
     """Return the policy with every group replaced by those that ``change`` returns for it."""

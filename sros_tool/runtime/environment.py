@@ -208,6 +208,32 @@ def enclave_argument(command: Sequence[str]) -> str:
     return named[-1] if named else "/"
 
 
+_REMAP_OPTIONS = ("-r", "--remap")
+_NODE_RULES, _NAMESPACE_RULE = ("__node", "__name"), "__ns"
+
+
+def node_argument(command: Sequence[str]) -> tuple[str, str] | None:
+    """Return namespace and name that a command gives its node, or None if it gives no name.
+
+    They are the first rules ``-r __ns:=NAMESPACE`` and ``-r __node:=NAME`` behind ``--ros-args``,
+    as rcl takes them (``remap.c``); without a namespace it is "/".  Rules for one of several nodes
+    (``-r talker:__node:=NAME``) are passed over: they name no enclave of the process.
+    """
+    found: dict[str, str] = {}
+    of_ros = False
+    for before, word in pairwise(("", *command)):
+        if word == _ROS_ARGS:
+            of_ros = True
+        elif word == "--":
+            of_ros = False
+        elif of_ros and before in _REMAP_OPTIONS:
+            rule, mark, value = word.partition(":=")
+            if mark:
+                found.setdefault("__node" if rule in _NODE_RULES else rule, value)
+    name = found.get("__node")
+    return (found.get(_NAMESPACE_RULE) or "/", name) if name else None
+
+
 def _is_ros2_run(command: Sequence[str]) -> bool:
     """Return whether a command is ``ros2 run [--prefix PREFIX] PACKAGE EXECUTABLE ...``."""
     if Path(command[0]).name != "ros2" or tuple(command[1:2]) != ("run",):

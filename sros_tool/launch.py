@@ -1,0 +1,91 @@
+"""An action for launch files of ROS 2 that starts each node in the enclave of its policy.
+
+In Python ``SecuredNodes(keystore="keystore", policy="policy.xml")`` from this module, in XML
+``<secured_nodes keystore="keystore" policy="policy.xml"/>``, before the nodes: it holds for what
+follows in its launch file and group, also in included files.
+
+This is the only module that imports ``launch``, and only ``launch`` imports it: by the entry point
+``launch.frontend.launch_extension`` whenever it reads an XML or YAML file.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from launch import Action, LaunchContext, SomeSubstitutionsType
+from launch.frontend import Entity, Parser, expose_action
+from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+
+from sros_tool.runtime.environment import REFUSING
+
+_PREFIX, _FILTER = "launch-prefix", "launch-prefix-filter"
+"""Launch configurations: words before each command, and the commands that get them."""
+
+
+@expose_action("secured_nodes")
+class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where it is missing
+    """Start each process that follows with ``sros run --policy``, so in its enclave or not at all.
+
+    It sets the prefix of commands, in front of one that is already there, such as of a debugger.
+    Launch itself, and a process with a prefix of its own, get variables with which no node starts,
+    or those of ``enclave``: launch needs one where it talks to nodes, as with lifecycle nodes and
+    composable nodes.
+    """
+
+    def __init__(
+        self,
+        *,
+        keystore: SomeSubstitutionsType,
+        policy: SomeSubstitutionsType,
+        enclave: SomeSubstitutionsType = "",
+        **more: Any,
+    ) -> None:
+        """Take the folder of the keystore, and the file of the policy that names its enclaves."""
+        super().__init__(**more)
+        self._given = tuple(map(normalize_to_list_of_substitutions, (keystore, policy, enclave)))
+
+    @classmethod
+    def parse(cls, entity: Entity, parser: Parser) -> tuple[type[SecuredNodes], dict[str, Any]]:
+        """Return the class, and its arguments from the attributes of an XML or YAML element."""
+        _, arguments = super().parse(entity, parser)
+        for name in ("keystore", "policy", "enclave"):
+            value = entity.get_attr(name, optional=name == "enclave")
+            if value is not None:
+                arguments[name] = parser.parse_substitution(value)
+        return cls, arguments
+
+    def execute(self, context: LaunchContext) -> None:
+        """Set the prefix and the variables.
+
+        Raises:
+            RuntimeError: a path is empty, a filter would keep the prefix from some processes, or
+                no process can run in ``enclave``.
+        """
+        keystore, policy, enclave = (perform_substitutions(context, each) for each in self._given)
+        if not keystore or not policy:
+            raise RuntimeError("secured_nodes needs a keystore and a policy: one of them is empty.")
+        if context.launch_configurations.get(_FILTER):
+            raise RuntimeError(
+                f"secured_nodes cannot be used with {_FILTER}: the processes that it leaves out "
+                "would be in no enclave. Leave the filter out."
+            )
+        context.environment.update(_environment(Path(keystore), enclave) if enclave else REFUSING)
+        before = context.launch_configurations.get(_PREFIX, "")
+        own = [sys.executable, "-P", "-m", "sros_tool", "run", keystore, "--policy", policy, "--"]
+        context.launch_configurations[_PREFIX] = f"{shlex.join(own)} {before}".rstrip()
+
+
+def _environment(keystore: Path, enclave: str) -> Mapping[str, str]:
+    """Return the variables of an enclave; raise `RuntimeError` if no process can run in it."""
+    from sros_tool.cli.common import visible_line
+    from sros_tool.cli.enclave_environment import loadable_environment
+    from sros_tool.errors import SrosError
+
+    try:
+        return {**REFUSING, **loadable_environment(keystore, enclave).variables}
+    except SrosError as error:
+        raise RuntimeError(visible_line(str(error))) from error

@@ -1,0 +1,104 @@
+"""`sros run --policy`: the enclave of a process is the one in which the policy has its node."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.harness import Ended, forked
+
+SHOW = "import json, os, sys; print(json.dumps([dict(os.environ), sys.argv]))"
+POLICY = """<policy version="0.2.0"><enclaves>
+<enclave path="/line/talker"><profiles>
+  <profile ns="/" node="talker"><topics publish="ALLOW"><topic>/chatter</topic></topics></profile>
+  <profile ns="/left/arm" node="talker"><topics publish="ALLOW"><topic>/a</topic></topics></profile>
+</profiles></enclave>
+<enclave path="/line/listener"><profiles>
+  <profile ns="/" node="listener"><topics subscribe="ALLOW"><topic>/a</topic></topics></profile>
+  <profile ns="/" node="both"><topics subscribe="ALLOW"><topic>/a</topic></topics></profile>
+</profiles></enclave>
+<enclave path="/line/other"><profiles>
+  <profile ns="/" node="both"><topics subscribe="ALLOW"><topic>/a</topic></topics></profile>
+</profiles></enclave>
+</enclaves></policy>"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A keystore in ``ks`` and its policy in ``p.xml``; only read."""
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "p.xml").write_text(POLICY)
+    forked("generate_artifacts", "-k", folder / "ks", "-p", folder / "p.xml").ok()
+    return folder
+
+
+def run(made: Path, *ros_args: str, root: tuple[object, ...] | None = None) -> Ended:
+    words = (made / "ks",) if root is None else root
+    command = (sys.executable, "-c", SHOW, "--ros-args", *ros_args)
+    env = {**os.environ, "ROS_SECURITY_KEYSTORE": str(made / "ks")}
+    return forked("run", *words, "--policy", made / "p.xml", "--", *command, env=env)
+
+
+@pytest.mark.parametrize(
+    ("ros_args", "enclave"),
+    [
+        (("-r", "__node:=talker"), "/line/talker"),
+        (("-r", "__node:=talker", "-r", "__ns:=/left/arm"), "/line/talker"),
+        (("--remap", "__ns:=/", "--remap", "__node:=listener"), "/line/listener"),
+        (("-r", "/a:=/b", "-r", "__name:=talker", "-r", "__node:=listener"), "/line/talker"),
+    ],
+)
+def test_the_enclave_is_that_of_the_node(
+    made: Path, ros_args: tuple[str, ...], enclave: str
+) -> None:
+    environment, words = json.loads(run(made, *ros_args).ok().out)
+    assert environment["ROS_SECURITY_ENCLAVE_OVERRIDE"] == enclave
+    assert environment["ROS_SECURITY_STRATEGY"] == "Enforce"
+    assert words[-2:] == ["--enclave", enclave]
+
+
+def test_the_keystore_may_come_from_the_environment(made: Path) -> None:
+    environment, _ = json.loads(run(made, "-r", "__node:=talker", root=()).ok().out)
+    assert environment["ROS_SECURITY_ENCLAVE_OVERRIDE"] == "/line/talker"
+
+
+@pytest.mark.parametrize(
+    ("ros_args", "why"),
+    [
+        ((), "names no node"),
+        (("-r", "talker:__node:=listener"), "names no node"),
+        (("-r", "__ns:=/left"), "names no node"),
+        (("--", "-r", "__node:=talker"), "names no node"),
+        (("-p", "__node:=talker"), "names no node"),
+        (("-r", "__node:="), "names no node"),
+        (("-r", "__node:=nobody"), "has the node /nobody in no enclave"),
+        (("-r", "__node:=talker", "-r", "__ns:=/left"), "node /left/talker in no enclave"),
+        (("-r", "__node:=both"), "in 2 enclaves, such as /line/listener, /line/other"),
+        (("-r", "__node:=\x1b[2Jtalker"), "\\x1b[2Jtalker in no enclave"),
+    ],
+)
+def test_what_is_in_no_single_enclave_is_not_started(
+    made: Path, ros_args: tuple[str, ...], why: str
+) -> None:
+    ended = run(made, *ros_args)
+    assert (ended.status, ended.out) == (2, "")
+    assert why in ended.err and "\x1b" not in ended.err and ended.err.count("\n") == 1
+
+
+def test_a_policy_and_an_enclave_exclude_each_other(made: Path) -> None:
+    ended = run(made, "-r", "__node:=talker", root=(made / "ks", "/line/talker"))
+    assert ended.status == 2 and "--policy and the enclave /line/talker exclude" in ended.err
+
+
+def test_a_policy_that_cannot_be_read_starts_nothing(made: Path, tmp_path: Path) -> None:
+    bomb = '<!DOCTYPE p [<!ENTITY a "aaaa">]><policy version="0.2.0">&a;</policy>'
+    for number, text in enumerate(("", "<policy", bomb)):
+        (tmp_path / f"{number}.xml").write_text(text)
+        words = ("--policy", tmp_path / f"{number}.xml", "--", "touch", tmp_path / "ran")
+        ended = forked("run", made / "ks", *words, "--ros-args", "-r", "__node:=talker")
+        assert ended.status == 2 and "Traceback" not in ended.err, text
+    assert not (tmp_path / "ran").exists()
