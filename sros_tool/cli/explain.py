@@ -865,6 +865,8 @@ def _answer_lines(
         yield row("wildcard", f"{answer.wildcard} also matches other names")
     for line in answer.lines:
         stated = f"{line.qualifier.value} {line.right} {line.name}"
+        if level := line.group.protect:
+            stated += f", protected at least with {level.lower()}"
         yield row("from", f"{_shown(line.source)}: {stated}")
     if answer.policy_sha256 and policy is None and decision.rule is not None:
         digest = answer.policy_sha256

@@ -20,7 +20,8 @@ from tests.support.harness import policy_text, publish, sros
 from tests.support.made_by_eloquent import EVERYTHING, make_eloquent
 
 PASSPHRASE = "the passphrase"
-_POLICY = policy_text({"/a": publish("chatter", "b/*"), "/b/c": publish("~/x")})
+_SIGNED = 'chatter<?sros protect="sign"?>'
+_POLICY = policy_text({"/a": publish(_SIGNED, "b/*"), "/b/c": publish("~/x")})
 _SCENARIO = """\
 title = "Camera"
 policy = "policy.xml"
