@@ -24,6 +24,7 @@ from benchmarks.floor import make_enclaves, sizes_of
 from benchmarks.inputs import enclaves_policy, topics_policy
 from benchmarks.observing import observing
 from benchmarks.picturing import picturing
+from benchmarks.requiring import requiring
 from benchmarks.zenoh import zenoh_files
 
 RULES = 14
@@ -68,6 +69,7 @@ def main() -> int:
         rows += [Row(*figure) for figure in deciding()]
         checked = checking(folder, options.enclaves, RULES, options.rounds)
         checked += explaining(folder, options.enclaves, RULES, options.rounds)
+        checked += requiring(folder, options.enclaves, options.rounds)
         rows += [Row(name, taken, None, limit, kept) for name, taken, limit, kept in checked]
         rows += [
             Row(*figure) for figure in zenoh_files(folder, options.enclaves, RULES, options.rounds)

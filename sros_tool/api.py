@@ -378,6 +378,52 @@ def check(
     return FindingFilter(severity=levels[severity], strict=strict).choose(found).shown
 
 
+def check_requirements(
+    path: AnyPath,
+    requirements: AnyPath,
+    *,
+    vendor: str = "",
+    domain: int | None = None,
+    now: datetime | None = None,
+    zone: tzinfo = UTC,
+) -> tuple[Finding, ...]:
+    """Return a finding for each requirement that a policy or a keystore breaks, for all names.
+
+    Args:
+        path: A policy file or a keystore.
+        requirements: The TOML file of the requirements.
+        vendor: The only vendor of DDS to decide for, or "zenoh"; every measured one and Zenoh by
+            default.
+        domain: The ROS domain id of the robot; by default the first one of the keystore.
+        now: The time at which permissions have to be valid; the current time by default.
+        zone: The time zone of the robot, in which some vendors read dates.
+
+    Returns:
+        Findings with ``subject``, ``text``, ``file`` and ``line``, and in ``related`` the other
+        lines of the policy and that of the requirement; () if all requirements hold.
+
+    Raises:
+        DocumentError: A file cannot be read, or a requirement cannot be decided with so many
+            wildcards.
+        UsageError: There is no such vendor.
+
+    Example:
+        >>> for finding in sros_tool.check_requirements("robot.xml", "robot.requirements.toml"):
+        ...     print(finding.place, finding.text)
+    """
+    from sros_tool.checks.kind import WARNING
+    from sros_tool.proof.findings import requirement_findings
+    from sros_tool.proof.requirements import read_requirements
+    from sros_tool.proof.system import WORLDS, load_system
+
+    if vendor and vendor not in WORLDS:
+        raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(WORLDS)}.")
+    read = read_requirements(Path(requirements))
+    system = load_system(Path(path), at=_moment(now), zone=zone, domain=domain, world=vendor)
+    found = requirement_findings(read, system)
+    return tuple(each for each in found if each.severity >= WARNING)
+
+
 def _moment(now: datetime | None) -> datetime:
     """Return ``now``, which must have a time zone, or the current time if it is None."""
     if now is None:

@@ -121,6 +121,35 @@ class Automaton:
                 edges.append((at, ANY_LETTER, at))
         return cls(tuple(edges), frozenset((at,)))
 
+    def between(self, begin: str, end: str) -> Automaton:
+        """Return an automaton for the texts that this one accepts between ``begin`` and ``end``."""
+        starts = self._reached(frozenset((0,)), begin)
+        stops = frozenset(
+            at for at in range(self.size) if self._reached(frozenset((at,)), end) & self.ends
+        )
+        edges = [(at + 1, letters, to + 1) for at, letters, to in self.edges]
+        first = [(0, letters, to + 1) for at, letters, to in self.edges if at in starts]
+        ends = {at + 1 for at in stops} | ({0} if starts & stops else set())
+        return Automaton((*dict.fromkeys(first), *edges), frozenset(ends))
+
+    def surrounded(self, begin: str, end: str) -> Automaton:
+        """Return an automaton for the accepted names with ``begin`` before and ``end`` behind."""
+        size, more = self.size, len(begin)
+        edges = [(i, Letters.of(letter), i + 1) for i, letter in enumerate(begin)]
+        edges += [(at + more, letters, to + more) for at, letters, to in self.edges]
+        ends = frozenset(each + more for each in self.ends)
+        for i, letter in enumerate(end):
+            edges += [(at, Letters.of(letter), more + size + i) for at in sorted(ends)]
+            ends = frozenset((more + size + i,))
+        return Automaton(tuple(edges), ends)
+
+    def _reached(self, places: frozenset[int], text: str) -> frozenset[int]:
+        for letter in text:
+            places = frozenset(
+                to for at, letters, to in self.edges if at in places and letter in letters
+            )
+        return places
+
     def __hash__(self) -> int:
         return self._hash
 
@@ -309,7 +338,31 @@ class _First:
         return possible.pop() if len(possible) == 1 else None
 
 
-_Node = _Some | _Not | _Every | _First
+@dataclass(frozen=True)
+class _AtLeast:
+    """The names that are in at least ``count`` of the sets ``of``."""
+
+    of: tuple[_Node, ...]
+    count: int
+
+    def parts(self) -> tuple[_Node, ...]:
+        return self.of
+
+    def truth(self, ask: _Ask) -> _Truth:
+        sure = 0
+        left = len(self.of)
+        for each in self.of:
+            inner = each.truth(ask)
+            sure += inner is True
+            left -= inner is False
+            if sure >= self.count:
+                return True
+            if left < self.count:
+                return False
+        return None
+
+
+_Node = _Some | _Not | _Every | _First | _AtLeast
 
 
 class SearchLimit:
@@ -378,6 +431,18 @@ class NameSet:
         if not others:
             return cls._of(plain)
         return cls._of(_First(tuple((each, True) for each in (plain, *others)), False))
+
+    @classmethod
+    def at_least(cls, count: int, sets: Iterable[NameSet]) -> NameSet:
+        """Return the names that are in at least ``count`` of several sets."""
+        return cls._of(_AtLeast(tuple(each._node for each in sets), count))
+
+    def around(self) -> Surroundings | None:
+        """Return exact names and automata that together have every name of this set, and others.
+
+        Returns None if that would be all names.
+        """
+        return _around(self._node, _roughness)
 
     def __or__(self, other: NameSet) -> NameSet:
         return NameSet.union((self, other))
@@ -448,6 +513,45 @@ class NameSet:
         return (self - other).is_empty(limit)
 
 
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """Exact names, and automata, which have at least the names of a set."""
+
+    exact: frozenset[str]
+    automata: frozenset[Automaton]
+
+
+def _around(node: _Node, best: Callable[[Surroundings], int]) -> Surroundings | None:
+    """Return surroundings of a set; of several, those for which ``best`` is least."""
+    match node:
+        case _Some():
+            return Surroundings(node.exact, node.automata)
+        case _Not():
+            return None
+        case _Every():
+            parts = (_around(each, best) for each in node.of)
+            return min(filter(None, parts), key=best, default=None)
+        case _First():
+            of = [each for each, kept in node.of if kept]
+            if node.last:
+                return None
+        case _AtLeast():
+            of = list(node.of)
+    found = [_around(each, best) for each in of]
+    known = [each for each in found if each is not None]
+    if len(known) < len(found):
+        return None
+    return Surroundings(
+        frozenset[str]().union(*(each.exact for each in known)),
+        frozenset[Automaton]().union(*(each.automata for each in known)),
+    )
+
+
+def _roughness(around: Surroundings) -> int:
+    """Return the sort key of surroundings: those that tell most of beginning and end come first."""
+    return -min((len(a.prefix) + len(a.suffix) for a in around.automata), default=_LAST)
+
+
 def _length(name: str) -> tuple[int, str]:
     return len(name.encode(errors="surrogatepass")), name
 
@@ -484,6 +588,13 @@ def _reduced(node: _Node, known: Mapping[Automaton, bool]) -> _Node | bool:
             if not isinstance(inner, bool):
                 kept.append(inner)
         return (kept[0] if len(kept) == 1 else _Every(tuple(kept))) if kept else True
+    if isinstance(node, _AtLeast):
+        found = [_reduced(each, known) for each in node.of]
+        count = node.count - found.count(True)
+        open_ones = tuple(each for each in found if not isinstance(each, bool))
+        if count <= 0 or len(open_ones) < count:
+            return count <= 0
+        return _AtLeast(open_ones, count)
     rules: list[tuple[_Node, bool]] = []
     last = node.last
     for each, says in node.of:
@@ -502,17 +613,19 @@ def _searches(node: _Node) -> Iterator[_Search]:
     """Yield searches that together find every name of a set that is not exact in it.
 
     Each considers the names of one automaton, and only the other automata that may have names in
-    common with it; the last one considers the names that no automaton accepts.
+    common with it.  If no few automata have all names of the set, the last one considers the names
+    that no automaton accepts.
     """
     leaves = tuple(_leaves(node))
     automata = sorted({each for leaf in leaves for each in leaf.automata}, key=_order)
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
-    for own in automata:
+    around = _around(node, lambda each: len(each.automata))
+    for own in automata if around is None else sorted(around.automata, key=_order):
         known = {each: False for each in automata if not own.may_meet(each)}
         left = _reduced(node, {**known, own: True})
         if left is not False:
             yield _Search(_within(own, left), frozenset(filter(own.matches, exact)))
-    if _reduced(node, dict.fromkeys(automata, False)):
+    if around is None and _reduced(node, dict.fromkeys(automata, False)):
         left = _reduced(node, {})
         yield _Search(_Not(_Some()) if isinstance(left, bool) else left, exact)
 

@@ -61,9 +61,10 @@ class FindingKind:
         line: int | None = None,
         remedy: str = "",
         accepted: str = "",
+        related: tuple[RelatedPlace, ...] = (),
     ) -> Finding:
         """Return a finding of this kind."""
-        return Finding(self, subject, text, file, line or None, remedy, accepted)
+        return Finding(self, subject, text, file, line or None, remedy, accepted, related)
 
     def as_json(self) -> dict[str, Any]:
         """Return the JSON value that `sros check --list --json` prints."""
@@ -79,13 +80,30 @@ class FindingKind:
 
 
 @dataclass(frozen=True, slots=True)
+class RelatedPlace:
+    """Another place that a finding is about; ``text`` says what is there, as a clause.
+
+    ``line`` counts from 1; None stands for the whole file.
+    """
+
+    text: str
+    file: str
+    line: int | None = None
+
+    def __str__(self) -> str:
+        """Return text such as ``robot.xml:12``."""
+        return f"{self.file}:{self.line}" if self.line else self.file
+
+
+@dataclass(frozen=True, slots=True)
 class Finding:
     """A problem found at one place.
 
     ``subject`` is the affected enclave, variable or file; ``file`` is a path, or ""; ``line``
     counts from 1.  ``text`` says what was found; ``own_remedy`` replaces the remedy of the kind
     unless it is empty.  ``accepted`` names the template or setting that accepts the finding, which
-    then counts as a note.
+    then counts as a note.  ``related`` are other places that it is
+    about, in the order to read them.
     """
 
     kind: FindingKind
@@ -95,6 +113,7 @@ class Finding:
     line: int | None = None
     own_remedy: str = ""
     accepted: str = ""
+    related: tuple[RelatedPlace, ...] = ()
 
     @property
     def id(self) -> str:
@@ -130,6 +149,9 @@ class Finding:
             "remedy": self.remedy,
             "source": self.kind.source,
             "accepted": self.accepted or None,
+            "related": [
+                {"text": each.text, "file": each.file, "line": each.line} for each in self.related
+            ],
         }
 
 

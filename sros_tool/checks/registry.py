@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from types import ModuleType
 
-from sros_tool.checks import policies, runtime, zenoh, zenoh_environment
+from sros_tool.checks import policies, requirements, runtime, zenoh, zenoh_environment
 from sros_tool.checks.keystores import (
     authorities,
     documents,
@@ -20,7 +20,7 @@ from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, Severity,
 from sros_tool.errors import UsageError
 
 _MODULES = (
-    *(policies, files, authorities, enclaves, documents, issued),
+    *(policies, requirements, files, authorities, enclaves, documents, issued),
     *(zenoh_files, zenoh, zenoh_environment, runtime),
 )
 

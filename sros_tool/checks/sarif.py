@@ -59,22 +59,33 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
         "message": {"text": _plain(f"{finding.subject}: {finding.text}. {finding.remedy}")},
     }
     if finding.file:
-        result["locations"] = [
+        result["locations"] = [_location(finding.file, finding.line, base)]
+    if finding.related:
+        result["relatedLocations"] = [
             {
-                "physicalLocation": {
-                    "artifactLocation": {
-                        "uri": quote(os.fsencode(_relative(finding.file, base))),
-                        "uriBaseId": _BASE,
-                    },
-                    "region": {"startLine": finding.line or 1},
-                }
+                "id": number,
+                **_location(each.file, each.line, base),
+                "message": {"text": _plain(each.text)},
             }
+            for number, each in enumerate(finding.related)
         ]
     if finding.accepted:
         result["suppressions"] = [
             {"kind": "external", "status": "accepted", "justification": finding.accepted}
         ]
     return result
+
+
+def _location(file: str, line: int | None, base: Path) -> dict[str, Any]:
+    return {
+        "physicalLocation": {
+            "artifactLocation": {
+                "uri": quote(os.fsencode(_relative(file, base))),
+                "uriBaseId": _BASE,
+            },
+            "region": {"startLine": line or 1},
+        }
+    }
 
 
 def _plain(text: str) -> str:

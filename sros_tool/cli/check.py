@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.checks.registry import ChosenFindings, FindingFilter
     from sros_tool.checks.targets import Circumstances
+    from sros_tool.proof.requirements import Requirement
+    from sros_tool.proof.system import System
 
 _FAMILIES = ("policy", "keystore", "runtime")
 _LEVELS = click.Choice(["note", "warning", "error"])
@@ -59,6 +61,8 @@ Example:
   $ sros check keystore --policy robot.xml --sarif > findings.sarif
   $ sros check --needs-renewal 30d keystore || \\
         sros renew keystore --all-expiring 30d
+  $ sros check robot.xml --suggest > robot.requirements.toml
+  $ sros check robot.xml --requirements robot.requirements.toml
 
 Findings that the keystore's template accepts count as notes and share one line; with --strict,
 for example in CI, they count like all others. Exit status: 1 if a finding of the --fail-on
@@ -107,9 +111,20 @@ severity or higher is shown, else 0.""",
 )
 @fleet_option("The robots that the placeholders of policies stand for.")
 @click.option(
+    "--requirements",
+    type=PATH,
+    metavar="FILE",
+    help="Decide whether the requirements in this TOML file hold, for all names.",
+)
+@click.option(
+    "--suggest",
+    is_flag=True,
+    help="Print requirements that hold today, as TOML, to keep or to strike.",
+)
+@click.option(
     "--vendor",
-    type=click.Choice([each.value for each in MEASURED]),
-    help="Leave out findings that concern only other DDS vendors.",
+    type=click.Choice([*(each.value for each in MEASURED), "zenoh"]),
+    help="Leave out findings that concern only other DDS vendors, or only DDS.",
 )
 @click.option(
     "--domain", metavar="ID", help="The ROS domain that the enclaves must be able to join."
@@ -151,6 +166,8 @@ def check(
     strict: bool,
     policies: tuple[Path, ...],
     fleet_file: Path | None,
+    requirements: Path | None,
+    suggest: bool,
     vendor: str | None,
     domain: str | None,
     distribution: str | None,
@@ -168,6 +185,7 @@ def check(
     """
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
+    from sros_tool.proof.requirements import read_requirements
 
     check_one_format()
     family, paths = _family(targets)
@@ -194,11 +212,56 @@ def check(
         )
     at = _circumstances(domain, moment, policies, fleet_file)
     at = replace(at, distribution=_distribution(distribution))
+    if suggest:
+        if form != "text" or requirements:
+            raise UsageError("--suggest prints TOML", "", "Give it alone.")
+        click.echo(_suggested(_one_path(family, paths, "--suggest"), at, vendor), nl=False)
+        return 0
+    read = read_requirements(requirements) if requirements else ()
+    one = _one_path(family, paths, "--requirements") if read else None
     with progress("checking"):
-        found = [_shown(each) for each in _findings(family, paths, at)]
+        every = _findings(family, paths, at)
+        every += _broken(one, read, at, vendor) if one else []
+        found = [_shown(each) for each in every]
     chosen = selection.choose(found)
     _SHOW[form](chosen, selection)
     return 1 if fail_on != "never" and chosen.fails(Severity[fail_on.upper()]) else 0
+
+
+def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
+    """Return the only path, which has to be a policy file or a keystore."""
+    from sros_tool.keystore.layout import is_keystore
+
+    if family != "runtime" and len(paths) < 2:
+        path = paths[0] if paths else keystore_from_environment()
+        if not path.is_dir() or is_keystore(path):
+            return path
+    raise UsageError(f"{option} takes one policy file or keystore")
+
+
+def _system(path: Path, at: Circumstances, vendor: str | None) -> System:
+    from sros_tool.proof.system import load_system
+
+    return load_system(
+        path, at=at.now, zone=at.zone, domain=at.domain, fleet=at.fleet, world=vendor or ""
+    )
+
+
+def _suggested(path: Path, at: Circumstances, vendor: str | None) -> str:
+    from sros_tool.proof.suggest import render_requirements, suggest
+
+    with progress("deciding"):
+        system = _system(path, at, vendor)
+        return render_requirements(suggest(system.rights, system.worlds), str(path))
+
+
+def _broken(
+    path: Path, requirements: Sequence[Requirement], at: Circumstances, vendor: str | None
+) -> list[Finding]:
+    """Return the findings of requirements."""
+    from sros_tool.proof.findings import requirement_findings
+
+    return requirement_findings(requirements, _system(path, at, vendor))
 
 
 def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
@@ -306,11 +369,15 @@ def _findings_here(
 
 
 def _shown(finding: Finding) -> Finding:
-    """Return the finding; its file becomes relative if it is below the working directory."""
-    path = Path(finding.file)
-    if path.is_absolute() and path.is_relative_to(Path.cwd()):
-        return replace(finding, file=str(path.relative_to(Path.cwd())))
-    return finding
+    """Return the finding; files below the working directory get relative paths."""
+    related = tuple(replace(each, file=_relative(each.file)) for each in finding.related)
+    return replace(finding, file=_relative(finding.file), related=related)
+
+
+def _relative(file: str) -> str:
+    path = Path(file)
+    below = path.is_absolute() and path.is_relative_to(Path.cwd())
+    return str(path.relative_to(Path.cwd())) if below else file
 
 
 def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
@@ -381,11 +448,12 @@ def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
 
 
 def _finding_lines(finding: Finding) -> list[str]:
-    """Return a finding as three lines: place and title, reason, and remedy."""
+    """Return a finding as lines: place and title, reason, remedy, and related places."""
     head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
     subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
     by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
-    return [head, f"    {subject}{finding.text}{by}", f"    {finding.remedy}"]
+    related = [f"      {each}: {each.text}" for each in finding.related]
+    return [head, f"    {subject}{finding.text}{by}", *related, f"    {finding.remedy}"]
 
 
 def echo_finding(finding: Finding) -> None:

@@ -211,6 +211,11 @@ class Evaluator:
         self._access = self._load()
         self._until_file, self._until = self._first_expiry()
 
+    @property
+    def access(self) -> Access | None:
+        """The access of the vendor's process; None if it does not run, or no peer accepts it."""
+        return self._access if isinstance(self._access, Access) else None
+
     def answer(self, question: Question) -> Answer:
         """Return the answer to a question, without policy lines, change and remedy."""
         if isinstance(self._access, Decision):

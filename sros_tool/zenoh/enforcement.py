@@ -6,11 +6,12 @@ Sources: zenoh 1.9, authorization.rs and access_control.rs; compared with the wh
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from itertools import product
 
+from sros_tool.automata import NameSet
 from sros_tool.zenoh.access import Flow, Message
 from sros_tool.zenoh.key_expressions import includes
 
@@ -154,6 +155,27 @@ class Enforcement:
         if denying:
             return AccessDecision(False, _once(denying), subjects, f"rule {denying[0]} denies it")
         return AccessDecision(False, (), subjects, "no rule allows it, and the default is DENY")
+
+    def passing(
+        self, remote: Remote, flow: Flow, message: Message, of: Callable[[Iterable[str]], NameSet]
+    ) -> NameSet:
+        """Return the keys, without wildcards, of which `decide` lets a message pass.
+
+        ``of`` returns the set of what key expressions include: of keys, or of other names for them.
+        """
+        everything = ~NameSet()
+        if not self.enabled:
+            return everything
+        combinations = self._matching(remote)
+        if not self._rules_of or not combinations:
+            return everything if self.allows_by_default else NameSet()
+        found = []
+        for combination in combinations:
+            rules = self._in_force[combination].get((flow, message), ())
+            denied = of(key for rule in rules if not rule.allows for key in rule.key_expressions)
+            allowed = of(key for rule in rules if rule.allows for key in rule.key_expressions)
+            found.append((everything if self.allows_by_default else allowed) - denied)
+        return NameSet.union(found)
 
     def _by_default(self, subjects: tuple[str, ...], why: str) -> AccessDecision:
         return AccessDecision(self.allows_by_default, (), subjects, why)

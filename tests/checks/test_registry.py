@@ -23,6 +23,7 @@ from tests.checks import (
     zenoh_cases,
 )
 from tests.checks.bench import Bench
+from tests.cli import test_requirements
 from tests.support.harness import sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
@@ -36,6 +37,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
         *keystore_cases.CASES,
         *runtime_cases.CASES,
         *zenoh_cases.CASES,
+        *test_requirements.CASES,
     }
     assert tested == set(KINDS)
     assert len(KINDS) >= 50
@@ -44,7 +46,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.id)
 def test_kinds_are_complete(kind: Any) -> None:
     assert re.fullmatch(
-        r"(policy|keystore|enclave|permissions|governance|portable|zenoh|runtime)\."
+        r"(policy|requirement|keystore|enclave|permissions|governance|portable|zenoh|runtime)\."
         r"[a-z0-9]+(-[a-z0-9]+)*",
         kind.id,
     )
@@ -128,6 +130,7 @@ def test_text_json_and_status(bench: Bench) -> None:
     (finding,) = told["findings"]
     assert set(finding) == {
         "id", "severity", "subject", "file", "line", "text", "remedy", "source", "accepted",
+        "related",
     }  # fmt: skip
     assert finding["file"] == str(bench.path("enclaves/base/key.pem"))
 

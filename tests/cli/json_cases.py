@@ -55,6 +55,7 @@ def make_folder(folder: Path) -> None:
     """Fill a folder with what the cases name: keystores in several states, a robot, policies."""
     for name, text in POLICIES.items():
         (folder / name).write_text(text)
+    (folder / "required.toml").write_text('[[nobody]]\npublish = ["/x"]\n')
     (folder / "quiet.log").write_text("nothing to see\n")
     for line in (
         "create_keystore ks",
@@ -320,6 +321,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks", 1),
         Case("ks --severity note", 1),
         Case("broken", 1),
+        Case("policy.xml --requirements required.toml", 1),
         Case("empty --list"),
         Case("--list --include policy.*"),
         Case("keystore ks --needs-renewal 1d"),
@@ -361,7 +363,7 @@ CASES: dict[str, tuple[Case, ...]] = {
 """The commands of each verb; those of `doctor` and `audit` need more than a folder."""
 
 SHARED_PARTS = {
-    "check": Case("broken", 1),
+    "check": Case("policy.xml --requirements required.toml", 1),
     "crl": Case("lost --refresh"),
     "import": Case("r.tgz robot"),
     "merge_policy": Case("policy.xml other.xml"),

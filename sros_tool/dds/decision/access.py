@@ -524,6 +524,13 @@ class Access:
         usable = _VALID_TOPICS if self._traits.creates_topics else _PLAIN_TOPICS
         return NameSet.union(found) & usable
 
+    def protection(self) -> tuple[tuple[NameSet, DomainRule, TopicRule], ...]:
+        """Return the topic rules of the domain, each with its topics: the first match counts."""
+        domain = self._governed.rule
+        if domain is None:
+            return ()
+        return tuple((names, domain, rule) for names, rule in self._governed.names_by_rule())
+
     def _kind_of(self, verb: AccessVerb, rule: TopicRule) -> _Kind:
         """Return what decides on the topics of a rule, as `_ruled` does."""
         if self._traits.crashes_on_empty_texts and not rule.topic_expression.strip():

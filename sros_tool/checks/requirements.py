@@ -1,0 +1,31 @@
+"""Kinds of findings about requirements; `sros_tool.proof` decides them."""
+
+from __future__ import annotations
+
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, FindingKind
+
+VIOLATED = FindingKind(
+    "requirement.violated",
+    ERROR,
+    "a requirement that does not hold",
+    "The access control allows, or does not allow, what the requirements file says otherwise. Each "
+    "name that could ever be used counts, not only those in use.",
+    "The requirements file.",
+    "Change the lines of the policy that are named, or the requirement.",
+)
+VACUOUS = FindingKind(
+    "requirement.vacuous",
+    WARNING,
+    "a requirement about names or enclaves that nothing has",
+    "It cannot fail, so it protects nothing: perhaps a name in it is misspelt, or was changed.",
+    "The requirements file.",
+    "Correct the name, or remove it from the requirement.",
+)
+NOT_ON_ZENOH = FindingKind(
+    "requirement.not-on-zenoh",
+    NOTE,
+    "requirements were not decided for Zenoh",
+    "The policy cannot be carried out on Zenoh, so what it would allow there is not known.",
+    "zenoh.io, Access Control.",
+    "Ignore this if the robot uses DDS.",
+)

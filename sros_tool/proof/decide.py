@@ -1,0 +1,385 @@
+"""Decide requirements in a world, for all names, with a witness for each that does not hold.
+
+To do something is to write one of its DDS topics: whoever may write the requests of a service can
+have them executed, even if it may not read the replies.  To subscribe is to read.  Only what an
+enclave must be able to do needs all of its topics.
+
+This module reads no files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import lru_cache
+
+from sros_tool.automata import NameSet, SearchLimit
+from sros_tool.policy.model import RIGHTS
+from sros_tool.policy.rights import KIND_OF
+from sros_tool.proof.flow import TopicHop, shortest_chain
+from sros_tool.proof.requirements import (
+    Apart,
+    AtMost,
+    Must,
+    Nobody,
+    Only,
+    Protected,
+    Requirement,
+    RightNames,
+    Widest,
+)
+from sros_tool.proof.worlds import Meeting, Topics, World, shortest
+from sros_tool.translate import dds_names, service_of
+
+
+@dataclass(frozen=True, slots=True)
+class Use:
+    """An enclave that may write or read a DDS topic, for a ``right`` to the ROS name ``name``.
+
+    ``right`` is "" where the topic belongs to no right, such as a DDS topic without a ROS name.
+    """
+
+    enclave: str
+    right: str
+    name: str
+    topic: str
+    writes: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """Why a requirement does not hold: the shortest list of uses that it forbids, or lacks.
+
+    For influence it is a chain: each use that writes is followed by the one that reads it.
+    ``others`` are further enclaves that break the requirement, each on its own.
+    """
+
+    uses: tuple[Use, ...]
+    others: tuple[str, ...] = ()
+
+    @property
+    def enclaves(self) -> tuple[str, ...]:
+        """The enclaves of the uses, in their order, each once."""
+        return tuple(dict.fromkeys(each.enclave for each in self.uses))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the uses, in their order, each once."""
+        return tuple(dict.fromkeys(each.name for each in self.uses))
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The decision on a requirement in one world.
+
+    ``witness`` is None if the requirement holds.  ``empty`` are names and enclaves in it that
+    nothing has, for which it cannot fail.
+    """
+
+    requirement: Requirement
+    witness: Witness | None
+    empty: tuple[str, ...] = ()
+
+
+def decide(requirement: Requirement, world: World, limit: SearchLimit | None = None) -> Verdict:
+    """Return the decision on a requirement; decisions for one question share ``limit``.
+
+    Raises:
+        DocumentError: it cannot be decided with so many wildcards.
+    """
+    limit = limit or SearchLimit()
+    match requirement:
+        case Only() | Nobody():
+            witness = _not_alone(requirement, world, limit)
+        case Must():
+            witness = _not_able(requirement, world, limit)
+        case AtMost():
+            witness = _too_many(requirement, world, limit)
+        case Widest():
+            witness = _too_wide(requirement, world, limit)
+        case Protected():
+            witness = _unprotected(requirement, world, limit)
+        case Apart():
+            witness = _influence(requirement, world, limit)
+        case _:
+            raise AssertionError(requirement)
+    if witness:
+        _confirm(requirement, witness, world)
+    return Verdict(requirement, witness, tuple(_empty(requirement, world, limit)))
+
+
+def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
+    """Ask the engine of the world about each use of a witness: it must agree."""
+    if isinstance(requirement, Protected):
+        return
+    may = not isinstance(requirement, Must)
+    for use in witness.uses:
+        if world.confirm(use.enclave, use.writes, use.topic) is not may:
+            raise AssertionError(f"{world.title} decides otherwise on {use}, for {requirement}")
+
+
+# ── rights and their topics ────────────────────────────────────────────────────────────────
+
+_HERE = "\0"
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A DDS topic of a right, by the text before and after the name."""
+
+    writes: bool
+    begin: str
+    end: str
+
+    def topics(self, name: str) -> Topics:
+        return Topics(self.begin, name, self.end)
+
+
+@lru_cache(maxsize=16)
+def _parts_of(right: str) -> tuple[_Part, ...]:
+    """Return the DDS topics that a right needs."""
+    names = dds_names(right, _HERE)
+    return tuple(
+        _Part(writes, *topic.split(_HERE))
+        for writes, topics in ((True, names.publish), (False, names.subscribe))
+        for topic in topics
+    )
+
+
+@lru_cache(maxsize=16)
+def _doing(right: str) -> tuple[_Part, ...]:
+    """Return the DDS topics of which each one lets an enclave do what a right is for."""
+    return tuple(each for each in _parts_of(right) if each.writes or right == "subscribe")
+
+
+def _each(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
+    """Yield the topics of rights, each with its right."""
+    for right, names in rights:
+        for name in names:
+            for part in _doing(right):
+                yield right, part, part.topics(name)
+
+
+def _match(patterns: Iterable[str], enclave: str) -> bool:
+    return any(fnmatchcase(enclave, each) for each in patterns)
+
+
+def _use(enclave: str, right: str, part: _Part, topics: Topics, topic: str) -> Use:
+    return Use(enclave, right, topics.ros_name(topic), topic, part.writes)
+
+
+def _better(use: Use) -> tuple[int, str, str]:
+    """Return the sort key of witnesses with one use: short names first."""
+    return len(use.name), use.name, use.enclave
+
+
+# ── who may do what ────────────────────────────────────────────────────────────────────────
+
+
+def _not_alone(requirement: Only | Nobody, world: World, limit: SearchLimit) -> Witness | None:
+    allowed = requirement.enclaves if isinstance(requirement, Only) else ()
+    found: dict[str, Use] = {}
+    for right, part, topics in _each(requirement.rights):
+        for met in world.side(part.writes).meeting(topics):
+            if _match(allowed, met.enclave):
+                continue
+            if topic := world.use(met, topics, limit):
+                use = _use(met.enclave, right, part, topics, topic)
+                found[met.enclave] = min(use, found.get(met.enclave, use), key=_better)
+    return _first_of(found.values())
+
+
+def _first_of(uses: Collection[Use]) -> Witness | None:
+    if not uses:
+        return None
+    best = min(uses, key=_better)
+    return Witness((best,), tuple(sorted({each.enclave for each in uses} - {best.enclave})))
+
+
+def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
+    """Return the shortest name that an enclave lacks a right to; all of its topics count."""
+    enclave = requirement.enclave
+    lacking = [
+        Use(enclave, "publish" if writes else "subscribe", topic, topic, writes)
+        for writes, topic in world.needed
+        if topic not in world.side(writes).of.get(enclave, NameSet())
+    ]
+    for right, names in requirement.rights:
+        for name in names:
+            for part in _parts_of(right):
+                own = world.side(part.writes).of.get(enclave, NameSet())
+                topics = part.topics(name)
+                # Of a wildcard, only names that a node can have are asked for.
+                topic = (topics.valid() - own).example(limit, longest=world.longest)
+                if topic:
+                    lacking.append(_use(enclave, right, part, topics, topic))
+    return Witness((min(lacking, key=_better),)) if lacking else None
+
+
+def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness | None:
+    """Return a name that too many enclaves may use, with as many of them as it needs."""
+    most = requirement.most
+    best: tuple[Use, ...] = ()
+    others: tuple[str, ...] = ()
+    for right, part, topics in _each(requirement.rights):
+        met = world.side(part.writes).meeting(topics)
+        if len(met) <= most:
+            continue
+        topic = _shared_by(world, met, most + 1, topics, limit)
+        if topic:
+            users = [each.enclave for each in met if topic in each.names]
+            uses = tuple(_use(each, right, part, topics, topic) for each in users[: most + 1])
+            if not best or _better(uses[0]) < _better(best[0]):
+                best, others = uses, tuple(users[most + 1 :])
+    return Witness(best, others) if best else None
+
+
+def _shared_by(
+    world: World, met: Sequence[Meeting], count: int, topics: Topics, limit: SearchLimit
+) -> str | None:
+    """Return a topic that at least ``count`` of the enclaves may use, or None."""
+    counts: dict[str, int] = {}
+    for each in met:
+        for topic in each.stated:
+            counts[topic] = counts.get(topic, 0) + 1
+    if not any(each.wild for each in met):
+        return shortest(topic for topic, number in counts.items() if number >= count)
+    return world.example(NameSet.at_least(count, (each.names for each in met)), topics, limit)
+
+
+def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness | None:
+    """Return the shortest name that a wildcard gives an enclave beyond the names it may."""
+    enclaves = [each for each in world.enclaves if _match(requirement.enclaves, each)]
+    found: dict[str, Use] = {}
+    for right, names in requirement.rights:
+        for part in _doing(right):
+            side, every = world.side(part.writes), part.topics("*")
+            within = NameSet.union(part.topics(name).every() for name in names)
+            for enclave in enclaves:
+                own = side.of[enclave]
+                around = own.around()
+                if around is not None and not around.automata:
+                    continue
+                access = world.stated[enclave]
+                exact = access.writes if part.writes else access.reads
+                if topic := world.example(own - exact - within, every, limit):
+                    use = _use(enclave, right, part, every, topic)
+                    found[enclave] = min(use, found.get(enclave, use), key=_better)
+    return _first_of(found.values())
+
+
+def _unprotected(requirement: Protected, world: World, limit: SearchLimit) -> Witness | None:
+    """Return the shortest name whose messages are not protected as demanded."""
+    weak = world.weaker(requirement.level)
+    if weak is None:
+        return None
+    found = []
+    for topics in _of_kinds(requirement.names):
+        if topic := world.example(weak, topics, limit):
+            found.append(Use("", "", topics.ros_name(topic), topic, True))
+    return Witness((min(found, key=_better),)) if found else None
+
+
+def _of_kinds(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
+    """Yield the topics of names of topics, services and actions, each once."""
+    return iter(
+        dict.fromkeys(
+            part.topics(name)
+            for kind, name in names
+            for right in RIGHTS[kind]
+            for part in _parts_of(right)
+        )
+    )
+
+
+# ── influence ──────────────────────────────────────────────────────────────────────────────
+
+
+def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness | None:
+    """Return a chain with the fewest hops from a source to a target, past ``through``."""
+    through = {each for each in world.enclaves if _match(requirement.through, each)}
+    inside = [each for each in world.enclaves if each not in through]
+    sources = [each for each in inside if _match(requirement.sources, each)]
+    targets = {each for each in inside if _match(requirement.targets, each)}
+    chain = shortest_chain(world, sources, targets, through, limit)
+    if not chain:
+        return None
+    return Witness(tuple(use for hop in chain for use in _uses(hop)))
+
+
+def _uses(hop: TopicHop) -> Iterator[Use]:
+    """Yield the use that writes and the use that reads."""
+    for enclave, writes in ((hop.source, True), (hop.target, False)):
+        right, name = _in_ros_terms(hop.topic, writes=writes)
+        yield Use(enclave, right, name, hop.topic, writes)
+
+
+_OF_PREFIX = {
+    "rt": ("publish", "subscribe"),
+    "rq": ("request", "reply"),
+    "rr": ("reply", "request"),
+}
+"""By the prefix of a DDS topic: the right to write it, and the right to read it."""
+
+
+def _in_ros_terms(topic: str, *, writes: bool) -> tuple[str, str]:
+    """Return the right to write or to read a DDS topic, and its ROS name; or "" and the topic."""
+    service, begin = service_of(topic)
+    name = service or (topic[2:] if topic.startswith("rt/") else "")
+    if not name:
+        return "", topic
+    return _OF_PREFIX[begin or "rt"][not writes], name
+
+
+# ── requirements that cannot fail ──────────────────────────────────────────────────────────
+
+OTHER_SIDE = {one: other for pair in RIGHTS.values() for one, other in (pair, pair[::-1])}
+"""For each right, the right at the other end."""
+
+
+def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterator[str]:
+    """Yield the names and enclaves of a requirement that nothing has."""
+    patterns: tuple[str, ...] = ()
+    match requirement:
+        case Only():
+            patterns = requirement.enclaves
+        case Widest():
+            patterns = requirement.enclaves
+        case Apart():
+            patterns = (*requirement.sources, *requirement.targets, *requirement.through)
+    for each in dict.fromkeys(patterns):
+        if not any(fnmatchcase(enclave, each) for enclave in world.enclaves):
+            yield f"enclave {each}"
+    match requirement:
+        case Only() | AtMost():
+            for right, names in requirement.rights:
+                for name in names:
+                    if not _anybody(world, _doing(right), name, limit):
+                        yield _named(right, name)
+        case Nobody():
+            for right, names in requirement.rights:
+                other = OTHER_SIDE[right]
+                for name in names:
+                    if not _anybody(world, (*_doing(other), *_doing(right)), name, limit):
+                        yield _named(right, name)
+        case Protected():
+            for kind, name in requirement.names:
+                parts = [part for right in RIGHTS[kind] for part in _doing(right)]
+                if not _anybody(world, parts, name, limit):
+                    yield f"{kind.removesuffix('s')} {name}"
+
+
+def _named(right: str, name: str) -> str:
+    return f"{KIND_OF[right].removesuffix('s')} {name}"
+
+
+def _anybody(world: World, parts: Iterable[_Part], name: str, limit: SearchLimit) -> bool:
+    """Return whether some enclave may use a topic of the name."""
+    for part in parts:
+        met = world.side(part.writes).meeting(part.topics(name))
+        if any(each.stated for each in met) or any(
+            world.use(each, part.topics(name), limit) for each in met
+        ):
+            return True
+    return False

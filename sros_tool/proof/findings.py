@@ -1,0 +1,199 @@
+"""Findings of requirements: what breaks them, by which lines of a policy, in which worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from sros_tool.automata import SearchLimit
+from sros_tool.checks.kind import Finding, RelatedPlace
+from sros_tool.checks.requirements import NOT_ON_ZENOH, VACUOUS, VIOLATED
+from sros_tool.names import is_expression
+from sros_tool.policy.model import Source
+from sros_tool.proof.decide import Use, Verdict, Witness, decide
+from sros_tool.proof.places import Place
+from sros_tool.proof.requirements import (
+    Apart,
+    AtMost,
+    Must,
+    Protected,
+    Requirement,
+    demand,
+)
+from sros_tool.proof.system import System
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One use of a witness, and the right that states it; None if nothing does."""
+
+    use: Use
+    place: Place | None
+
+    @property
+    def source(self) -> Source | None:
+        """The file and line of the right, if it has any."""
+        return self.place.source if self.place else None
+
+    def does(self) -> str:
+        """Return text such as ``publish /cmd_vel``, with the wildcard that allows it."""
+        use, stated = self.use, self.place.right if self.place else None
+        right, name = use.right, use.name
+        if stated and stated.kind == "actions":
+            right = stated.right
+            name = f"action {name.partition('/_action/')[0]}"
+        by = f" by {stated.name}" if stated and is_expression(stated.name) else ""
+        return f"{right or ('write' if use.writes else 'read')} {name}{by}"
+
+    def text(self) -> str:
+        """Return text such as ``/teleop may publish /cmd_vel by /cmd*``."""
+        return f"{self.use.enclave} may {self.does()}"
+
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """A requirement that does not hold, the steps of its witness, and the worlds where it does not.
+
+    ``worlds`` is empty if it holds in none of those that were decided.
+    """
+
+    requirement: Requirement
+    witness: Witness
+    steps: tuple[Step, ...]
+    worlds: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """All decisions: what does not hold, and requirements with what nothing has."""
+
+    violations: tuple[Violation, ...]
+    vacuous: tuple[tuple[Requirement, tuple[str, ...]], ...]
+
+
+MOST_STEPS = 8_000_000
+"""Most steps to search for names that wildcards have in common: some twenty seconds."""
+
+
+def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
+    """Return the decisions on requirements in all worlds.
+
+    Raises:
+        DocumentError: one cannot be decided with so many wildcards.
+    """
+    violations, vacuous = [], []
+    limit = SearchLimit(MOST_STEPS)
+    for requirement in requirements:
+        verdicts = [(world, decide(requirement, world, limit)) for world in system.worlds]
+        broken = [(world, each.witness) for world, each in verdicts if each.witness]
+        if broken:
+            witness = min((each for _, each in broken), key=lambda each: len(each.uses))
+            steps = tuple(Step(use, system.places.find(use)) for use in witness.uses)
+            titles = tuple(world.title for world, _ in broken)
+            titles = () if len(broken) == len(system.worlds) else titles
+            violations.append(Violation(requirement, witness, steps, titles))
+        empty = _common(each for _, each in verdicts)
+        if empty:
+            vacuous.append((requirement, empty))
+    return Decided(tuple(violations), tuple(vacuous))
+
+
+def _common(verdicts: Iterable[Verdict]) -> tuple[str, ...]:
+    """Return what is empty in all worlds, in the order of the first one."""
+    first, *others = (each.empty for each in verdicts)
+    return tuple(each for each in first if all(each in other for other in others))
+
+
+# ── as findings ────────────────────────────────────────────────────────────────────────────
+
+_SHOWN = 5
+
+
+def requirement_findings(requirements: Sequence[Requirement], system: System) -> list[Finding]:
+    """Return a finding for each requirement that does not hold, or that cannot fail.
+
+    Raises:
+        DocumentError: one cannot be decided with so many wildcards.
+    """
+    decided = decide_all(requirements, system)
+    found = [_violated(each) for each in decided.violations]
+    found += [_vacuous(requirement, empty) for requirement, empty in decided.vacuous]
+    if system.left_out:
+        error = system.left_out
+        text = f"{error.what}: {error.why}" if error.why else error.what
+        found.append(NOT_ON_ZENOH.found(system.file, text, system.file))
+    return found
+
+
+def _violated(violation: Violation) -> Finding:
+    requirement, steps = violation.requirement, violation.steps
+    first = next((each.source for each in steps if each.source), None) or requirement.source
+    text = f"{_fact(violation)}, but {demand(requirement)}"
+    if violation.worlds:
+        text += f"; with {', '.join(violation.worlds)} only"
+    if requirement.why:
+        text += f": {requirement.why}"
+    related = [
+        RelatedPlace(each.text(), each.source.file, each.source.line or None)
+        for each in steps
+        if each.source and len(steps) > 1
+    ]
+    own = requirement.source
+    related.append(RelatedPlace(f"required: {_titled(requirement)}", own.file, own.line or None))
+    use = steps[0].use
+    subject = use.name if isinstance(requirement, AtMost | Protected) else use.enclave
+    return VIOLATED.found(
+        subject, text, first.file, first.line, related=tuple(dict.fromkeys(related))
+    )
+
+
+def _titled(requirement: Requirement) -> str:
+    name = f"{requirement.name}: " if requirement.name else ""
+    return f"{name}{demand(requirement)}"
+
+
+def _fact(violation: Violation) -> str:
+    """Return what breaks the requirement, as a clause without the subject of the finding."""
+    steps = violation.steps
+    match violation.requirement:
+        case Apart():
+            return f"influences {steps[-1].use.enclave}: {_chain(steps)}"
+        case Must():
+            return f"may not {steps[0].does()}"
+        case Protected():
+            return "its messages are not"
+        case AtMost():
+            users = _listed([each.use.enclave for each in steps])
+            return f"{users} may {steps[0].does()}{_others(violation)}"
+        case _:
+            return f"may {steps[0].does()}{_others(violation)}"
+
+
+def _chain(steps: Sequence[Step]) -> str:
+    """Return text such as ``/a -publish /x-> /b -publish /y-> /c``."""
+    hops = zip(steps[::2], steps[1::2], strict=True)
+    return " ".join(
+        (steps[0].use.enclave, *(f"-{said.does()}-> {heard.use.enclave}" for said, heard in hops))
+    )
+
+
+def _others(violation: Violation) -> str:
+    others = violation.witness.others
+    return f", and so may {_listed(others)}" if others else ""
+
+
+def _listed(names: Sequence[str]) -> str:
+    if len(names) > _SHOWN:
+        names = (*names[:_SHOWN], f"{len(names) - _SHOWN} more")
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _vacuous(requirement: Requirement, empty: Sequence[str]) -> Finding:
+    own = requirement.source
+    return VACUOUS.found(
+        own.file,
+        f"nothing has {_listed(empty)}: {demand(requirement)}",
+        own.file,
+        own.line,
+    )

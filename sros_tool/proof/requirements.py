@@ -1,0 +1,415 @@
+"""Requirements on the access of enclaves, and the TOML file that they are read from.
+
+A requirement is a table of the file, such as::
+
+    [[only]]
+    publish = ["/cmd_vel"]
+    enclaves = ["/robot/mux"]
+    why = "Commands meet in one place."
+
+Names are absolute ROS names, with the wildcards of policies; enclaves are names or patterns, as for
+``--match``.  What each kind demands is said by its class.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from sros_tool.errors import DocumentError
+from sros_tool.files import parse_toml
+from sros_tool.names import expression_problem, is_expression
+from sros_tool.policy.model import RIGHTS, Source
+from sros_tool.policy.protection import Level
+from sros_tool.policy.rights import KIND_OF
+from sros_tool.xml import read_bytes
+
+_MOST_REQUIREMENTS = 1000
+_MOST_TEXTS = 1000  # of one key
+_LONGEST_TEXT = 500  # characters of a name or a reason
+_LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Requirement:
+    """What all requirements have: the place of their table, and two texts for people, or ""."""
+
+    KIND: ClassVar[str]
+
+    source: Source
+    name: str = ""
+    why: str = ""
+
+    def __str__(self) -> str:
+        """Return the own name of the requirement, or what it demands."""
+        return self.name or demand(self)
+
+
+RightNames = tuple[tuple[str, tuple[str, ...]], ...]
+"""The rights that a requirement is about, each with names that can have wildcards."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _OfRights(Requirement):
+    """A requirement about ``rights`` to names."""
+
+    rights: RightNames
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Only(_OfRights):
+    """No enclave except ``enclaves`` has one of the rights to one of the names."""
+
+    KIND = "only"
+
+    enclaves: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nobody(_OfRights):
+    """No enclave has one of the rights to one of the names."""
+
+    KIND = "nobody"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Must(_OfRights):
+    """The enclave has all the rights to all the names."""
+
+    KIND = "must"
+
+    enclave: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AtMost(_OfRights):
+    """No single name can be used by more than ``most`` enclaves, with one right."""
+
+    KIND = "at_most"
+
+    most: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Widest(_OfRights):
+    """Wildcards give the enclaves the rights to no other names; without names, to none at all.
+
+    What an enclave may use because its exact name is stated does not count.
+    """
+
+    KIND = "widest"
+
+    enclaves: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Protected(Requirement):
+    """The messages of all ``names`` (pairs of kind and name) are signed, or encrypted."""
+
+    KIND = "protected"
+
+    names: tuple[tuple[str, str], ...]
+    level: Level
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Apart(Requirement):
+    """The enclaves ``sources`` cannot influence ``targets``, except through ``through``."""
+
+    KIND = "apart"
+
+    sources: tuple[str, ...]
+    targets: tuple[str, ...]
+    through: tuple[str, ...] = ()
+
+
+def demand(requirement: Requirement) -> str:
+    """Return what a requirement demands, as a clause such as ``nobody may publish /x``."""
+    match requirement:
+        case Only(rights=rights, enclaves=enclaves):
+            return f"only {_listed(enclaves)} may {_said(rights)}"
+        case Nobody(rights=rights):
+            return f"nobody may {_said(rights)}"
+        case Must(rights=rights, enclave=enclave):
+            return f"{enclave} has to be able to {_said(rights, 'and')}"
+        case AtMost(rights=rights, most=most):
+            return f"at most {most} enclave{'' if most == 1 else 's'} may {_said(rights)}"
+        case Widest(rights=rights, enclaves=enclaves):
+            return f"wildcards may let {_listed(enclaves)} only {_said(rights)}"
+        case Protected(names=names, level=level):
+            shown = _listed([f"{kind.removesuffix('s')} {name}" for kind, name in names])
+            return f"{shown} has to be {'encrypted' if level is Level.ENCRYPT else 'signed'}"
+        case Apart(sources=sources, targets=targets, through=through):
+            past = f" except through {_listed(through)}" if through else ""
+            return f"{_listed(sources)} must not influence {_listed(targets)}{past}"
+        case _:
+            raise AssertionError(requirement)
+
+
+def _said(rights: RightNames, link: str = "or") -> str:
+    """Return text such as ``publish /cmd_vel or call action /dock``."""
+    texts = (
+        f"{right}{' action' if KIND_OF[right] == 'actions' else ''} {_listed(names)}"
+        for right, names in rights
+    )
+    return f" {link} ".join(texts)
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Return a list as text; of a long one only its beginning."""
+    found = list(names)
+    more = f" and {len(found) - 4} more" if len(found) > 4 else ""
+    return (", ".join(found[:4]) or "nothing") + more
+
+
+# ── reading ────────────────────────────────────────────────────────────────────────────────
+
+
+def read_requirements(path: Path) -> tuple[Requirement, ...]:
+    """Return the requirements in a TOML file, in its order.
+
+    Raises:
+        DocumentError: the file cannot be read, or a part of it is not valid; names file and line.
+    """
+    return parse_requirements(read_bytes(path, "requirements file", most=1024 * 1024), str(path))
+
+
+def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
+    """Return the requirements in a TOML document; ``file`` names it in errors and sources.
+
+    Raises:
+        DocumentError: a part of it is not valid.
+    """
+    try:
+        text = data.decode()
+        document = parse_toml(text)
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        why = str(error)
+        raise DocumentError(
+            f"the requirements file '{file}' is not valid TOML", f"{why[:1].upper()}{why[1:]}."
+        ) from error
+    places = _places(text)
+    tables: list[tuple[int, _Table]] = []
+    for kind, found in document.items():
+        if kind not in _READERS:
+            line = next((n for n, each in _headers(text) if each == kind), 0)
+            raise DocumentError(
+                f"{Source(file, line)}: {_short(kind)} is no kind of requirement",
+                f"There are {', '.join(_READERS)}.",
+            )
+        lines = places.get(kind, [])
+        plain = isinstance(found, list) and all(isinstance(each, dict) for each in found)
+        if not plain or len(found) != len(lines):
+            raise DocumentError(
+                f"{file}: {kind} is not written as tables",
+                "Each requirement begins with a line of its own, so that findings can name it.",
+                f"Write [[{kind}]] before each one, and no such line within a text.",
+            )
+        tables += [
+            (line, _Table(kind, table, Source(file, line), keys))
+            for (line, keys), table in zip(lines, found, strict=True)
+        ]
+    if not tables:
+        raise DocumentError(
+            f"'{file}' has no requirement",
+            "",
+            'Write for example [[nobody]] and below it request = ["*/set_parameters"].',
+        )
+    if len(tables) > _MOST_REQUIREMENTS:
+        raise DocumentError(f"'{file}' has more than {_MOST_REQUIREMENTS} requirements")
+    return tuple(_READERS[table.kind](table) for _, table in sorted(tables, key=lambda e: e[0]))
+
+
+_HEADER = re.compile(r"[ \t]*\[\[?[ \t]*([A-Za-z0-9_-]+)[ \t]*\]")
+_KEY = re.compile(r"[ \t]*([A-Za-z0-9_-]+)[ \t]*=")
+
+
+def _headers(text: str) -> Iterator[tuple[int, str]]:
+    """Yield the number and the name of each line that begins a table."""
+    for number, line in enumerate(text.split("\n"), 1):
+        if found := _HEADER.match(line):
+            yield number, found[1]
+
+
+def _places(text: str) -> dict[str, list[tuple[int, dict[str, int]]]]:
+    """Map each kind to the lines of its tables, each with the lines of its keys."""
+    found: dict[str, list[tuple[int, dict[str, int]]]] = {}
+    keys: dict[str, int] = {}
+    for number, line in enumerate(text.split("\n"), 1):
+        if header := _HEADER.match(line):
+            keys = {}
+            found.setdefault(header[1], []).append((number, keys))
+        elif key := _KEY.match(line):
+            keys.setdefault(key[1], number)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """One table of a file, with the lines of its keys, and functions that check its values."""
+
+    kind: str
+    values: Mapping[str, Any]
+    source: Source
+    lines: Mapping[str, int]
+
+    def known(self, *keys: str) -> dict[str, Any]:
+        """Return the arguments of every requirement, after a check that all keys are known."""
+        every = (*keys, "name", "why")
+        for key in self.values:
+            if key not in every:
+                raise self.error(
+                    key,
+                    f"{_short(key)} is not a key of [[{self.kind}]]",
+                    (f"There are {', '.join(every)}."),
+                )
+        texts = {key: self.text(key) if key in self.values else "" for key in ("name", "why")}
+        return {"source": self.source, **texts}
+
+    def text(self, key: str) -> str:
+        value = self.values.get(key)
+        if not isinstance(value, str) or not value or len(value) > _LONGEST_TEXT:
+            raise self.error(
+                key,
+                f"{key} has {_short(value)}, and not a text",
+                f"It has 1 to {_LONGEST_TEXT} characters.",
+            )
+        return value
+
+    def texts(self, key: str, *, least: int = 1) -> tuple[str, ...]:
+        """Return the texts of a list."""
+        value = self.values.get(key)
+        if value is None:
+            raise self.error(key, f"{key} is missing in [[{self.kind}]]", "")
+        if (
+            not isinstance(value, list)
+            or not least <= len(value) <= _MOST_TEXTS
+            or not all(isinstance(each, str) for each in value)
+        ):
+            raise self.error(
+                key,
+                f"{key} is not a list of names",
+                f"A list has {least} to {_MOST_TEXTS} names in quotation marks.",
+            )
+        return tuple(dict.fromkeys(value))
+
+    def names(self, key: str, *, least: int = 1) -> tuple[str, ...]:
+        """Return absolute names, perhaps with wildcards."""
+        found = self.texts(key, least=least)
+        for each in found:
+            problem = expression_problem(each)
+            if not problem and each[0] not in "/*":
+                problem = "It is not absolute: it does not begin with '/' or '*'."
+            if not problem and each == "/":
+                problem = "It is a namespace."
+            if problem:
+                raise self.error(key, f"{_short(each)} is not valid in {key}", problem)
+        return found
+
+    def enclaves(self, key: str) -> tuple[str, ...]:
+        """Return names and patterns of enclaves."""
+        found = self.texts(key)
+        for each in found:
+            problem = "" if each == "/" else expression_problem(each)
+            if not problem and each[0] not in "/*?[":
+                problem = "An enclave begins with '/'."
+            if problem:
+                raise self.error(key, f"{_short(each)} is no enclave in {key}", problem)
+        return found
+
+    def rights(self, *, least: int = 1) -> RightNames:
+        """Return the rights that the table names, at least one, each with ``least`` names."""
+        found = tuple(
+            (right, self.names(right, least=least)) for right in KIND_OF if right in self.values
+        )
+        if not found:
+            raise self.error(
+                "", f"[[{self.kind}]] names no right", f"The rights are {', '.join(KIND_OF)}."
+            )
+        return found
+
+    def error(self, key: str, what: str, why: str) -> DocumentError:
+        place = Source(self.source.file, self.lines.get(key, self.source.line))
+        return DocumentError(f"{place}: {what}", why)
+
+
+def _only(table: _Table) -> Only:
+    own = table.known(*KIND_OF, "enclaves")
+    return Only(**own, rights=table.rights(), enclaves=table.enclaves("enclaves"))
+
+
+def _nobody(table: _Table) -> Nobody:
+    return Nobody(**table.known(*KIND_OF), rights=table.rights())
+
+
+def _must(table: _Table) -> Must:
+    own = table.known(*KIND_OF, "enclave")
+    enclave = table.text("enclave")
+    problem = expression_problem(enclave)
+    if is_expression(enclave):
+        problem = "It has a wildcard: each enclave that must be able to has a table of its own."
+    if enclave != "/" and (problem or not enclave.startswith("/")):
+        raise table.error(
+            "enclave",
+            f"{_short(enclave)} is no enclave",
+            problem or "An enclave begins with '/'.",
+        )
+    return Must(**own, rights=table.rights(), enclave=enclave)
+
+
+def _at_most(table: _Table) -> AtMost:
+    own = table.known(*KIND_OF, "enclaves")
+    most = table.values.get("enclaves")
+    if type(most) is not int or not 0 < most < 2**31:
+        raise table.error(
+            "enclaves",
+            f"enclaves has {_short(most)}, and not a number",
+            "Write how many enclaves may use one name, from 1; for none there is [[nobody]].",
+        )
+    return AtMost(**own, rights=table.rights(), most=most)
+
+
+def _widest(table: _Table) -> Widest:
+    own = table.known(*KIND_OF, "enclaves")
+    return Widest(**own, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
+
+
+def _protected(table: _Table) -> Protected:
+    own = table.known(*RIGHTS, "level")
+    level = table.values.get("level")
+    if not isinstance(level, str) or level not in _LEVELS:
+        raise table.error(
+            "level", f"level has {_short(level)}", f"Write {' or '.join(map(repr, _LEVELS))}."
+        )
+    names = tuple((k, name) for k in RIGHTS if k in table.values for name in table.names(k))
+    if not names:
+        raise table.error("", "[[protected]] names nothing", f"Write one of {', '.join(RIGHTS)}.")
+    return Protected(**own, names=names, level=_LEVELS[level])
+
+
+def _apart(table: _Table) -> Apart:
+    own = table.known("from", "to", "through")
+    through = table.enclaves("through") if "through" in table.values else ()
+    return Apart(
+        **own, sources=table.enclaves("from"), targets=table.enclaves("to"), through=through
+    )
+
+
+_READERS: Mapping[str, Callable[[_Table], Requirement]] = {
+    Only.KIND: _only,
+    Nobody.KIND: _nobody,
+    Must.KIND: _must,
+    Protected.KIND: _protected,
+    Apart.KIND: _apart,
+    AtMost.KIND: _at_most,
+    Widest.KIND: _widest,
+}
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."

@@ -1,0 +1,160 @@
+"""``sros check --requirements`` and ``--suggest``: what is printed, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sros_tool.proof import findings
+from tests.support.harness import policy_text, publish, sros
+
+LISTEN = '<topics subscribe="ALLOW"><topic>{}</topic></topics>'
+WILD = publish("/cmd_*")
+POLICY = policy_text(
+    {
+        "/mux": publish("/cmd_vel"),
+        "/web": WILD + LISTEN.format("/scan"),
+        "/wheels": LISTEN.format("/cmd_vel"),
+        "/lidar": publish("/scan"),
+    }
+)
+REQUIRED = """\
+# what has to be true
+[[only]]
+publish = ["/cmd_vel"]
+enclaves = ["/mux"]
+why = "commands meet in one place"
+
+[[apart]]
+name = "the web does not drive"
+from = ["/lidar"]
+to = ["/wheels"]
+
+[[must]]
+enclave = "/mux"
+publish = ["/cmd_vel"]
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a policy, and with requirements of which two do not hold."""
+    made = tmp_path_factory.mktemp("requirements")
+    (made / "robot.xml").write_text(POLICY)
+    (made / "required.toml").write_text(REQUIRED)
+    return made
+
+
+CASES = {"requirement.violated", "requirement.vacuous", "requirement.not-on-zenoh"}
+"""The kinds of findings that tests here bring about."""
+ONLY = ("check", "robot.xml", "--include", "requirement.*")
+
+
+def test_text(folder: Path) -> None:
+    ended = sros(*ONLY, "--requirements", "required.toml", cwd=folder)
+    assert ended.status == 1
+    lines = POLICY.splitlines()
+    wild = next(number for number, line in enumerate(lines, 1) if "/cmd_*" in line)
+    assert ended.out.splitlines()[:6] != []
+    head = f"robot.xml:{wild}: error: a requirement that does not hold [requirement.violated]"
+    assert head in ended.out.splitlines()
+    assert "/web: may publish /cmd_vel by /cmd_*, but only /mux may publish /cmd_vel: " in ended.out
+    assert "commands meet in one place" in ended.out
+    assert "/lidar -publish /scan-> /web -publish /cmd_vel by /cmd_*-> /wheels" in ended.out
+    assert "required.toml:7: required: the web does not drive: /lidar must not" in ended.out
+    assert "2 errors" in ended.err
+
+
+def test_json_and_sarif_have_the_lines_of_both(folder: Path) -> None:
+    asked = (*ONLY, "--requirements", "required.toml")
+    found = json.loads(sros(*asked, "--json", cwd=folder).out)["findings"]
+    assert {each["id"] for each in found} == {"requirement.violated"}
+    places = [[place["file"] for place in each["related"]] for each in found]
+    assert sorted(map(len, places)) == [1, 5]
+    assert all(each[-1] == "required.toml" for each in places)
+    (run,) = json.loads(sros(*asked, "--sarif", cwd=folder).out)["runs"]
+    for result, finding in zip(run["results"], found, strict=True):
+        assert len(result["relatedLocations"]) == len(finding["related"])
+        for shown, related in zip(result["relatedLocations"], finding["related"], strict=True):
+            place = shown["physicalLocation"]
+            assert place["artifactLocation"]["uri"] == related["file"]
+            assert place["region"]["startLine"] == related["line"]
+            assert shown["message"]["text"] == related["text"]
+
+
+def test_what_holds_and_what_cannot_fail(folder: Path, tmp_path: Path) -> None:
+    held = tmp_path / "held.toml"
+    held.write_text(REQUIRED.split("[[apart]]")[0].replace('"/mux"', '"/mux", "/web"'))
+    sros(*ONLY, "--requirements", held, cwd=folder).ok()
+    held.write_text('[[only]]\npublish = ["/cmdvel"]\nenclaves = ["/mix"]\n')
+    ended = sros(*ONLY, "--requirements", held, cwd=folder)
+    assert ended.status == 1
+    assert f"{held}:1: warning: a requirement about names or enclaves that nothing has" in ended.out
+    assert "nothing has enclave /mix and topic /cmdvel: only /mix may publish" in ended.out
+    sros(*ONLY, "--requirements", held, "--exclude", "requirement.vacuous", cwd=folder).ok()
+
+
+def test_a_policy_that_zenoh_cannot_carry_out(folder: Path, tmp_path: Path) -> None:
+    """Between ``*`` and ``*`` there is no list of the names that a denial leaves."""
+    policy = tmp_path / "dds.xml"
+    denied = '<topics publish="DENY"><topic>/*b*c*</topic></topics>'
+    policy.write_text(policy_text({"/a": publish("/*") + denied}))
+    required = tmp_path / "required.toml"
+    required.write_text('[[widest]]\npublish = ["/*"]\nenclaves = ["/a"]\n')
+    asked = ("check", policy, *ONLY[2:], "--requirements", required)
+    ended = sros(*asked, "--severity", "note").ok()
+    assert "[requirement.not-on-zenoh]" in ended.out
+    assert sros(*asked, "--vendor", "fastdds", "--severity", "note").ok().out == ""
+    ended = sros(*asked, "--vendor", "zenoh")
+    assert ended.status == 2
+    assert "cannot be said to Zenoh" in ended.err
+
+
+def test_a_suggestion_holds(folder: Path, tmp_path: Path) -> None:
+    suggested = tmp_path / "suggested.toml"
+    suggested.write_text(sros("check", "robot.xml", "--suggest", cwd=folder).ok().out)
+    text = suggested.read_text()
+    assert '[[only]]\npublish = ["/scan"]\nenclaves = ["/lidar"]' in text
+    assert '# topic /* has to be encrypted\n[[protected]]\ntopics = ["/*"]' in text
+    assert '[[widest]]\npublish = ["/cmd_*"]' in text
+    sros(*ONLY, "--requirements", suggested, cwd=folder).ok()
+    changed = tmp_path / "changed.xml"
+    changed.write_text(POLICY.replace("/cmd_*", "/*"))
+    ended = sros("check", changed, *ONLY[2:], "--requirements", suggested)
+    assert ended.status == 1
+    assert ended.out.count("[requirement.violated]") == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("robot.xml", "robot.xml", "--requirements", "required.toml"), "takes one policy"),
+        (("runtime", "--requirements", "required.toml"), "takes one policy"),
+        ((".", "--requirements", "required.toml"), "takes one policy"),
+        (("robot.xml", "--requirements", "gone.toml"), "gone.toml"),
+        (("robot.xml", "--requirements", "robot.xml"), "not valid TOML"),
+        (("required.toml", "--requirements", "required.toml"), "required.toml"),
+        (("robot.xml", "--suggest", "--json"), "--suggest prints TOML"),
+        (("robot.xml", "--suggest", "--requirements", "required.toml"), "--suggest prints TOML"),
+    ],
+)
+def test_what_is_refused(words: tuple[str, ...], says: str, folder: Path) -> None:
+    ended = sros("check", *words, cwd=folder)
+    assert ended.status == 2
+    assert says in ended.err
+    assert "defect" not in ended.err
+
+
+def test_more_wildcards_than_can_be_decided_are_one_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each ``?`` after a star doubles what has to be told apart."""
+    monkeypatch.setattr(findings, "MOST_STEPS", 5000)
+    policy, required = tmp_path / "hard.xml", tmp_path / "hard.toml"
+    policy.write_text(policy_text({"/e": publish("/*a" + "?" * 200)}))
+    required.write_text(f'[[widest]]\npublish = ["/*a*{"?" * 180}"]\nenclaves = ["*"]\n')
+    ended = sros("check", policy, "--requirements", required)
+    assert ended.status == 2
+    assert "it cannot be decided which names so many wildcards match" in ended.err

@@ -1,0 +1,169 @@
+"""Requirements decided name by name, with each vendor's own decision: slow, and plainly right.
+
+Only short names are tried, of few letters.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from itertools import product
+
+from sros_tool.names import READING_SERVICES
+from sros_tool.policy.patterns import matches
+from sros_tool.proof.requirements import Apart, AtMost, Must, Nobody, Only, Requirement, Widest
+from sros_tool.translate import dds_names
+
+LETTERS = "abc"
+LONGEST = 4
+
+
+def short_names() -> list[str]:
+    """Every absolute ROS name of a few letters."""
+    found = []
+    for size in range(1, LONGEST):
+        for letters in product(LETTERS + "/", repeat=size):
+            text = "".join(letters)
+            if "//" not in text and text[0] != "/" and text[-1] != "/":
+                found.append(f"/{text}")
+    return found
+
+
+NAMES = short_names()
+PARTS = ("send_goal", "cancel_goal", "get_result", "feedback", "status")
+WITH_PARTS = [*NAMES, *(f"/{a}/_action/{part}" for a in LETTERS for part in PARTS)]
+WRITING = {
+    "publish": lambda names: names.publish,
+    "subscribe": lambda names: names.subscribe,
+}
+
+
+def topics() -> list[str]:
+    """The DDS topics of all short names."""
+    return [
+        f"{begin}{name}{end}"
+        for begin, end in (("rt", ""), ("rq", "Request"), ("rr", "Reply"))
+        for name in WITH_PARTS
+    ]
+
+
+TOPICS = topics()
+
+
+@dataclass(frozen=True)
+class Finite:
+    """The short topics that each enclave may write and read, and those stated without wildcards."""
+
+    writes: Mapping[str, frozenset[str]]
+    reads: Mapping[str, frozenset[str]]
+    stated: Mapping[tuple[str, bool], frozenset[str]]
+
+    def may(self, enclave: str, writes: bool, topic: str) -> bool:
+        """Whether an enclave may write or read a topic."""
+        return topic in (self.writes if writes else self.reads).get(enclave, ())
+
+
+Uses = Collection[tuple[str, str]]
+"""Pairs of an enclave and a topic."""
+
+
+def breaches(requirement: Requirement, world: Finite) -> Iterator[tuple[str, ...]]:
+    """Yield what breaks a requirement: the name, or the enclaves of a chain."""
+    match requirement:
+        case Only() | Nobody():
+            allowed = requirement.enclaves if isinstance(requirement, Only) else ()
+            for enclave in world.writes:
+                if not any(fnmatchcase(enclave, each) for each in allowed):
+                    for name, topic, writes in doings(requirement.rights):
+                        if world.may(enclave, writes, topic):
+                            yield (name,)
+        case Must(enclave=enclave):
+            for right, patterns in requirement.rights:
+                for name in WITH_PARTS:
+                    needed = dds_names(right, name)
+                    able = all(world.may(enclave, True, each) for each in needed.publish) and all(
+                        world.may(enclave, False, each) for each in needed.subscribe
+                    )
+                    if any(matches(each, name) for each in patterns) and not able:
+                        yield (name,)
+        case AtMost(most=most):
+            for name, topic, writes in doings(requirement.rights):
+                if sum(world.may(each, writes, topic) for each in world.writes) > most:
+                    yield (name,)
+        case Widest():
+            for enclave in world.writes:
+                if any(fnmatchcase(enclave, each) for each in requirement.enclaves):
+                    for right, patterns in requirement.rights:
+                        for name, topic, writes in doings(((right, ("*",)),)):
+                            if any(matches(each, name) for each in patterns):
+                                continue
+                            if topic not in world.stated[enclave, writes] and world.may(
+                                enclave, writes, topic
+                            ):
+                                yield (name,)
+        case Apart():
+            yield from chains(requirement, world)
+        case _:
+            raise AssertionError(requirement)
+
+
+def doings(rights: Collection[tuple[str, tuple[str, ...]]]) -> Iterator[tuple[str, str, bool]]:
+    """Yield name, topic and whether to write it, for each topic that lets one do a right."""
+    for right, patterns in rights:
+        for name in WITH_PARTS:
+            if any(matches(each, name) for each in patterns):
+                needed = dds_names(right, name)
+                yield from ((name, topic, True) for topic in needed.publish)
+                if right == "subscribe":
+                    yield from ((name, topic, False) for topic in needed.subscribe)
+
+
+QUESTIONS = tuple(f"rq/*/{each}Request" for each in READING_SERVICES)
+
+
+def chains(requirement: Apart, world: Finite) -> Iterator[tuple[str, ...]]:
+    """Yield a shortest chain of enclaves for each source and target."""
+
+    def among(patterns: Collection[str]) -> list[str]:
+        return [each for each in world.writes if any(fnmatchcase(each, one) for one in patterns)]
+
+    through = set(among(requirement.through))
+    for source in among(requirement.sources):
+        before: dict[str, tuple[str, ...]] = {source: (source,)}
+        queue = deque([source] if source not in through else [])
+        while queue:
+            here = queue.popleft()
+            for there in world.writes:
+                flow = world.writes[here] & world.reads[there]
+                if there not in before and there not in through and any(map(counts, flow)):
+                    before[there] = (*before[here], there)
+                    queue.append(there)
+        for target in among(requirement.targets):
+            if target in before and target != source:
+                yield before[target]
+
+
+def counts(topic: str) -> bool:
+    """Whether a topic carries information from one enclave to another."""
+    return topic != "rt/parameter_events" and not any(matches(each, topic) for each in QUESTIONS)
+
+
+Decide = Callable[[str, bool, str], bool]
+
+
+def finite(
+    enclaves: Collection[str],
+    stated: Mapping[tuple[str, bool], frozenset[str]],
+    decide: Decide,
+) -> Finite:
+    """The world in which ``decide`` says whether an enclave may write (or read) a topic."""
+    sides = [
+        {
+            each: frozenset(topic for topic in TOPICS if decide(each, writes, topic))
+            for each in enclaves
+        }
+        for writes in (True, False)
+    ]
+    return Finite(sides[0], sides[1], stated)

@@ -1,0 +1,135 @@
+"""What is decided for all names is what name by name decides, with the engine of each vendor."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections import Counter
+from collections.abc import Iterator
+from datetime import UTC, datetime
+
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
+from sros_tool.policy.rights import KIND_OF
+from sros_tool.proof.decide import Witness, decide
+from sros_tool.proof.requirements import (
+    Apart,
+    AtMost,
+    Must,
+    Nobody,
+    Only,
+    Requirement,
+    Widest,
+)
+from sros_tool.proof.system import policy_system
+from sros_tool.translate import dds_names
+from tests.proof.brute_force import TOPICS, Finite, breaches, finite
+from tests.support.children import LONG
+
+NOW = datetime(2027, 1, 1, tzinfo=UTC)
+COUNT = int(os.environ.get("SROS_REQUIREMENTS", "20000" if LONG else "150"))
+SEED = int(os.environ.get("SROS_REQUIREMENTS_SEED", "1"))
+ENCLAVES = ("/e", "/f", "/g", "/h")
+NAMES = (
+    "/a", "/b", "/a/b", "/ab", "/abc", "/b/a", "/c", "/*", "/a*", "/*b", "/a/*", "/?", "/a?",
+    "/[ab]", "/[!a]*", "/a*b", "/*/b", "/?/?", "*b", "/b*a", "/[a-c]b", "/ca", "/a/_action/*",
+)  # fmt: skip
+PATTERNS = (*NAMES, "*", "/??", "/[bc]*", "*/a", "/*a*", "/c/*")
+SOURCE = Source("r.toml", 1)
+"""Where every requirement here stands."""
+
+
+def draw_policy(draw: random.Random) -> Policy:
+    """Some enclaves with few rights and denials to names that often meet."""
+    return Policy(tuple(draw_enclave(draw, each) for each in ENCLAVES[: draw.randint(2, 4)]))
+
+
+def draw_enclave(draw: random.Random, path: str) -> Enclave:
+    groups = []
+    for _ in range(draw.randint(1, 4)):
+        right = draw.choice(("publish", "subscribe") * 3 + tuple(KIND_OF))
+        qualifier = DENY if draw.random() < 0.25 else ALLOW
+        names = tuple(dict.fromkeys(draw.choices(NAMES, k=draw.randint(1, 2))))
+        groups.append(Group(KIND_OF[right], ((right, qualifier),), names))
+    return Enclave(path, (Profiles((Profile("/", "node", tuple(groups)),)),))
+
+
+def draw_requirement(draw: random.Random) -> Requirement:
+    def some(of: tuple[str, ...], most: int = 2) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(draw.choices(of, k=draw.randint(1, most))))
+
+    enclaves = (*ENCLAVES, *ENCLAVES, "*", "/[ef]")
+    right = draw.choice(("publish", "subscribe") * 2 + tuple(KIND_OF))
+    rights = ((right, some(PATTERNS)),)
+    kind = draw.choice((Only, Nobody, Must, AtMost, Widest, Apart))
+    if kind is Only:
+        return Only(source=SOURCE, rights=rights, enclaves=some(enclaves))
+    if kind is Nobody:
+        return Nobody(source=SOURCE, rights=rights)
+    if kind is Must:
+        return Must(source=SOURCE, rights=rights, enclave=draw.choice(ENCLAVES))
+    if kind is AtMost:
+        return AtMost(source=SOURCE, rights=rights, most=draw.randint(1, 2))
+    if kind is Widest:
+        return Widest(source=SOURCE, rights=rights, enclaves=some(enclaves))
+    through = some(enclaves, 1) if draw.random() < 0.3 else ()
+    return Apart(source=SOURCE, sources=some(enclaves), targets=some(enclaves), through=through)
+
+
+def stated(policy: Policy) -> dict[tuple[str, bool], frozenset[str]]:
+    """The topics that each enclave may write, and read, without a wildcard."""
+    found: dict[tuple[str, bool], set[str]] = {}
+    for enclave in policy.enclaves:
+        found[enclave.path, True], found[enclave.path, False] = set(), set()
+        for profile in enclave.all_profiles():
+            for group in profile.groups:
+                for right, qualifier in group.rights:
+                    for name in group.names:
+                        if qualifier is ALLOW and not set("*?[").intersection(name):
+                            topics = dds_names(right, name)
+                            found[enclave.path, True].update(topics.publish)
+                            found[enclave.path, False].update(topics.subscribe)
+    return {place: frozenset(topics) for place, topics in found.items()}
+
+
+def cases() -> Iterator[tuple[int, Policy, list[Requirement]]]:
+    """Yield policies, each with several requirements: ``COUNT`` of these in all."""
+    for number in range(COUNT // 10):
+        draw = random.Random(f"{SEED}.{number}")
+        yield number, draw_policy(draw), [draw_requirement(draw) for _ in range(10)]
+
+
+def test_every_decision_is_that_of_brute_force() -> None:
+    seen: Counter[tuple[str, str, bool]] = Counter()
+    different: list[str] = []
+    for number, policy, requirements in cases():
+        system = policy_system(policy, at=NOW)
+        for world in system.worlds:
+            small = finite(world.enclaves, stated(policy), world.confirm)
+            for requirement in requirements:
+                witness = decide(requirement, world).witness
+                different += disagreements(number, requirement, world.title, witness, small)
+                seen[world.title, requirement.KIND, witness is not None] += 1
+    assert different == []
+    assert len({title for title, _, _ in seen}) == 4
+    assert min(seen.values()) > COUNT / 200
+    print(seen)
+
+
+def disagreements(
+    number: int, requirement: Requirement, world: str, witness: Witness | None, small: Finite
+) -> Iterator[str]:
+    """Where a decision differs from that of brute force.
+
+    Only short names are tried there: a longer witness was confirmed by the engine itself.
+    """
+    found = list(breaches(requirement, small))
+    if found and witness is None:
+        yield f"{number}, {world}: {requirement} breaks by {found[0]}"
+    if witness is None:
+        return
+    if isinstance(requirement, Apart):
+        length = min(map(len, found), default=len(ENCLAVES) + 1)
+        if len(witness.uses) > 2 * (length - 1):
+            yield f"{number}, {world}: {requirement} has a chain of {length}, and not {witness}"
+    elif (witness.uses[0].name,) not in found and witness.uses[0].topic in TOPICS:
+        yield f"{number}, {world}: {requirement} does not break by {witness}"

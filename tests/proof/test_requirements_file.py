@@ -1,0 +1,159 @@
+"""The requirements file: what it can say, and what is wrong with it, by file and line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sros_tool.errors import DocumentError
+from sros_tool.policy.model import Source
+from sros_tool.policy.protection import Level
+from sros_tool.proof.requirements import (
+    Apart,
+    AtMost,
+    Must,
+    Nobody,
+    Only,
+    Protected,
+    Widest,
+    demand,
+    parse_requirements,
+    read_requirements,
+)
+
+EVERY_KIND = """\
+[[only]]
+publish = ["/cmd_vel"]
+subscribe = ["/a", "/b", "/c", "/d", "/e", "/f"]
+enclaves = ["/robot/mux", "/arm/*"]
+name = "drive"
+why = "commands meet in one place"
+
+[[ nobody ]] # each calls set_parameters
+request = ["*/set_parameters"]
+[[must]]
+enclave = "/robot/mux"
+call = ["/go"]
+publish = ["/x"]
+[[at_most]]
+execute = ["/go"]
+enclaves = 1
+[[widest]]
+enclaves = ["*"]
+reply = []
+[[protected]]
+topics = ["/camera/*"]
+actions = ["/go"]
+level = "encrypt"
+[[apart]]
+from = ["/web/*"]
+to = ["/"]
+through = ["/robot/mux"]
+[[protected]]
+services = ["/x"]
+level = "sign"
+"""
+
+
+def at(line: int) -> Source:
+    return Source("r.toml", line)
+
+
+def test_every_kind_is_read_with_its_line() -> None:
+    assert parse_requirements(EVERY_KIND.encode(), "r.toml") == (
+        Only(
+            source=at(1),
+            name="drive",
+            why="commands meet in one place",
+            rights=(
+                ("publish", ("/cmd_vel",)),
+                ("subscribe", ("/a", "/b", "/c", "/d", "/e", "/f")),
+            ),
+            enclaves=("/robot/mux", "/arm/*"),
+        ),
+        Nobody(source=at(8), rights=(("request", ("*/set_parameters",)),)),
+        Must(
+            source=at(10),
+            rights=(("publish", ("/x",)), ("call", ("/go",))),
+            enclave="/robot/mux",
+        ),
+        AtMost(source=at(14), rights=(("execute", ("/go",)),), most=1),
+        Widest(source=at(17), rights=(("reply", ()),), enclaves=("*",)),
+        Protected(
+            source=at(20), names=(("topics", "/camera/*"), ("actions", "/go")), level=Level.ENCRYPT
+        ),
+        Apart(source=at(24), sources=("/web/*",), targets=("/",), through=("/robot/mux",)),
+        Protected(source=at(28), names=(("services", "/x"),), level=Level.SIGN),
+    )
+
+
+def test_each_says_what_it_demands() -> None:
+    assert [demand(each) for each in parse_requirements(EVERY_KIND.encode(), "r.toml")] == [
+        "only /robot/mux, /arm/* may publish /cmd_vel or subscribe /a, /b, /c, /d and 2 more",
+        "nobody may request */set_parameters",
+        "/robot/mux has to be able to publish /x and call action /go",
+        "at most 1 enclave may execute action /go",
+        "wildcards may let * only reply nothing",
+        "topic /camera/*, action /go has to be encrypted",
+        "/web/* must not influence / except through /robot/mux",
+        "service /x has to be signed",
+    ]
+
+
+NOBODY = '[[nobody]]\npublish = ["/x"]\n'
+WRONG = {
+    "": "has no requirement",
+    "[[nobody]": "not valid TOML",
+    f"{NOBODY}[[none]]\n": "r.toml:3: 'none' is no kind of requirement",
+    'nobody = [{publish = ["/x"]}]': "nobody is not written as tables",
+    '[nobody]\npublish = ["/x"]': "nobody is not written as tables",
+    "nobody = 1": "nobody is not written as tables",
+    f'{NOBODY}why = """\n[[nobody]]\n"""': "nobody is not written as tables",
+    f"{NOBODY}\nenclaves = []": "r.toml:4: 'enclaves' is not a key of [[nobody]]",
+    "[[nobody]]\n": "r.toml:1: [[nobody]] names no right",
+    "[[nobody]]\n\npublish = []": "r.toml:3: publish is not a list of names",
+    '[[nobody]]\npublish = "/x"': "r.toml:2: publish is not a list of names",
+    "[[nobody]]\npublish = [1]": "r.toml:2: publish is not a list of names",
+    '[[nobody]]\npublish = ["x"]': "'x' is not valid in publish",
+    '[[nobody]]\npublish = ["/"]': "'/' is not valid in publish",
+    '[[nobody]]\npublish = ["~/x"]': "'~/x' is not valid in publish",
+    '[[nobody]]\npublish = ["/x y"]': "'/x y' is not valid in publish",
+    '[[nobody]]\npublish = ["/[^a]"]': "'/[^a]' is not valid in publish",
+    f"{NOBODY}why = 1": "r.toml:3: why has 1, and not a text",
+    f'{NOBODY}why = ""': "r.toml:3: why has '', and not a text",
+    f'{NOBODY}name = "{"n" * 501}"': "r.toml:3: name has",
+    '[[only]]\npublish = ["/x"]': "r.toml:1: enclaves is missing in [[only]]",
+    '[[only]]\npublish = ["/x"]\nenclaves = ["robot"]': "r.toml:3: 'robot' is no enclave",
+    '[[must]]\npublish = ["/x"]\nenclave = "/a*"': "r.toml:3: '/a*' is no enclave",
+    '[[must]]\npublish = ["/x"]\nenclave = "a"': "r.toml:3: 'a' is no enclave",
+    '[[must]]\npublish = ["/x"]': "r.toml:1: enclave has None",
+    '[[at_most]]\npublish = ["/x"]\nenclaves = 0': "r.toml:3: enclaves has 0",
+    '[[at_most]]\npublish = ["/x"]\nenclaves = true': "r.toml:3: enclaves has True",
+    '[[at_most]]\npublish = ["/x"]\nenclaves = ["/a"]': "r.toml:3: enclaves has ['/a']",
+    '[[protected]]\ntopics = ["/x"]': "r.toml:1: level has None",
+    '[[protected]]\ntopics = ["/x"]\nlevel = "SIGN"': "r.toml:3: level has 'SIGN'",
+    '[[protected]]\ntopics = ["/x"]\nlevel = []': "r.toml:3: level has []",
+    '[[protected]]\nlevel = "sign"': "r.toml:1: [[protected]] names nothing",
+    '[[apart]]\nfrom = ["/x"]': "r.toml:1: to is missing in [[apart]]",
+    f"{NOBODY * 1001}": "more than 1000 requirements",
+    f"a = {'[' * 1500}{']' * 1500}": "not valid TOML",
+    f"{'x.' * 3000}y = 1": "not valid TOML",
+    "[[\x1b]]": "not valid TOML",
+}
+
+
+@pytest.mark.parametrize("text", WRONG, ids=lambda text: repr(text[:40]))
+def test_what_is_wrong_is_one_error_that_names_the_place(text: str) -> None:
+    with pytest.raises(DocumentError) as caught:
+        parse_requirements(text.encode(), "r.toml")
+    assert WRONG[text] in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    (tmp_path / "latin.toml").write_bytes(b"why = '\xff'")
+    (tmp_path / "large.toml").write_text("#" * 2_000_000)
+    for name in ("latin.toml", "large.toml", "gone.toml", "."):
+        with pytest.raises(DocumentError):
+            read_requirements(tmp_path / name)
