@@ -16,7 +16,11 @@ from sros_tool.demo.scenarios.zenoh.attacks import ATTACKS as ZENOH_ATTACKS
 PROJECT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
     path.relative_to(PROJECT)
-    for path in (*PROJECT.glob("*.md"), *PROJECT.glob("docs/**/*.md"), *PROJECT.glob("policies/*.md"))
+    for path in (
+        *PROJECT.glob("*.md"),
+        *PROJECT.glob("docs/**/*.md"),
+        *PROJECT.glob("policies/*.md"),
+    )
 )
 FENCE = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
 

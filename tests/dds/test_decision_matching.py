@@ -10,6 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from sros_tool.automata import Letters
 from sros_tool.dds.decision import matching
 from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.vendors import Style
@@ -76,7 +77,7 @@ def test_many_unclosed_sets_take_linear_time(part: str, monkeypatch: pytest.Monk
     """A permissions document of a few kilobytes took half a minute."""
     read = 0
 
-    def counted(text: str, index: int) -> tuple[str | None, str | None, int]:
+    def counted(text: str, index: int) -> tuple[Letters | None, bool, int]:
         nonlocal read
         read += 1
         return token(text, index)
