@@ -76,16 +76,40 @@ def size_problem(fleet: Fleet) -> str:
 
 def robot_of(fleet: Fleet, enclave: str) -> Robot | None:
     """Return the robot that an enclave belongs to, or None: it is that of no robot."""
+    for pattern in _fitting(fleet, enclave):
+        for robot in _candidates(fleet, pattern, enclave):
+            inside = group_of(pattern.parts) in ("", *robot.groups)
+            if inside and path_for(pattern.parts, robot) == enclave:
+                return robot
+    return None
+
+
+def left_robot_of(fleet: Fleet, enclave: str) -> str:
+    """Return the name of the robot whose enclave this was, by its path: it left, or its group.
+
+    Return "" for an enclave of a robot, and for one whose path names none.  A path with a namespace
+    alone tells only of robots that are still in the fleet.
+    """
+    if robot_of(fleet, enclave):
+        return ""
+    for pattern in _fitting(fleet, enclave):
+        match = pattern.expression.fullmatch(enclave)
+        name = match.groupdict().get("robot", "") if match else ""
+        if name and name not in fleet.robots:
+            return name
+        for robot in _candidates(fleet, pattern, enclave):
+            if path_for(pattern.parts, robot) == enclave:
+                return robot.name
+    return ""
+
+
+def _fitting(fleet: Fleet, enclave: str) -> Iterator[_Pattern]:
+    """Yield the patterns that end as the path of an enclave does."""
     patterns = _patterns(fleet.enclaves)
     end = len(enclave)
     while end >= 0:
-        for pattern in patterns.get(enclave[end:], ()):
-            for robot in _candidates(fleet, pattern, enclave):
-                inside = group_of(pattern.parts) in ("", *robot.groups)
-                if inside and path_for(pattern.parts, robot) == enclave:
-                    return robot
+        yield from patterns.get(enclave[end:], ())
         end = enclave.rfind("/", 0, end) if end else -1
-    return None
 
 
 class _Pattern(NamedTuple):

@@ -238,11 +238,11 @@ def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
             yield Note(
                 "fleet.left-enclaves",
                 f"the robot {robot.name} {why}: {shown}{more} stay as they are, and work. To take "
-                f"them back, run `sros revoke {quote(str(root))} {_words(root, left)}`.",
+                f"them back, run `sros revoke {quote(str(root))} {words_for(root, left)}`.",
             )
 
 
-def _words(root: Path, names: Sequence[str]) -> str:
+def words_for(root: Path, names: Sequence[str]) -> str:
     """Return the words that name exactly these enclaves of a keystore."""
     begin = f"{os.path.commonpath(names).rstrip('/')}/"
     if len(names) > 1 and begin != "/":

@@ -8,8 +8,8 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_fleet
-from sros_tool.keystore.layout import check_keystore, list_enclaves
+from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_fleet, words_for
+from sros_tool.keystore.layout import PRIVATE, SETTINGS, check_keystore, list_enclaves
 
 
 def select_enclaves(
@@ -52,6 +52,12 @@ def _of_robots(root: Path, robots: Sequence[str], checked: bool) -> list[str]:
     if not robots:
         return []
     fleet = checked_fleet(root) if checked else load_fleet(root)
+    if fleet is None and not any((root / each).exists() for each in (PRIVATE, SETTINGS)):
+        raise KeystoreError(
+            f"'{root}' is no keystore with a fleet, so it has no robot {robots[0]!r}",
+            "An export for a robot has the enclaves of that robot alone, and not the fleet.",
+            "Leave --robot out, choose enclaves with --match, or name the keystore at home.",
+        )
     if fleet is None:
         raise KeystoreError(
             f"keystore '{root}' has no fleet, so it has no robot {robots[0]!r}",
@@ -61,8 +67,17 @@ def _of_robots(root: Path, robots: Sequence[str], checked: bool) -> list[str]:
         )
     found: list[str] = []
     for name in robots:
-        own = enclaves_of_robot(root, fleet, fleet.robot(name))
+        own = enclaves_of_robot(root, fleet, fleet.robots[name]) if name in fleet.robots else ()
         if not own:
+            if left := _named_after(root, name):
+                raise KeystoreError(
+                    f"by its fleet, keystore '{root}' has no enclave of a robot {name}",
+                    f"It has {', '.join(left[:_SHOWN])}"
+                    f"{' and others' if len(left) > _SHOWN else ''}: perhaps the robot left the "
+                    "fleet, or a group.",
+                    f"Name the enclaves themselves: {words_for(root, left)}.",
+                )
+            fleet.robot(name)
             raise KeystoreError(
                 f"the robot {name} has no enclave in keystore '{root}'",
                 "",
@@ -70,3 +85,11 @@ def _of_robots(root: Path, robots: Sequence[str], checked: bool) -> list[str]:
             )
         found += own
     return found
+
+
+_SHOWN = 5
+
+
+def _named_after(root: Path, robot: str) -> list[str]:
+    """Return the enclaves with the name of a robot as a part of their paths."""
+    return [name for name in list_enclaves(root) if robot in name.split("/")[1:]]

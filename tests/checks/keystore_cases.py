@@ -123,6 +123,9 @@ CASES |= {
     "keystore.ledger-damaged": lambda b: b.path("ledger.jsonl").write_text("nonsense\n"),
     "keystore.settings-edited": lambda b: _replace(b, "sros.toml", "180d", "181d"),
     "keystore.fleet-edited": lambda b: b.path("fleet.toml").write_text("[robots.base]\n"),
+    "keystore.left-enclaves": lambda b: b.path("fleet.toml").write_text(
+        'enclaves = ["/{robot}"]\n[robots.r1]\n'
+    ),
     "governance.not-as-settings": lambda b: b.governance(
         ("<rtps_protection_kind>ENCRYPT", "<rtps_protection_kind>SIGN")
     ),

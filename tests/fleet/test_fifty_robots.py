@@ -147,7 +147,8 @@ def test_the_keystore_knows_whose_enclave_is_whose(made: Path) -> None:
     unknown = sros("list_enclaves", "ks", "--robot", "r70", cwd=made)
     assert unknown.status == 2
     assert "no robot 'r70'. It has r7" in unknown.err
-    assert "has no fleet" in sros("list_enclaves", "r7", "--robot", "r7", cwd=made).err
+    exported = sros("list_enclaves", "r7", "--robot", "r7", cwd=made)
+    assert "An export for a robot has the enclaves of that robot alone" in exported.err
 
 
 def copied(made: Path, folder: Path) -> Path:
@@ -213,6 +214,12 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     assert "/hall/r11/base/cmd" in str(permissions(folder / "ks", "/dispatcher"))
     fleet = load_fleet(folder / "ks")
     assert fleet and "r9" not in fleet.robots and len(fleet.robots) == 48
+    words = ("--include", "keystore.left-enclaves", "--severity", "note", "--json")
+    found = json.loads(sros("check", "ks", *words, cwd=folder).out)["findings"]
+    assert [each["text"] for each in found] == ["r9: /r9/base, /r9/lift"]
+    refused = sros("revoke", "ks", "--robot", "r9", cwd=folder)
+    assert refused.status == 2
+    assert "Name the enclaves themselves: --match '/r9/*'" in refused.err
     sros("revoke", "ks", "--match", "/r9/*", cwd=folder).ok()
 
     # Another domain is in all permissions, or refused.

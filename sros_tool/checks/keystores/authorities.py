@@ -17,6 +17,8 @@ from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
+from sros_tool.fleet.enclaves import left_robot_of
+from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.fleet import FLEET_REMEDY
 from sros_tool.keystore.layout import (
     CRL,
@@ -255,6 +257,16 @@ FLEET_EDITED = FindingKind(
     "sros: the ledger has the SHA-256 of the file as sros wrote it.",
     FLEET_REMEDY,
 )
+LEFT_ENCLAVES = FindingKind(
+    "keystore.left-enclaves",
+    NOTE,
+    "enclaves of robots that are no longer in the fleet, or in its group",
+    "Whoever has their files has their rights until they expire, and `--robot` does not choose "
+    "them any more.",
+    "sros: their paths are those of a robot's enclaves, and they belong to no robot.",
+    "Revoke them by `sros revoke ROOT NAME...` if the robots are gone. Leave an enclave that was "
+    "never one of a robot.",
+)
 NOT_AS_SETTINGS = FindingKind(
     "governance.not-as-settings",
     WARNING,
@@ -337,6 +349,24 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
     yield from _revocation_list(keystore)
 
 
+_SHOWN, _MOST_LEFT = 5, 20
+"""How many enclaves of a robot that left are named, and of how many robots."""
+
+
+def _left_enclaves(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
+    robots: dict[str, list[str]] = {}
+    for name in keystore.names:
+        if robot := left_robot_of(fleet, name):
+            robots.setdefault(robot, []).append(name)
+    for robot, names in list(robots.items())[:_MOST_LEFT]:
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        clause = f"{robot}: {', '.join(names[:_SHOWN])}{more}"
+        yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown(FLEET))
+    if (more_robots := len(robots) - _MOST_LEFT) > 0:
+        clause = f"and of {more_robots} more robots"
+        yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown(FLEET))
+
+
 def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about the settings and the ledger: ros2/sros2 makes neither."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
@@ -351,6 +381,8 @@ def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
     if keystore.fleet_edited:
         clause = f"{FLEET} {keystore.fleet_edited}"
         yield FLEET_EDITED.found("fleet", clause, keystore.shown(FLEET))
+    if keystore.fleet:
+        yield from _left_enclaves(keystore, keystore.fleet)
     for clause in edits.unsigned:
         yield NOT_AS_SETTINGS.found("settings", clause, file)
     file = keystore.shown(LEDGER)
