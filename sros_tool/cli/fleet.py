@@ -190,6 +190,7 @@ Example:
   r7     earlier          3 d 4 h ago earlier permissions of 2027-05-01T06:...
   r8     another's files  2 min ago   10 files of r9
   r31    never confirmed  -           2 enclaves
+  $ sros fleet status keystore --max-age 7d
   $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
 The exit status is 0 if every robot confirmed that it has what an export would
@@ -197,6 +198,11 @@ give it now, and 1 if not.""",
 )
 @click.argument("root", metavar="[ROOT]", type=PATH, required=False)
 @robot_option("Only this robot of the fleet, with all that it has.")
+@click.option(
+    "--max-age",
+    metavar="DURATION",
+    help="Count a robot as not confirmed if its last confirmation is older, such as 7d.",
+)
 @click.option("--prometheus", is_flag=True, help="Print metrics for node_exporter's textfile.")
 @click.option("--html", is_flag=True, help="Print a page.")
 @output_option("Replace FILE at once instead of printing.")
@@ -205,6 +211,7 @@ give it now, and 1 if not.""",
 def _status(
     root: Path | None,
     robots: tuple[str, ...],
+    max_age: str | None,
     prometheus: bool,
     html: bool,
     output: Path | None,
@@ -219,18 +226,22 @@ def _status(
     restarted, which a confirmation does not tell.
     """
     from sros_tool.keystore.fleet_status import fleet_status
+    from sros_tool.validity import parse_duration
 
     if as_json + prometheus + html > 1:
         raise UsageError("--json, --prometheus and --html exclude each other", "", "Choose one.")
     if as_json and output:
         raise UsageError("--json takes no --output", "", "Leave one of them out.")
     root, moment = root or keystore_from_environment(), now()
+    oldest = parse_duration(max_age) if max_age is not None else None
     if output:
         if prometheus:
             check_suffix(output)
         check_output(output, force=True)
     with progress("comparing"):
         found = fleet_status(root, robots)
+    if oldest:
+        found = found.with_overdue(oldest, moment)
     if as_json:
         print_json(_status_json(found, moment))
         return 0 if found.complete else 1
@@ -275,13 +286,18 @@ def _lines(found: FleetStatus, moment: datetime, robots: Sequence[str]) -> Itera
     if found.stage != "complete":
         behind = sum(each.stage != found.stage for each in found.robots if each.enclaves)
         yield f"CA rotation: {found.stage}; {_number(behind, 'robot')} not there yet"
+    if found.overdue:
+        yield f"{_number(len(found.overdue), 'robot')} confirmed too long ago"
     if found.unassigned:
         yield f"{_number(found.unassigned, 'enclave')} of no robot: nothing is known of them"
     rows = [("robot", "state", "confirmed", "what")]
     rows += [
         (each.robot, _word(each.state), _age(each, moment), "; ".join(_summary(each, found.stage)))
         for each in found.robots
-        if robots or each.state not in ("current", "none") or each.notes
+        if robots
+        or each.state not in ("current", "none")
+        or each.notes
+        or each.robot in found.overdue
     ]
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     for row in rows if len(rows) > 1 else ():
@@ -307,13 +323,19 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         if each.state not in ("another", "revoked"):
             groups.setdefault((each.state, each.since), Counter())[each.kind] += 1
     for (state, since), kinds in list(groups.items())[:_MOST_GROUPS]:
-        named = (kind if number == 1 else f"{number} {kind}" for kind, number in kinds.items())
+        named = (kind if number == 1 else _several(number, kind) for kind, number in kinds.items())
         yield f"{state} {', '.join(named)}{f' of {since}' if since else ''}"
     if len(groups) > _MOST_GROUPS:
         yield f"more, see --robot {robot.robot}"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"CA files of the stage {robot.stage}"
     yield from robot.notes
+
+
+def _several(number: int, kind: str) -> str:
+    if kind == "permissions":
+        return f"{number} {kind}"
+    return f"{number} certificates" if kind == "certificate" else f"{number} {kind} files"
 
 
 def _details(robot: RobotStatus) -> Iterator[str]:
@@ -354,6 +376,7 @@ def _status_json(found: FleetStatus, moment: datetime) -> dict[str, Any]:
         "stage": found.stage,
         "counts": dict(found.counts),
         "unassigned": found.unassigned,
+        "overdue": sorted(found.overdue),
         "robots": [
             {
                 "robot": each.robot,

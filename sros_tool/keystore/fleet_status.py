@@ -11,8 +11,8 @@ import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from datetime import datetime
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
@@ -136,12 +136,14 @@ class FleetStatus:
     """The robots of a fleet, and the stage of the keystore's CA rotation.
 
     ``unassigned`` is the number of enclaves that belong to no robot, of which nothing is known.
+    ``overdue`` are the robots that confirmed too long ago: see `with_overdue`.
     """
 
     root: Path
     stage: str
     robots: tuple[RobotStatus, ...]
     unassigned: int
+    overdue: frozenset[str] = frozenset()
 
     @property
     def counts(self) -> Mapping[State, int]:
@@ -151,8 +153,19 @@ class FleetStatus:
 
     @property
     def complete(self) -> bool:
-        """Whether each robot that has enclaves confirmed that it has the present files."""
-        return all(each.state in (State.CURRENT, State.NONE) for each in self.robots)
+        """Whether each robot with enclaves confirmed in time that it has the present files."""
+        return not self.overdue and all(
+            each.state in (State.CURRENT, State.NONE) for each in self.robots
+        )
+
+    def with_overdue(self, max_age: timedelta, now: datetime) -> FleetStatus:
+        """Return the same with the robots whose last confirmation is older than ``max_age``."""
+        late = (
+            each.robot
+            for each in self.robots
+            if each.enclaves and each.received and now - each.received > max_age
+        )
+        return replace(self, overdue=frozenset(late))
 
 
 def fleet_status(root: Path, names: Sequence[str] = ()) -> FleetStatus:

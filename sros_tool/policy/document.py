@@ -51,6 +51,7 @@ from sros_tool.policy.placeholders import (
     sample,
 )
 from sros_tool.policy.protection import PROTECT, Level
+from sros_tool.resources import policies_dir
 from sros_tool.xml import parse, read_bytes, serialize, tag_of
 
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
@@ -216,7 +217,8 @@ class Includer:
         try:
             target = self.load(file)
         except DocumentError as error:
-            raise PolicyError(f"{where}: {error.what}", error.why, error.remedy) from error
+            remedy = error.remedy or (_missing_remedy(file) if not file.exists() else "")
+            raise PolicyError(f"{where}: {error.what}", error.why, remedy) from error
         linked = bool(href) and Path(os.path.normpath(place.file.parent / unquote(href))) != file
         inner = IncludedFile(file, (*place.trail, step), linked)
         found = self._expanded([target], inner)
@@ -248,6 +250,18 @@ class Includer:
                 "Write the path from the root element of the included file.",
             )
         return list(found)
+
+
+def _missing_remedy(file: Path) -> str:
+    """Return how to get an included file that ships with sros, or "" for any other file."""
+    common = "common"
+    tail = file.parts[file.parts.index(common) :] if common in file.parts else ()
+    if not tail or not policies_dir().joinpath(*tail).is_file():
+        return ""
+    return (
+        "It ships with sros: `sros policies --copy DIR` writes DIR/common, whose place is next to "
+        "the policy."
+    )
 
 
 _ITEMS = frozenset(kind.removesuffix("s") for kind in RIGHTS)

@@ -190,6 +190,18 @@ def test_a_policy_with_placeholders_needs_a_fleet(made: Path) -> None:
         assert "policy" not in done.err
 
 
+def test_the_rights_of_every_node_are_not_next_to_the_policy(made: Path, tmp_path: Path) -> None:
+    include = '<xi:include href="{}" xpointer="xpointer(/profile/*)"/>'
+    for file, ships in (("common/node.xml", True), ("common/x.xml", False)):
+        text = POLICY.replace("<topics", include.format(file) + "<topics", 1).replace(
+            "<policy ", '<policy xmlns:xi="http://www.w3.org/2001/XInclude" ', 1
+        )
+        (tmp_path / "robot.xml").write_text(text)
+        ended = sros("check", tmp_path / "robot.xml", "--fleet", made / "fleet.toml")
+        assert f"{file}' does not exist" in ended.out
+        assert ("sros policies --copy DIR" in ended.out) is ships
+
+
 def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     """Renewed and revoked by robot; a robot that leaves; a domain that changes; an edit by hand."""
     folder = copied(made, tmp_path)

@@ -101,6 +101,17 @@ def test_a_fleet_that_has_all_it_should_have(field: Field) -> None:
     assert found["robots"]["r1"]["pending"] == []
     assert found["robots"]["r1"]["files"]["permissions"] == {"current": 1}
     assert field.run("fleet", "status", "ks").out.splitlines()[0] == "3 robots: 3 current"
+    field.run("fleet", "status", "ks", "--max-age", "1h")
+    kept = field.root / "confirmed/r1.json"
+    kept.write_text(
+        json.dumps({**json.loads(kept.read_text()), "received": "2020-01-01T00:00:00Z"})
+    )
+    lines = field.run("fleet", "status", "ks", "--max-age", "1h", status=1).out.splitlines()
+    assert lines[:2] == ["3 robots: 3 current", "1 robot confirmed too long ago"]
+    assert lines[-1].startswith("r1 ")
+    late = json.loads(field.run("fleet", "status", "ks", "--max-age", "1h", "--json", status=1).out)
+    assert (late["overdue"], late["complete"]) == (["r1"], False)
+    field.run("fleet", "status", "ks")
     (field.root / "confirmed/notes.txt").write_text("mine")
     said = field.run("check", "keystore", "ks", "--severity", "note").out
     assert "confirmed/notes.txt" in said and "r1.json" not in said
