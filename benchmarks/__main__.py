@@ -137,7 +137,7 @@ def _artifacts(folder: Path, count: int, rounds: int) -> list[Row]:
         (folder / f"floor{index}").mkdir()
     floor = _timed(lambda i: make_enclaves(folder / f"floor{i}", files, count), rounds)
     task = f"policy of {count} enclaves, {RULES} rules each -> all artifacts"
-    again_task = "... again: permissions replaced, keys kept"
+    again_task = "... again: nothing changes"
     kept = made <= 2 * floor and made < 1.5
     return [
         Row(task, made, floor, "2 x floor and 1.5 s", kept),
