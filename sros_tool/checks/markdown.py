@@ -30,4 +30,5 @@ def _lines(finding: Finding) -> Iterator[str]:
     subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
     by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
     yield code(f"{subject}{finding.text}{by}")
+    yield from (code(f"{each}: {each.text}") for each in finding.related)
     yield code(finding.remedy)

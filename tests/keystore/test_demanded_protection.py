@@ -92,8 +92,8 @@ def test_a_new_keystore_is_made_with_it(folder: Path) -> None:
     assert missing(folder / "new", policy) == []
     permission = sros("create_permission", "new", "/mux", "p.xml", cwd=folder).ok()
     assert "governance" not in permission.err
-    words = ("/mux", "publish", "/cmd_vel", "--policy", "p.xml")
-    for shown in (sros("explain", "new", *words, cwd=folder), sros("explain", *words, cwd=folder)):
+    asked = ("/mux", "publish", "/cmd_vel", "--policy", "p.xml")
+    for shown in (sros("explain", "new", *asked, cwd=folder), sros("explain", *asked, cwd=folder)):
         assert "payload ENCRYPT" in shown.out
         assert "p.xml:6: ALLOW publish /cmd_vel, protected at least with encrypt" in shown.out
 
