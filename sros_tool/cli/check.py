@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -16,15 +17,20 @@ from sros_tool import __version__
 from sros_tool.cli.common import (
     PATH,
     check_one_format,
+    check_output,
     coloured,
     domain_of,
     fleet_option,
+    force_option,
     json_option,
     json_text,
     keystore_from_environment,
     moment_of,
     now,
     print_json,
+    save,
+    taken_secrets,
+    visible,
     visible_line,
 )
 from sros_tool.cli.progress import progress
@@ -35,8 +41,10 @@ if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.checks.registry import ChosenFindings, FindingFilter
     from sros_tool.checks.targets import Circumstances
+    from sros_tool.demo.doctor import Diagnosis
     from sros_tool.proof.requirements import Requirement
     from sros_tool.proof.system import System
+    from sros_tool.runtime.ros2cli import SecurityProvider
 
 _FAMILIES = ("policy", "keystore", "runtime")
 _LEVELS = click.Choice(["note", "warning", "error"])
@@ -538,12 +546,22 @@ Example:
       and refused the denied writer and reader on /sros_not_allowed: ...
   DDS Security can be enforced here, by Cyclone DDS (libddsc), but NOT by ROS
   nodes: rmw_fastrtps_cpp does not enforce it. The ROS 2 packages of ...
+  $ sros doctor --report support.md
 
 Exit status: 1 if the RMW that ROS nodes use here does not enforce security (without
 any RMW: if nothing here does), or if a finding is an error; else 0.""",
 )
+@click.option(
+    "--report",
+    "report",
+    metavar="FILE",
+    type=PATH,
+    help="Also write FILE to attach to a question: versions, environment, findings; no secrets, "
+    "and no names of hosts, users, paths.",
+)
+@force_option
 @json_option
-def doctor(as_json: bool) -> None:
+def doctor(report: Path | None, force: bool, as_json: bool) -> None:
     """Find out which DDS stacks and RMWs of this machine enforce security.
 
     Each one is tried in a separate process, in a temporary enclave: its name and version do not
@@ -552,7 +570,13 @@ def doctor(as_json: bool) -> None:
     """
     from sros_tool.checks.kind import ERROR, WARNING
     from sros_tool.demo.doctor import diagnosis_text, examine
+    from sros_tool.runtime.ros2cli import security_provider
+    from sros_tool.runtime.support import support_report
 
+    if force and not report:
+        raise UsageError("--force is for --report", "", "Name a file, or leave --force out.")
+    if report:
+        check_output(report, force=force)
     moment = now()
     diagnosis = examine(moment)
     insecure = {
@@ -561,14 +585,44 @@ def doctor(as_json: bool) -> None:
         if stack.rmw and stack.enforces is False
     }
     findings = _findings_here(os.environ, moment, insecure)
+    provider = security_provider(os.environ)
     if as_json:
         shown = [each.as_json() for each in findings]
-        print_json({**diagnosis.as_json(), "findings": shown})
+        ros2 = {"provider": provider.provider, "hidden": provider.hidden} if provider else None
+        print_json({**diagnosis.as_json(), "ros2_security": ros2, "findings": shown})
     else:
-        click.echo(diagnosis_text(diagnosis))
+        click.echo(visible(diagnosis_text(diagnosis)))
+        if provider:
+            click.echo(visible_line(str(provider)))
         for each in findings:
             if each.severity >= WARNING:
                 click.echo()
                 echo_finding(each)
+    if report:
+        lines = _report_sections(diagnosis, provider, findings)
+        text = support_report(os.environ, lines, secrets=taken_secrets())
+        document = visible(text).encode("utf-8", "backslashreplace")
+        click.echo(f"{save(report, document)}; read it before you attach it", err=True)
     if not diagnosis.sound or any(each.severity >= ERROR for each in findings):
         sys.exit(1)
+
+
+def _report_sections(
+    diagnosis: Diagnosis, provider: SecurityProvider | None, findings: Sequence[Finding]
+) -> dict[str, list[str]]:
+    """Return the lines of a support report; of findings only what is the same for all users."""
+    words = {True: "enforces security", False: "does not enforce", None: "could not be tried"}
+    stacks = [
+        f"{each.name}: {words[each.enforces]}. {each.dds} {each.version}. {each.evidence}"
+        for each in diagnosis.stacks
+        if each.present
+    ]
+    counted = Counter((each.severity.word, each.id, each.kind.title) for each in findings)
+    return {
+        "DDS": [*stacks, diagnosis.conclusion],
+        "ros2 security": [str(provider)] if provider else [],
+        "Findings": [
+            f"{number} × {severity}: {title} [{identity}]"
+            for (severity, identity, title), number in counted.items()
+        ],
+    }

@@ -566,6 +566,11 @@ def secrets_taken() -> Iterator[None]:
         _taken.clear()
 
 
+def taken_secrets() -> tuple[str, ...]:
+    """Return the values of the variables with secrets, for what has to leave them out."""
+    return tuple(_taken.values())
+
+
 key_option = click.option(
     "--key",
     metavar="URI",
