@@ -126,6 +126,8 @@ def make_corpus(root: Path) -> Corpus:
     (root / "request.pem").write_bytes(next(robot.rglob("request.pem")).read_bytes())
     sros("sign_request", keystore, root / "request.pem", "-o", root / "answer.tar.gz").ok()
     sros("distribute_key", keystore, "/a", root / "export").ok()
+    made = sros("fleet", "report", root / "export", "--robot", "r7").ok()
+    (root / "confirmation.json").write_text(made.out)
     sros("rotate_ca", keystore, "--identity", "--to", "distribute").ok()
     _openssl(root, "genpkey", "-algorithm", "ED25519", "-out", "ed25519.pem")
     _openssl(root, "genrsa", "-out", "rsa.pem", "2048")

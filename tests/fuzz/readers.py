@@ -23,8 +23,11 @@ from sros_tool.explain.denials import propose, read_denials
 from sros_tool.explain.evaluator import JoinContext
 from sros_tool.explain.log import explain_log
 from sros_tool.keystore.authorities.imported import check_imported
+from sros_tool.keystore.confirmation import keep, last_confirmation, receive
 from sros_tool.keystore.delivery.answer import import_answer
 from sros_tool.keystore.describe import describe
+from sros_tool.keystore.fleet_metrics import fleet_metrics
+from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.history import history
 from sros_tool.keystore.ledger import certificate_entry, read_ledger
 from sros_tool.keystore.lifecycle.adopt import adopt_keystore
@@ -50,6 +53,7 @@ from sros_tool.pki.keys import load_key
 from sros_tool.pki.requests import key_digest, load_request
 from sros_tool.policy.document import convert_policy, read_policy, write_policy
 from sros_tool.policy.rights import policy_rights
+from sros_tool.prometheus import render_metrics
 from sros_tool.report.sources import read_source
 from sros_tool.translate import ros_rights
 from sros_tool.translate_from_zenoh import policy_of, rights_behind
@@ -260,6 +264,18 @@ def _of_node(data: bytes, place: Place) -> None:
     adopt_keystore(place.folder / "new", old, now=NOW, dry_run=True)
 
 
+def _confirmation(data: bytes, place: Place) -> None:
+    """Receive what a robot says that it has, keep it, and compare it with the keystore."""
+    received = receive(data, "r7", "drawn", now=NOW)
+    (place.keystore / "fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.r7]\n')
+    keep(place.keystore, received)
+    kept = last_confirmation(place.keystore, "r7")
+    assert kept and kept.confirmation == received.confirmation
+    found = fleet_status(place.keystore).with_overdue(timedelta(days=1), NOW)
+    assert [each.robot for each in found.robots] == ["r7"]
+    assert "r7" in render_metrics(fleet_metrics(found, now=NOW))
+
+
 CA = "ks/public/identity_ca.cert.pem"
 READERS: dict[str, Reader] = {
     "certificate": Reader(
@@ -296,6 +312,7 @@ READERS: dict[str, Reader] = {
         ("ks/enclaves/a/session.json5", "ks/enclaves/router/router.json5", "by_hand.json5"),
         3,
     ),
+    "confirmation": Reader(_confirmation, ("confirmation.json",), 2),
     "rotation": Reader(_rotation, ("ks/rotation.json",)),
     "answer": Reader(_answer, ("answer.tar.gz",)),
     "log": Reader(_log, ("log",), 2),

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sros_tool.runtime.netns import try_isolation
+from sros_tool.runtime.netns import end_with_parent, try_isolation
 from tests.support.children import PATIENCE, run, wait_for
 
 CHECKOUT = Path(__file__).parents[2]
@@ -134,6 +134,7 @@ class Fleet:
                 stderr=log,
                 stdout=log,
                 start_new_session=True,
+                preexec_fn=end_with_parent,  # also if the tests are killed
             )
         wait_for(lambda: "listening" in (robot.folder / "sshd.log").read_text(), "sshd")
 
