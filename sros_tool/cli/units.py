@@ -69,7 +69,8 @@ Examples:
     multiple=True,
     type=click.Choice([each.value for each in Job]),
     help="A timer that renews what expires within 30 days, checks the keystore each day, or "
-    "writes metrics every 15 minutes.  Can be repeated.",
+    "writes metrics every 15 minutes: of the keystore, or of `sros fleet status` (fleet).  Can be "
+    "repeated.",
 )
 @click.option(
     "--target",
@@ -144,6 +145,12 @@ def units(
     folder = PATH.convert(rest[-1], None, None)
     if passphrase is not None and Job.RENEW not in jobs:
         raise UsageError("--passphrase-file is for --job renew only")
+    if jobs and (rest[1:] or several) and there is None:
+        raise UsageError(
+            f"the nodes run where the keystore is in {INSTALLED}, and the jobs are for '{root}'",
+            "One folder of units is for one machine.",
+            "Write them to two folders by two commands, or name the keystore there by --target.",
+        )
     target = None if there is None else target_path(there)
     files: dict[str, str] = {}
     notes: list[Note] = []

@@ -22,6 +22,7 @@ _NODES = "/etc/sros/nodes"
 """The folder with a program for each enclave, where no command is named."""
 
 METRICS_FILE = "/var/lib/sros-metrics/sros.prom"
+FLEET_FILE = "/var/lib/sros-metrics/fleet.prom"
 
 _MADE = "# Made by `sros units`; change it with `systemctl edit`, and this file stays as it is."
 _PLAIN_PATH = re.compile(r"(/[A-Za-z0-9_][A-Za-z0-9._+-]*)+\Z")
@@ -55,10 +56,12 @@ class Job(StrEnum):
     RENEW = "renew"
     CHECK = "check"
     METRICS = "metrics"
+    FLEET = "fleet"
 
 
-_WHEN = {Job.RENEW: "daily", Job.CHECK: "daily", Job.METRICS: "*:0/15"}
-_SPREAD = {Job.RENEW: "1h", Job.CHECK: "1h", Job.METRICS: "30s"}
+_OFTEN = "*:0/15"
+_WHEN = {Job.RENEW: "daily", Job.CHECK: "daily", Job.METRICS: _OFTEN, Job.FLEET: _OFTEN}
+_SPREAD = {Job.RENEW: "1h", Job.CHECK: "1h", Job.METRICS: "30s", Job.FLEET: "30s"}
 _RENEWED_WITHIN = "30d"
 
 
@@ -209,6 +212,17 @@ def job_units(
             f"Write the metrics of the keystore {root}",
             ("metrics", root, "-o", METRICS_FILE),
             ["PrivateNetwork=yes", "StateDirectory=sros-metrics", "UMask=0022"],
+        ),
+        Job.FLEET: (
+            f"Write the metrics of the fleet of {root}",
+            ("fleet", "status", root, "--prometheus", "-o", FLEET_FILE),
+            [
+                "PrivateNetwork=yes",
+                "StateDirectory=sros-metrics",
+                "UMask=0022",
+                "# Robots without the present files, which the metrics tell.",
+                "SuccessExitStatus=1",
+            ],
         ),
     }[job]
     if passphrase and job is Job.RENEW:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.runtime.units import FLEET_FILE
 from tests.support.harness import policy_text, publish, snapshot, sros
 
 THERE = "/etc/sros/keystore"
@@ -73,7 +74,7 @@ def test_a_node_is_verified_first_where_sros_is(made: Path, tmp_path: Path) -> N
 
 
 def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> None:
-    jobs = ("--job", "renew", "--job", "check", "--job", "metrics")
+    jobs = ("--job", "renew", "--job", "check", "--job", "metrics", "--job", "fleet")
     words = ("--sros", "/usr/bin/sros", "--passphrase-file", "/etc/sros/pass")
     sros("units", made, *jobs, tmp_path / "units", *words).ok()
     names = {each.name for each in (tmp_path / "units").iterdir()}
@@ -82,6 +83,9 @@ def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> 
     assert f"ExecStart=/usr/bin/sros renew {made} --all-expiring 30d\n" in renew
     assert f"User={made.owner()}\n" in renew
     assert "ca-passphrase:/etc/sros/pass\n" in renew
+    fleet = (tmp_path / "units/sros-fleet.service").read_text()
+    assert f"ExecStart=/usr/bin/sros fleet status {made} --prometheus -o {FLEET_FILE}\n" in fleet
+    assert "\nSuccessExitStatus=1\n" in fleet
 
 
 @pytest.mark.parametrize(
@@ -91,6 +95,7 @@ def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> 
         (("F",), "units takes"),
         (("/leg",), "units takes"),
         (("--job", "check", "F", "--", "/bin/true"), "no enclave is named"),
+        (("/leg", "--job", "check", "F"), "One folder of units is for one machine"),
         (("--job", "check", "F", "--passphrase-file", "/x"), "--job renew only"),
         (("/leg", "F", "--target", "/a b"), "cannot be written in a unit"),
         (("/leg", "F", "--target", "k"), "--target 'k'"),

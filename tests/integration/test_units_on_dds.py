@@ -20,7 +20,7 @@ from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifa
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.runtime.netns import try_isolation
-from sros_tool.runtime.units import METRICS_FILE, Job, job_units, node_settings, node_template
+from sros_tool.runtime.units import Job, job_units, node_settings, node_template
 from tests.integration.converse import converse, listener, talker
 from tests.support.children import python, run
 from tests.support.harness import policy_text, publish, sros
@@ -105,12 +105,18 @@ def test_the_jobs_do_their_work_under_their_restrictions(robot: Path, tmp_path: 
     keystore, metrics = tmp_path / "ks", tmp_path / "metrics"
     metrics.mkdir()
     before = (keystore / "enclaves/arm/cert.pem").read_bytes()
+    (tmp_path / "fleet.toml").write_text("[robots.r1]\n")
+    (tmp_path / "robot.xml").write_text(policy_text({"/{robot}/a": publish("/a")}))
+    stated = ("-p", tmp_path / "robot.xml", "--fleet", tmp_path / "fleet.toml")
+    sros("generate_artifacts", "-k", keystore, *stated).ok()
     for job in Job:
         files = job_units(job, str(keystore), user="root", sros="/bin/sros")
         (tmp_path / "job").write_text(files[f"sros-{job}.service"])
         (line,) = re.findall("^ExecStart=/bin/sros (.*)$", (tmp_path / "job").read_text(), re.M)
-        words = line.replace(METRICS_FILE, str(metrics / "sros.prom")).replace("30d", "9999d")
+        words = line.replace("/var/lib/sros-metrics", str(metrics)).replace("30d", "9999d")
         program = [sys.executable, "-m", "sros_tool", *words.split()]
-        run([sys.executable, CONFINED, tmp_path / "job", keystore, metrics, "--", *program])
+        confined = [sys.executable, CONFINED, tmp_path / "job", keystore, metrics, "--", *program]
+        run(confined, status=1 if job is Job.FLEET else 0)
     assert (keystore / "enclaves/arm/cert.pem").read_bytes() != before
     assert "sros_enclaves{" in (metrics / "sros.prom").read_text()
+    assert 'robot="r1"' in (metrics / "fleet.prom").read_text()
