@@ -95,6 +95,10 @@ _Moves = Mapping[int, int]
 """By distance (0 stays): the positions, as bits, that a letter moves by so many."""
 
 
+_MOST_KNOWN = 20_000
+"""Most answers that an automaton keeps: the same names are asked about again and again."""
+
+
 @dataclass(frozen=True)
 class Automaton:
     """A finite automaton: positions from 0, edges between them with letters, and where it ends.
@@ -161,6 +165,17 @@ class Automaton:
         """Return whether the automaton accepts ``name``."""
         if not name.startswith(self.prefix) or not name.endswith(self.suffix):
             return False
+        if name not in self._known:
+            if len(self._known) >= _MOST_KNOWN:
+                self._known.clear()
+            self._known[name] = self._accepts(name)
+        return self._known[name]
+
+    @cached_property
+    def _known(self) -> dict[str, bool]:
+        return {}
+
+    def _accepts(self, name: str) -> bool:
         reached = 1
         for letter in name:
             if letter not in self._moves:

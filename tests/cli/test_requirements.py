@@ -158,3 +158,55 @@ def test_more_wildcards_than_can_be_decided_are_one_error(
     ended = sros("check", policy, "--requirements", required)
     assert ended.status == 2
     assert "it cannot be decided which names so many wildcards match" in ended.err
+
+
+@pytest.fixture(scope="module")
+def keystore(folder: Path) -> Path:
+    """A keystore of the policy, with its configurations of Zenoh; only to be read."""
+    sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", cwd=folder).ok()
+    sros("zenoh", "ks", cwd=folder).ok()
+    return folder / "ks"
+
+
+def test_a_keystore_is_decided_as_it_is_signed(keystore: Path, tmp_path: Path) -> None:
+    asked = ("check", "ks", *ONLY[2:], "--requirements")
+    folder = keystore.parent
+    ended = sros(*asked, "required.toml", cwd=folder)
+    assert ended.status == 1
+    assert "ks/enclaves/web/permissions.p7s: error: a requirement that does not" in ended.out
+    assert "/web: may publish /cmd_vel by /cmd_*, but only /mux may publish /cmd_vel: " in ended.out
+    assert "/lidar -publish /scan-> /web -publish /cmd_vel by /cmd_*-> /wheels" in ended.out
+    assert "2 errors" in ended.err
+    assert "only:" not in ended.out
+    zenoh = sros(*asked, "required.toml", "--vendor", "zenoh", cwd=folder)
+    assert zenoh.out == ended.out
+    # What has expired lets nobody do anything.
+    (tmp_path / "must.toml").write_text('[[must]]\nenclave = "/mux"\npublish = ["/cmd_vel"]\n')
+    sros(*asked, tmp_path / "must.toml", cwd=folder).ok()
+    late = ("--at", "2099-01-01", "--vendor", "fastdds")
+    ended = sros(*asked, tmp_path / "must.toml", *late, cwd=folder)
+    assert ended.status == 1
+    assert "/mux: may not" in ended.out
+
+
+def test_a_keystore_gives_proposals_that_hold(keystore: Path, tmp_path: Path) -> None:
+    suggested = tmp_path / "suggested.toml"
+    suggested.write_text(sros("check", keystore, "--suggest").ok().out)
+    assert '[[only]]\npublish = ["/scan"]\nenclaves = ["/lidar"]' in suggested.read_text()
+    sros("check", keystore, *ONLY[2:], "--requirements", suggested).ok()
+
+
+def test_a_requirement_of_protection_is_about_the_governance(folder: Path, tmp_path: Path) -> None:
+    required = tmp_path / "protected.toml"
+    required.write_text('[[protected]]\ntopics = ["/scan"]\nlevel = "encrypt"\n')
+    sros("generate_artifacts", "-k", tmp_path / "ks", "-p", folder / "robot.xml").ok()
+    asked = ("check", tmp_path / "ks", *ONLY[2:], "--requirements", required)
+    sros(*asked).ok()
+    weak = [f"protection.{each}" for each in ("default.data=SIGN", "default.metadata=NONE")]
+    for each in weak:
+        sros("update_keystore", tmp_path / "ks", "--set", each, "--allow-looser").ok()
+    ended = sros(*asked)
+    assert ended.status == 1
+    assert "/scan: its messages are not, but topic /scan has to be encrypted" in ended.out
+    required.write_text(required.read_text().replace("encrypt", "sign"))
+    sros(*asked).ok()

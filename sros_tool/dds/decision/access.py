@@ -251,8 +251,11 @@ class _GrantRules:
         return NameSet.first(self._deciding(self._index[0]), self._otherwise.allowed)
 
     def _deciding(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
-        for each in entries:
-            yield self._names_of((each,)), each.allow and bool(each.expression)
+        """Yield the topics of entries, joined as long as their verdict is the same, with it."""
+        for allowed, some in groupby(
+            entries, key=lambda each: each.allow and bool(each.expression)
+        ):
+            yield self._names_of(some), allowed
 
     def _names_of(self, entries: Iterable[_Entry]) -> NameSet:
         texts = (_usable_expression(self._traits, each.expression) for each in entries)
