@@ -152,7 +152,7 @@ class _Raising:
             f"keystore protect {other} in their own way",
             "Some names match both wildcards, and it is unclear which of the two decides.",
             "Say it in the policy of names that only one of the wildcards matches, or change the "
-            "settings with `sros update_keystore ROOT --rule` or --drop-rule.",
+            "settings: `sros update_keystore --help` describes --rule and --drop-rule.",
         )
 
     def _value(self, number: int | None) -> TopicProtection:
