@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "AccessAnswer",

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NoReturn
 
-from tools import apt, checks, dds
+from tools import apt, checks, dds, release
 from tools.environment import GROUPS, prepare
 from tools.record import PYTHON, Record, current, holds, read_record, write_record
 from tools.steps import CHECKOUT, VENV, SetupError, locked, say
@@ -22,6 +22,8 @@ Usage: ./dev COMMAND [ARGUMENTS…]
   lint                run only ruff and mypy
   bench [ARGUMENTS…]  run the benchmarks (python -m benchmarks)
   sros ARGUMENTS…     run the sros of this checkout
+  release-check       build the packages, look for what must not be in them, and try the wheel with
+                      every Python 3.11 to 3.14 that is here, with and without extras
   setup               set up everything that the other commands need, and check it again
 
 Each command first sets up what it needs: a virtual environment in .venv; for demo and test also a
@@ -44,6 +46,7 @@ NEEDS = {
     "lint": Needs(("package", "test")),
     "bench": Needs(),
     "sros": Needs(),
+    "release-check": Needs(("package", "test"), dds=True),
     "setup": Needs(GROUPS, dds=True, for_tests=True),
 }
 
@@ -120,6 +123,8 @@ def _run(command: str, arguments: list[str]) -> int:
         return 0
     if command in ("test", "lint"):
         return checks.run(arguments, env, with_tests=command == "test")
+    if command == "release-check":
+        return release.check()
     if command == "bench":
         os.chdir(CHECKOUT)
         return _become([str(PYTHON), "-m", "benchmarks", *arguments], env)

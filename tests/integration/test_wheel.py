@@ -5,9 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 import zipfile
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pytest
+
+from sros_tool.cli.ros2 import SecurityCommand
+from tools import release
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
@@ -42,6 +46,40 @@ def test_the_licences_of_what_draws_the_pages_are_in_it(unpacked: Path) -> None:
     (licences,) = unpacked.glob("*.dist-info/licenses")
     assert (licences / "LICENSE").read_bytes() == (CHECKOUT / "LICENSE").read_bytes()
     assert "d3" in (licences / "sros_tool/report/assets/view.js.LICENSES.txt").read_text()
+
+
+def test_nothing_else_is_in_it(unpacked: Path) -> None:
+    files = {
+        str(path.relative_to(unpacked)): path.read_bytes()
+        for path in unpacked.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert list(release.problems_of(files, wheel=True)) == []
+    planted = {
+        "tests/a.py": b"",
+        "sros_tool/a.pyc": b"",
+        "sros_tool/.env": b"",
+        "sros_tool/a.pem": b"-----BEGIN PRIVATE KEY-----\nMIGH",
+        "sros_tool/a.txt": b"in " + bytes(CHECKOUT) + b"/a",
+    }
+    found = list(release.problems_of({**files, **planted}, wheel=True))
+    assert len(found) == len(planted)
+    for name in {"tests", *planted} - {"tests/a.py"}:
+        assert any(each.startswith(name) for each in found), name
+
+
+def test_what_a_release_checks_is_complete() -> None:
+    assert set(release.EXTRAS) == release.extras()
+    assert len(set(release.versions().values())) == 1, release.versions()
+
+
+def test_other_programs_find_what_they_load(unpacked: Path) -> None:
+    """The entry points of ros2cli and launch, as importlib.metadata gives them to these."""
+    found = {
+        (e.group, e.name): e for d in distributions(path=[str(unpacked)]) for e in d.entry_points
+    }
+    assert found["ros2cli.command", "security"].load() is SecurityCommand
+    assert found["launch.frontend.launch_extension", "sros_tool"].value == "sros_tool.launch"
 
 
 def test_every_file_of_the_package_is_in_it(unpacked: Path) -> None:
