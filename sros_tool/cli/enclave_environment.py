@@ -134,7 +134,7 @@ def loadable_environment(
     module = os.environ.get(MODULE_VARIABLE)
     if module and not target:
         variables[MODULE_VARIABLE] = module
-    notes = () if target else tuple(pin_notes(state.token))
+    notes = (_token_there(name, state.token),) if target else tuple(pin_notes(state.token))
     return EnclaveEnvironment(variables, notes, needs_pin=not state.token.pin_source)
 
 
@@ -152,6 +152,16 @@ def _check_key_closed(key: Path, root: Path, name: str) -> None:
 
 
 # ── keys on tokens ─────────────────────────────────────────────────────────────────────────
+
+
+def _token_there(name: str, place: TokenUri) -> Note:
+    pin = f"its PIN in '{place.pin_source}'" if place.pin_source else "its PIN"
+    return Note(
+        "token.there",
+        f"the key of {name} is on the token {place.token!r}: where the process runs, it needs the "
+        f"device or socket of this token, its PKCS #11 module, and {pin}. None of them is in this "
+        "output.",
+    )
 
 
 def _check_token_used(place: TokenUri, name: str, rmw: str | None) -> None:

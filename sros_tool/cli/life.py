@@ -27,10 +27,11 @@ from sros_tool.cli.common import (
     print_restart,
     several_enclaves,
     split_root,
+    visible,
 )
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import changes_json, enclave_json, notes_json
-from sros_tool.errors import UsageError
+from sros_tool.errors import SrosError, UsageError
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.renew import Renewal
@@ -478,7 +479,7 @@ def rotate_ca(
         raise UsageError("give only one of --status, --next, --to, --finish and --same-key")
     root = root or keystore_from_environment()
     if not (go_on or to or finish or same_key):
-        _show_status(rotation_status(root, now=now()), as_json)
+        _show_status(rotation_status(root, now=now()), _unconfirmed(root), as_json)
         return
     validity = parse_span(ca_validity) if ca_validity is not None else None
     if same_key:
@@ -584,7 +585,24 @@ def _print_step(
         click.echo(remark, err=True)
 
 
-def _show_status(status: RotationStatus, as_json: bool) -> None:
+def _unconfirmed(root: Path) -> tuple[str, ...] | str:
+    """Return the robots that have not confirmed the stage of a rotation, or why that is unknown."""
+    from sros_tool.keystore.lifecycle.rotation.confirmed import robots_cut_off
+    from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+
+    rotation = read_rotation(root)
+    if rotation.stage is RotationStage.NONE:
+        return ()
+    try:
+        return robots_cut_off(root, rotation, rotation.next_stage())
+    except SrosError as error:
+        return error.what
+
+
+_MOST_ROBOTS = 20
+
+
+def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_json: bool) -> None:
     from sros_tool.validity import iso
 
     rotation = status.rotation
@@ -607,6 +625,7 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
                     }
                     for each in status.authorities
                 ],
+                "unconfirmed": None if isinstance(unconfirmed, str) else list(unconfirmed),
                 "remarks": list(status.remarks),
             }
         )
@@ -620,6 +639,14 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
         click.echo(
             f"  {name:14} {each.state:7} {each.enclaves} of {status.enclaves} enclaves  {end}"
             f"  {each.subject} (SHA-256 {each.sha256[:8]})"
+        )
+    if isinstance(unconfirmed, str):
+        click.echo(visible(f"which robots confirmed this stage is unknown: {unconfirmed}"))
+    elif unconfirmed:
+        more = len(unconfirmed) - _MOST_ROBOTS
+        click.echo(
+            f"not confirmed by {', '.join(unconfirmed[:_MOST_ROBOTS])}"
+            f"{f' and {more} more' if more > 0 else ''}: see `sros fleet status`"
         )
     for remark in status.remarks:
         click.echo(remark)

@@ -223,6 +223,9 @@ def test_a_rotation_goes_on_when_every_robot_has_confirmed_its_stage(field: Fiel
             refused = field.run("rotate_ca", "ks", step, status=2).err
             assert f"confirmed the stage {now}: r2. " in refused
             assert field.status()["stage"] == now
+            told = json.loads(field.run("rotate_ca", "ks", "--status", "--json").out)
+            assert told["unconfirmed"] == ["r2"]
+            assert "not confirmed by r2: see" in field.run("rotate_ca", "ks", "--status").out
         field.deliver("r2")
         assert field.states() == dict.fromkeys(ROBOTS, "current")
         assert {each["stage"] for each in field.status()["robots"].values()} == {now}
@@ -239,6 +242,10 @@ def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> No
     assert "cut off: r2 are unable" in ended.err
     (field.root / "fleet.toml").write_text("[robots.r1]\n")
     assert "is not the one that sros wrote" in field.run("rotate_ca", "ks", "--next", status=2).err
+    told = field.run("rotate_ca", "ks", "--status").out
+    assert "which robots confirmed this stage is unknown: " in told
+    told = field.run("rotate_ca", "ks", "--status", "--json").out
+    assert json.loads(told)["unconfirmed"] is None
 
 
 @pytest.mark.parametrize(
