@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 Figure = tuple[str, float, str, bool]
-"""The task, its seconds, the limit, and whether it is kept."""
+"""The task, its seconds of CPU, the limit, and whether it is kept."""
 LIMIT = 5.0
 
 
@@ -23,16 +23,16 @@ def requiring(folder: Path, enclaves: int, rounds: int) -> list[Figure]:
     text = requirements(enclaves).encode()
 
     def work() -> float:
-        begin = time.perf_counter()
+        begin = time.process_time()
         found = decide_all(
             parse_requirements(text, "required.toml"), load_system(policy, at=datetime.now(UTC))
         )
-        taken = time.perf_counter() - begin
+        taken = time.process_time() - begin
         assert len(found.violations) == 1
         return taken
 
     taken = statistics.median(work() for _ in range(rounds))
-    name = f"sros check --requirements: 50, {enclaves} enclaves and names"
+    name = f"sros check: 50 requirements, {enclaves} enclaves and names: CPU"
     return [(name, taken, f"{LIMIT:g} s", taken < LIMIT)]
 
 

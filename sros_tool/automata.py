@@ -536,7 +536,7 @@ class Surroundings:
     automata: frozenset[Automaton]
 
 
-def _around(node: _Node, best: Callable[[Surroundings], int]) -> Surroundings | None:
+def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Surroundings | None:
     """Return surroundings of a set; of several, those for which ``best`` is least."""
     match node:
         case _Some():
@@ -562,9 +562,10 @@ def _around(node: _Node, best: Callable[[Surroundings], int]) -> Surroundings | 
     )
 
 
-def _roughness(around: Surroundings) -> int:
+def _roughness(around: Surroundings) -> tuple[int, int]:
     """Return the sort key of surroundings: those that tell most of beginning and end come first."""
-    return -min((len(a.prefix) + len(a.suffix) for a in around.automata), default=_LAST)
+    told = min((len(a.prefix) + len(a.suffix) for a in around.automata), default=_LAST)
+    return -told, -len(around.exact)
 
 
 def _length(name: str) -> tuple[int, str]:
@@ -634,7 +635,7 @@ def _searches(node: _Node) -> Iterator[_Search]:
     leaves = tuple(_leaves(node))
     automata = sorted({each for leaf in leaves for each in leaf.automata}, key=_order)
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
-    around = _around(node, lambda each: len(each.automata))
+    around = _around(node, lambda each: (len(each.automata), 0))
     for own in automata if around is None else sorted(around.automata, key=_order):
         known = {each: False for each in automata if not own.may_meet(each)}
         left = _reduced(node, {**known, own: True})

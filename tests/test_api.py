@@ -14,6 +14,7 @@ import pytest
 import sros_tool
 from sros_tool import DocumentError, KeystoreError, UsageError
 from sros_tool.resources import policies_dir
+from tests.support.harness import policy_text, publish
 
 PROJECT = Path(__file__).parents[1]
 TALKER = "/talker_listener/talker"
@@ -218,3 +219,17 @@ def test_what_cannot_be_meant_is_refused_with_a_remedy(
 def test_a_moment_of_another_zone_is_as_good(keystore: sros_tool.Keystore) -> None:
     then = datetime(2090, 1, 1, tzinfo=UTC)
     assert sros_tool.check(keystore, now=then)
+
+
+def test_requirements_are_decided(tmp_path: Path) -> None:
+    policy, required = tmp_path / "robot.xml", tmp_path / "required.toml"
+    policy.write_text(policy_text({"/a": publish("/x*"), "/b": publish("/y")}))
+    required.write_text('[[nobody]]\npublish = ["/xyz"]\n[[nobody]]\npublish = ["/z"]\n')
+    broken, vacuous = sros_tool.check_requirements(policy, required)
+    assert (broken.id, broken.subject, broken.line) == ("requirement.violated", "/a", 1)
+    assert broken.text == "may publish /xyz by /x*, but nobody may publish /xyz"
+    assert [str(each) for each in broken.related] == [f"{required}:1"]
+    assert (vacuous.id, vacuous.file, vacuous.line) == ("requirement.vacuous", str(required), 3)
+    assert sros_tool.check_requirements(policy, required, vendor="zenoh") == (broken, vacuous)
+    with pytest.raises(UsageError, match="unknown vendor"):
+        sros_tool.check_requirements(policy, required, vendor="none")

@@ -181,7 +181,7 @@ def _not_alone(requirement: Only | Nobody, world: World, limit: SearchLimit) -> 
     allowed = requirement.enclaves if isinstance(requirement, Only) else ()
     found: dict[str, Use] = {}
     for right, part, topics in _each(requirement.rights):
-        for met in world.side(part.writes).meeting(topics):
+        for met in world.side(part.writes).meeting(topics, limit):
             if _match(allowed, met.enclave):
                 continue
             if topic := world.use(met, topics, limit):
@@ -223,7 +223,7 @@ def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness 
     best: tuple[Use, ...] = ()
     others: tuple[str, ...] = ()
     for right, part, topics in _each(requirement.rights):
-        met = world.side(part.writes).meeting(topics)
+        met = world.side(part.writes).meeting(topics, limit)
         if len(met) <= most:
             continue
         topic = _shared_by(world, met, most + 1, topics, limit)
@@ -377,7 +377,7 @@ def _named(right: str, name: str) -> str:
 def _anybody(world: World, parts: Iterable[_Part], name: str, limit: SearchLimit) -> bool:
     """Return whether some enclave may use a topic of the name."""
     for part in parts:
-        met = world.side(part.writes).meeting(part.topics(name))
+        met = world.side(part.writes).meeting(part.topics(name), limit)
         if any(each.stated for each in met) or any(
             world.use(each, part.topics(name), limit) for each in met
         ):

@@ -122,7 +122,9 @@ class _Flow:
                         yield topic, reader
         if around is not None and not around.automata:
             return
-        for reader in self._world.side(False).perhaps_meeting(around.automata if around else None):
+        for reader in self._world.side(False).perhaps_meeting(
+            around.automata if around else None, self._limit
+        ):
             if reader != enclave and is_new(reader):
                 shared = self._world.shared(enclave, reader, written, self._limit)
                 if shared:

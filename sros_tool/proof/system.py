@@ -264,7 +264,9 @@ def _zenoh_world(root: Path, at: datetime, domain: int, stated: Mapping[str, Top
     router = ZenohEvaluator(root, at=at, domain=domain).router
     if router.process is None:
         raise KeystoreError(
-            f"what Zenoh enforces in keystore '{root}' is not known", f"{router.problem}."
+            f"what Zenoh enforces in keystore '{root}' is not known",
+            f"{router.problem}.",
+            "Name a vendor of DDS with --vendor to decide for it alone.",
         )
     rules = router.process.access
 

@@ -121,13 +121,13 @@ class Side:
         self._topics = sorted(self.exact)
         self._backwards = sorted(each[::-1] for each in self.exact)
 
-    def meeting(self, topics: Topics) -> list[Meeting]:
+    def meeting(self, topics: Topics, limit: SearchLimit) -> list[Meeting]:
         """Return the enclaves that perhaps may use some of the topics, sorted.
 
         An enclave without ``stated`` topics may in truth have none: only an example shows.
         """
         stated: dict[str, list[str]] = {}
-        for topic in self.among(topics.expression):
+        for topic in self.among(topics.expression, limit):
             for enclave in self.exact[topic]:
                 if topic in self.of[enclave]:
                     stated.setdefault(enclave, []).append(topic)
@@ -142,34 +142,38 @@ class Side:
             for each in sorted(wild.union(stated))
         ]
 
-    def among(self, expression: str) -> Sequence[str]:
+    def among(self, expression: str, limit: SearchLimit) -> Sequence[str]:
         """Return the exact topics of all enclaves that match an expression."""
         if expression not in self._found:
+            limit.spend(len(self._wild))
             own = _wild(expression)
             self._found[expression] = (
-                tuple(self._matching(own))
+                tuple(self._matching(own, limit))
                 if own
                 else ((expression,) if expression in self.exact else ())
             )
         return self._found[expression]
 
-    def _matching(self, own: Automaton) -> Iterator[str]:
+    def _matching(self, own: Automaton, limit: SearchLimit) -> Iterator[str]:
         """Yield the exact topics that an automaton accepts."""
         forwards = _starting(self._topics, own.prefix)
         backwards = _starting(self._backwards, own.suffix[::-1])
+        limit.spend(min(len(forwards), len(backwards)))
         if len(forwards) <= len(backwards):
             found: Iterator[str] = (self._topics[i] for i in forwards)
         else:
             found = (self._backwards[i][::-1] for i in backwards)
         return filter(own.matches, found)
 
-    def perhaps_meeting(self, automata: Collection[Automaton] | None) -> list[str]:
+    def perhaps_meeting(
+        self, automata: Collection[Automaton] | None, limit: SearchLimit
+    ) -> list[str]:
         """Return the enclaves that may perhaps use a topic of the automata, or any (None)."""
         if automata is None:
             return sorted(self.of)
         found = set(self._any)
         for own in automata:
-            for topic in self._matching(own):
+            for topic in self._matching(own, limit):
                 found.update(self.exact[topic])
             for each, enclaves in self._wild.items():
                 if each.may_meet(own):
@@ -249,7 +253,7 @@ class World:
         known = {
             topic
             for side in (self._writers, self._readers)
-            for topic in side.among(topics.expression)
+            for topic in side.among(topics.expression, limit)
             if topic in names
         }
         valid = valid_topics(topics.begin, topics.end)
