@@ -240,6 +240,11 @@ class Automaton:
             before.setdefault(to, []).append((letters, at))
         return _only_way(before, next(iter(self.ends)), frozenset((0,)))[::-1]
 
+    @cached_property
+    def order(self) -> tuple[str, str, str]:
+        """A sort key that does not depend on when automata were made."""
+        return self.prefix, self.suffix, repr(self.edges)
+
     def may_meet(self, other: Automaton) -> bool:
         """Return False only if no name is accepted by both: beginnings or ends differ."""
         return _agree(self.prefix, other.prefix) and _agree(self.suffix[::-1], other.suffix[::-1])
@@ -635,13 +640,14 @@ def _searches(node: _Node) -> Iterator[_Search]:
     leaves = tuple(_leaves(node))
     automata = sorted({each for leaf in leaves for each in leaf.automata}, key=_order)
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
+    everything = {each: True for each in automata if each.endless_bits & 1}
     around = _around(node, lambda each: (len(each.automata), 0))
     for own in automata if around is None else sorted(around.automata, key=_order):
         known = {each: False for each in automata if not own.may_meet(each)}
-        left = _reduced(node, {**known, own: True})
+        left = _reduced(node, {**known, **everything, own: True})
         if left is not False:
             yield _Search(_within(own, left), frozenset(filter(own.matches, exact)))
-    if around is None and _reduced(node, dict.fromkeys(automata, False)):
+    if around is None and not everything and _reduced(node, dict.fromkeys(automata, False)):
         left = _reduced(node, {})
         yield _Search(_Not(_Some()) if isinstance(left, bool) else left, exact)
 
@@ -652,7 +658,7 @@ def _within(own: Automaton, left: _Node | bool) -> _Node:
 
 
 def _order(automaton: Automaton) -> tuple[str, str, str]:
-    return automaton.prefix, automaton.suffix, repr(automaton.edges)
+    return automaton.order
 
 
 class _Search:

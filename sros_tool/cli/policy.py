@@ -167,11 +167,19 @@ Example:
   3 rights differ
   $ sros diff_policy robot.xml keystore/enclaves/talker/permissions.p7s
   $ sros diff_policy keystore keystore/enclaves/router/router.json5
-  $ sros diff_policy robot.xml robot.xml --fleet old.toml --fleet new.toml""",
+  $ sros diff_policy robot.xml robot.xml --fleet old.toml --fleet new.toml
+  $ sros diff_policy --no-new-access git:main:robot.xml robot.xml
+  + /talker publish topic /arm_*  (robot.xml:7): such as /arm_c
+  1 right is new""",
 )
 @click.argument("a", metavar="A", type=PATH)
 @click.argument("b", metavar="B", type=PATH)
 @fleets_option
+@click.option(
+    "--no-new-access",
+    is_flag=True,
+    help="Find only what B adds to A, decided for all names; what it removes is no difference.",
+)
 @click.option(
     "--format",
     "form",
@@ -181,7 +189,14 @@ Example:
     help="Output for people, programs, or a comment on a pull request, with a picture.",
 )
 @json_option
-def diff_policy(a: Path, b: Path, fleet_files: tuple[Path, ...], form: str, as_json: bool) -> int:
+def diff_policy(
+    a: Path,
+    b: Path,
+    fleet_files: tuple[Path, ...],
+    no_new_access: bool,
+    form: str,
+    as_json: bool,
+) -> int:
     """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
     A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or
@@ -191,12 +206,21 @@ def diff_policy(a: Path, b: Path, fleet_files: tuple[Path, ...], form: str, as_j
     are one. Of two policies, the protection that they demand is compared, too.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
+
+    With --no-new-access, A and B can also be folders of policies, and policies at a revision of
+    git, as git:REVISION:PATH. The exit status is 0 only if B gives no enclave any access that A
+    does not give, with no vendor and for no name, and protects nothing less; it is 2 if that
+    cannot be decided. Dates are not compared.
     """
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.rights import compare
 
     check_one_format()
     form = "json" if as_json else form
+    if no_new_access:
+        from sros_tool.cli.new_access import show_new_access
+
+        return show_new_access(a, b, fleets_of(fleet_files), form)
     with progress("reading"):
         fleets = fleets_of(fleet_files)
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])

@@ -14,7 +14,7 @@ from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
 from sros_tool.fleet.enclaves import MAX_ENCLAVES, group_of, path_for
 from sros_tool.fleet.model import Fleet, Robot
 from sros_tool.names import check_enclave_name, check_namespace, expression_problem
-from sros_tool.policy.document import read_policy
+from sros_tool.policy.document import PolicyFiles, read_policy
 from sros_tool.policy.model import Enclave, Group, Policy, Profile, Source
 from sros_tool.policy.placeholders import Parts, fill, has_placeholder, parts_of, placeholders_of
 
@@ -174,15 +174,17 @@ class FleetPolicy(Mapping[str, Enclave]):
             yield name
 
 
-def read_policy_for(path: Path, fleet: Fleet | None) -> Policy:
+def read_policy_for(path: Path, fleet: Fleet | None, read: PolicyFiles | None = None) -> Policy:
     """Return the policy in a file, with its placeholders filled in for a fleet, if there is one.
+
+    ``read`` returns the content of files that are not in the file system.
 
     Raises:
         PolicyError: (or another `DocumentError`) as of `read_policy` and `FleetPolicy`.
     """
     if fleet is None:
-        return read_policy(path)
-    return FleetPolicy(read_policy(path, placeholders=True), fleet).policy()
+        return read_policy(path, read=read)
+    return FleetPolicy(read_policy(path, placeholders=True, read=read), fleet).policy()
 
 
 def _name_problem(name: str) -> str:

@@ -126,11 +126,11 @@ def _governance_changes(old: Governance, new: Governance) -> Iterator[SettingCha
         (_rule_of(old, domain), _rule_of(new, domain)) for domain in before if domain in after
     )
     for one, other in pairs:
-        yield from _attribute_changes(one, other, "protection", "")
+        yield from attribute_changes(one, other, "protection", "")
         for expression, first, second in _topic_pairs(one, other):
             key, name = _key_and_name(expression)
             if first and second:
-                yield from _attribute_changes(first, second, key, name)
+                yield from attribute_changes(first, second, key, name)
             elif second:
                 yield SettingChange(Effect.LOOSER, key, "no rule", "a rule", f"{name} can be used")
             else:
@@ -204,9 +204,13 @@ def _key_and_name(expression: str) -> tuple[str, str]:
     return f"protection of {expression}", f"DDS topic {expression}"
 
 
-def _attribute_changes(
+def attribute_changes(
     old: DomainRule | TopicRule, new: DomainRule | TopicRule, prefix: str, name: str
 ) -> Iterator[SettingChange]:
+    """Yield what changes between two rules of a kind; keys begin with ``prefix``.
+
+    ``name`` are the topics of topic rules, in ROS terms.
+    """
     for each in attributes(type(old)):
         before, after = getattr(old, each.name), getattr(new, each.name)
         if before == after:

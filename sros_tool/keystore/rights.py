@@ -8,7 +8,7 @@ gives what its access control lets other enclaves do.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
@@ -55,7 +55,8 @@ class RightsSource:
     enclaves that it can give rights to; None for all.  ``sound`` is False if DDS would refuse a
     part of it: a signature that does not verify, or permissions that are missing or malformed.
     ``fleet`` knows which enclave is whose, if the file or folder is for one.  ``protections`` are
-    what a policy says about the protection of names; None for anything else.
+    what a policy says about the protection of names; None for anything else.  ``documents`` are the
+    permissions of enclaves, as far as there are any.
     """
 
     path: Path
@@ -66,6 +67,7 @@ class RightsSource:
     notes: tuple[Note, ...]
     fleet: Fleet | None = None
     protections: tuple[StatedProtection, ...] | None = None
+    documents: Mapping[str, Permissions] = field(default_factory=dict)
 
 
 def load_rights(path: Path, fleet: Fleet | None = None) -> RightsSource:
@@ -166,7 +168,13 @@ def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:
     reader = _Reader()
     rights, scope = reader.permissions(file, str(path))
     return RightsSource(
-        path, kind, rights, frozenset(scope), reader.sound, tuple(reader.unverified + reader.notes)
+        path,
+        kind,
+        rights,
+        frozenset(scope),
+        reader.sound,
+        tuple(reader.unverified + reader.notes),
+        documents=reader.documents,
     )
 
 
@@ -194,6 +202,7 @@ def _keystore_rights(root: Path) -> RightsSource:
         reader.sound,
         tuple(reader.unverified[:1] + reader.notes),
         load_fleet(root),
+        documents=reader.documents,
     )
 
 
@@ -207,6 +216,7 @@ class _Reader:
     sound: bool = True
     unverified: list[Note] = field(default_factory=list)
     notes: list[Note] = field(default_factory=list)
+    documents: dict[str, Permissions] = field(default_factory=dict)
     _authorities: dict[bytes, x509.Certificate] = field(default_factory=dict)
 
     def permissions(self, file: Path, what: str) -> tuple[frozenset[Right], tuple[str, ...]]:
@@ -227,6 +237,7 @@ class _Reader:
             Note(note.id, f"{what}: {note.text}") for note in _left_out(permissions.grants)
         ]
         grants = _first_of_each(permissions)
+        self.documents.update(dict.fromkeys(grants, permissions))
         rights = (right for name, grant in grants.items() for right in grant_rights(name, grant))
         return frozenset(rights), tuple(grants)
 

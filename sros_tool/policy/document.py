@@ -21,7 +21,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
@@ -84,6 +84,10 @@ class IncludedFile:
     linked: bool = False
 
 
+PolicyFiles = Callable[[Path], bytes]
+"""Function that returns the content of a policy file; it raises `DocumentError` without one."""
+
+
 @dataclass(slots=True)
 class Includer:
     """A reader of the policy files in ``root`` and below; each file is read once.
@@ -92,6 +96,8 @@ class Includer:
     """
 
     root: Path
+    read: PolicyFiles | None = None
+    """Where files are read from; None stands for the file system."""
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
     _sizes: dict[Path, int] = field(default_factory=dict)
     _includes: int = 0
@@ -106,7 +112,8 @@ class Includer:
     def load(self, file: Path) -> etree._Element:
         """Return the root element of the document at ``file``, which is a real path."""
         if file not in self._documents:
-            self.use_content(file, read_bytes(file, "policy file"))
+            read = self.read or (lambda file: read_bytes(file, "policy file"))
+            self.use_content(file, read(file))
         self._bytes += self._sizes[file]
         if self._bytes > _MAX_BYTES:
             raise _too_large(f"'{file}'", f"{_MAX_BYTES // 1024**2} MiB")
@@ -208,7 +215,7 @@ class Includer:
             )
         href, pointer = element.get("href", ""), element.get("xpointer", "")
         file = self.target(element, place)
-        if inside and not file.exists():
+        if inside and not self._exists(file):
             yield from self.children(inside[0], place)
             return
         step = (file, pointer)
@@ -223,6 +230,15 @@ class Includer:
         inner = IncludedFile(file, (*place.trail, step), linked)
         found = self._expanded([target], inner)
         yield from self._selected(found, pointer, where) if pointer else found
+
+    def _exists(self, file: Path) -> bool:
+        if self.read is None:
+            return file.exists()
+        try:
+            self.load(file)
+        except DocumentError:
+            return False
+        return True
 
     def _selected(
         self, roots: Iterator[tuple[etree._Element, IncludedFile]], pointer: str, where: str
@@ -318,34 +334,48 @@ _EARLIER_ROOTS = ("profiles",)
 _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
-def read_policy(path: Path, content: bytes | None = None, *, placeholders: bool = False) -> Policy:
+def read_policy(
+    path: Path,
+    content: bytes | None = None,
+    *,
+    placeholders: bool = False,
+    read: PolicyFiles | None = None,
+) -> Policy:
     """Return the policy in a file and its includes, which must be in its folder or below.
 
     ``content`` replaces the content of the file, which then need not exist.  With
     ``placeholders``, names may have those of `sros_tool.policy.placeholders`, and are not filled
-    in: only `sros_tool.fleet.expansion` can use such a policy.
+    in: only `sros_tool.fleet.expansion` can use such a policy.  ``read`` returns the content of
+    files that are not in the file system.
 
     Raises:
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
             a name is not a valid ROS name, or an enclave is defined twice.
     """
-    return _Reader(path, content, placeholders=placeholders).policy()
+    return _Reader(path, content, placeholders=placeholders, read=read).policy()
 
 
 class _Reader:
     _other_roots: tuple[str, ...] = ()
     """The root elements that are read besides <policy>."""
 
-    def __init__(self, path: Path, content: bytes | None, *, placeholders: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        content: bytes | None,
+        *,
+        placeholders: bool = False,
+        read: PolicyFiles | None = None,
+    ) -> None:
         self._shown = path
         self._placeholders = placeholders
         self._owner: Parts = ()
         """The path of the enclave that is being read, if it has placeholders."""
         self._file = Path(os.path.realpath(path))
-        self._includer = Includer(self._file.parent)
+        self._includer = Includer(self._file.parent, read)
         if content is not None:
             self._includer.use_content(self._file, content)
-        elif not os.path.exists(self._file):  # noqa: PTH110 - False for a name that is too long
+        elif read is None and not os.path.exists(self._file):  # noqa: PTH110 - False for a name that is too long
             raise PolicyError(f"the policy file '{path}' does not exist")
 
     def policy(self) -> Policy:

@@ -259,6 +259,11 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks/enclaves/a/permissions.xml ks/enclaves/a", 0),
         Case("wild.xml policy.xml", 1),
         Case("protected.xml policy.xml", 1),
+        Case("--no-new-access policy.xml policy.xml"),
+        Case("--no-new-access policy.xml wild.xml", 1),
+        Case("--no-new-access ks wild.xml", 1),
+        Case("--no-new-access protected.xml policy.xml", 1),
+        Case("--no-new-access policy.xml protected.xml"),
     ),
     "minimize_policy": (
         Case("policy.xml --observed other.xml"),

@@ -1,0 +1,1 @@
+"""Proofs about policies and keystores, for all names: what a change adds."""

@@ -1,0 +1,334 @@
+"""What a change adds, against brute force over short names, and as a user asks for it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections import Counter
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.matching import matches
+from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
+from sros_tool.policy.document import write_policy
+from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Profiles, Qualifier
+from sros_tool.proof.growth import Gain, compare_access
+from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource, load_side
+from sros_tool.translate import SERVICE_ENDS, dds_names, governance_for
+from tests.support.children import LONG
+from tests.support.harness import sros
+
+PAIRS = 5000 if LONG else 12
+VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
+GOVERNANCE = governance_for(load_template(DEFAULT_TEMPLATE).protection, ALL_DOMAINS)
+NAMES = (
+    "/a", "/b", "/ab", "/a/b", "/*", "/a*", "/*b", "/?", "/[ab]", "/[!a]", "/[a-b]?", "/a?*",
+    "/*a*", "/a/*", "/[!b]*", "/?b", "/ab*",
+)  # fmt: skip
+SHORT = [
+    name
+    for length in (1, 2, 3)
+    for name in ("/" + "".join(letters) for letters in product("abc/", repeat=length))
+    if "//" not in name and not name.endswith("/")
+]
+TOPICS = [
+    *(f"rt{name}" for name in SHORT),
+    *(f"{begin}{name}{end}" for begin, end in SERVICE_ENDS.items() for name in SHORT[:20]),
+]
+
+
+def drawn_policy(dice: Random) -> Policy:
+    enclaves = []
+    for path in dice.sample(("/a", "/b"), dice.randint(1, 2)):
+        groups = []
+        for _ in range(dice.randint(1, 4)):
+            kind = dice.choice(("topics", "topics", "topics", "services"))
+            rights = dice.sample(RIGHTS[kind], dice.randint(1, 2))
+            qualifier = dice.choices(tuple(Qualifier), (3, 1))[0]
+            names = tuple(dice.sample(NAMES, dice.randint(1, 3)))
+            groups.append(Group(kind, tuple((r, qualifier) for r in sorted(rights)), names))
+        profile = Profile("/", "n", tuple(groups))
+        enclaves.append(Enclave(path, (Profiles((profile,)),)))
+    return Policy(tuple(enclaves))
+
+
+def changed(policy: Policy, dice: Random) -> Policy:
+    """The policy with one name, one qualifier or one enclave changed, or another policy."""
+    if dice.random() < 0.2:
+        return drawn_policy(dice)
+    enclaves = list(policy.enclaves)
+    at = dice.randrange(len(enclaves))
+    profile = enclaves[at].profiles[0].profiles[0]
+    groups = list(profile.groups)
+    one = dice.randrange(len(groups))
+    if dice.random() < 0.7:
+        groups[one] = replace(groups[one], names=tuple(dice.sample(NAMES, dice.randint(1, 3))))
+    else:
+        del groups[one]
+    kept = replace(profile, groups=tuple(groups))
+    enclaves[at] = replace(enclaves[at], profiles=(Profiles((kept,)),))
+    return Policy(tuple(enclaves))
+
+
+def allowed(side: AccessSource, vendor: Vendor, enclave: str) -> set[tuple[AccessVerb, str]]:
+    permissions = side.permissions.get(enclave)
+    if permissions is None:
+        return set()
+    subject = permissions.grants[0].subject
+    access = Access(vendor, GOVERNANCE, permissions, subject, domain=0, at=AT)
+    return {(v, t) for v in VERBS for t in TOPICS if access.decide(v, t).outcome.ok}
+
+
+def says(gain: Gain, enclave: str, verb: AccessVerb, topic: str, vendor: Vendor) -> bool:
+    if enclave not in gain.enclaves or vendor.title not in gain.worlds:
+        return False
+    if gain.right is None:
+        return gain.topic == topic
+    names = dds_names(gain.right.right, gain.right.name)
+    topics = names.publish if verb is AccessVerb.PUBLISH else names.subscribe
+    return any(matches(vendor.traits.style, each, topic) for each in topics)
+
+
+def test_random_pairs_against_every_short_name(tmp_path: Path) -> None:
+    dice = Random(17)
+    seen: Counter[bool] = Counter()
+    for _ in range(PAIRS):
+        policy = drawn_policy(dice)
+        sides = []
+        for name, one in (("base", policy), ("head", changed(policy, dice))):
+            (tmp_path / f"{name}.xml").write_bytes(write_policy(one))
+            sides.append(load_side(tmp_path / f"{name}.xml"))
+        base, head = sides
+        growth = compare_access(base, head)
+        for vendor, enclave in product(MEASURED, ("/a", "/b")):
+            before, after = (allowed(side, vendor, enclave) for side in sides)
+            for found, more in ((growth.added, after - before), (growth.removed, before - after)):
+                for verb, topic in more:
+                    assert any(says(e, enclave, verb, topic, vendor) for e in found), (
+                        policy, vendor, verb, topic
+                    )  # fmt: skip
+                seen[bool(more)] += 1
+        assert not compare_access(head, head)
+    assert min(seen[True], seen[False]) > PAIRS
+
+
+def test_each_name_that_is_reported_is_new(tmp_path: Path) -> None:
+    """The comparison confirms each name itself: a wrong one would be an error there."""
+    dice = Random(3)
+    for _ in range(max(PAIRS // 10, 3)):
+        files = [tmp_path / "base.xml", tmp_path / "head.xml"]
+        for file in files:
+            file.write_bytes(write_policy(drawn_policy(dice)))
+        base, head = map(load_side, files)
+        for gain in compare_access(base, head).added:
+            for enclave, vendor in product(gain.enclaves, MEASURED):
+                if vendor.title in gain.worlds and gain.topic in TOPICS:
+                    before, after = (allowed(side, vendor, enclave) for side in (base, head))
+                    assert gain.topic in {topic for _, topic in after - before}
+
+
+POLICY = """<policy version="0.2.0" xmlns:xi="http://www.w3.org/2001/XInclude">
+  <enclaves>
+    <enclave path="/web"><profiles><profile ns="/" node="web">
+      <topics publish="ALLOW">
+        <topic>{}</topic>
+      </topics>
+      <topics publish="DENY"><topic>/cmd_{}</topic></topics>
+    </profile></profiles></enclave>
+    <enclave path="/mux"><profiles><profile ns="/" node="mux">
+      <topics subscribe="ALLOW"><topic>/web_cmd</topic></topics>
+      <topics publish="ALLOW"><topic>/wheels</topic></topics>
+    </profile></profiles></enclave>
+    <enclave path="/wheels"><profiles><profile ns="/" node="wheels">
+      <topics subscribe="ALLOW"><topic>/wheels</topic></topics>{}
+    </profile></profiles></enclave>
+  </enclaves>
+</policy>
+"""
+
+
+def write(folder: Path, name: str, *values: str) -> Path:
+    (folder / name).write_text(POLICY.format(*values), encoding="utf-8")
+    return folder / name
+
+
+def test_a_wildcard_that_differs_only_in_names_that_nobody_uses(tmp_path: Path) -> None:
+    write(tmp_path, "base.xml", "/log_[a-y]*", "vel", "")
+    write(tmp_path, "head.xml", "/log_[a-z]*", "vel", "")
+    ended = sros("diff_policy", "--no-new-access", "base.xml", "head.xml", cwd=tmp_path)
+    assert ended.status == 1
+    assert ended.out == "+ /web publish topic /log_[a-z]*  (head.xml:5): such as /log_z\n"
+    back = sros("diff_policy", "--no-new-access", "head.xml", "base.xml", cwd=tmp_path)
+    assert back.status == 0
+    assert "- /web publish topic /log_[a-z]*  (head.xml:5): such as /log_z" in back.out
+
+
+def test_a_denial_that_is_gone_and_whom_it_lets_be_influenced(tmp_path: Path) -> None:
+    write(tmp_path, "base.xml", "/*", "vel", "")
+    write(tmp_path, "head.xml", "/*", "other", "")
+    out = sros("diff_policy", "--no-new-access", "base.xml", "head.xml", cwd=tmp_path).out
+    assert "such as /cmd_vel, which BASE denies by /cmd_vel at base.xml:7" in out
+    assert "- /web publish topic /*  (base.xml:5): such as /cmd_other" in out
+    write(tmp_path, "base.xml", "/x", "vel", "")
+    write(tmp_path, "head.xml", "/web_*", "vel", "")
+    ended = sros("diff_policy", "--no-new-access", "base.xml", "head.xml", "--json", cwd=tmp_path)
+    value = json.loads(ended.out)
+    assert {(each["source"], each["target"]) for each in value["reach"]} == {
+        ("/web", "/mux"), ("/web", "/wheels")
+    }  # fmt: skip
+    assert [len(each["path"]) for each in value["reach"]] == [1, 2]
+
+
+def test_less_protection_is_found(tmp_path: Path) -> None:
+    protected = '<topics publish="ALLOW"><topic>/image{}<?sros protect="{}"?></topic></topics>'
+    write(tmp_path, "base.xml", "/x", "vel", protected.format("*", "encrypt"))
+    for name, level, told in (("*", "sign", "sign"), ("_left*", "encrypt", "nothing")):
+        write(tmp_path, "head.xml", "/x", "vel", protected.format(name, level))
+        ended = sros("diff_policy", "--no-new-access", "base.xml", "head.xml", cwd=tmp_path)
+        assert ended.status == 1
+        assert f"+ less protection: protect topic /image* encrypt -> {told}" in ended.out
+    back = sros("diff_policy", "--no-new-access", "head.xml", "base.xml", cwd=tmp_path)
+    assert "less protection" not in back.out
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    write(folder, "robot.xml", "/log_*", "vel", "")
+    sros("create_keystore", "ks", cwd=folder).ok()
+    sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", cwd=folder).ok()
+    return folder
+
+
+def test_keystores_and_signed_permissions(made: Path) -> None:
+    for one, other in (
+        ("ks", "ks"), ("robot.xml", "ks"), ("ks", "robot.xml"), ("ks/enclaves/web", "robot.xml"),
+        ("ks/enclaves/web/permissions.p7s", "ks"),
+    ):  # fmt: skip
+        assert sros("diff_policy", "--no-new-access", one, other, cwd=made).status == 0, (
+            one,
+            other,
+        )
+    write(made, "wide.xml", "/*", "vel", "")
+    ended = sros("diff_policy", "--no-new-access", "ks/enclaves/web", "wide.xml", cwd=made)
+    assert ended.status == 1
+    assert ended.out.startswith("+ /web publish topic /*  (wide.xml:5): such as /")
+
+
+def test_a_signature_that_does_not_verify_is_not_compared(made: Path) -> None:
+    broken = made / "broken"
+    broken.mkdir()
+    source = made / "ks" / "enclaves" / "web"
+    for name in ("permissions.p7s", "permissions_ca.cert.pem"):
+        (broken / name).write_bytes((source / name).read_bytes())
+    content = (broken / "permissions.p7s").read_bytes()
+    (broken / "permissions.p7s").write_bytes(content.replace(b"rt/log_*", b"rt/lag_*"))
+    ended = sros("diff_policy", "--no-new-access", "broken", "robot.xml", cwd=made)
+    assert ended.status == 2
+    assert "cannot be compared" in ended.err
+
+
+# ── revisions ──────────────────────────────────────────────────────────────────────────────
+
+
+def git(folder: Path, *words: str) -> str:
+    person = {f"GIT_{who}_{what}": "x@x" for who in ("AUTHOR", "COMMITTER")
+              for what in ("NAME", "EMAIL")}  # fmt: skip
+    nobody = {"GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_NOSYSTEM": "1"}
+    done = subprocess.run(
+        ["git", "-C", str(folder), *words],
+        env={**os.environ, **person, **nobody},
+        capture_output=True,
+        check=True,
+    )
+    return done.stdout.decode()
+
+
+INCLUDE = '<xi:include href="common/more.xml" xpointer="xpointer(/profile/*)"/>'
+MORE = '<profile ns="/" node="x"><topics publish="ALLOW"><topic>{}</topic></topics></profile>'
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    git(tmp_path, "init", "-q", "-b", "main")
+    (tmp_path / "policies" / "common").mkdir(parents=True)
+    write(tmp_path / "policies", "robot.xml", "/x", "vel", INCLUDE)
+    (tmp_path / "policies" / "common" / "more.xml").write_text(MORE.format("/a"))
+    git(tmp_path, "add", "-A")
+    git(tmp_path, "commit", "-q", "-m", "first")
+    return tmp_path
+
+
+def test_a_revision_is_read_with_its_own_includes(repository: Path) -> None:
+    words = ("diff_policy", "--no-new-access", "git:main:policies/robot.xml")
+    assert sros(*words, "policies/robot.xml", cwd=repository).status == 0
+    (repository / "policies" / "common" / "more.xml").write_text(MORE.format("/b"))
+    ended = sros(*words, "policies/robot.xml", cwd=repository)
+    assert ended.status == 1
+    more = repository / "policies" / "common" / "more.xml"
+    assert f"+ /wheels publish topic /b  ({more}:1)\n" in ended.out
+    assert "- /wheels publish topic /a  (git:main:policies/common/more.xml:1)\n" in ended.out
+    below = repository / "policies"
+    same = sros("diff_policy", "--no-new-access", "git:HEAD:./robot.xml", "git:main:policies",
+                cwd=below)  # fmt: skip
+    assert same.status == 0, same.err
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("git:nothing:policies/robot.xml", "finds no revision 'nothing'"),
+        ("git:--output=x:policies/robot.xml", "finds no revision '--output=x'"),
+        ("git:main:policies/none.xml", "does not exist"),
+        ("git:main:../robot.xml", "outside of the repository"),
+        ("git:main", "names no policy at a revision"),
+        ("git::robot.xml", "names no policy at a revision"),
+        ("git:main:policies/link.xml", "Unable to compare"),
+        ("git:main:policies/away.xml", "leaves the folder of the policy"),
+    ],
+)
+def test_revisions_that_cannot_be_read(repository: Path, what: str, said: str) -> None:
+    (repository / "policies" / "link.xml").symlink_to("robot.xml")
+    away = INCLUDE.replace("common/more.xml", "../../etc/passwd")
+    write(repository / "policies", "away.xml", "/x", "vel", away)
+    git(repository, "add", "-A")
+    git(repository, "commit", "-q", "-m", "second")
+    words = ("diff_policy", "--no-new-access", what, "policies/robot.xml")
+    ended = sros(*words, cwd=repository)
+    assert ended.status == 2
+    assert said in ended.err
+    assert "/dev/null" not in ended.err
+    assert not (repository / "x").exists()
+
+
+def test_nothing_that_a_repository_configures_is_run(repository: Path) -> None:
+    trap = repository / "trap"
+    trap.write_text(f"#!/bin/sh\ntouch {repository}/sprung\ncat\n")
+    trap.chmod(0o755)
+    for key in ("core.fsmonitor", "core.pager", "diff.x.textconv", "filter.x.smudge", "core.editor",
+                "filter.x.process", "core.sshCommand", "gpg.program", "credential.helper",
+                "remote.origin.uploadpack"):  # fmt: skip
+        git(repository, "config", key, str(trap))
+    git(repository, "config", "remote.origin.url", str(repository))
+    git(repository, "config", "remote.origin.promisor", "true")
+    git(repository, "config", "extensions.partialClone", "origin")
+    (repository / ".gitattributes").write_text("*.xml diff=x filter=x\n")
+    for each in ("post-checkout", "reference-transaction", "post-index-change"):
+        (repository / ".git" / "hooks" / each).write_bytes(trap.read_bytes())
+        (repository / ".git" / "hooks" / each).chmod(0o755)
+    sides = ("git:main:policies/robot.xml", "policies/robot.xml")
+    assert sros("diff_policy", "--no-new-access", *sides, cwd=repository).status == 0
+    # With an object that is missing, git would ask the remote for it.
+    blob = git(repository, "rev-parse", "HEAD:policies/robot.xml").strip()
+    missing = repository / ".git" / "objects" / blob[:2] / blob[2:]
+    missing.rename(repository / "kept")
+    assert sros("diff_policy", "--no-new-access", *sides, cwd=repository).status == 2
+    assert not (repository / "sprung").exists()
