@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -35,13 +36,14 @@ from sros_tool.cli.common import (
 )
 from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import MEASURED
-from sros_tool.errors import NOT_DONE, UsageError
+from sros_tool.errors import NOT_DONE, SrosError, UsageError
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.checks.registry import ChosenFindings, FindingFilter
     from sros_tool.checks.targets import Circumstances
     from sros_tool.demo.doctor import Diagnosis
+    from sros_tool.fleet.model import Fleet
     from sros_tool.proof.requirements import Requirement
     from sros_tool.proof.system import System
     from sros_tool.runtime.ros2cli import SecurityProvider
@@ -232,7 +234,10 @@ def check(
         every += _broken(one, read, at, vendor) if one else []
         found = [_shown(each) for each in every]
     chosen = selection.choose(found)
-    _SHOW[form](chosen, selection)
+    if form == "text" and at.fleet:
+        _print_text(chosen, _by_robot(chosen.shown, _with_enclaves(at.fleet, paths)))
+    else:
+        _SHOW[form](chosen, selection)
     return 1 if fail_on != "never" and chosen.fails(Severity[fail_on.upper()]) else 0
 
 
@@ -445,9 +450,52 @@ def _print_markdown(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     click.echo(findings_markdown(chosen, _summary(chosen)))
 
 
-def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
-    for each in chosen.shown:
+def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
+    """Return a fleet with the paths of its enclaves in policy files."""
+    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.policy.document import read_policy
+
+    patterns: list[str] = []
+    for path in paths:
+        with suppress(SrosError):  # what is wrong with it is a finding
+            patterns += FleetPolicy(read_policy(path, placeholders=True), fleet).patterns
+    return fleet.with_enclaves(patterns)
+
+
+def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Finding, str]]:
+    """Yield findings, and the robots for which the same one is left out.
+
+    It is the same if it is about the same line of the policy, in the enclave of another robot.
+    """
+    from sros_tool.fleet.folding import path_of_robots
+
+    found: dict[object, list[tuple[Finding, str]]] = {}
+    number: Counter[object] = Counter()
+    for each in findings:
+        path, robot = path_of_robots(fleet, each.subject)
+        place = (each.id, each.file, each.line, each.accepted, each.remedy)
+        number[each.subject, place] += 1  # of several that an enclave has there
+        found.setdefault((place, path, number[each.subject, place]), []).append((each, robot))
+    for (first, _), *others in found.values():
+        robots = [robot for _, robot in others]
+        more = ", ..." if len(robots) > _MOST_ROBOTS else ""
+        count = f"{len(robots)} more robot{'s' * (len(robots) > 1)}"
+        named = f"the same for {count}: {', '.join(robots[:_MOST_ROBOTS])}{more}"
+        yield first, named if robots else ""
+
+
+_MOST_ROBOTS = 10
+
+
+def _print_all(chosen: ChosenFindings, _selection: FindingFilter) -> None:
+    _print_text(chosen, ((each, "") for each in chosen.shown))
+
+
+def _print_text(chosen: ChosenFindings, shown: Iterable[tuple[Finding, str]]) -> None:
+    for each, others in shown:
         echo_finding(each)
+        if others:
+            click.echo(visible_line(f"    {others}"))
     for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
@@ -525,7 +573,7 @@ def _print_kinds(selection: FindingFilter, form: str) -> None:
 
 
 _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
-    "text": _print_text,
+    "text": _print_all,
     "json": _print_json,
     "sarif": _print_sarif,
     "markdown": _print_markdown,

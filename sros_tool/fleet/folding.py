@@ -36,6 +36,15 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
             yield f"{kind}  ({_named(fleet, names)})"
 
 
+def path_of_robots(fleet: Fleet, enclave: str) -> tuple[str, str]:
+    """Return the path of an enclave with a placeholder for its robot, and the robot's name.
+
+    For an enclave of no robot, the path stays as it is and the name is "".
+    """
+    robot = robot_of(fleet, enclave)
+    return (_with_placeholders(enclave, enclave, robot), robot.name) if robot else (enclave, "")
+
+
 def _with_placeholders(text: str, enclave: str, robot: Robot) -> str:
     own = _whole(robot.name).sub("{robot}", enclave)
     parts = re.split(rf"(?<![A-Za-z0-9_]){re.escape(enclave)}(?![A-Za-z0-9_/])", text)

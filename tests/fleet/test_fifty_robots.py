@@ -202,6 +202,24 @@ def test_the_rights_of_every_node_are_not_next_to_the_policy(made: Path, tmp_pat
         assert ("sros policies --copy DIR" in ended.out) is ships
 
 
+def test_findings_that_are_the_same_for_many_robots_are_said_once(made: Path) -> None:
+    ended = sros("check", "robot.xml", "--fleet", "fleet.toml", cwd=made)
+    lines = ended.out.splitlines()
+    rosout = [at for at, each in enumerate(lines) if each.endswith("[policy.no-rosout]")]
+    assert len(rosout) == 3, "base, lift and the dispatcher"
+    said = [lines[at + 3] if at + 3 < len(lines) else "" for at in rosout]
+    assert [each.strip().partition(":")[0] for each in said if "the same" in each] == [
+        "the same for 49 more robots",
+        "the same for 24 more robots",
+    ]
+    counted = json.loads(
+        sros("check", "robot.xml", "--fleet", "fleet.toml", "--json", cwd=made).out
+    )
+    assert f"{counted['counts']['error']} errors" in ended.err
+    ids = [each["id"] for each in counted["findings"]]
+    assert ids.count("policy.no-rosout") == 76
+
+
 def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     """Renewed and revoked by robot; a robot that leaves; a domain that changes; an edit by hand."""
     folder = copied(made, tmp_path)
