@@ -200,11 +200,7 @@ def _first_of(uses: Collection[Use]) -> Witness | None:
 def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
     """Return the shortest name that an enclave lacks a right to; all of its topics count."""
     enclave = requirement.enclave
-    lacking = [
-        Use(enclave, "publish" if writes else "subscribe", topic, topic, writes)
-        for writes, topic in world.needed
-        if topic not in world.side(writes).of.get(enclave, NameSet())
-    ]
+    lacking = []
     for right, names in requirement.rights:
         for name in names:
             for part in _parts_of(right):
@@ -214,7 +210,12 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
                 topic = (topics.valid() - own).example(limit, longest=world.longest)
                 if topic:
                     lacking.append(_use(enclave, right, part, topics, topic))
-    return Witness((min(lacking, key=_better),)) if lacking else None
+    if lacking:
+        return Witness((min(lacking, key=_better),))
+    for writes, topic in world.needed:
+        if topic not in world.side(writes).of[enclave]:
+            return Witness((Use(enclave, "", topic, topic, writes),))
+    return None
 
 
 def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness | None:

@@ -54,13 +54,15 @@ class Step:
 class Violation:
     """A requirement that does not hold, the steps of its witness, and the worlds where it does not.
 
-    ``worlds`` is empty if it holds in none of those that were decided.
+    ``worlds`` is empty if it holds in none of those that were decided.  ``missing`` is an enclave
+    of the witness that does not exist, or "".
     """
 
     requirement: Requirement
     witness: Witness
     steps: tuple[Step, ...]
     worlds: tuple[str, ...]
+    missing: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +93,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             steps = tuple(Step(use, system.places.find(use)) for use in witness.uses)
             titles = tuple(world.title for world, _ in broken)
             titles = () if len(broken) == len(system.worlds) else titles
-            violations.append(Violation(requirement, witness, steps, titles))
+            known = {each for world in system.worlds for each in world.enclaves}
+            missing = next((each for each in witness.enclaves if each and each not in known), "")
+            violations.append(Violation(requirement, witness, steps, titles, missing))
         empty = _common(each for _, each in verdicts)
         if empty:
             vacuous.append((requirement, empty))
@@ -159,7 +163,7 @@ def _fact(violation: Violation) -> str:
         case Apart():
             return f"influences {steps[-1].use.enclave}: {_chain(steps)}"
         case Must():
-            return f"may not {steps[0].does()}"
+            return "does not exist" if violation.missing else f"may not {steps[0].does()}"
         case Protected():
             return "its messages are not"
         case AtMost():

@@ -88,6 +88,9 @@ def test_what_holds_and_what_cannot_fail(folder: Path, tmp_path: Path) -> None:
     held = tmp_path / "held.toml"
     held.write_text(REQUIRED.split("[[apart]]")[0].replace('"/mux"', '"/mux", "/web"'))
     sros(*ONLY, "--requirements", held, cwd=folder).ok()
+    held.write_text('[[must]]\nenclave = "/none"\npublish = ["/cmd_vel"]\n')
+    ended = sros(*ONLY, "--requirements", held, cwd=folder)
+    assert "/none: does not exist, but /none has to be able to publish /cmd_vel" in ended.out
     held.write_text('[[only]]\npublish = ["/cmdvel"]\nenclaves = ["/mix"]\n')
     ended = sros(*ONLY, "--requirements", held, cwd=folder)
     assert ended.status == 1

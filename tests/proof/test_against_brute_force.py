@@ -28,6 +28,8 @@ from tests.support.children import LONG
 NOW = datetime(2027, 1, 1, tzinfo=UTC)
 COUNT = int(os.environ.get("SROS_REQUIREMENTS", "20000" if LONG else "150"))
 SEED = int(os.environ.get("SROS_REQUIREMENTS_SEED", "1"))
+OF_EACH = 40 if LONG else 10
+"""Requirements for each policy: to try all names of a policy takes longer than to decide."""
 ENCLAVES = ("/e", "/f", "/g", "/h")
 NAMES = (
     "/a", "/b", "/a/b", "/ab", "/abc", "/b/a", "/c", "/*", "/a*", "/*b", "/a/*", "/?", "/a?",
@@ -93,9 +95,9 @@ def stated(policy: Policy) -> dict[tuple[str, bool], frozenset[str]]:
 
 def cases() -> Iterator[tuple[int, Policy, list[Requirement]]]:
     """Yield policies, each with several requirements: ``COUNT`` of these in all."""
-    for number in range(COUNT // 10):
+    for number in range(COUNT // OF_EACH):
         draw = random.Random(f"{SEED}.{number}")
-        yield number, draw_policy(draw), [draw_requirement(draw) for _ in range(10)]
+        yield number, draw_policy(draw), [draw_requirement(draw) for _ in range(OF_EACH)]
 
 
 def test_every_decision_is_that_of_brute_force() -> None:
