@@ -12,11 +12,13 @@ from pathlib import Path
 
 import setuptools
 
-HERE = Path(__file__).resolve().parent  # with --symlink-install colcon runs a link to this file
+HERE = Path(__file__).resolve().parent
 PROJECT = tomllib.loads((HERE / "pyproject.toml").read_text())["project"]
 NAME = PROJECT["name"]
-BESIDE = ("policies", "keystore_templates")
-"""Folders that belong into the package, and are at the top of the repository."""
+LINKED = Path.cwd().resolve() != HERE
+"""With --symlink-install, colcon runs a link to this file among links to all packages."""
+BESIDE = () if LINKED else ("policies", "keystore_templates")
+"""Folders at the top of the repository that belong into the package; linked, it finds them."""
 
 
 class Distribution(setuptools.Distribution):

@@ -4,6 +4,12 @@
 sros_path="$COLCON_CURRENT_PREFIX/share/sros_tool/ros2_security"
 case ":${PYTHONPATH-}:" in
     *":$sros_path:"*) ;;
-    *) export PYTHONPATH="${PYTHONPATH:+$PYTHONPATH:}$sros_path" ;;
+    *)
+        # colcon leaves a ":" at the end until later: in the middle it is the working folder.
+        sros_before="${PYTHONPATH-}"
+        sros_before="${sros_before%:}"
+        export PYTHONPATH="${sros_before:+$sros_before:}$sros_path"
+        unset sros_before
+        ;;
 esac
 unset sros_path

@@ -79,6 +79,14 @@ def test_the_program_of_the_workspace_works(workspace: Path) -> None:
     assert not list((workspace / "src").rglob("*.egg-info"))
 
 
+def test_nothing_is_imported_from_the_working_folder(workspace: Path) -> None:
+    """An empty part of PYTHONPATH is the working folder, which anybody may own."""
+    for before in ({}, {"PYTHONPATH": "/somewhere"}):
+        paths = sourced(workspace, 'printf %s "$PYTHONPATH"', **before).split(":")
+        assert all(paths) and paths[-1].endswith("/share/sros_tool/ros2_security")
+        assert len(paths) == 2 + len(before)
+
+
 def test_its_ros2_security_is_that_of_sros_where_sros2_is_installed_too(workspace: Path) -> None:
     """A workspace comes first in PYTHONPATH, and ros2cli takes the last entry of a name."""
     sros2 = workspace / "ros/lib/sros2.dist-info"
