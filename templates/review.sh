@@ -23,9 +23,15 @@ if [ -n "$SROS_BASE" ]; then
         worst 2
     elif [ ! -e "$before/tree/$SROS_POLICY" ]; then
         printf '### Rights: the policy is new, so all of its access is new\n' >>"$SROS_SUMMARY"
+        if [ "$SROS_NEW_ACCESS" != allow ]; then worst 1; fi
     else
         sros diff_policy "$before/tree/$SROS_POLICY" "$SROS_POLICY" --format markdown \
             >>"$SROS_SUMMARY" || { code=$?; if [ "$code" -gt 1 ]; then worst "$code"; fi; }
+        sros diff_policy --no-new-access "$before/tree/$SROS_POLICY" "$SROS_POLICY" \
+            --format markdown >>"$SROS_SUMMARY" || {
+            code=$?
+            if [ "$code" -gt 1 ] || [ "$SROS_NEW_ACCESS" != allow ]; then worst "$code"; fi
+        }
     fi
     rm -rf "$before"
     git worktree prune
