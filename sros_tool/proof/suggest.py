@@ -13,7 +13,7 @@ from dataclasses import replace
 from itertools import islice
 
 from sros_tool.automata import SearchLimit
-from sros_tool.names import READING_SERVICES, is_expression
+from sros_tool.names import READING_SERVICES, expression_problem, is_expression
 from sros_tool.policy.model import RIGHTS, Source
 from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import Right
@@ -78,9 +78,11 @@ class _Stated:
         self.users: dict[tuple[str, str], set[str]] = defaultdict(set)
         self.wild: dict[str, set[str]] = defaultdict(set)
         for each in rights:
+            if each.kind == "dds" or expression_problem(each.name):
+                continue  # permissions of others may have any text
             if is_expression(each.name):
                 self.wild[each.right].add(each.name)
-            elif each.kind != "dds":
+            else:
                 self.users[each.right, each.name].add(each.enclave)
 
     def names(self, right: str) -> list[str]:

@@ -6,9 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.automata import NameSet
+from sros_tool.dds.decision.matching import names_of
+from sros_tool.dds.decision.vendors import Style
 from sros_tool.errors import DocumentError
-from sros_tool.policy.model import Source
+from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.protection import Level
+from sros_tool.policy.rights import Right
 from sros_tool.proof.requirements import (
     Apart,
     AtMost,
@@ -21,6 +25,8 @@ from sros_tool.proof.requirements import (
     parse_requirements,
     read_requirements,
 )
+from sros_tool.proof.suggest import render_requirements, suggest
+from sros_tool.proof.worlds import TopicAccess, World
 
 EVERY_KIND = """\
 [[only]]
@@ -157,3 +163,22 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     for name in ("latin.toml", "large.toml", "gone.toml", "."):
         with pytest.raises(DocumentError):
             read_requirements(tmp_path / name)
+
+
+def test_proposals_have_no_name_that_the_file_could_not_have() -> None:
+    names = ("/ok", "rt/x*", "/a b", "/a\x1b[31m*", "/fine*")
+    rights = [
+        Right(each, ALLOW, right, name)
+        for name in names
+        for each, right in (("/e", "publish"), ("/f", "subscribe"))
+    ]
+    sides = {
+        "/e": TopicAccess(names_of(Style.FNMATCH, ("rt/ok", "rt/fine*")), NameSet()),
+        "/f": TopicAccess(NameSet(), names_of(Style.FNMATCH, ("rt/ok", "rt/fine*"))),
+    }
+    world = World("a world", sides, confirm=lambda *_: True, stated=sides)
+    text = render_requirements(suggest(rights, [world]), 'a "file"\n')
+    found = parse_requirements(text.encode(), "r.toml")
+    assert [demand(each) for each in found][:1] == ["only /e may publish /ok"]
+    assert "wildcards may let * only publish /fine*" in map(demand, found)
+    assert "\x1b" not in text
