@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.dds.decision.access import Access
@@ -29,7 +30,7 @@ from sros_tool.policy.rights import Right
 from sros_tool.policy.stated import StatedProtection
 from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource
 from sros_tool.proof.worlds import named, valid_topics
-from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, unguarded
+from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
 from sros_tool.translate import SERVICE_ENDS, dds_names, governance_for
 
 _VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
@@ -73,7 +74,8 @@ class NewReach:
 class Growth:
     """What HEAD adds to BASE, and what it removes; ``reach`` and ``removed`` follow from these.
 
-    ``reach_known`` is False if only some enclaves are compared.  ``worlds`` are what was decided.
+    ``reach`` has at most 10,000 pairs; ``reach_known`` is False if only some enclaves are compared.
+    ``worlds`` are what was decided.
     """
 
     added: tuple[Gain, ...]
@@ -107,7 +109,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     return Growth(
         added,
         removed,
-        tuple(_new_reach(base, head)) if added and scope is None else (),
+        tuple(islice(_new_reach(base, head), _MOST_REACH)) if added and scope is None else (),
         scope is None,
         tuple(dict.fromkeys(_loosened(base, head, limit))),
         tuple(
@@ -451,15 +453,49 @@ _ROS_TOPICS = NameSet.union(
 # ── reach ──────────────────────────────────────────────────────────────────────────────────
 
 
+_Edges = Mapping[str, Mapping[str, Hop]]
+"""By source and target: a hop from one enclave to another."""
+_MOST_REACH = 10_000
+
+
 def _new_reach(base: AccessSource, head: AccessSource) -> Iterator[NewReach]:
-    """Yield whom enclaves can influence in ``head`` and not in ``base``."""
-    before, after = _network(base), _network(head)
-    known = frozenset(before.enclaves)
-    for source in after.enclaves:
-        earlier = before.reach(source).influences if source in known else {}
-        for target, path in sorted(after.reach(source).influences.items()):
-            if target not in earlier:
-                yield NewReach(source, target, path)
+    """Yield whom enclaves can influence in ``head`` and not in ``base``, over new hops."""
+    before, after = _edges(base), _edges(head)
+    changed = {
+        source for source, of in after.items() if not of.keys() <= before.get(source, {}).keys()
+    }
+    backwards: dict[str, dict[str, Hop]] = defaultdict(dict)
+    for source, of in after.items():
+        for target, hop in of.items():
+            backwards[target][source] = hop
+    sources = changed.union(*(_reached(backwards, each) for each in sorted(changed)))
+    for source in sorted(sources):
+        known = _reached(before, source).keys()
+        found = _reached(after, source)
+        for target in sorted(found.keys() - known - {source}):
+            path: list[Hop] = []
+            at = target
+            while at != source:
+                path.insert(0, found[at])
+                at = found[at].source
+            yield NewReach(source, target, tuple(path))
+
+
+def _edges(side: AccessSource) -> _Edges:
+    network = _network(side)
+    return {each: {hop.target: hop for hop in network.hops(each)} for each in network.enclaves}
+
+
+def _reached(edges: _Edges, start: str) -> dict[str, Hop]:
+    """Return the enclaves that hops lead to, each with the last hop of a shortest path."""
+    found: dict[str, Hop] = {}
+    row = [start]
+    for here in row:
+        for there, hop in edges.get(here, {}).items():
+            if there not in found and there != start:
+                found[there] = hop
+                row.append(there)
+    return found
 
 
 def _network(side: AccessSource) -> Network:
