@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         create_keystore,
         explain_access,
         export_enclaves,
+        fleet_status,
         generate,
         load_template,
         open_keystore,
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
         SrosError,
         UsageError,
     )
+    from sros_tool.keystore.fleet_status import FleetStatus
     from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
@@ -53,6 +55,7 @@ __all__ = [
     "Creation",
     "DocumentError",
     "Finding",
+    "FleetStatus",
     "Keystore",
     "KeystoreError",
     "Policy",
@@ -65,6 +68,7 @@ __all__ = [
     "create_keystore",
     "explain_access",
     "export_enclaves",
+    "fleet_status",
     "generate",
     "load_template",
     "open_keystore",
@@ -74,6 +78,7 @@ __all__ = [
 _ELSEWHERE = {
     "Creation": "sros_tool.keystore.lifecycle.create",
     "Finding": "sros_tool.checks.kind",
+    "FleetStatus": "sros_tool.keystore.fleet_status",
     "Policy": "sros_tool.policy.model",
     "Template": "sros_tool.keystore.template",
     **dict.fromkeys((name for name in __all__ if name.endswith("Error")), "sros_tool.errors"),

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC, datetime, timedelta, tzinfo
 from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
@@ -19,7 +19,9 @@ from sros_tool.errors import Note, UsageError
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
+    from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.authorities.keyring import Keyring
+    from sros_tool.keystore.fleet_status import FleetStatus
     from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
@@ -174,6 +176,7 @@ def read_policy(path: AnyPath) -> Policy:
 def generate(
     keystore: AnyPath,
     *policies: AnyPath | Policy,
+    fleet: AnyPath | None = None,
     enclaves: Iterable[str] = (),
     domain: int | None = None,
     secrets: Secrets | None = None,
@@ -188,6 +191,8 @@ def generate(
     Args:
         keystore: An existing keystore, or its path.
         policies: Policies, or the paths of policy files.
+        fleet: The file with the robots that the placeholders of policies stand for; then all
+            policies have to be paths.
         enclaves: Names of more enclaves, which get the default permissions of the template.
         domain: The ROS domain id that the enclaves will be used in; the governance must name it.
         secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
@@ -202,7 +207,7 @@ def generate(
         KeystoreError: The keystore does not exist, is busy or broken, or is not for ``domain``.
         PolicyError: Two policies differ on an enclave, or a policy file is malformed.
         InvalidNameError: An enclave's name is not valid.
-        UsageError: No policy and no enclave is given.
+        UsageError: No policy and no enclave is given, or a policy that was read with a fleet.
 
     Example:
         >>> sros_tool.generate(keystore, "policies/talker_listener.xml").created
@@ -216,12 +221,64 @@ def generate(
     return create.generate_artifacts(
         Path(keystore),
         enclaves=names,
-        policies=[_policy(each) for each in policies],
+        policies=_fleet_policies(policies, fleet) if fleet else [_policy(e) for e in policies],
         now=_moment(now),
         domain=domain,
         keyring=_keyring(secrets),
         dry_run=dry_run,
     )
+
+
+def _fleet_policies(policies: Iterable[AnyPath | Policy], fleet: AnyPath) -> list[FleetPolicy]:
+    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.policy.document import read_policy
+
+    robots, found = read_fleet(Path(fleet)), []
+    for each in policies:
+        if not isinstance(each, str | PathLike):
+            raise UsageError(
+                "a policy that was read already has no placeholders for a fleet",
+                "",
+                "Pass the path of its file.",
+            )
+        found.append(FleetPolicy(read_policy(Path(each), placeholders=True), robots))
+    return found
+
+
+def fleet_status(
+    keystore: AnyPath,
+    robots: Iterable[str] = (),
+    *,
+    max_age: timedelta | None = None,
+    now: datetime | None = None,
+) -> FleetStatus:
+    """Return what each robot of a fleet has, by what it last confirmed.
+
+    Args:
+        keystore: A keystore with a fleet, or its path.
+        robots: The names of some robots; all by default.
+        max_age: Robots whose last confirmation is older count as ``overdue``.
+        now: The time from which ages count; the current time by default.
+
+    Returns:
+        The ``robots`` with ``robot``, ``state``, ``received`` and ``pending`` (the files that are
+        not current), ``counts`` by state, ``overdue``, and ``complete``: whether every robot has
+        confirmed that it has the present files.
+
+    Raises:
+        KeystoreError: The keystore does not exist, has no fleet, or cannot be read.
+        DocumentError: The fleet has no such robot.
+
+    Example:
+        >>> status = sros_tool.fleet_status(keystore, max_age=timedelta(days=7))
+        >>> [each.robot for each in status.robots if each.state != "current"]
+        ['r8']
+    """
+    from sros_tool.keystore import fleet_status as status
+
+    found = status.fleet_status(Path(keystore), tuple(_several("robots", robots)))
+    return found.with_overdue(max_age, _moment(now)) if max_age else found
 
 
 def export_enclaves(

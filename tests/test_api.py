@@ -125,6 +125,22 @@ def test_an_answer_says_by_which_line_and_until_when(keystore: sros_tool.Keystor
     assert later.remedy
 
 
+def test_a_fleet_has_one_policy_and_one_status(tmp_path: Path) -> None:
+    policy, fleet = tmp_path / "robot.xml", tmp_path / "fleet.toml"
+    policy.write_text(policy_text({"/{robot}/a": publish("/{robot}/x")}))
+    fleet.write_text("[robots.r1]\n[robots.r2]\n")
+    made = sros_tool.create_keystore(tmp_path / "ks")
+    assert sros_tool.generate(made, policy, fleet=fleet).created == ("/r1/a", "/r2/a")
+    found = sros_tool.fleet_status(made, max_age=timedelta(days=1))
+    assert [each.state.value for each in found.robots] == ["never", "never"]
+    assert not found.complete and not found.overdue
+    assert [each.robot for each in sros_tool.fleet_status(made, ["r2"]).robots] == ["r2"]
+    with pytest.raises(UsageError, match="one string"):
+        sros_tool.fleet_status(made, "r2")
+    with pytest.raises(UsageError, match="was read already"):
+        sros_tool.generate(made, sros_tool.read_policy(POLICY), fleet=fleet)
+
+
 def test_a_choice_of_a_template_is_found_only_when_asked_for(tmp_path: Path) -> None:
     made = sros_tool.create_keystore(tmp_path / "ks", template="sros2", domains="0,7")
     assert sros_tool.check(made) == ()
