@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 from collections import Counter
 from dataclasses import replace
@@ -221,6 +222,19 @@ def test_keystores_and_signed_permissions(made: Path) -> None:
     ended = sros("diff_policy", "--no-new-access", "ks/enclaves/web", "wide.xml", cwd=made)
     assert ended.status == 1
     assert ended.out.startswith("+ /web publish topic /*  (wide.xml:5): such as /")
+
+
+def test_a_governance_that_opens_a_topic(made: Path) -> None:
+    shutil.copytree(made / "ks", made / "open")
+    rule = "topic /wheels data=NONE read_access_control=false"
+    sros("update_keystore", "open", "--rule", rule, "--allow-looser", cwd=made).ok()
+    ended = sros("diff_policy", "--no-new-access", "ks", "open", cwd=made)
+    assert ended.status == 1
+    assert "+ /mux, /web read DDS topic rt/wheels, which no right states\n" in ended.out
+    assert "+ less protection: protection.data ENCRYPT -> NONE" in ended.out
+    back = sros("diff_policy", "--no-new-access", "open", "ks", cwd=made)
+    assert back.status == 0
+    assert "- more protection: protection.data NONE -> ENCRYPT" in back.out
 
 
 def test_a_signature_that_does_not_verify_is_not_compared(made: Path) -> None:
