@@ -16,6 +16,8 @@ from contextlib import suppress
 from os import getuid
 from pathlib import Path
 
+from sros_tool import __version__
+
 _NUMBER = re.compile(r"\d{1,3}\Z", re.ASCII)
 _VERSION = re.compile(r"v?\d[\w.+!-]{0,40}\Z", re.ASCII)
 _KNOWN_VALUES: Mapping[str, frozenset[str] | re.Pattern[str]] = {
@@ -53,7 +55,6 @@ _PRESENT = (
 )
 """Variables of which it is reported only whether they are set."""
 _PACKAGES = (
-    "sros_tool",
     "click",
     "cryptography",
     "lxml",
@@ -94,7 +95,7 @@ def _versions() -> list[str]:
         with suppress(importlib.metadata.PackageNotFoundError):
             version = importlib.metadata.version(name)
             found.append(f"{name} {version if _VERSION.match(version) else 'of a local version'}")
-    return [f"Python {platform.python_version()}", *found]
+    return [f"sros {__version__}", f"Python {platform.python_version()}", *found]
 
 
 def _system() -> list[str]:
