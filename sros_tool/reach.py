@@ -223,14 +223,31 @@ class Network:
         """Yield every hop from an enclave to another one."""
         return self._steps(enclave, True, set(), {enclave})
 
+    def users(self, direction: str, topic: str) -> frozenset[str]:
+        """Return the enclaves that may publish or subscribe (``direction``) to a DDS topic.
+
+        ``topic`` can be a wildcard: then they may use some topic that it matches.
+        """
+        asked = _Access("", topic, ())
+        ends = self._sides[direction].meeting(topic)
+        return frozenset(end.enclave for end in ends if _shared(asked, end))
+
     def reach(self, enclave: str) -> Reach:
         """Return the enclaves that an enclave can influence and learn from, over several hops."""
-        return Reach(enclave, self._search(enclave, True), self._search(enclave, False))
+        return Reach(enclave, self.influenced({enclave}), self.influencing({enclave}))
 
-    def _search(self, start: str, forward: bool) -> dict[str, HopPath]:
-        paths: dict[str, HopPath] = {start: ()}
+    def influenced(self, enclaves: Collection[str]) -> dict[str, HopPath]:
+        """Return all others that these enclaves can influence, each with a shortest path."""
+        return self._search(enclaves, True)
+
+    def influencing(self, enclaves: Collection[str]) -> dict[str, HopPath]:
+        """Return all others that can influence these enclaves, each with a shortest path."""
+        return self._search(enclaves, False)
+
+    def _search(self, starts: Collection[str], forward: bool) -> dict[str, HopPath]:
+        paths: dict[str, HopPath] = dict.fromkeys(sorted(starts), ())
         used: _Used = set()
-        queue = deque([start])
+        queue = deque(paths)
         while queue:
             here = queue.popleft()
             for hop in self._steps(here, forward, used, paths):
@@ -238,8 +255,7 @@ class Network:
                 if there not in paths:
                     paths[there] = (*paths[here], hop) if forward else (hop, *paths[here])
                     queue.append(there)
-        del paths[start]
-        return paths
+        return {enclave: path for enclave, path in paths.items() if path}
 
     def _steps(
         self, enclave: str, forward: bool, used: _Used, known: Container[str]

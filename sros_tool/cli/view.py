@@ -23,14 +23,18 @@ from sros_tool.cli.common import (
     now,
     print_json,
     save,
+    visible_line,
 )
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import file_change
-from sros_tool.errors import UsageError
+from sros_tool.errors import SrosError, UsageError
 from sros_tool.values import as_plain, versioned
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from datetime import datetime
+
+    from click.shell_completion import CompletionItem
 
     from sros_tool.checks.kind import Finding as Checked
     from sros_tool.fleet.model import Fleet
@@ -42,7 +46,22 @@ _ENDINGS = {".htm": "html", ".mmd": "mermaid", ".gv": "dot"}
 
 
 class _SeveralObserved(SeveralValues):
-    several = ("--observed",)
+    several = ("--observed", "--focus")
+
+
+def _complete_focus(
+    ctx: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem | str]:
+    """Complete the names and enclaves in the rights of the first SOURCE, if it can be read."""
+    from sros_tool.keystore.rights import load_rights
+
+    given = ctx.params.get("sources") or ctx.args
+    try:
+        rights = load_rights(Path(given[0])).rights if given else frozenset()
+    except (SrosError, OSError):
+        return []
+    names = {each.enclave for each in rights} | {each.name for each in rights}
+    return [name for name in sorted(names) if name.startswith(incomplete)]
 
 
 @click.command(
@@ -53,6 +72,7 @@ Examples:
   $ sros view keystore -o robot.html --open
   wrote 'robot.html'
   $ sros view policies/mobile_robot.xml --format svg -o mobile_robot.svg
+  $ sros view robot.xml --focus /cmd_vel -o drive.html
   $ sros view robot.xml --observed learned.xml -o use.html
   $ sros view old.xml new.xml -o change.html
   $ sros view robot.xml keystore -o drift.html
@@ -92,6 +112,19 @@ Examples:
     help="Group ENCLAVE, and the enclaves below it, by the host they run on.",
 )
 @fleets_option
+@click.option(
+    "--focus",
+    "words",
+    multiple=True,
+    metavar="NAME...",
+    help="Draw only what leads to this topic, service, action or enclave, and what it leads to.",
+    shell_complete=_complete_focus,
+)
+@click.option(
+    "--hops",
+    type=click.IntRange(1, 99),
+    help="With --focus, draw enclaves so many hops away; further ones are counted. [default: 2]",
+)
 @click.option("--all", "everything", is_flag=True, help="Also draw rights that every node needs.")
 @click.option("--graphviz", is_flag=True, help="Lay out the SVG with Graphviz.")
 @force_option
@@ -106,6 +139,8 @@ def view(
     template: str | None,
     hosts: tuple[str, ...],
     fleet_files: tuple[Path, ...],
+    words: tuple[str, ...],
+    hops: int | None,
     everything: bool,
     graphviz: bool,
     force: bool,
@@ -117,18 +152,27 @@ def view(
     permissions, a Zenoh configuration (router.json5), or the output of `sros generate_policy
     --json`. Two policies are compared as before and after, a policy and a keystore for drift, and
     a Zenoh configuration with what it should allow. --observed compares the rights in SOURCE
-    with those that are used.
+    with those that are used. --focus answers who may use a name, and who influences these.
 
     The page is one file that needs no network. No format contains keys or paths of this machine.
     """
     check_one_format()
+    if hops and not words:
+        raise UsageError("--hops is for --focus only", "", "Name what to look at with --focus.")
     moment = now()
     written = _format("json" if as_json else form, output, graphviz)
     if output:
         check_output(output, force=force or dry_run)
     with progress("drawing"):
-        picture = _picture(sources, observed, template, hosts, moment, fleets_of(fleet_files))
-        document = _rendered(picture, written, everything, graphviz, moment)
+        picture, read = _picture(sources, observed, template, hosts, moment, fleets_of(fleet_files))
+        if words:
+            from sros_tool.report.focus import focused
+
+            picture = focused(picture, read, words)
+        document = _rendered(picture, written, everything, graphviz, moment, hops)
+    if written != "json":
+        for line in picture.headlines:
+            click.echo(visible_line(line), err=True)
     if dry_run and as_json:
         changes = file_change(output, existed=output.exists()) if output else []
         print_json({"dry_run": True, "changes": changes, "notes": []})
@@ -163,7 +207,8 @@ def _picture(
     hosts: tuple[str, ...],
     moment: datetime,
     fleets: tuple[Fleet | None, Fleet | None],
-) -> Picture:
+) -> tuple[Picture, Sequence[PictureSource]]:
+    """Return the picture, and the sources whose rights are in it."""
     from dataclasses import replace
 
     from sros_tool.report.compose import Context, compose, overlay, union
@@ -194,20 +239,20 @@ def _picture(
     context = Context(common_rights(), robots | _hosts(hosts))
     if observed:
         seen = union([read_source(path, now=moment) for path in observed])
-        return overlay(read[0], seen, "use", context)
+        return overlay(read[0], seen, "use", context), (read[0], seen)
     if len(read) == 1:
-        return compose(read[0], context)
+        return compose(read[0], context), read
     kinds = [each.origin.kind for each in read]
     if kinds[1] == "observation":
-        return overlay(read[0], read[1], "use", context)
+        return overlay(read[0], read[1], "use", context), read
     if kinds[0] == kinds[1]:
-        return overlay(read[0], read[1], "change", context)
+        return overlay(read[0], read[1], "change", context), read
     if "zenoh" in kinds:
         first, second = sorted(read, key=lambda each: each.origin.kind == "zenoh")
-        return overlay(first, second, "worlds", context)
+        return overlay(first, second, "worlds", context), read
     # Drift is shown from the side of the policy, whichever was named first.
     first, second = sorted(read, key=lambda each: each.origin.kind != "policy")
-    return overlay(first, second, "drift", context)
+    return overlay(first, second, "drift", context), read
 
 
 def _check_no_governance(sources: tuple[Path, ...], read: list[PictureSource]) -> None:
@@ -226,7 +271,6 @@ def _checked(path: Path, moment: datetime, fleet: Fleet | None) -> list[Pictured
     """Return the findings of `sros check` for a source, or none if it cannot be checked."""
     from sros_tool.checks.targets import Circumstances, path_findings
     from sros_tool.cli.common import local_zone
-    from sros_tool.errors import SrosError
     from sros_tool.report.picture import PicturedFinding
 
     try:
@@ -279,13 +323,22 @@ def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str,
 
 
 def _rendered(
-    picture: Picture, form: str, everything: bool, graphviz: bool, moment: datetime
+    picture: Picture,
+    form: str,
+    everything: bool,
+    graphviz: bool,
+    moment: datetime,
+    hops: int | None,
 ) -> str:
+    from sros_tool.report.flow_layout import HOPS, flow_scene
     from sros_tool.report.layout import scenes_of
 
     if form == "json":
         return json_text(versioned(as_plain(picture))) + "\n"
-    scenes = scenes_of(picture, placed=form in ("html", "svg") and not graphviz)
+    placed = form in ("html", "svg") and not graphviz
+    scenes = scenes_of(picture, placed=placed)
+    if picture.focus:
+        scenes = (flow_scene(picture, hops or HOPS, placed=placed), *scenes)
     if form == "html":
         from sros_tool.report.page import render_page
 

@@ -149,7 +149,7 @@ def _picture(
     known: Known,
     context: Context,
 ) -> Picture:
-    edges = tuple(sorted(edges, key=_edge_order))
+    edges = tuple(sorted(edges, key=edge_order))
     governance = next((each.governance for each in reversed(sources) if each.governance), None)
     said = next((each.protections for each in reversed(sources) if each.protections), ())
     demanded = _Demanded(() if governance else said)
@@ -162,7 +162,7 @@ def _picture(
             Name(
                 kind,
                 name,
-                _namespace_of(name),
+                namespace_of(name),
                 demanded.protection(kind, name) or protection_of(governance, kind, name),
                 is_expression(name),
             )
@@ -174,7 +174,8 @@ def _picture(
     )
 
 
-def _edge_order(edge: Edge) -> tuple[str, int, str, str, tuple[str, ...], str]:
+def edge_order(edge: Edge) -> tuple[str, int, str, str, tuple[str, ...], str]:
+    """Return the sort key of the edges of a picture."""
     right = RIGHT_ORDER[edge.right]
     return edge.enclave, right, edge.name, edge.qualifier, edge.parts, edge.mark
 
@@ -214,10 +215,10 @@ def group_of(enclave: str, hosts: Mapping[str, str]) -> str:
         if place in hosts:
             return hosts[place]
         place = place.rpartition("/")[0]
-    return hosts.get("/", _namespace_of(enclave))
+    return hosts.get("/", namespace_of(enclave))
 
 
-def _namespace_of(name: str) -> str:
+def namespace_of(name: str) -> str:
     """Return the namespace of a name: the part before its last slash."""
     return name.rpartition("/")[0] or "/"
 
@@ -278,7 +279,7 @@ def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
     """
     found: dict[tuple[OverlaySide, Right], tuple[str, ...]] = {}
     reached: dict[Right, list[bool]] = defaultdict(list)
-    for edge in sorted(edges, key=_edge_order):
+    for edge in sorted(edges, key=edge_order):
         for name in edge.by:
             right = Right(edge.enclave, edge.qualifier, edge.right, name)
             reached[right].append(edge.mark is OverlaySide.FIRST and not edge.common)
@@ -314,10 +315,11 @@ class Known:
         )
         self._names = {kind: sorted(names) for kind, names in found.items()}
         self._matched: dict[tuple[str, str], tuple[str, ...]] = {}
-        self._open: dict[str, list[str]] = defaultdict(list)
+        wild: dict[str, list[str]] = defaultdict(list)
         for part in sorted(unfolded(rights)):
             if is_expression(part.name) and not self.reached(part.kind, part.name):
-                self._open[part.kind].append(part.name)
+                wild[part.kind].append(part.name)
+        self._open = {kind: _Wild(names) for kind, names in wild.items()}
 
     def reached(self, kind: str, name: str) -> tuple[str, ...]:
         """Return the known names that a wildcard matches; for an exact name, only that name."""
@@ -336,9 +338,9 @@ class Known:
         """
         if not is_expression(right.name):
             return (right.name,)
-        meets = covers if right.qualifier is DENY else overlap
-        wild = (each for each in self._open[right.kind] if meets(right.name, each))
-        return tuple(dict.fromkeys((*self.reached(right.kind, right.name), *wild)))
+        found = self._open.get(right.kind)
+        wild = found.drawn(right.qualifier, right.name) if found else ()
+        return (*self.reached(right.kind, right.name), *wild)
 
     def _matching(self, kind: str, expression: str) -> Iterable[str]:
         if kind == "actions":
@@ -351,6 +353,24 @@ class Known:
             if matches(expression, name):
                 found.append(name)
         return found
+
+
+class _Wild:
+    """Wildcards without known names."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = Names(names)
+        self._drawn: dict[tuple[Qualifier, str], tuple[str, ...]] = {}
+
+    def drawn(self, qualifier: Qualifier, name: str) -> tuple[str, ...]:
+        """Return those that an ALLOW of a wildcard overlaps with, or that a DENY of it covers."""
+        key = (qualifier, name)
+        if key not in self._drawn:
+            meeting = self._names.meeting(name)
+            self._drawn[key] = tuple(
+                each for each in meeting if qualifier is not DENY or covers(name, each)
+            )
+        return self._drawn[key]
 
 
 _NO_ACTION = Right("", ALLOW, "call", "")

@@ -28,6 +28,7 @@ def render_dot(picture: Picture, scene: Scene) -> str:
     lines = [
         f"digraph {_quoted(picture.title)} {{",
         '  graph [rankdir=LR, fontname="sans-serif", ranksep=1.2, nodesep=0.15]',
+        f"  graph [labelloc=t, label={_quoted(_title(picture))}]",
         '  node [shape=box, style=rounded, fontname="monospace", fontsize=11]',
         '  edge [fontname="sans-serif", fontsize=9, color="#5d7590"]',
     ]
@@ -49,7 +50,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
     """Return the scene as a Mermaid flowchart."""
     cards = _once(scene)
     clusters = _clusters(cards)
-    lines = ["---", f"title: {_yaml(picture.title)}", "---", "flowchart LR"]
+    lines = ["---", f"title: {_yaml(_title(picture))}", "---", "flowchart LR"]
     for number, (title, members) in enumerate(clusters.items()):
         lines.append(f'  subgraph g{number}["{_entities(title)}"]')
         lines += [f"    {_mermaid_node(scene, key, cards[key])}" for key in members]
@@ -93,6 +94,10 @@ def graphviz_svg(dot: str) -> str:
 
 
 # ── both formats ───────────────────────────────────────────────────────────────────────────
+
+
+def _title(picture: Picture) -> str:
+    return ". ".join((picture.title, *picture.headlines))
 
 
 def _once(scene: Scene) -> Mapping[str, Card]:

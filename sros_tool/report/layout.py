@@ -24,14 +24,15 @@ from sros_tool.report.picture import (
     Tie,
     WireLevel,
     coarsened,
+    counted,
     fold,
 )
 
 _SIDE_WIDTH, _NAMES_WIDTH, _GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14
 """The height of a line of text, the padding of a card, and the height of a line of a note."""
-_GAP, _LEAD, _TOP, _MARGIN = 9.0, 24.0, 34.0, 14
-_SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters per line on a card
+_GAP, _LEAD, _TOP, MARGIN = 9.0, 24.0, 34.0, 14
+SIDE_LETTERS, NAMES_LETTERS = 20, 35  # letters per line on a card
 _ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # onlookers have more bundles than both limits
 _MOST_ONLOOKERS = 26  # the number of letters
 _FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # with more: private names are counted; bundles joined
@@ -70,7 +71,16 @@ _COMMON = {
 }
 """The note on a card of names that every node may use, if those rights are not drawn."""
 OWN = "own:"
-SENDERS, LISTENERS = "may send", "may receive"
+SENDERS, NAMES, LISTENERS = "may send", "topics, services, actions", "may receive"
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """What a column has; ``anchor`` is where ``x`` is in the text: start, middle or end."""
+
+    x: int
+    anchor: str
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +100,7 @@ class Scene:
     links: tuple[Link, ...]
     frames: tuple[Frame, ...]
     onlookers: tuple[Onlooker, ...]
+    heads: tuple[Head, ...]
     hidden: int = 0
     shown: int = 0
 
@@ -98,7 +109,8 @@ class Scene:
 class Card:
     """A rectangle with text: an enclave, a group of enclaves, or a bundle of names.
 
-    ``column`` is 0, 1 or 2; an enclave that sends and listens has a card on both sides.  ``lines``
+    ``column`` counts from 0, names are in odd columns; an enclave that sends and listens has a card
+    on both sides.  A card in the focus of the picture is ``chosen``.  ``lines``
     is the text, ``notes`` smaller text below it.  ``members`` are all enclaves or names of the
     card.  Only cards of names have ``kind``, ``level`` and ``tags`` (letters of onlookers); only
     cards of enclaves have ``group``.
@@ -118,6 +130,7 @@ class Card:
     level: WireLevel = WireLevel.UNKNOWN
     group: str = ""
     tags: str = ""
+    chosen: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,10 +284,11 @@ class _Draft:
     def scene(self, name: str, title: str) -> Scene:
         """Return the scene without positions (every y is 0), frames and number of names."""
         cards = {card.id: card for card in self._cards()}
+        width = 2 * (MARGIN + _SIDE_WIDTH + _GUTTER) + _NAMES_WIDTH
         return Scene(
             id=name,
             title=title,
-            width=2 * (_MARGIN + _SIDE_WIDTH + _GUTTER) + _NAMES_WIDTH,
+            width=width,
             height=0,
             cards=tuple(cards.values()),
             links=self._links(cards),
@@ -282,26 +296,25 @@ class _Draft:
             onlookers=tuple(
                 Onlooker(tag, node, right) for (node, right), tag in self._tags.items()
             ),
+            heads=(
+                Head(MARGIN, "start", SENDERS),
+                Head(width // 2, "middle", NAMES),
+                Head(width - MARGIN, "end", LISTENERS),
+            ),
         )
 
     def placed(self, name: str, title: str) -> Scene:
         """Return the scene with the positions of all cards, links and frames."""
         scene = self.scene(name, title)
         cards = {card.id: card for card in scene.cards}
-        columns: list[list[ColumnItem]] = [[], [], []]
-        for card in cards.values():
-            columns[card.column].append(ColumnItem(card.id, card.height, card.group))
         lines = sorted({ends[:2] for ends in self._ties})
-        ordered = order_columns(columns[0], columns[1], columns[2], lines)
-        tops = _tops(ordered, lines)
-        cards = {key: replace(card, y=round(tops[key])) for key, card in cards.items()}
-        bottom = max((card.y + card.height for card in cards.values()), default=0)
+        cards = stacked(cards.values(), lines, 3)
         return replace(
             scene,
-            height=bottom + _MARGIN,
-            cards=tuple(cards[item.id] for column in ordered for item in column),
+            height=bottom_of(cards.values()),
+            cards=tuple(cards.values()),
             links=self._links(cards),
-            frames=tuple(_frames(ordered, cards)),
+            frames=tuple(frames_of(cards.values())),
         )
 
     # ── cards ──────────────────────────────────────────────────────────────────────────────
@@ -339,15 +352,15 @@ class _Draft:
             for reach in (_REACHES[right],)
             if other == node and SENDS[right] is sends
         ]
-        lines = _wrapped(label, _SIDE_LETTERS)
+        lines = wrapped(label, SIDE_LETTERS)
         return Card(
             id=side,
             role="group" if is_group else "enclave",
             column=0 if sends else 2,
-            x=_MARGIN if sends else _MARGIN + _SIDE_WIDTH + _NAMES_WIDTH + 2 * _GUTTER,
+            x=MARGIN if sends else MARGIN + _SIDE_WIDTH + _NAMES_WIDTH + 2 * _GUTTER,
             y=0,
             width=_SIDE_WIDTH,
-            height=2 * PAD + LINE * len(lines) + SMALL * len(notes),
+            height=height_of(lines, notes),
             lines=lines,
             notes=tuple(notes),
             members=members,
@@ -355,60 +368,35 @@ class _Draft:
         )
 
     def _names_card(self, number: int, bundle: Bundle) -> Card:
-        titles, notes = _names_title(bundle)
-        lines = tuple(line for title in titles for line in _wrapped(title, _NAMES_LETTERS))
         drawn = {tie.node for tie in bundle.ties}
-        if len(self._everybody[bundle.kind, bundle.names[0]] - drawn):
-            notes = (*notes, _COMMON[bundle.kind])
-        tags = "".join(
-            sorted({self._tags[tie.node, tie.right] for tie in bundle.ties if self._looks(tie)})
-        )
-        return Card(
-            id=f"n{number}",
-            role="names",
-            column=1,
-            x=_MARGIN + _SIDE_WIDTH + _GUTTER,
-            y=0,
-            width=_NAMES_WIDTH,
-            height=2 * PAD + LINE * len(lines) + SMALL * len(notes),
-            lines=lines,
-            notes=notes,
-            members=bundle.names,
-            kind=bundle.kind,
-            level=bundle.protection.level,
-            tags=tags,
-        )
+        shared = len(self._everybody[bundle.kind, bundle.names[0]] - drawn) > 0
+        tags = {self._tags[tie.node, tie.right] for tie in bundle.ties if self._looks(tie)}
+        x = MARGIN + _SIDE_WIDTH + _GUTTER
+        notes = (_COMMON[bundle.kind],) if shared else ()
+        card = names_card(f"n{number}", bundle, 1, notes)
+        return replace(card, x=x, width=_NAMES_WIDTH, tags="".join(sorted(tags)))
 
     # ── links ──────────────────────────────────────────────────────────────────────────────
 
-    def _links(self, cards: dict[str, Card]) -> tuple[Link, ...]:
-        """Return the links, with their ends spread over the edges of the cards."""
-        keys = sorted(self._ties)
-        ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
-        for number, (source, target, *_) in enumerate(keys):
-            for here, there, out in ((source, target, True), (target, source, False)):
-                ports[here, out].append((cards[there].y + cards[there].height / 2, number))
-        where: dict[tuple[int, bool], int] = {}
-        for (card, out), found in ports.items():
-            box = cards[card]
-            step = min(14.0, (box.height - 2 * PAD) / max(1, len(found) - 1))
-            first = box.y + box.height / 2 - step * (len(found) - 1) / 2
-            for place, (_, number) in enumerate(sorted(found)):
-                where[number, out] = round(first + place * step)
-        return tuple(
-            Link(
-                source,
-                target,
-                where[number, True],
-                where[number, False],
-                tuple(sorted(self._ties[key])),
-                qualifier,
-                (cards[source] if cards[source].role == "names" else cards[target]).level,
-                wildcard,
-                mark,
-            )
-            for number, key in enumerate(keys)
-            for source, target, qualifier, wildcard, mark in (key,)
+    def _links(self, cards: Mapping[str, Card]) -> tuple[Link, ...]:
+        return linked(
+            cards,
+            [
+                Link(
+                    source,
+                    target,
+                    0,
+                    0,
+                    tuple(sorted(rights)),
+                    qualifier,
+                    (cards[source] if cards[source].role == "names" else cards[target]).level,
+                    wildcard,
+                    mark,
+                )
+                for (source, target, qualifier, wildcard, mark), rights in sorted(
+                    self._ties.items()
+                )
+            ],
         )
 
 
@@ -437,11 +425,6 @@ def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
 # ── text on cards ───────────────────────────────────────────────────────────────────────
 
 
-def counted(number: int, thing: str) -> str:
-    """Return a number with its noun, like ``1 topic`` or ``2 topics``."""
-    return f"{number} {thing}{'' if number == 1 else 's'}"
-
-
 def _own_text(own: Mapping[str, int]) -> list[str]:
     """Return lines like ``own: 3 topics, 2 services`` for names that only one enclave uses."""
     found = [counted(number, KIND_NAMES[kind]) for kind, number in own.items() if number]
@@ -464,6 +447,32 @@ def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return names[:_SHOWN_NAMES], (f"and {len(names) - _SHOWN_NAMES} more {kind}s",)
 
 
+def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = ()) -> Card:
+    """Return the card of a bundle, without x, y and width; ``more`` are further notes."""
+    titles, notes = _names_title(bundle)
+    lines = tuple(line for title in titles for line in wrapped(title, NAMES_LETTERS))
+    notes += more
+    return Card(
+        id=card,
+        role="names",
+        column=column,
+        x=0,
+        y=0,
+        width=0,
+        height=height_of(lines, notes),
+        lines=lines,
+        notes=notes,
+        members=bundle.names,
+        kind=bundle.kind,
+        level=bundle.protection.level,
+    )
+
+
+def height_of(lines: Sequence[str], notes: Sequence[str]) -> int:
+    """Return the height of a card with these lines and notes."""
+    return 2 * PAD + LINE * len(lines) + SMALL * len(notes)
+
+
 def _common_namespace(names: Sequence[str]) -> str:
     """Return the innermost namespace that contains all names, "" for the root."""
     found = []
@@ -474,7 +483,7 @@ def _common_namespace(names: Sequence[str]) -> str:
     return "/".join(found)
 
 
-def _wrapped(text: str, letters: int) -> tuple[str, ...]:
+def wrapped(text: str, letters: int) -> tuple[str, ...]:
     """Return ``text`` in lines of at most ``letters``, split at slashes or underscores."""
     lines = []
     while len(text) > letters:
@@ -492,22 +501,72 @@ def _wrapped(text: str, letters: int) -> tuple[str, ...]:
 # ── positions ──────────────────────────────────────────────────────────────────────────
 
 
+def stacked(
+    cards: Iterable[Card], lines: Sequence[tuple[str, str]], columns: int
+) -> dict[str, Card]:
+    """Return cards by id, each with its y, ordered by column and y.
+
+    Cards of names are in odd columns; ``lines`` are pairs of ids in neighbouring columns.
+    """
+    found = {card.id: card for card in cards}
+    items: list[list[ColumnItem]] = [[] for _ in range(columns)]
+    for card in found.values():
+        items[card.column].append(ColumnItem(card.id, card.height, card.group))
+    ordered = order_columns(items, lines)
+    tops = _tops(ordered, lines)
+    return {
+        item.id: replace(found[item.id], y=round(tops[item.id]))
+        for column in ordered
+        for item in column
+    }
+
+
+def bottom_of(cards: Iterable[Card]) -> int:
+    """Return the height of a scene with these cards."""
+    return max((card.y + card.height for card in cards), default=0) + MARGIN
+
+
+def linked(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]:
+    """Return links with their ends spread over the edges of the cards."""
+    ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
+    for number, link in enumerate(links):
+        for here, there, out in (
+            (link.source, link.target, True),
+            (link.target, link.source, False),
+        ):
+            ports[here, out].append((cards[there].y + cards[there].height / 2, number))
+    where: dict[tuple[int, bool], int] = {}
+    for (card, out), found in ports.items():
+        box = cards[card]
+        step = min(14.0, (box.height - 2 * PAD) / max(1, len(found) - 1))
+        first = box.y + box.height / 2 - step * (len(found) - 1) / 2
+        for place, (_, number) in enumerate(sorted(found)):
+            where[number, out] = round(first + place * step)
+    return tuple(
+        replace(link, y1=where[number, True], y2=where[number, False])
+        for number, link in enumerate(links)
+    )
+
+
 def _tops(
     columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
 ) -> dict[str, float]:
     """Map cards to their y; the tallest column is packed, the other columns aligned to it."""
     extent = [_extent(column) for column in columns]
-    tallest = max(range(3), key=lambda number: (extent[number], number == 1))
-    tops = place_column(columns[tallest], {}, _GAP, _TOP, _LEAD if tallest != 1 else 0)
+    tallest = max(range(len(columns)), key=lambda number: (extent[number], number % 2 == 1))
+    tops: dict[str, float] = {}
     height = {item.id: item.height for column in columns for item in column}
-    order = {1: (0, 2), 0: (1, 2), 2: (1, 0)}[tallest]
-    for number in order:
+    near: dict[str, list[str]] = defaultdict(list)
+    for one, other in lines:
+        near[one].append(other)
+        near[other].append(one)
+    for number in sorted(range(len(columns)), key=lambda number: abs(number - tallest)):
         wanted = {}
-        for item in columns[number]:
-            ends = [b if a == item.id else a for a, b in lines if item.id in (a, b)]
-            centres = [tops[end] + height[end] / 2 for end in ends if end in tops]
+        for item in columns[number] if number != tallest else ():
+            centres = [tops[end] + height[end] / 2 for end in near[item.id] if end in tops]
             wanted[item.id] = sum(centres) / len(centres) if centres else extent[tallest]
-        tops |= place_column(columns[number], wanted, _GAP, _TOP, _LEAD if number != 1 else 0)
+        lead = 0 if number % 2 else _LEAD
+        tops |= place_column(columns[number], wanted, _GAP, _TOP, lead)
     return tops
 
 
@@ -516,16 +575,16 @@ def _extent(column: Sequence[ColumnItem]) -> float:
     return sum(item.height + _GAP for item in column) + _LEAD * groups
 
 
-def _frames(columns: Sequence[Sequence[ColumnItem]], cards: dict[str, Card]) -> Iterable[Frame]:
-    for column in (columns[0], columns[2]):
-        groups: dict[str, list[Card]] = defaultdict(list)
-        for item in column:
-            groups[item.group].append(cards[item.id])
-        for title, found in groups.items():
-            if all(card.role == "group" for card in found):
-                continue
+def frames_of(cards: Iterable[Card]) -> Iterable[Frame]:
+    """Yield a frame for the cards of each group in a column of enclaves."""
+    groups: dict[tuple[int, str], list[Card]] = defaultdict(list)
+    for card in cards:
+        if card.role != "names":
+            groups[card.column, card.group].append(card)
+    for (_, title), found in groups.items():
+        if not all(card.role == "group" for card in found):
             top, bottom = found[0].y - 24, found[-1].y + found[-1].height + 6
-            yield Frame(title, found[0].x - 6, top, _SIDE_WIDTH + 12, bottom - top)
+            yield Frame(title, found[0].x - 6, top, found[0].width + 12, bottom - top)
 
 
 @dataclass(frozen=True, slots=True)
@@ -538,31 +597,27 @@ class ColumnItem:
 
 
 def order_columns(
-    left: Sequence[ColumnItem],
-    middle: Sequence[ColumnItem],
-    right: Sequence[ColumnItem],
-    lines: Sequence[tuple[str, str]],
-) -> tuple[list[ColumnItem], list[ColumnItem], list[ColumnItem]]:
-    """Return the items of the three columns in an order with few crossings of lines.
+    columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
+) -> list[list[ColumnItem]]:
+    """Return the items of all columns in an order with few crossings of lines.
 
     ``lines`` are pairs of ids of items in neighbouring columns.  The result is the order with the
     fewest crossings of all sweeps.
     """
-    near: dict[str, list[str]] = {item.id: [] for item in (*left, *middle, *right)}
+    near: dict[str, list[str]] = {item.id: [] for column in columns for item in column}
     for one, other in lines:
         near[one].append(other)
         near[other].append(one)
-    columns = [list(left), list(middle), list(right)]
-    best, fewest = [list(column) for column in columns], _crossings(columns, lines)
+    current = [list(column) for column in columns]
+    best, fewest = [list(column) for column in current], _crossings(current, lines)
+    inner, outer = range(1, len(columns), 2), range(0, len(columns), 2)
     for sweep in range(_SWEEPS):
-        outer = (0, 2) if sweep % 2 else (2, 0)
-        for moved in (1, *outer):
-            places = _places(columns)
-            columns[moved] = _by_barycentre(columns[moved], near, places)
-        crossings = _crossings(columns, lines)
+        for moved in (*inner, *(outer if sweep % 2 else reversed(outer))):
+            current[moved] = _by_barycentre(current[moved], near, _places(current))
+        crossings = _crossings(current, lines)
         if crossings < fewest:
-            best, fewest = [list(column) for column in columns], crossings
-    return best[0], best[1], best[2]
+            best, fewest = [list(column) for column in current], crossings
+    return best
 
 
 def _places(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, float]:
@@ -599,7 +654,7 @@ def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[st
     side = {item.id: number for number, column in enumerate(columns) for item in column}
     place = {item.id: n for column in columns for n, item in enumerate(column)}
     total = 0
-    for first in (0, 1):
+    for first in range(len(columns) - 1):
         pairs = []
         for one, other in lines:
             if side[one] > side[other]:

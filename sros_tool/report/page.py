@@ -18,6 +18,7 @@ from typing import Any
 
 from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
+from sros_tool.reach import OF_EVERY_NODE
 from sros_tool.report.layout import Scene
 from sros_tool.report.picture import Bundle, Picture, PicturedEnclave, fold
 from sros_tool.validity import iso
@@ -88,9 +89,11 @@ def _digest(text: str) -> str:
 def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
     """Return the script's data: bundles of names, which need much less space than edges."""
     return {
+        "headlines": picture.headlines,
         "overlay": as_plain(picture.overlay),
+        "of_every_node": OF_EVERY_NODE,
         "enclaves": [_enclave(each) for each in picture.enclaves],
-        "bundles": [_bundle(each) for each in fold(picture.names, picture.edges)],
+        "bundles": [_bundle(each) for each in fold(picture.names, picture.edges, apart=True)],
         "scenes": [_scene(each) for each in scenes],
         "differences": as_plain(picture.differences),
         "validities": as_plain(picture.validities),
@@ -116,6 +119,7 @@ def _bundle(bundle: Bundle) -> dict[str, Any]:
     return {
         "kind": bundle.kind,
         "names": bundle.names,
+        "asks": bundle.asks,
         "protection": as_plain(bundle.protection),
         "ties": _table(ties),
     }

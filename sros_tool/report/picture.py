@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from sros_tool.names import READING_SERVICES
 from sros_tool.policy.model import ALLOW, RIGHTS, Qualifier
 from sros_tool.policy.rights import RIGHT_ORDER
 from sros_tool.values import shows
@@ -20,6 +21,7 @@ SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
 )
 """Whether the arrow of a right points to the name, because the enclave sends first."""
 
+_ASKED = tuple(f"/{name}" for name in READING_SERVICES)
 _KINDS = (*RIGHTS, "dds")
 """The kinds of names in display order; dds is a topic without a ROS name."""
 
@@ -105,6 +107,11 @@ class Name:
     namespace: str
     protection: Protection
     wildcard: bool = False
+
+
+def asks(name: Name | Edge) -> bool:
+    """Return whether a name is a service whose requests change nothing (`QUESTIONS` of reach)."""
+    return name.kind == "services" and name.name.endswith(_ASKED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,8 +208,38 @@ class OverlayDifference:
 
 
 @dataclass(frozen=True, slots=True)
+class Influence:
+    """An enclave that influences, or is influenced, over ``hops``, by a shortest ``path``."""
+
+    enclave: str
+    hops: int
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class Focus:
+    """The answer about one name or enclave, which is true for all names, known or not.
+
+    ``kind`` is the kind of the name, or enclave.  ``senders`` and ``receivers`` may use the name.
+    ``influencing`` influence the senders, or the enclave: with two hops, a sender directly.
+    ``influenced`` are influenced by the enclave; empty for a name.
+    """
+
+    kind: str
+    name: str
+    sentence: str
+    senders: tuple[str, ...]
+    receivers: tuple[str, ...]
+    influencing: tuple[Influence, ...]
+    influenced: tuple[Influence, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Picture:
-    """The rights in a system, with their protection, validity and findings."""
+    """The rights in a system, with their protection, validity and findings.
+
+    With a ``focus``, only what leads to it and from it.
+    """
 
     title: str
     origins: tuple[SourceTitle, ...]
@@ -213,6 +250,17 @@ class Picture:
     differences: tuple[OverlayDifference, ...] = ()
     validities: tuple[Validity, ...] = ()
     findings: tuple[PicturedFinding, ...] = ()
+    focus: tuple[Focus, ...] = ()
+
+    @property
+    def headlines(self) -> tuple[str, ...]:
+        """The answers that the picture gives, as sentences without a full stop."""
+        return tuple(each.sentence for each in self.focus)
+
+
+def counted(number: int, thing: str) -> str:
+    """Return a number with its noun, like ``1 topic`` or ``2 topics``."""
+    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -237,7 +285,8 @@ class Tie:
 class Bundle:
     """Sorted names of the same kind and protection, with the same ties.
 
-    In a ``partial`` bundle, each tie is for only some of the names.
+    In a ``partial`` bundle, each tie is for only some of the names.  ``asks`` are services whose
+    requests change nothing.
     """
 
     kind: str
@@ -245,14 +294,20 @@ class Bundle:
     names: tuple[str, ...]
     ties: tuple[Tie, ...]
     partial: bool = False
+    asks: bool = False
 
 
 def fold(
-    names: Iterable[Name], edges: Iterable[Edge], owner: Callable[[str], str] = str
+    names: Iterable[Name],
+    edges: Iterable[Edge],
+    owner: Callable[[str], str] = str,
+    *,
+    apart: bool = False,
 ) -> tuple[Bundle, ...]:
     """Return the names that have an edge in bundles, sorted by kind and first name.
 
-    ``owner`` maps an enclave to the node that represents it: itself, or its group.
+    ``owner`` maps an enclave to the node that represents it: itself, or its group.  With ``apart``,
+    services whose requests change nothing have bundles of their own.
     """
     ties: dict[tuple[str, str], set[Tie]] = defaultdict(set)
     for edge in edges:
@@ -267,13 +322,16 @@ def fold(
                 edge.common,
             )
         )
-    bundles: dict[tuple[str, Protection, frozenset[Tie]], list[str]] = defaultdict(list)
+    bundles: dict[tuple[str, Protection, frozenset[Tie], bool], list[str]] = defaultdict(list)
     for name in names:
         if found := ties.get((name.kind, name.name)):
-            bundles[name.kind, name.protection, frozenset(found)].append(name.name)
+            key = (name.kind, name.protection, frozenset(found), apart and asks(name))
+            bundles[key].append(name.name)
     folded = (
-        Bundle(kind, protection, tuple(sorted(members)), tuple(sorted(found, key=_order)))
-        for (kind, protection, found), members in bundles.items()
+        Bundle(
+            kind, protection, tuple(sorted(members)), tuple(sorted(found, key=_order)), asks=asking
+        )
+        for (kind, protection, found, asking), members in bundles.items()
     )
     return tuple(sorted(folded, key=lambda each: (_KINDS.index(each.kind), each.names)))
 

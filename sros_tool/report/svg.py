@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from textwrap import wrap
 from xml.sax.saxutils import escape
 
 from sros_tool.policy.model import ALLOW
@@ -10,20 +11,17 @@ from sros_tool.report.layout import (
     KIND_NAMES,
     LEVEL_NAMES,
     LINE,
-    LISTENERS,
     ONLOOKERS,
     OWN,
     PAD,
-    SENDERS,
     SMALL,
     Card,
     Link,
     Scene,
-    counted,
 )
-from sros_tool.report.picture import Overlay, OverlaySide, Picture, WireLevel
+from sros_tool.report.picture import Overlay, OverlaySide, Picture, WireLevel, counted
 
-_HEAD = 40
+_HEAD, _SAID = 40, 19
 _STYLE = """\
 svg{--paper:#fbfcfd;--card:#fff;--ink:#17222e;--soft:#56657a;--rule:#cfd7e1;--frame:#eef2f6;\
 --line:#5d7590;--deny:#b3261e;--first:#a34a00;--second:#176b3a;--encrypt:#176b3a;--sign:#1f5fae;\
@@ -35,11 +33,13 @@ text{font:12px ui-monospace,"SFMono-Regular",Menlo,Consolas,"DejaVu Sans Mono",m
 fill:var(--ink);white-space:pre}
 .small{font:11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft)}
 .title{font:600 15px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
+.said{font:13px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
 .head{font:600 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft);\
 letter-spacing:.06em}
 .enclave text{font-weight:600}.enclave .small{font-weight:400}
 .paper{fill:var(--paper)}.card rect{fill:var(--card);stroke:var(--rule)}
-.enclave rect,.group rect{stroke:var(--soft)}.frame{fill:var(--frame)}
+.enclave rect,.group rect{stroke:var(--soft)}\
+.chosen rect{stroke:var(--sign);stroke-width:2.5}.frame{fill:var(--frame)}
 .link{fill:none;stroke:var(--line);stroke-width:1.5;marker-end:url(#to)}
 .wild{stroke-width:1;stroke-opacity:.75}
 .sign{stroke-dasharray:9 3}.none{stroke-dasharray:2 3}
@@ -83,7 +83,9 @@ def render_svg(picture: Picture, scene: Scene) -> str:
     """Return the scene as an SVG document; the same scene gives the same bytes."""
     legend = list(_legend(picture, scene))
     used = _USE if picture.overlay and picture.overlay.kind == "use" else ""
-    height = scene.height + _HEAD + 16 + 20 * len(legend)
+    said = [line for each in picture.headlines for line in _lines(f"{each}.", scene.width)]
+    top = _HEAD + _SAID * len(said) + (8 if said else 0)
+    height = scene.height + top + 16 + 20 * len(legend)
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {scene.width} {height}" '
         f'width="{scene.width}" height="{height}" role="img">',
@@ -94,7 +96,11 @@ def render_svg(picture: Picture, scene: Scene) -> str:
         f'<text class="title" x="14" y="26">{escape(picture.title)}</text>',
         f'<text class="small" x="{scene.width - 14}" y="26" text-anchor="end">'
         f"{escape(_summary(picture, scene))}</text>",
-        f'<g transform="translate(0 {_HEAD})">',
+        *(
+            f'<text class="said" x="14" y="{_HEAD + 8 + _SAID * number}">{escape(line)}</text>'
+            for number, line in enumerate(said)
+        ),
+        f'<g transform="translate(0 {top})">',
         *_heads(scene),
     ]
     cards = {card.id: card for card in scene.cards}
@@ -113,7 +119,7 @@ def render_svg(picture: Picture, scene: Scene) -> str:
     lines += [line for card in scene.cards for line in _card(card)]
     lines.append("</g>")
     for number, text in enumerate(legend):
-        y = _HEAD + scene.height + 16 + 20 * number
+        y = top + scene.height + 16 + 20 * number
         lines.append(f'<g transform="translate(14 {y})">{text}</g>')
     return "\n".join((*lines, "</svg>", ""))
 
@@ -123,14 +129,15 @@ def _summary(picture: Picture, scene: Scene) -> str:
     return text + (f", {scene.hidden} left out that every node needs" if scene.hidden else "")
 
 
+def _lines(text: str, width: int) -> list[str]:
+    """Return a sentence in lines that fit into a picture of this width."""
+    return wrap(text, max(20, (width - 28) // 7), break_on_hyphens=False)
+
+
 def _heads(scene: Scene) -> Iterable[str]:
-    middle = scene.width / 2
-    for x, anchor, text in (
-        (14, "start", SENDERS),
-        (round(middle), "middle", "topics, services, actions"),
-        (scene.width - 14, "end", LISTENERS),
-    ):
-        yield (f'<text class="head" x="{x}" y="4" text-anchor="{anchor}">{text.upper()}</text>')
+    for head in scene.heads:
+        text = escape(head.text.upper())
+        yield f'<text class="head" x="{head.x}" y="4" text-anchor="{head.anchor}">{text}</text>'
 
 
 def _curve(link: Link, source: Card, target: Card) -> str:
@@ -169,8 +176,9 @@ def _link(link: Link, cards: dict[str, Card], overlay: Overlay | None) -> str:
 
 def _card(card: Card) -> Iterable[str]:
     names = card.role == "names"
+    kind = f"card {card.role}{' chosen' if card.chosen else ''}"
     yield (
-        f'<g class="card {card.role}" transform="translate({card.x} {card.y})">'
+        f'<g class="{kind}" transform="translate({card.x} {card.y})">'
         f"<title>{escape(', '.join(card.members))}</title>"
         f'<rect width="{card.width}" height="{card.height}" rx="6"/>'
     )

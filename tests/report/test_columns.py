@@ -52,7 +52,7 @@ def test_ordering_never_makes_more_crossings_and_counts_them_right(
     left.sort(key=lambda item: item.group)
     right.sort(key=lambda item: item.group)
     middle = [ColumnItem(f"m{n}", 20) for n in range(8)]
-    columns = order_columns(left, middle, right, lines)
+    columns = order_columns([left, middle, right], lines)
     place = {item.id: number for column in columns for number, item in enumerate(column)}
     crossing = sum(
         (place[a] - place[c]) * (place[b] - place[d]) < 0

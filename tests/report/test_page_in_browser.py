@@ -17,7 +17,7 @@ from sros_tool.keystore.reader import governance_of
 from sros_tool.keystore.rights import load_rights
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.reach import OF_EVERY_NODE, Network, unguarded
+from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network, unguarded
 from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.layout import scenes_of
 from sros_tool.report.page import render_page
@@ -198,12 +198,15 @@ def test_the_flow_agrees_with_the_one_that_explain_follows(
     tmp_path: Path,
     open_to_all: str,
 ) -> None:
-    by_permissions = Network(policy_rights(read_policy(MOBILE_ROBOT)), without=OF_EVERY_NODE)
+    by_permissions = Network(
+        policy_rights(read_policy(MOBILE_ROBOT)), without=OF_EVERY_NODE, questions=QUESTIONS
+    )
     network, path = by_permissions, robot_page
     if root := open_keystores.get(open_to_all):
         network = Network(
             load_rights(root).rights,
             without=OF_EVERY_NODE,
+            questions=QUESTIONS,
             unguarded=unguarded(governance_of(root)),
             everybody=enclave_names(root),
         )
@@ -476,6 +479,19 @@ def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -
         page.click("#tab-differences")
         text = page.inner_text("#differences")
         assert "allowed, never observed" in text and "observed, not allowed" in text
+
+
+def test_a_focus_says_its_answer_and_shows_what_leads_to_it(
+    browser: Browser, robot_keystore: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "focus.html"
+    sros("view", robot_keystore, "--focus", "/cmd_vel", "-o", path).ok()
+    with opened(browser, path) as page:
+        said = page.inner_text("#headlines")
+        assert said.startswith("/mobile_robot/velocity_mux alone may publish /cmd_vel; ")
+        assert texts(page, "#map .card.chosen") == {"/cmd_vel"}
+        assert "/scan" not in " ".join(texts(page, "#map .card"))
+        assert {"2 HOPS BEFORE", "MAY SEND", "MAY RECEIVE"} == texts(page, "#map text.head")
 
 
 def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:

@@ -102,7 +102,7 @@ export function columns(bundles) {
 }
 
 // What the columns are, above them; only where every card is in one of the three.
-export function heads(cards) {
+function heads(cards) {
   const found = [];
   const add = (column, anchor, at, text) => {
     const card = cards.find(column);

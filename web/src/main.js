@@ -1,6 +1,6 @@
 // Puts the page together: tabs, search, filters, the map, and what was chosen.
 
-import { MOST_BUNDLES, columns, flowScene, heads } from "./arrange.js";
+import { MOST_BUNDLES, columns, flowScene } from "./arrange.js";
 import { cardDetails, enclaveDetails, findingItem, nameDetails } from "./details.js";
 import { byId, counted, el, svg } from "./dom.js";
 import { drawScene, legend } from "./draw.js";
@@ -46,8 +46,7 @@ function currentScene() {
     if (bundles.length > MOST_BUNDLES) scene.title += `; drawn are the first ${MOST_BUNDLES} groups of them: filter further`;
     return scene;
   }
-  const scene = model.scenes[state.scene];
-  return { ...scene, heads: heads(scene.cards) };
+  return model.scenes[state.scene];
 }
 
 function showMap() {
@@ -243,6 +242,8 @@ function fillLists() {
 }
 
 function start() {
+  byId("headlines").replaceChildren(...model.headlines.map((text) => el("p", { text: `${text}.` })));
+  byId("headlines").hidden = !model.headlines.length;
   const any = (text) => ["", text];
   options("scene", model.scenes.map((scene, at) => [String(at), scene.title]));
   byId("scene-label").hidden = model.scenes.length < 2;

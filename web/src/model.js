@@ -9,8 +9,6 @@ export const LEVELS = {
 };
 const SENDS = new Set(["publish", "request", "call"]);
 const ONE_WAY = new Set(["publish", "subscribe"]);
-// With this topic, which every node writes and reads, everybody would reach everybody.
-const OF_EVERY_NODE = "/parameter_events";
 
 export const sends = (tie) => SENDS.has(tie.right);
 
@@ -97,9 +95,12 @@ export class Model {
   // Who writes (or reads) a bundle in the sense of information that flows: whom permissions allow
   // it, denials left out, and everybody else where the governance does not look at permissions.
   #ends(bundle, writing) {
-    if (bundle.names.every((name) => name === OF_EVERY_NODE)) return [];
+    // With a topic that every node writes and reads, everybody would reach everybody.
+    if (bundle.names.every((name) => this.of_every_node.includes(name))) return [];
+    // A request that only asks tells the server nothing.
+    const silent = bundle.asks ? (writing ? "request" : "reply") : "";
     const ties = bundle.ties.filter(
-      (tie) => !tie.deny && (!ONE_WAY.has(tie.right) || sends(tie) === writing),
+      (tie) => !tie.deny && tie.right !== silent && (!ONE_WAY.has(tie.right) || sends(tie) === writing),
     );
     const { read_control, write_control } = bundle.protection;
     if (writing ? write_control : read_control) return ties;

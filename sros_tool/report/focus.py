@@ -1,0 +1,364 @@
+"""A picture of one name or enclave: what leads to it over several hops, and what it leads to.
+
+Who may use a name, and who influences whom, is decided by `sros_tool.reach` for all names that
+rights and governance allow, known or not.  What is drawn between two enclaves are the known names
+by which information goes from one to the other, or one example where there is none.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from sros_tool.dds.governance import Governance
+from sros_tool.errors import UsageError
+from sros_tool.keystore.missing import likely_names
+from sros_tool.names import ACTION_SEPARATOR, is_expression
+from sros_tool.policy.model import ALLOW, DENY
+from sros_tool.policy.patterns import matches, overlap
+from sros_tool.policy.rights import Right
+from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_text, unguarded
+from sros_tool.report.compose import PictureSource, edge_order, namespace_of, protection_of
+from sros_tool.report.picture import Edge, Focus, Influence, Name, Picture, asks, counted
+from sros_tool.translate import dds_names
+
+ENCLAVE = "enclave"
+_VERBS = {
+    "topics": ("publish", "publisher", "subscribe to"),
+    "services": ("call", "caller", "serve"),
+    "actions": ("call action", "caller", "execute"),
+    "dds": ("write DDS topic", "writer", "read"),
+}
+"""By kind of name: what senders do, what they are, and what receivers do."""
+_OTHER_SIDE = {
+    "publish": "subscribe",
+    "request": "reply",
+    "reply": "request",
+    "call": "execute",
+    "execute": "call",
+}
+_ONE_WAY = ("publish", "subscribe")
+_COMMANDS = ("send_goal", "cancel_goal")
+_NAMED = 3  # enclaves that a sentence names; of more it says the number
+
+
+def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[str]) -> Picture:
+    """Return the part of a picture that leads to the names or enclaves in ``words``, or from them.
+
+    Args:
+        picture: a picture of ``sources``, one or two.
+        words: absolute ROS names, perhaps with wildcards; DDS topics; paths of enclaves.
+
+    Raises:
+        UsageError: nothing in the sources has such a name.
+    """
+    system = _System(picture, sources)
+    wanted = dict.fromkeys(each for word in words for each in system.meant(word))
+    found = tuple(system.focus(kind, name) for kind, name in wanted)
+    picture = system.with_shortest_paths(replace(picture, focus=found))
+    flow = Flow.of(picture)
+    edges = tuple(edge for edge in picture.edges if flow.has(edge))
+    enclaves = {edge.enclave for edge in edges} | flow.before.keys() | flow.after.keys()
+    names = {(edge.kind, edge.name) for edge in edges}
+    return replace(
+        picture,
+        enclaves=tuple(each for each in picture.enclaves if each.path in enclaves),
+        names=tuple(each for each in picture.names if (each.kind, each.name) in names),
+        edges=edges,
+        findings=tuple(e for e in picture.findings if not e.enclave or e.enclave in enclaves),
+        validities=tuple(e for e in picture.validities if not e.enclave or e.enclave in enclaves),
+    )
+
+
+# ── what a picture with a focus draws ──────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """The stages of the flow of information to the names of a focus, and from them.
+
+    ``own`` are the enclaves and ``targets`` the names (kind and name) in the focus.  ``before``
+    maps enclaves to their number of hops to these names, 1 for one that may send, and for one in
+    the focus; ``after`` from them, 1 for one that may receive.  ``stages`` maps names to the number
+    of hops of the enclaves that read them: 0 for names in the focus, and for those that an enclave
+    in it writes; for names after these, to the negative number of hops of those that write them.
+    """
+
+    own: frozenset[str]
+    targets: frozenset[tuple[str, str]]
+    before: Mapping[str, int]
+    after: Mapping[str, int]
+    stages: Mapping[tuple[str, str], tuple[int, ...]]
+
+    @classmethod
+    def of(cls, picture: Picture) -> Flow:
+        """Return the flow of a picture, which has a focus."""
+        own = frozenset(each.name for each in picture.focus if each.kind == ENCLAVE)
+        wanted = [(each.kind, each.name) for each in picture.focus if each.kind != ENCLAVE]
+        targets = frozenset(
+            (name.kind, name.name)
+            for name in picture.names
+            for kind, asked in wanted
+            if name.kind == kind and (name.name == asked or overlap(asked, name.name))
+        )
+        before: dict[str, int] = {}
+        after: dict[str, int] = {}
+        for each in picture.focus:
+            for found, near, far in (
+                (before, (each.name,) if each.name in own else each.senders, each.influencing),
+                (after, each.receivers, each.influenced),
+            ):
+                for enclave, hops in (
+                    *((enclave, 1) for enclave in near),
+                    *((one.enclave, one.hops) for one in far),
+                ):
+                    found[enclave] = min(hops, found.get(enclave, hops))
+        for edge in picture.edges:
+            # Those that are denied a name, or that use a part of an action, belong to it.
+            if (edge.kind, edge.name) in targets:
+                (before if edge.sends else after).setdefault(edge.enclave, 1)
+        flow = cls(own, targets, before, after, {})
+        ends = defaultdict[tuple[str, str], tuple[set[int], set[int]]](lambda: (set(), set()))
+        for edge in picture.edges:
+            for side in (0, 1):
+                ends[edge.kind, edge.name][side].update(flow._stages(edge)[side])
+        stages = {
+            key: tuple(sorted((one & other) | ({0} if key in targets else set())))
+            for key, (one, other) in ends.items()
+        }
+        return replace(flow, stages={key: each for key, each in stages.items() if each})
+
+    def ends(self, edge: Edge, stage: int) -> tuple[bool, bool]:
+        """Return whether an edge leads to its name, and whether it leads from it, at a stage."""
+        if stage not in self.stages.get((edge.kind, edge.name), ()):
+            return False, False
+        before, after = self._stages(edge)
+        return stage in before, stage in after
+
+    def has(self, edge: Edge) -> bool:
+        """Return whether an edge is a part of the flow at any stage."""
+        return any(
+            any(self.ends(edge, stage)) for stage in self.stages.get((edge.kind, edge.name), ())
+        )
+
+    def _stages(self, edge: Edge) -> tuple[set[int], set[int]]:
+        """Return the stages of the name at which its enclave could write it, and read it."""
+        writes: set[int] = set()
+        reads: set[int] = set()
+        before, after = self.before.get(edge.enclave, 0), self.after.get(edge.enclave, 0)
+        if (edge.kind, edge.name) in self.targets and (before if edge.sends else after) == 1:
+            (writes if edge.sends else reads).add(0)
+        if edge.qualifier is not ALLOW or edge.name in OF_EVERY_NODE:
+            return writes, reads
+        if may_write(edge):
+            writes |= {before - 1} if before > 1 else set()
+            writes |= {-after} if after else set()
+            writes |= {0} if edge.enclave in self.own else set()
+        if may_read(edge):
+            reads |= {before} if before else set()
+            reads |= {1 - after} if after else set()
+        return writes, reads
+
+
+def may_write(edge: Edge) -> bool:
+    """Return whether information goes from the enclave of an edge to its name."""
+    if edge.right in _ONE_WAY:
+        return edge.sends
+    return not (edge.right == "request" and asks(edge))
+
+
+def may_read(edge: Edge) -> bool:
+    """Return whether information goes from the name of an edge to its enclave."""
+    if edge.right in _ONE_WAY:
+        return not edge.sends
+    return not (edge.right == "reply" and asks(edge))
+
+
+# ── answers ────────────────────────────────────────────────────────────────────────────────
+
+
+class _System:
+    """The rights and the governance of the sources of a picture."""
+
+    def __init__(self, picture: Picture, sources: Sequence[PictureSource]) -> None:
+        self._picture = picture
+        enclaves = {each.path for each in picture.enclaves}
+        self._rights = [
+            right for source in sources for right in source.rights if right.enclave in enclaves
+        ]
+        self._governance: Governance | None = next(
+            (each.governance for each in reversed(sources) if each.governance), None
+        )
+        everybody = sorted(enclaves)
+        opened = tuple(unguarded(self._governance)) if self._governance else ()
+        self._by_permissions = Network(self._rights)
+        self._direct = Network(self._rights, unguarded=opened, everybody=everybody)
+        self._network = Network(
+            self._rights,
+            without=OF_EVERY_NODE,
+            questions=QUESTIONS,
+            unguarded=opened,
+            everybody=everybody,
+        )
+        self._known = {(each.kind, each.name) for each in picture.names}
+        self._paths: list[HopPath] = []
+
+    def meant(self, word: str) -> Iterator[tuple[str, str]]:
+        """Yield the kind and name of everything that is called ``word``.
+
+        An exact name that no right states can be meant if a wildcard matches it.
+        """
+        enclaves = [each.path for each in self._picture.enclaves]
+        found = [ENCLAVE] * (word in enclaves)
+        found += [each.kind for each in self._picture.names if each.name == word]
+        if not found:
+            found = [
+                kind for kind in _VERBS if any(_meets(each, kind, word) for each in self._rights)
+            ]
+        if not found:
+            known = (*enclaves, *(each.name for each in self._picture.names))
+            meant = likely_names(word, known)
+            raise UsageError(
+                f"no name and no enclave in '{self._picture.title}' is called {word!r}",
+                "--focus takes a topic, service or action such as /cmd_vel, or an enclave.",
+                f"Perhaps you mean {' or '.join(meant)}." if meant else "",
+            )
+        for kind in found:
+            yield kind, word
+
+    def focus(self, kind: str, name: str) -> Focus:
+        """Return who may use a name, and who influences these; or the same for an enclave."""
+        if kind == ENCLAVE:
+            influencing = self._influences(self._network.influencing({name}))
+            influenced = self._influences(self._network.influenced({name}), 0)
+            sentence = (
+                f"{name} can influence {_several(influenced, 1)}, "
+                f"and {_several(influencing, 2)} can influence it"
+            )
+            return Focus(kind, name, sentence, (), (), influencing, influenced)
+        topics = tuple(_commands(kind, name))
+        senders, receivers = (
+            frozenset(user for topic in topics for user in self._direct.users(side, topic))
+            for side in ("publish", "subscribe")
+        )
+        influencing = self._influences(self._network.influencing(senders))
+        open_to_all = senders != frozenset(
+            user for topic in topics for user in self._by_permissions.users("publish", topic)
+        )
+        sentence = _sentence(kind, name, senders, receivers, influencing, open_to_all)
+        if not is_expression(name) and (kind, name) not in self._known:
+            sentence = f"no right states {name} itself, but wildcards match it: {sentence}"
+        return Focus(
+            kind, name, sentence, tuple(sorted(senders)), tuple(sorted(receivers)), influencing
+        )
+
+    def _influences(self, paths: Mapping[str, HopPath], near: int = 1) -> tuple[Influence, ...]:
+        self._paths += paths.values()
+        found = (
+            Influence(enclave, near + len(path), path_text(path)) for enclave, path in paths.items()
+        )
+        return tuple(sorted(found, key=lambda each: (each.hops, each.enclave)))
+
+    def with_shortest_paths(self, picture: Picture) -> Picture:
+        """Return a picture with all hops of shortest paths, also where no known name has it."""
+        allowed = [edge for edge in picture.edges if edge.qualifier is ALLOW]
+        drawn = {
+            (edge.enclave, edge.kind, edge.name, fits)
+            for edge in allowed
+            for fits in (may_write, may_read)
+            if fits(edge)
+        }
+        added = set()
+        for hop in {hop for path in self._paths for hop in path}:
+            for enclave, right, stated, fits in (
+                (hop.source, hop.right, hop.said, may_write),
+                (hop.target, _OTHER_SIDE[hop.right], hop.heard, may_read),
+            ):
+                if (enclave, hop.kind, hop.name, fits) not in drawn:
+                    by = () if stated == hop.name else (stated,)
+                    added.add(Edge(enclave, hop.kind, hop.name, right, ALLOW, by))
+        for each in picture.focus:
+            if each.kind != ENCLAVE and not is_expression(each.name):
+                added |= set(self._by_wildcards(each.kind, each.name))
+        new = {(edge.kind, edge.name) for edge in added} - self._known
+        names = (*picture.names, *(self._name(*key) for key in new))
+        return replace(
+            picture,
+            edges=tuple(sorted((*picture.edges, *added), key=edge_order)),
+            names=tuple(sorted(names, key=lambda each: (each.kind, each.name))),
+        )
+
+    def _by_wildcards(self, kind: str, name: str) -> Iterator[Edge]:
+        """Yield the edges of a name that no right states itself."""
+        if (kind, name) in self._known:
+            return
+        found: dict[tuple[str, str], list[Right]] = defaultdict(list)
+        for right in self._rights:
+            if right.kind == kind and matches(right.name, name):
+                found[right.enclave, right.right].append(right)
+        for (enclave, what), rights in found.items():
+            qualifier = DENY if any(each.qualifier is DENY for each in rights) else ALLOW
+            by = sorted({each.name for each in rights if each.qualifier is qualifier})
+            yield Edge(enclave, kind, name, what, qualifier, tuple(by))
+
+    def _name(self, kind: str, name: str) -> Name:
+        protection = protection_of(self._governance, kind, name)
+        return Name(kind, name, namespace_of(name), protection, is_expression(name))
+
+
+def _meets(right: Right, kind: str, word: str) -> bool:
+    return right.kind == kind and right.qualifier is ALLOW and overlap(right.name, word)
+
+
+def _commands(kind: str, name: str) -> Iterator[str]:
+    """Yield the DDS topics by which a sender commands: requests that ask for a result do not."""
+    if kind == "dds":
+        yield name
+    elif kind == "actions":
+        for each in _COMMANDS:
+            yield from dds_names("request", f"{name}{ACTION_SEPARATOR}{each}").publish
+    else:
+        yield from dds_names("publish" if kind == "topics" else "request", name).publish
+
+
+def _sentence(
+    kind: str,
+    name: str,
+    senders: Collection[str],
+    receivers: Collection[str],
+    influencing: Sequence[Influence],
+    open_to_all: bool,
+) -> str:
+    """Return who may use a name, and how many influence its senders."""
+    sends, sender, receives = _VERBS[kind]
+    who = "every enclave" if open_to_all else _who(senders)
+    text = f"{who} may {sends} {name}"
+    text += ", which the governance leaves open" if open_to_all else ""
+    text += f"; {_who(receivers)} may {receives} it"
+    if open_to_all or not senders:
+        return text
+    them = f"the {sender}" if len(senders) == 1 else f"these {sender}s"
+    near = sum(each.hops == 2 for each in influencing)
+    if not influencing:
+        return f"{text}; no other enclave influences {them}"
+    s = "s" if near == 1 else ""
+    over = "" if near == len(influencing) else f", {len(influencing)} over several hops"
+    return f"{text}; {counted(near, 'other enclave')} influence{s} {them} directly{over}"
+
+
+def _several(found: Sequence[Influence], direct: int) -> str:
+    """Return a number of enclaves, and how many of them by one hop."""
+    near = sum(each.hops == direct for each in found)
+    text = counted(len(found), "enclave") if found else "no enclave"
+    return text if near == len(found) else f"{text} ({near} directly)"
+
+
+def _who(enclaves: Collection[str]) -> str:
+    """Return few enclaves by name, and more by their number."""
+    if not enclaves:
+        return "no enclave"
+    if len(enclaves) > _NAMED:
+        return counted(len(enclaves), "enclave")
+    *first, last = sorted(enclaves)
+    return f"{', '.join(first)} and {last}" if first else f"{last} alone"

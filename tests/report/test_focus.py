@@ -1,0 +1,248 @@
+"""A picture with a focus: who may use a name, who influences these, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from lxml import etree
+
+from sros_tool.policy.model import ALLOW, DENY
+from sros_tool.policy.rights import Right
+from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network
+from sros_tool.report.compose import PictureSource, compose
+from sros_tool.report.dot_mermaid import render_dot, render_mermaid
+from sros_tool.report.flow_layout import flow_scene
+from sros_tool.report.focus import Flow, focused
+from sros_tool.report.picture import Picture, SourceTitle
+from tests.report.pictures import HOSTILE, MOBILE_ROBOT, group, hostile_permissions, source_of
+from tests.support.harness import policy_text, sros
+
+MUX = "/mobile_robot/velocity_mux"
+
+
+def seen(folder: Path, enclaves: dict[str, str], *words: str) -> Picture:
+    source = source_of(folder, enclaves)
+    return focused(compose(source), [source], words)
+
+
+def value(*words: object) -> dict[str, Any]:
+    found = json.loads(sros("view", *words, "--json").ok().out)
+    assert isinstance(found, dict)
+    return found
+
+
+CHAIN = {
+    "/web": group("topics", "publish", "/goal", "/web/log"),
+    "/planner": group("topics", "subscribe", "/goal") + group("topics", "publish", "/plan"),
+    "/mux": group("topics", "subscribe", "/plan") + group("topics", "publish", "/cmd_vel"),
+    "/base": group("topics", "subscribe", "/cmd_vel") + group("topics", "publish", "/odom"),
+    "/recorder": group("topics", "subscribe", "/*"),
+    "/camera": group("topics", "publish", "/image"),
+}
+
+
+def test_the_answer_is_a_sentence_and_only_what_leads_to_the_name_is_drawn(tmp_path: Path) -> None:
+    picture = seen(tmp_path, CHAIN, "/cmd_vel")
+    assert picture.headlines == (
+        "/mux alone may publish /cmd_vel; /base and /recorder may subscribe to it; "
+        "1 other enclave influences the publisher directly, 2 over several hops",
+    )
+    assert {name.name for name in picture.names} == {"/cmd_vel", "/plan", "/goal"}
+    assert "/camera" not in {each.path for each in picture.enclaves}
+    scene = flow_scene(picture)
+    check_flow(scene_columns := {c.id: c.column for c in scene.cards}, picture)
+    assert scene_columns["s/planner"] < scene_columns["s/mux"] < scene_columns["l/base"]
+    further = next(card for card in scene.cards if card.id == "s:")
+    assert (further.members, further.notes) == (("/web",), ("over up to 3 hops",))
+    assert "s/web" in {card.id for card in flow_scene(picture, 3).cards}
+
+
+def check_flow(columns: dict[str, int], picture: Picture) -> None:
+    scene = flow_scene(picture)
+    for card in scene.cards:
+        assert card.x + card.width <= scene.width and card.y + card.height <= scene.height
+    for link in scene.links:
+        assert columns[link.source] + 1 == columns[link.target]
+        assert link.y1 > 0 and link.y2 > 0
+    assert [card.members for card in scene.cards if card.chosen] == [("/cmd_vel",)]
+
+
+def test_an_enclave_is_a_focus_with_both_directions(tmp_path: Path) -> None:
+    picture = seen(tmp_path, CHAIN, "/planner")
+    assert picture.headlines == (
+        "/planner can influence 3 enclaves (2 directly), and 1 enclave can influence it",
+    )
+    (answer,) = picture.focus
+    assert {each.enclave for each in answer.influenced} == {"/mux", "/base", "/recorder"}
+    assert [each.path for each in answer.influencing] == ["/web -publish /goal-> /planner"]
+    assert "/image" not in {each.name for each in picture.names}
+
+
+@pytest.mark.parametrize(
+    ("word", "sentence"),
+    [
+        ("/odom", "/base alone may publish /odom; /recorder alone may subscribe to it; 3 other"),
+        ("/image", "/camera alone may publish /image; /recorder alone may subscribe to it; no"),
+        (
+            "/unknown",
+            "no right states /unknown itself, but wildcards match it: no enclave may publish "
+            "/unknown; /recorder alone may subscribe to it",
+        ),
+        ("/web/*", "/web alone may publish /web/*; /recorder alone may subscribe to it; no other"),
+    ],
+)
+def test_names_with_and_without_wildcards(tmp_path: Path, word: str, sentence: str) -> None:
+    picture = seen(tmp_path, CHAIN, word)
+    if word == "/odom":  # the base is influenced by three, one of them directly
+        sentence = sentence.replace("3 other", "1 other enclave influences the publisher directly")
+    assert picture.headlines[0].startswith(sentence)
+    flow_scene(picture)
+
+
+def test_denials_of_the_name_are_drawn(tmp_path: Path) -> None:
+    denied = CHAIN | {
+        "/recorder": CHAIN["/recorder"] + group("topics", "subscribe", "/cmd*", qualifier="DENY")
+    }
+    picture = seen(tmp_path, denied, "/cmd_vel")
+    assert "/base alone may subscribe" in picture.headlines[0]
+    assert [
+        (str(link.qualifier), link.target)
+        for link in flow_scene(picture).links
+        if link.qualifier is DENY
+    ] == [("DENY", "l/recorder")]
+
+
+def test_services_and_actions_say_who_calls_and_who_answers(tmp_path: Path) -> None:
+    enclaves = {
+        "/client": group("services", "request", "/reset", "/server/get_parameters"),
+        "/server": group("services", "reply", "/reset", "/server/get_parameters")
+        + group("actions", "call", "/dock"),
+        "/dock": group("actions", "execute", "/dock"),
+        "/half": group("services", "request", "/dock/_action/send_goal"),
+    }
+    picture = seen(tmp_path, enclaves, "/reset", "/dock")
+    assert [(each.kind, each.senders, each.receivers) for each in picture.focus] == [
+        ("services", ("/client",), ("/server",)),
+        ("enclave", (), ()),
+        ("actions", ("/half", "/server"), ("/dock",)),
+    ]
+    # A question to a node is no influence on it, its answer is one.
+    asked = {"/client": enclaves["/client"], "/server": enclaves["/server"]}
+    asked["/client"] = group("services", "request", "/server/get_parameters")
+    (answer,) = seen(tmp_path, asked, "/server").focus
+    assert answer.influencing == ()
+    assert [each.enclave for each in answer.influenced] == ["/client"]
+
+
+def test_what_the_governance_leaves_open_is_open_to_all(tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(policy_text(CHAIN))
+    template = tmp_path / "open.toml"
+    shipped = (MOBILE_ROBOT.parent.parent / "keystore_templates/production.toml").read_text()
+    rule = '\n[[protection.topic]]\nnames = ["/cmd_vel"]\nwrite_access_control = false\n'
+    template.write_text(shipped + rule)
+    found = value(policy, "--template", template, "--focus", "/cmd_vel")["focus"]
+    assert found[0]["sentence"].startswith(
+        "every enclave may publish /cmd_vel, which the governance leaves open; "
+    )
+    assert len(found[0]["senders"]) == len(CHAIN)
+
+
+def test_a_wildcard_pair_without_a_known_name_is_drawn_with_an_example(tmp_path: Path) -> None:
+    enclaves = {
+        "/a": group("topics", "publish", "/x/*", "/x/one"),
+        "/b": group("topics", "subscribe", "/*/two", "/other/two")
+        + group("topics", "publish", "/z/z"),
+    }
+    (answer,) = (picture := seen(tmp_path, enclaves, "/z/z")).focus
+    assert [each.enclave for each in answer.influencing] == ["/a"]
+    assert ("/a", "publish") in {(edge.enclave, edge.right) for edge in picture.edges}
+
+
+ENCLAVES = st.sampled_from(["/a", "/b", "/c", "/d"])
+NAMES = st.sampled_from(["/x", "/y", "/x/z", "/x/*", "/*", "/?", "/n/get_state"])
+RIGHTS = st.frozensets(
+    st.builds(
+        Right,
+        ENCLAVES,
+        st.sampled_from([ALLOW, ALLOW, ALLOW, DENY]),
+        st.sampled_from(["publish", "subscribe", "request", "reply", "call", "execute"]),
+        NAMES,
+    ),
+    min_size=3,
+    max_size=14,
+)
+
+
+@given(RIGHTS, st.sampled_from(["/x", "/y", "/a"]))
+def test_every_enclave_of_an_answer_is_drawn_and_linked(
+    rights: frozenset[Right], word: str
+) -> None:
+    """Each enclave at a hop has a link to the next one, and the numbers are those of the reach."""
+    source = PictureSource(SourceTitle("x", "policy"), rights)
+    picture = compose(source)
+    known = {each.path for each in picture.enclaves} | {each.name for each in picture.names}
+    if word not in known:
+        return
+    picture = focused(picture, [source], [word])
+    flow = Flow.of(picture)
+    network = Network(rights, without=OF_EVERY_NODE, questions=QUESTIONS)
+    for each in picture.focus:
+        starts = {each.name} if each.kind == "enclave" else set(each.senders)
+        far = {path: len(hops) + 1 for path, hops in network.influencing(starts).items()}
+        assert {one.enclave: one.hops for one in each.influencing} == far
+    scene = flow_scene(picture, 9)
+    drawn = {(card.id[0] == "s", path) for card in scene.cards for path in card.members}
+    assert drawn >= {(True, path) for path in flow.before} | {(False, path) for path in flow.after}
+    linked = {end for link in scene.links for end in (link.source, link.target)}
+    for path, hops in flow.before.items():
+        if hops > 1:
+            assert f"s{path}" in linked
+    for link in scene.links:
+        columns = {card.id: card.column for card in scene.cards}
+        assert columns[link.source] + 1 == columns[link.target]
+
+
+def test_what_is_not_there_is_refused_with_a_likely_name() -> None:
+    ended = sros("view", MOBILE_ROBOT, "--focus", "cmd_vel")
+    assert ended.status == 2
+    assert "no name and no enclave in 'mobile_robot.xml' is called 'cmd_vel'" in ended.err
+    assert "Perhaps you mean /cmd_vel" in ended.err
+    assert sros("view", MOBILE_ROBOT, "--hops", "3").status == 2
+    assert "\x1b" not in sros("view", MOBILE_ROBOT, "--focus", "/x\x1b[2J\n").err
+
+
+def test_every_format_has_the_answer(tmp_path: Path) -> None:
+    picture = seen(tmp_path, CHAIN, "/cmd_vel")
+    scene = flow_scene(picture, placed=False)
+    assert "/mux alone may publish /cmd_vel" in render_dot(picture, scene)
+    assert "/mux alone may publish /cmd_vel" in render_mermaid(picture, scene)
+    ended = sros("view", MOBILE_ROBOT, "--focus", "/cmd_vel", "--format", "svg").ok()
+    assert f"{MUX} alone may publish /cmd_vel" in ended.err
+    words = " ".join(etree.fromstring(ended.out.encode()).itertext())
+    assert f"{MUX} alone may publish /cmd_vel" in words and "2 HOPS BEFORE" in words
+
+
+def test_hostile_names_can_be_a_focus(tmp_path: Path) -> None:
+    path = tmp_path / "hostile.xml"
+    path.write_text(hostile_permissions())
+    for form in ("svg", "mermaid", "html"):
+        shown = sros("view", path, "--focus", f"/{HOSTILE[0]}", "--format", form).ok()
+        assert "<script>window.broken" not in shown.out
+    etree.fromstring(sros("view", path, "--focus", HOSTILE[2], "--format", "svg").ok().out.encode())
+
+
+def test_a_column_with_many_enclaves_has_groups(tmp_path: Path) -> None:
+    enclaves = {
+        f"/r{n}/part{m}": group("topics", "publish", "/status") for n in range(5) for m in range(8)
+    }
+    enclaves["/office"] = group("topics", "subscribe", "/status") + group("topics", "publish", "/x")
+    scene = flow_scene(seen(tmp_path, enclaves, "/x"))
+    groups = [card for card in scene.cards if card.role == "group"]
+    assert [len(card.members) for card in groups] == [8] * 5
+    assert sum(link.target.startswith("n") for link in scene.links) == 5 + 1
