@@ -73,6 +73,7 @@ Examples:
   wrote 'robot.html'
   $ sros view policies/mobile_robot.xml --format svg -o mobile_robot.svg
   $ sros view robot.xml --focus /cmd_vel -o drive.html
+  $ sros view robot.xml --requirements robot.requirements.toml -o broken.svg
   $ sros view robot.xml --observed learned.xml -o use.html
   $ sros view old.xml new.xml -o change.html
   $ sros view robot.xml keystore -o drift.html
@@ -125,6 +126,12 @@ Examples:
     type=click.IntRange(1, 99),
     help="With --focus, draw enclaves so many hops away; further ones are counted. [default: 2]",
 )
+@click.option(
+    "--requirements",
+    type=PATH,
+    metavar="FILE",
+    help="Draw in red what breaks the requirements in this TOML file.",
+)
 @click.option("--all", "everything", is_flag=True, help="Also draw rights that every node needs.")
 @click.option("--graphviz", is_flag=True, help="Lay out the SVG with Graphviz.")
 @force_option
@@ -141,6 +148,7 @@ def view(
     fleet_files: tuple[Path, ...],
     words: tuple[str, ...],
     hops: int | None,
+    requirements: Path | None,
     everything: bool,
     graphviz: bool,
     force: bool,
@@ -169,6 +177,10 @@ def view(
             from sros_tool.report.focus import focused
 
             picture = focused(picture, read, words)
+        if requirements:
+            picture = _with_requirements(
+                picture, requirements, sources, template, moment, fleets_of(fleet_files)[0]
+            )
         document = _rendered(picture, written, everything, graphviz, moment, hops)
     if written != "json":
         for line in picture.headlines:
@@ -253,6 +265,45 @@ def _picture(
     # Drift is shown from the side of the policy, whichever was named first.
     first, second = sorted(read, key=lambda each: each.origin.kind != "policy")
     return overlay(first, second, "drift", context), read
+
+
+def _with_requirements(
+    picture: Picture,
+    requirements: Path,
+    sources: tuple[Path, ...],
+    template: str | None,
+    moment: datetime,
+    fleet: Fleet | None,
+) -> Picture:
+    """Return the picture with what breaks requirements, decided as `sros check` does."""
+    from sros_tool.cli.common import local_zone
+    from sros_tool.proof.findings import decide_all, violation_text
+    from sros_tool.proof.requirements import read_requirements
+    from sros_tool.proof.system import load_system
+    from sros_tool.report.compose import with_requirements
+    from sros_tool.report.picture import Requirements, Use, Violation
+
+    if len(sources) > 1 or template:
+        raise UsageError(
+            "--requirements takes one policy or keystore, without --template",
+            "Protection is that of the keystore.",
+            "Draw a keystore that was made from the template.",
+        )
+    wanted = read_requirements(requirements)
+    system = load_system(sources[0], at=moment, zone=local_zone(os.environ), fleet=fleet)
+    decided = decide_all(wanted, system)
+    violations = tuple(
+        Violation(
+            violation_text(each),
+            tuple(
+                Use(step.use.enclave, *step.drawn())
+                for step in each.steps
+                if step.place and step.use.right
+            ),
+        )
+        for each in decided.violations
+    )
+    return with_requirements(picture, Requirements(len(wanted) - len(violations), violations))
 
 
 def _check_no_governance(sources: tuple[Path, ...], read: list[PictureSource]) -> None:

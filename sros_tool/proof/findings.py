@@ -10,6 +10,7 @@ from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import NOT_ON_ZENOH, VACUOUS, VIOLATED
 from sros_tool.names import is_expression
 from sros_tool.policy.model import Source
+from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.decide import Use, Verdict, Witness, decide
 from sros_tool.proof.places import Place
 from sros_tool.proof.requirements import (
@@ -44,6 +45,16 @@ class Step:
             name = f"action {name.partition('/_action/')[0]}"
         by = f" by {stated.name}" if stated and is_expression(stated.name) else ""
         return f"{right or ('write' if use.writes else 'read')} {name}{by}"
+
+    def drawn(self) -> tuple[str, str, str, str]:
+        """Return right, kind and name as a picture has them, and the wildcard that allows it."""
+        right, name, stated = self.use.right, self.use.name, self.place and self.place.right
+        action, inside, _ = name.partition("/_action/")
+        if stated and stated.kind == "actions" and inside:
+            right, name = stated.right, action
+        kind = KIND_OF[right] if name.startswith("/") else "dds"
+        by = stated.name if stated and is_expression(stated.name) else ""
+        return right, kind, name, by
 
     def text(self) -> str:
         """Return text such as ``/teleop may publish /cmd_vel by /cmd*``."""
@@ -129,14 +140,30 @@ def requirement_findings(requirements: Sequence[Requirement], system: System) ->
     return found
 
 
-def _violated(violation: Violation) -> Finding:
-    requirement, steps = violation.requirement, violation.steps
-    first = next((each.source for each in steps if each.source), None) or requirement.source
+def violation_text(violation: Violation) -> str:
+    """Return who breaks a requirement, and what it demands, in one sentence."""
+    return f"{_subject(violation)}: {_text(violation)}"
+
+
+def _text(violation: Violation) -> str:
+    requirement = violation.requirement
     text = f"{_fact(violation)}, but {demand(requirement)}"
     if violation.worlds:
         text += f"; with {', '.join(violation.worlds)} only"
     if requirement.why:
         text += f": {requirement.why}"
+    return text
+
+
+def _subject(violation: Violation) -> str:
+    """Return the enclave, or the name that the finding is about."""
+    use = violation.steps[0].use
+    return use.name if isinstance(violation.requirement, AtMost | Protected) else use.enclave
+
+
+def _violated(violation: Violation) -> Finding:
+    requirement, steps = violation.requirement, violation.steps
+    first = next((each.source for each in steps if each.source), None) or requirement.source
     related = [
         RelatedPlace(each.text(), each.source.file, each.source.line or None)
         for each in steps
@@ -144,10 +171,12 @@ def _violated(violation: Violation) -> Finding:
     ]
     own = requirement.source
     related.append(RelatedPlace(f"required: {_titled(requirement)}", own.file, own.line or None))
-    use = steps[0].use
-    subject = use.name if isinstance(requirement, AtMost | Protected) else use.enclave
     return VIOLATED.found(
-        subject, text, first.file, first.line, related=tuple(dict.fromkeys(related))
+        _subject(violation),
+        _text(violation),
+        first.file,
+        first.line,
+        related=tuple(dict.fromkeys(related)),
     )
 
 

@@ -38,6 +38,7 @@ from sros_tool.report.picture import (
     PicturedEnclave,
     PicturedFinding,
     Protection,
+    Requirements,
     SourceTitle,
     Statement,
     Validity,
@@ -124,6 +125,43 @@ def overlay(
         overlay=_OVERLAYS[kind],
         differences=_unused(edges) if kind == "use" else _changed(*rights),
         enclaves=tuple(replace(e, observed=e.path not in unseen) for e in picture.enclaves),
+    )
+
+
+def with_requirements(
+    picture: Picture, requirements: Requirements, governance: Governance | None = None
+) -> Picture:
+    """Return a picture in which the uses that break requirements are marked.
+
+    A use of a name that the picture does not have, such as one that only wildcards match, is added.
+    """
+    broken = {
+        (use.enclave, use.kind, use.name, use.right): use
+        for each in requirements.violations
+        for use in each.uses
+    }
+    edges, found = [], set()
+    for edge in picture.edges:
+        key = (edge.enclave, edge.kind, edge.name, edge.right)
+        violates = key in broken and edge.qualifier is ALLOW
+        edges.append(replace(edge, violates=True, common=False) if violates else edge)
+        found |= {key} if violates else set()
+    for key, use in broken.items():
+        if key not in found:
+            by = (use.by,) if use.by else ()
+            edges.append(Edge(use.enclave, use.kind, use.name, use.right, ALLOW, by, violates=True))
+    known = {(each.kind, each.name) for each in picture.names}
+    new = {(edge.kind, edge.name) for edge in edges} - known
+    names = [
+        Name(kind, name, namespace_of(name), protection_of(governance, kind, name))
+        for kind, name in new
+    ]
+    paths = {each.path for each in picture.enclaves}
+    return replace(
+        picture,
+        requirements=requirements,
+        edges=tuple(sorted((e for e in edges if e.enclave in paths), key=edge_order)),
+        names=tuple(sorted((*picture.names, *names), key=lambda each: (each.kind, each.name))),
     )
 
 

@@ -63,7 +63,8 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
         arrow = _MERMAID_ARROWS[link.level.value] if link.qualifier is ALLOW else "--x"
         text = _entities(_link_label(picture, link))
         lines.append(f'  {_end(link.source)} {arrow}|"{text}"| {_end(link.target)}')
-        colour = _DENIED if link.qualifier is not ALLOW else _COLOURS[link.mark]
+        red = link.violates or link.qualifier is not ALLOW
+        colour = _DENIED if red else _COLOURS[link.mark]
         styles[colour].append(number)
     lines += [
         f"  linkStyle {','.join(map(str, found))} stroke:{colour}"
@@ -142,6 +143,8 @@ def _link_label(picture: Picture, link: Link) -> str:
         text = f"DENY {text}"
     if link.wildcard:
         text += " by *"
+    if link.violates:
+        text += ": breaks a requirement"
     if picture.overlay and link.mark is not OverlaySide.BOTH:
         said = picture.overlay.first if link.mark is OverlaySide.FIRST else picture.overlay.second
         text += f": {said}"
@@ -162,10 +165,11 @@ def _dot_edge(picture: Picture, link: Link) -> str:
     denied = link.qualifier is not ALLOW
     attributes = [
         f"label={_quoted(_link_label(picture, link))}",
-        f'color="{_DENIED if denied else _COLOURS[link.mark]}"',
+        f'color="{_DENIED if denied or link.violates else _COLOURS[link.mark]}"',
         f"style={_DOT_STYLES[link.level.value]}",
     ]
     attributes += ["arrowhead=tee"] if denied else []
+    attributes += ["penwidth=3"] if link.violates else []
     ends = f"{_quoted(_key(link.source))} -> {_quoted(_key(link.target))}"
     return f"{ends} [{', '.join(attributes)}]"
 

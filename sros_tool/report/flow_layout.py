@@ -247,14 +247,20 @@ class _Draft:
 
     def links(self, cards: Mapping[str, Card]) -> list[Link]:
         """Return all links, without the places of their ends."""
-        found: dict[tuple[str, str, str, bool, str], set[str]] = defaultdict(set)
+        found: dict[tuple[str, str, str, bool, str, bool], set[str]] = defaultdict(set)
         for stage in self._stages:
             for number, (_, left, right) in enumerate(stage.bundles):
                 names = f"n{stage.column} {number}"
                 for ties, out in ((left, True), (right, False)):
                     for tie in ties:
                         ends = (tie.node, names) if out else (names, tie.node)
-                        key = (*ends, tie.qualifier.value, bool(tie.by), tie.mark.value)
+                        key = (
+                            *ends,
+                            tie.qualifier.value,
+                            bool(tie.by),
+                            tie.mark.value,
+                            tie.violates,
+                        )
                         found[key].add(tie.right)
         links = [
             Link(
@@ -267,8 +273,11 @@ class _Draft:
                 (cards[source] if cards[source].role == "names" else cards[target]).level,
                 wildcard,
                 OverlaySide(mark),
+                violates,
             )
-            for (source, target, qualifier, wildcard, mark), rights in sorted(found.items())
+            for (source, target, qualifier, wildcard, mark, violates), rights in sorted(
+                found.items()
+            )
         ]
         return [*links, *self._further_links(cards)]
 

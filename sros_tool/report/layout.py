@@ -26,6 +26,7 @@ from sros_tool.report.picture import (
     coarsened,
     counted,
     fold,
+    is_plain,
 )
 
 _SIDE_WIDTH, _NAMES_WIDTH, _GUTTER = 184, 330, 110
@@ -137,7 +138,8 @@ class Card:
 class Link:
     """An arrow from the right edge of one card to the left edge of another card.
 
-    ``rights`` is its label, such as publish; ``wildcard`` says that only wildcards give the right.
+    ``rights`` is its label, such as publish; ``wildcard`` says that only wildcards give the right,
+    ``violates`` that it breaks a requirement.
     """
 
     source: str
@@ -149,6 +151,7 @@ class Link:
     level: WireLevel
     wildcard: bool
     mark: OverlaySide
+    violates: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,26 +259,25 @@ class _Draft:
                 self._bundles.append(bundle)
         if len(self._bundles) > _MOST_BUNDLES:
             self._bundles = list(coarsened(self._bundles))
-        self._ties: dict[tuple[str, str, Qualifier, bool, OverlaySide], set[str]] = defaultdict(set)
+        self._ties: dict[tuple[str, str, Qualifier, bool, OverlaySide, bool], set[str]]
+        self._ties = defaultdict(set)
         for number, bundle in enumerate(self._bundles):
             for tie in bundle.ties:
                 if not self._looks(tie):
                     side, names = f"{'s' if tie.sends else 'l'}{tie.node}", f"n{number}"
                     ends = (side, names) if tie.sends else (names, side)
-                    self._ties[(*ends, tie.qualifier, bool(tie.by), tie.mark)].add(tie.right)
+                    key = (*ends, tie.qualifier, bool(tie.by), tie.mark, tie.violates)
+                    self._ties[key].add(tie.right)
 
     def _looks(self, tie: Tie) -> bool:
         """Return whether the tie is shown as a letter instead of a line."""
-        plain = tie.qualifier is ALLOW and tie.mark is OverlaySide.BOTH
-        return plain and (tie.node, tie.right) in self._looking
+        return is_plain(tie) and (tie.node, tie.right) in self._looking
 
     def _alone(self, bundle: Bundle) -> str:
         """Return the node with ties to these names if only one, except onlookers; otherwise ""."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
-        if any(
-            tie.qualifier is not ALLOW or tie.mark is not OverlaySide.BOTH for tie in bundle.ties
-        ):
+        if not all(map(is_plain, bundle.ties)):
             return ""
         nodes = {each for name in bundle.names for each in self._everybody[bundle.kind, name]}
         nodes -= looking - drawn
@@ -392,8 +394,9 @@ class _Draft:
                     (cards[source] if cards[source].role == "names" else cards[target]).level,
                     wildcard,
                     mark,
+                    violates,
                 )
-                for (source, target, qualifier, wildcard, mark), rights in sorted(
+                for (source, target, qualifier, wildcard, mark, violates), rights in sorted(
                     self._ties.items()
                 )
             ],

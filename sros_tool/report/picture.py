@@ -66,7 +66,7 @@ UNKNOWN = Protection(WireLevel.UNKNOWN)
 
 @shows(
     *("enclave", "kind", "name", "right", "qualifier"),
-    *("by", "parts", "mark", "common", "direction"),
+    *("by", "parts", "mark", "common", "violates", "direction"),
 )
 @dataclass(frozen=True, slots=True, order=True)
 class Edge:
@@ -74,7 +74,8 @@ class Edge:
 
     ``by`` are the expressions that match the name, empty if the right has the exact name.
     ``parts`` are the parts of an action, such as feedback, if the right is not for the whole
-    action.  ``common`` marks rights that every node needs to start.
+    action.  ``common`` marks rights that every node needs to start, ``violates`` those by which a
+    requirement does not hold.
     """
 
     enclave: str
@@ -86,6 +87,7 @@ class Edge:
     parts: tuple[str, ...] = ()
     mark: OverlaySide = OverlaySide.BOTH
     common: bool = False
+    violates: bool = False
 
     @property
     def sends(self) -> bool:
@@ -235,6 +237,46 @@ class Focus:
 
 
 @dataclass(frozen=True, slots=True)
+class Use:
+    """A use of a name that breaks a requirement; ``by`` is the wildcard that allows it, or ""."""
+
+    enclave: str
+    right: str
+    kind: str
+    name: str
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """A requirement that does not hold, in words, and the uses that break it."""
+
+    text: str
+    uses: tuple[Use, ...]
+
+
+_SAID = 5  # violations that the headlines say; the list of findings has all
+
+
+@dataclass(frozen=True, slots=True)
+class Requirements:
+    """The number of requirements that hold, and those that do not."""
+
+    hold: int
+    violations: tuple[Violation, ...] = ()
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return the result in sentences without a full stop."""
+        holds = f"{counted(self.hold, 'requirement')} hold{'s' if self.hold == 1 else ''}"
+        if not self.violations:
+            return (holds,)
+        number = len(self.violations)
+        more = (f"{number - _SAID} more do not hold",) if number > _SAID else ()
+        said = (f"Violated: {each.text}" for each in self.violations[:_SAID])
+        return (*said, *more, *((holds,) if self.hold else ()))
+
+
+@dataclass(frozen=True, slots=True)
 class Picture:
     """The rights in a system, with their protection, validity and findings.
 
@@ -251,11 +293,13 @@ class Picture:
     validities: tuple[Validity, ...] = ()
     findings: tuple[PicturedFinding, ...] = ()
     focus: tuple[Focus, ...] = ()
+    requirements: Requirements | None = None
 
     @property
     def headlines(self) -> tuple[str, ...]:
         """The answers that the picture gives, as sentences without a full stop."""
-        return tuple(each.sentence for each in self.focus)
+        found = self.requirements.sentences() if self.requirements else ()
+        return (*(each.sentence for each in self.focus), *found)
 
 
 def counted(number: int, thing: str) -> str:
@@ -274,11 +318,17 @@ class Tie:
     parts: tuple[str, ...]
     mark: OverlaySide
     common: bool
+    violates: bool = False
 
     @property
     def sends(self) -> bool:
         """Whether the arrow points from the enclave to the names."""
         return SENDS[self.right]
+
+
+def is_plain(tie: Tie) -> bool:
+    """Return whether a tie is neither denied, nor different, nor against a requirement."""
+    return tie.qualifier is ALLOW and tie.mark is OverlaySide.BOTH and not tie.violates
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,6 +370,7 @@ def fold(
                 edge.parts,
                 edge.mark,
                 edge.common,
+                edge.violates,
             )
         )
     bundles: dict[tuple[str, Protection, frozenset[Tie], bool], list[str]] = defaultdict(list)
@@ -343,7 +394,7 @@ def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
     """
     found: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
     for bundle in bundles:
-        plain = all(t.qualifier is ALLOW and t.mark is OverlaySide.BOTH for t in bundle.ties)
+        plain = all(map(is_plain, bundle.ties))
         senders = frozenset((tie.node, tie.right) for tie in bundle.ties if tie.sends)
         apart = None if plain and senders else bundle.ties
         found[bundle.kind, bundle.protection, senders, apart].append(bundle)
@@ -357,6 +408,6 @@ def _joined(bundles: Sequence[Bundle]) -> Bundle:
     return Bundle(bundles[0].kind, bundles[0].protection, tuple(names), tuple(ties), partial)
 
 
-def _order(tie: Tie) -> tuple[int, str, str, tuple[str, ...], tuple[str, ...], str, bool]:
+def _order(tie: Tie) -> tuple[object, ...]:
     right = RIGHT_ORDER[tie.right]
-    return right, tie.node, tie.qualifier, tie.by, tie.parts, tie.mark, tie.common
+    return right, tie.node, tie.qualifier, tie.by, tie.parts, tie.mark, tie.common, tie.violates

@@ -46,7 +46,8 @@ letter-spacing:.06em}
 .first{stroke:var(--first);stroke-width:2.25;marker-end:url(#to1)}
 .second{stroke:var(--second);stroke-width:2.25;marker-end:url(#to2)}
 .deny{stroke:var(--deny);stroke-width:1.75;stroke-opacity:1;marker-end:url(#no)}
-.tip{fill:var(--line)}.tip1{fill:var(--paper);stroke:var(--first);stroke-width:1.2}.tip2{fill:var(--second)}
+.violates{stroke:var(--deny);stroke-width:3;stroke-opacity:1;marker-end:url(#bad)}
+.tip{fill:var(--line)}.tipbad{fill:var(--deny)}.tip1{fill:var(--paper);stroke:var(--first);stroke-width:1.2}.tip2{fill:var(--second)}
 .cross{fill:var(--paper);stroke:var(--deny);stroke-width:1.6}
 .glyph{fill:none;stroke:var(--soft);stroke-width:1.4}
 .lock{fill:none;stroke-width:1.4}.lock-encrypt{stroke:var(--encrypt)}.lock-sign{stroke:var(--sign)}\
@@ -61,6 +62,8 @@ markerUnits="userSpaceOnUse" orient="auto"><path class="tip" d="M0 0.5L8 4L0 7.5
 markerUnits="userSpaceOnUse" orient="auto"><path class="tip1" d="M1 1L7 4L1 7z"/></marker>
 <marker id="to2" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="9" markerHeight="9" \
 markerUnits="userSpaceOnUse" orient="auto"><path class="tip2" d="M0 4L4 0L8 4L4 8z"/></marker>
+<marker id="bad" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="11" markerHeight="11" \
+markerUnits="userSpaceOnUse" orient="auto"><path class="tipbad" d="M0 0.5L8 4L0 7.5z"/></marker>
 <marker id="no" viewBox="0 0 14 14" refX="13" refY="7" markerWidth="14" markerHeight="14" \
 markerUnits="userSpaceOnUse" orient="0"><path class="cross" d="M7 1.5a5.5 5.5 0 1 0 .01 0z\
 M3.2 10.8L10.8 3.2"/></marker>"""
@@ -113,7 +116,8 @@ def render_svg(picture: Picture, scene: Scene) -> str:
     # The most important links are drawn last, on top.
     rank = {OverlaySide.BOTH: 0, OverlaySide.FIRST: 1, OverlaySide.SECOND: 2}
     for link in sorted(
-        scene.links, key=lambda each: (each.qualifier is not ALLOW, rank[each.mark])
+        scene.links,
+        key=lambda each: (each.violates, each.qualifier is not ALLOW, rank[each.mark]),
     ):
         lines.append(_link(link, cards, picture.overlay))
     lines += [line for card in scene.cards for line in _card(card)]
@@ -152,6 +156,8 @@ def _link_text(link: Link, overlay: Overlay | None) -> str:
     text = f"{link.qualifier.value} {', '.join(link.rights)}"
     if link.wildcard:
         text += " (by a wildcard)"
+    if link.violates:
+        text += ": breaks a requirement"
     if overlay and link.mark is not OverlaySide.BOTH:
         text += f": {overlay.first if link.mark is OverlaySide.FIRST else overlay.second}"
     return f"{text}, {LEVEL_NAMES[link.level]}"
@@ -162,6 +168,7 @@ def _link_classes(link: Link) -> str:
     classes = ["link", link.level.value]
     classes += ["wild"] if link.wildcard else []
     classes += [link.mark.value] if link.mark is not OverlaySide.BOTH else []
+    classes += ["violates"] if link.violates else []
     classes += ["deny"] if link.qualifier is not ALLOW else []
     return " ".join(classes)
 
@@ -227,6 +234,8 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
         rows.append(('<path class="link wild" d="M0 -4h40"/>', "allowed by a wildcard only"))
     if any(link.qualifier is not ALLOW for link in scene.links):
         rows.append(('<path class="link deny" d="M0 -4h40"/>', "denied"))
+    if any(link.violates for link in scene.links):
+        rows.append(('<path class="link violates" d="M0 -4h40"/>', "breaks a requirement"))
     if picture.overlay:
         rows.append(('<path class="link first" d="M0 -4h40"/>', picture.overlay.first))
         rows.append(('<path class="link second" d="M0 -4h40"/>', picture.overlay.second))

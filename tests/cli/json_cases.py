@@ -318,6 +318,8 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("policy.xml"),
         Case("policy.xml denied.xml"),
         Case("wild.xml --observed policy.xml"),
+        Case("policy.xml --focus /x /a /b"),
+        Case("policy.xml --requirements required.toml"),
         Case("broken"),
         Case("ks -o new.json --dry-run"),
         Case("ks --dry-run"),

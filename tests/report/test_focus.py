@@ -246,3 +246,28 @@ def test_a_column_with_many_enclaves_has_groups(tmp_path: Path) -> None:
     groups = [card for card in scene.cards if card.role == "group"]
     assert [len(card.members) for card in groups] == [8] * 5
     assert sum(link.target.startswith("n") for link in scene.links) == 5 + 1
+
+
+def test_what_breaks_a_requirement_is_red_and_said(tmp_path: Path) -> None:
+    enclaves = CHAIN | {"/web": group("topics", "publish", "/goal", "/cmd*")}
+    policy, wanted = tmp_path / "robot.xml", tmp_path / "robot.toml"
+    policy.write_text(policy_text(enclaves))
+    only = '[[only]]\npublish = ["/cmd_vel"]\nenclaves = ["/mux"]\n'
+    wanted.write_text(only + '[[must]]\nenclave = "/mux"\npublish = ["/cmd_vel"]\n')
+    found = value(policy, "--requirements", wanted)
+    assert found["requirements"]["hold"] == 1
+    (violation,) = found["requirements"]["violations"]
+    assert violation["text"].startswith("/web: may publish /cmd_vel by /cmd*, but ")
+    assert [(e["enclave"], e["name"]) for e in found["edges"] if e["violates"]] == [
+        ("/web", "/cmd_vel")
+    ]
+    shown = sros("view", policy, "--requirements", wanted, "--format", "svg").ok()
+    assert "Violated: /web: may publish /cmd_vel" in shown.err
+    assert shown.out.count('class="link unknown wild violates"') == 1
+    assert "breaks a requirement" in shown.out
+    policy.write_text(policy_text(CHAIN))
+    held = sros("view", policy, "--requirements", wanted, "--format", "svg").ok()
+    assert "2 requirements hold" in held.err and "2 requirements hold." in held.out
+    assert 'class="link unknown violates"' not in held.out
+    refused = sros("view", policy, policy, "--requirements", wanted)
+    assert (refused.status, refused.out) == (2, "")

@@ -34,11 +34,15 @@ def test_two_runs_write_the_same_bytes(form: str, robot_keystore: Path) -> None:
     assert len(found) == 1
 
 
-def test_the_picture_of_the_readme_is_what_its_command_writes(tmp_path: Path) -> None:
-    shown = REPOSITORY / "docs" / "mobile_robot.svg"
-    command = ("view", MOBILE_ROBOT, "--template", "production", "-o")
-    sros(*command, tmp_path / "mobile_robot.svg").ok()
-    assert (tmp_path / "mobile_robot.svg").read_bytes() == shown.read_bytes()
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("mobile_robot.svg", ("--template", "production")), ("drive.svg", ("--focus", "/cmd_vel"))],
+)
+def test_the_pictures_of_the_docs_are_what_their_commands_write(
+    tmp_path: Path, name: str, options: tuple[str, ...]
+) -> None:
+    sros("view", MOBILE_ROBOT, *options, "-o", tmp_path / name).ok()
+    assert (tmp_path / name).read_bytes() == (REPOSITORY / "docs" / name).read_bytes()
 
 
 @pytest.mark.parametrize("form", FORMATS)

@@ -481,6 +481,18 @@ def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -
         assert "allowed, never observed" in text and "observed, not allowed" in text
 
 
+@pytest.mark.parametrize("size", SIZES)
+def test_fit_shows_the_whole_map(browser: Browser, robot_page: Path, size: str) -> None:
+    width, height = SIZES[size]
+    with opened(browser, robot_page, viewport={"width": width, "height": height}) as page:
+        page.click("#zoom-fit")
+        box = page.locator("#map").bounding_box()
+        room = page.locator("#canvas").bounding_box()
+        assert box and room
+        assert box["width"] <= room["width"] and box["height"] <= height
+        assert box["height"] <= room["height"] + 1
+
+
 def test_a_focus_says_its_answer_and_shows_what_leads_to_it(
     browser: Browser, robot_keystore: Path, tmp_path: Path
 ) -> None:

@@ -66,6 +66,7 @@ export function linkOf(source, target, bundle, ties) {
     level: bundle.protection.level,
     wildcard: ties.every((tie) => tie.by.length > 0),
     open: ties.every((tie) => tie.open),
+    violates: ties.some((tie) => tie.violates),
     mark: ties[0].mark,
   };
 }

@@ -26,6 +26,7 @@ export function chips(model, tie) {
   if (marked) found.push(chip(tie.mark, marked));
   if (tie.by?.length) found.push(chip("", `by ${tie.by.join(", ")}`));
   if (tie.parts?.length) found.push(chip("", `only ${tie.parts.join(", ")}`));
+  if (tie.violates) found.push(chip("error", "breaks a requirement"));
   if (tie.common) found.push(chip("", "as every node"));
   return found;
 }

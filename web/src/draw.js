@@ -19,6 +19,7 @@ const TIPS = [
   ["to", "tip", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
   ["to1", "tip1", "M1 1L7 4L1 7z", 8, 7, "auto"],
   ["to2", "tip2", "M0 4L4 0L8 4L4 8z", 8, 7, "auto"],
+  ["bad", "tipbad", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
   ["no", "cross", "M7 1.5a5.5 5.5 0 1 0 .01 0zM3.2 10.8L10.8 3.2", 14, 13, "0"],
 ];
 const horizontal = linkHorizontal().x((point) => point[0]).y((point) => point[1]);
@@ -33,7 +34,7 @@ export function pathOf(link, cards) {
 export function linkText(link, overlay) {
   const said = `${link.deny ? "DENY" : "ALLOW"} ${link.rights.join(", ")}`;
   const marked = markText(overlay, link.mark);
-  return [said, link.wildcard && "by a wildcard", link.open && "as everybody may", marked, LEVELS[link.level]]
+  return [said, link.wildcard && "by a wildcard", link.open && "as everybody may", link.violates && "breaks a requirement", marked, LEVELS[link.level]]
     .filter(Boolean)
     .join(", ");
 }
@@ -99,14 +100,14 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
     .attr("text-anchor", (head) => head.anchor)
     .text((head) => head.text.toUpperCase());
   const cards = new Map(scene.cards.map((card) => [card.id, card]));
-  const rank = (link) => (link.deny ? 3 : { both: 0, first: 1, second: 2 }[link.mark]);
+  const rank = (link) => (link.violates ? 4 : link.deny ? 3 : { both: 0, first: 1, second: 2 }[link.mark]);
   const links = root
     .append("g")
     .selectAll("path")
     .data([...scene.links].sort((a, b) => rank(a) - rank(b)))
     .join("path")
     .attr("class", (link) =>
-      ["link", link.level, link.wildcard && "wild", link.mark !== "both" && link.mark, link.deny && "deny"]
+      ["link", link.level, link.wildcard && "wild", link.mark !== "both" && link.mark, link.violates && "violates", link.deny && "deny"]
         .filter(Boolean)
         .join(" "),
     )
@@ -244,6 +245,7 @@ export function legend(scene, overlay, make) {
   line("", "allowed");
   if (scene.links.some((link) => link.wildcard)) line("wild", "by a wildcard only");
   if (scene.links.some((link) => link.deny)) line("deny", "denied");
+  if (scene.links.some((link) => link.violates)) line("violates", "breaks a requirement");
   if (overlay && scene.links.some((link) => link.mark === "first")) line("first", overlay.first);
   if (overlay && scene.links.some((link) => link.mark === "second")) line("second", overlay.second);
   for (const each of scene.onlookers) {

@@ -71,9 +71,19 @@ function zoom(step) {
   const { width } = state.shown;
   const room = byId("canvas").clientWidth - 2;
   if (step === 0) state.zoom = Math.min(1.15, Math.max(0.72, room / width));
-  else state.zoom = Math.min(2.5, Math.max(0.3, state.zoom * (step > 0 ? 1.2 : 1 / 1.2)));
+  else state.zoom = Math.min(2.5, Math.max(0.05, state.zoom * (step > 0 ? 1.2 : 1 / 1.2)));
   byId("map").setAttribute("width", Math.round(width * state.zoom));
   byId("map").setAttribute("height", Math.round(state.shown.height * state.zoom));
+}
+
+// The whole drawing, however small; what opens first is as wide as the window, and readable.
+function fit() {
+  const { width, height } = state.shown;
+  const canvas = byId("canvas");
+  const tall = Math.min(canvas.clientHeight, window.innerHeight) - 4;
+  state.zoom = Math.max(0.05, Math.min(1.15, (canvas.clientWidth - 2) / width, tall / height));
+  byId("map").setAttribute("width", Math.floor(width * state.zoom));
+  byId("map").setAttribute("height", Math.floor(height * state.zoom));
 }
 
 function light() {
@@ -274,7 +284,7 @@ function start() {
   byId("close").addEventListener("click", close);
   byId("zoom-in").addEventListener("click", () => zoom(1));
   byId("zoom-out").addEventListener("click", () => zoom(-1));
-  byId("zoom-fit").addEventListener("click", () => zoom(0));
+  byId("zoom-fit").addEventListener("click", fit);
   byId("hops-more").addEventListener("click", () => hop(1));
   byId("hops-less").addEventListener("click", () => hop(-1));
   byId("print").addEventListener("click", () => window.print());
