@@ -281,7 +281,7 @@ def _with_requirements(
     from sros_tool.proof.requirements import read_requirements
     from sros_tool.proof.system import load_system
     from sros_tool.report.compose import with_requirements
-    from sros_tool.report.picture import Requirements, Use, Violation
+    from sros_tool.report.picture import PicturedUse, PicturedViolation, Requirements
 
     if len(sources) > 1 or template:
         raise UsageError(
@@ -293,10 +293,10 @@ def _with_requirements(
     system = load_system(sources[0], at=moment, zone=local_zone(os.environ), fleet=fleet)
     decided = decide_all(wanted, system)
     violations = tuple(
-        Violation(
+        PicturedViolation(
             violation_text(each),
             tuple(
-                Use(step.use.enclave, *step.drawn())
+                PicturedUse(step.use.enclave, *step.drawn())
                 for step in each.steps
                 if step.place and step.use.right
             ),

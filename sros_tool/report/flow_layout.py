@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import accumulate
 
 from sros_tool.policy.model import ALLOW, Qualifier
-from sros_tool.report.focus import ENCLAVE, Flow
+from sros_tool.report.focus import ENCLAVE, FocusFlow
 from sros_tool.report.layout import (
     LISTENERS,
     MARGIN,
@@ -60,7 +60,7 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, placed: bool = True) -> Sc
         hops: how far enclaves are drawn on both sides, from 1.
         placed: for formats that place cards themselves: without y and frames.
     """
-    draft = _Draft(picture, Flow.of(picture), hops)
+    draft = _Draft(picture, FocusFlow.of(picture), hops)
     cards = draft.in_columns()
     links = draft.links(cards)
     names = {name for card in cards.values() if card.kind for name in card.members}
@@ -101,7 +101,7 @@ class _Stage:
 class _Draft:
     """The builder of a scene with a focus."""
 
-    def __init__(self, picture: Picture, flow: Flow, hops: int) -> None:
+    def __init__(self, picture: Picture, flow: FocusFlow, hops: int) -> None:
         self._picture, self._flow, self._hops = picture, flow, hops
         self._groups = {each.path: each.group for each in picture.enclaves}
         self._further = tuple(

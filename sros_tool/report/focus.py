@@ -57,7 +57,7 @@ def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[
     wanted = dict.fromkeys(each for word in words for each in system.meant(word))
     found = tuple(system.focus(kind, name) for kind, name in wanted)
     picture = system.with_shortest_paths(replace(picture, focus=found))
-    flow = Flow.of(picture)
+    flow = FocusFlow.of(picture)
     edges = tuple(edge for edge in picture.edges if flow.has(edge))
     enclaves = {edge.enclave for edge in edges} | flow.before.keys() | flow.after.keys()
     names = {(edge.kind, edge.name) for edge in edges}
@@ -75,7 +75,7 @@ def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[
 
 
 @dataclass(frozen=True, slots=True)
-class Flow:
+class FocusFlow:
     """The stages of the flow of information to the names of a focus, and from them.
 
     ``own`` are the enclaves and ``targets`` the names (kind and name) in the focus.  ``before``
@@ -92,7 +92,7 @@ class Flow:
     stages: Mapping[tuple[str, str], tuple[int, ...]]
 
     @classmethod
-    def of(cls, picture: Picture) -> Flow:
+    def of(cls, picture: Picture) -> FocusFlow:
         """Return the flow of a picture, which has a focus."""
         own = frozenset(each.name for each in picture.focus if each.kind == ENCLAVE)
         wanted = [(each.kind, each.name) for each in picture.focus if each.kind != ENCLAVE]
@@ -151,24 +151,24 @@ class Flow:
             (writes if edge.sends else reads).add(0)
         if edge.qualifier is not ALLOW or edge.name in OF_EVERY_NODE:
             return writes, reads
-        if may_write(edge):
+        if _may_write(edge):
             writes |= {before - 1} if before > 1 else set()
             writes |= {-after} if after else set()
             writes |= {0} if edge.enclave in self.own else set()
-        if may_read(edge):
+        if _may_read(edge):
             reads |= {before} if before else set()
             reads |= {1 - after} if after else set()
         return writes, reads
 
 
-def may_write(edge: Edge) -> bool:
+def _may_write(edge: Edge) -> bool:
     """Return whether information goes from the enclave of an edge to its name."""
     if edge.right in _ONE_WAY:
         return edge.sends
     return not (edge.right == "request" and asks(edge))
 
 
-def may_read(edge: Edge) -> bool:
+def _may_read(edge: Edge) -> bool:
     """Return whether information goes from the name of an edge to its enclave."""
     if edge.right in _ONE_WAY:
         return not edge.sends
@@ -266,14 +266,14 @@ class _System:
         drawn = {
             (edge.enclave, edge.kind, edge.name, fits)
             for edge in allowed
-            for fits in (may_write, may_read)
+            for fits in (_may_write, _may_read)
             if fits(edge)
         }
         added = set()
         for hop in {hop for path in self._paths for hop in path}:
             for enclave, right, stated, fits in (
-                (hop.source, hop.right, hop.said, may_write),
-                (hop.target, _OTHER_SIDE[hop.right], hop.heard, may_read),
+                (hop.source, hop.right, hop.said, _may_write),
+                (hop.target, _OTHER_SIDE[hop.right], hop.heard, _may_read),
             ):
                 if (enclave, hop.kind, hop.name, fits) not in drawn:
                     by = () if stated == hop.name else (stated,)

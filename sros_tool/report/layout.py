@@ -33,7 +33,7 @@ _SIDE_WIDTH, _NAMES_WIDTH, _GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14
 """The height of a line of text, the padding of a card, and the height of a line of a note."""
 _GAP, _LEAD, _TOP, MARGIN = 9.0, 24.0, 34.0, 14
-SIDE_LETTERS, NAMES_LETTERS = 20, 35  # letters per line on a card
+SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters per line on a card
 _ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # onlookers have more bundles than both limits
 _MOST_ONLOOKERS = 26  # the number of letters
 _FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # with more: private names are counted; bundles joined
@@ -72,7 +72,8 @@ _COMMON = {
 }
 """The note on a card of names that every node may use, if those rights are not drawn."""
 OWN = "own:"
-SENDERS, NAMES, LISTENERS = "may send", "topics, services, actions", "may receive"
+SENDERS, LISTENERS = "may send", "may receive"
+_NAMES = "topics, services, actions"
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,7 +301,7 @@ class _Draft:
             ),
             heads=(
                 Head(MARGIN, "start", SENDERS),
-                Head(width // 2, "middle", NAMES),
+                Head(width // 2, "middle", _NAMES),
                 Head(width - MARGIN, "end", LISTENERS),
             ),
         )
@@ -453,7 +454,7 @@ def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = ()) -> Card:
     """Return the card of a bundle, without x, y and width; ``more`` are further notes."""
     titles, notes = _names_title(bundle)
-    lines = tuple(line for title in titles for line in wrapped(title, NAMES_LETTERS))
+    lines = tuple(line for title in titles for line in wrapped(title, _NAMES_LETTERS))
     notes += more
     return Card(
         id=card,

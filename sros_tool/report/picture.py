@@ -237,7 +237,7 @@ class Focus:
 
 
 @dataclass(frozen=True, slots=True)
-class Use:
+class PicturedUse:
     """A use of a name that breaks a requirement; ``by`` is the wildcard that allows it, or ""."""
 
     enclave: str
@@ -248,11 +248,11 @@ class Use:
 
 
 @dataclass(frozen=True, slots=True)
-class Violation:
+class PicturedViolation:
     """A requirement that does not hold, in words, and the uses that break it."""
 
     text: str
-    uses: tuple[Use, ...]
+    uses: tuple[PicturedUse, ...]
 
 
 _SAID = 5  # violations that the headlines say; the list of findings has all
@@ -263,7 +263,7 @@ class Requirements:
     """The number of requirements that hold, and those that do not."""
 
     hold: int
-    violations: tuple[Violation, ...] = ()
+    violations: tuple[PicturedViolation, ...] = ()
 
     def sentences(self) -> tuple[str, ...]:
         """Return the result in sentences without a full stop."""

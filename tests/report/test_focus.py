@@ -17,7 +17,7 @@ from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network
 from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.dot_mermaid import render_dot, render_mermaid
 from sros_tool.report.flow_layout import flow_scene
-from sros_tool.report.focus import Flow, focused
+from sros_tool.report.focus import FocusFlow, focused
 from sros_tool.report.picture import Picture, SourceTitle
 from tests.report.pictures import HOSTILE, MOBILE_ROBOT, group, hostile_permissions, source_of
 from tests.support.harness import policy_text, sros
@@ -190,7 +190,7 @@ def test_every_enclave_of_an_answer_is_drawn_and_linked(
     if word not in known:
         return
     picture = focused(picture, [source], [word])
-    flow = Flow.of(picture)
+    flow = FocusFlow.of(picture)
     network = Network(rights, without=OF_EVERY_NODE, questions=QUESTIONS)
     for each in picture.focus:
         starts = {each.name} if each.kind == "enclave" else set(each.senders)
