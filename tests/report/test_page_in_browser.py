@@ -215,7 +215,7 @@ def test_the_flow_agrees_with_the_one_that_explain_follows(
     with opened(browser, path) as page:
         for name, upstream in product(ASKED_FOR_FLOW, (True, False)):
             distance = distances(network, name, upstream)
-            assert len(distance) > 1
+            assert distance
             # By permissions, too, whatever one of these names reaches comes to most enclaves.
             differs = {"writing": upstream, "some names": (name, upstream) == ("/scan", False)}
             if differs.get(open_to_all):
