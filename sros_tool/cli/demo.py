@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
+from click.core import ParameterSource
 
 from sros_tool.cli.common import (
     PATH,
@@ -19,6 +21,7 @@ from sros_tool.cli.common import (
     now,
     print_json,
     visible,
+    visible_line,
 )
 from sros_tool.errors import UsageError
 
@@ -55,12 +58,17 @@ Example:
   $ sros demo --scenario governance --plot cost.svg
   $ sros demo --scenario all
   $ sros demo --backend zenoh --summary zenoh.md
+  $ sros run keystore /talker_listener/talker -- sros demo talker
+  talker on Cyclone DDS, topic /chatter, domain 0: secured, in the enclave ...
+  ready
+  sent   Hello World: 1
 
 Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1.
 A row marked "open" shows an attack that is known to succeed, and counts as expected. OPEN
 marks an attack that succeeds because of your own keystore (--keystore), and would fail with
 the template production: the exit status is 1 unless --accept-open names the row.""",
 )
+@click.argument("role", required=False, type=click.Choice(["talker", "listener", "router"]))
 @click.option(
     "--backend",
     type=click.Choice(["auto", "rclpy", "cyclone", "zenoh"]),
@@ -142,7 +150,10 @@ the template production: the exit status is 1 unless --accept-open names the row
 )
 @force_option
 @json_option
+@click.pass_context
 def demo(
+    ctx: click.Context,
+    role: str | None,
     backend: str,
     scenarios: tuple[str, ...],
     list_them: bool,
@@ -167,7 +178,13 @@ def demo(
     scenario `attacks` tries all attacks that sros knows, also without the defences that stop them;
     it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), all scenarios
     run, in about 25 s.
+
+    With a ROLE, it is one node instead, in the environment that is there, until Ctrl-C: a talker or
+    a listener on Cyclone DDS (or rclpy, or Zenoh, which also needs a router), to see by hand who
+    hears whom. It says at once whether it is secured. Only --backend and --topic go with it.
     """
+    if role is not None:
+        _run_by_hand(ctx, role, backend, topic)
     from sros_tool.demo.program import DemoOptions, run_demo
     from sros_tool.demo.scenarios import choose_scenarios
     from sros_tool.demo.show import demo_table
@@ -218,6 +235,25 @@ def demo(
         click.echo(visible(demo_table(result)))
     if not result.as_expected:
         sys.exit(1)
+
+
+def _run_by_hand(ctx: click.Context, role: str, backend: str, topic: str | None) -> NoReturn:
+    """Run a node until it is stopped, and end with its exit status."""
+    from sros_tool.demo.by_hand import HandNode, run_by_hand
+    from sros_tool.demo.scenarios.model import Role
+    from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, check_topic
+
+    for parameter in ctx.command.params:
+        chosen = ctx.get_parameter_source(parameter.name or "")
+        takes = parameter.name in ("role", "backend", "topic") or not parameter.expose_value
+        if not takes and chosen is not ParameterSource.DEFAULT:
+            option = parameter.opts[0]
+            raise UsageError(f"a {role} takes no {option}", "", "Leave it out.")
+    if backend == "auto":
+        on_zenoh = os.environ.get("RMW_IMPLEMENTATION") == "rmw_zenoh_cpp" or role == "router"
+        backend = "zenoh" if on_zenoh else "cyclone"
+    node = HandNode(Role(role), backend, check_topic(DEFAULT_TOPIC if topic is None else topic))
+    sys.exit(run_by_hand(node, lambda line: click.echo(visible_line(line))))
 
 
 def _list(backend: str, as_json: bool) -> None:

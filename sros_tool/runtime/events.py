@@ -116,7 +116,7 @@ class EventReader:
             return []
         whole = data[: data.rfind(b"\n") + 1]
         self._position += len(whole)
-        return [_parse(line, self._path) for line in whole.splitlines()]
+        return [parse_event(line, self._path) for line in whole.splitlines()]
 
 
 def read_events(path: Path) -> list[Event]:
@@ -128,7 +128,12 @@ def read_events(path: Path) -> list[Event]:
     return EventReader(path).new_events()
 
 
-def _parse(line: bytes, path: Path) -> Event:
+def parse_event(line: bytes, path: Path) -> Event:
+    """Return the event that a line of the file at ``path`` has.
+
+    Raises:
+        DocumentError: The line is not an event.
+    """
     try:
         record = json.loads(line)
         return Event(

@@ -6,7 +6,7 @@ another form.  Each text was seen in a real log of Fast DDS 2.9.1 or 2.14.5 (Per
 SecurityManager.cpp, PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c, authentication.c,
 q_omg_security.c), or rcl of Jazzy.
 
-To add a vendor, add its rows to `_LOG_TEXTS`, the text that it puts around a reason to `_FRAME`,
+To add a vendor, add its rows to `LOG_TEXTS`, the text that it puts around a reason to `_FRAME`,
 and its words for writers and readers to `DIRECTIONS`.
 """
 
@@ -134,7 +134,7 @@ _ASK_FOR_TOPIC = (
     "ROS_SECURITY_LOG_FILE; or run `sros explain` for each topic of the node."
 )
 
-_LOG_TEXTS: tuple[LogText, ...] = (
+LOG_TEXTS: tuple[LogText, ...] = (
     # ── rcl and the RMWs ───────────────────────────────────────────────────────────────────
     _text(
         "not-built-in", _ROS, r"doesn't have the security libraries|compile Fast DDS using the"
@@ -584,7 +584,7 @@ UNKNOWN = LogText(
     "Read the line: it may matter. If it kept a node from starting, `sros check KEYSTORE` and "
     "`sros explain KEYSTORE ENCLAVE join` check all that DDS checks.",
 )
-"""The meaning of a line that looks like a DDS Security message but is not in `_LOG_TEXTS`."""
+"""The meaning of a line that looks like a DDS Security message but is not in `LOG_TEXTS`."""
 
 _STYLES = (
     (Vendor.CYCLONE, re.compile(r"\A\d+\.\d+ \[\d*\]\s+\S+: ")),
@@ -673,7 +673,7 @@ def endpoint_refusal(text: str) -> str:
 
 
 def _first_refusal(refused: Refused, text: str) -> str:
-    patterns = [each.pattern for each in _LOG_TEXTS if each.refuses is refused]
+    patterns = [each.pattern for each in LOG_TEXTS if each.refuses is refused]
     for line in plain_text(text).splitlines():
         if any(pattern.search(line) for pattern in patterns):
             return plain_refusal(line)
@@ -689,13 +689,13 @@ def denied_topic(line: str) -> tuple[Vendor, re.Match[str]] | None:
 
 
 _TOPIC_DENIED = [
-    (each.vendor, each.pattern) for each in _LOG_TEXTS if each.id == "topic-denied" and each.vendor
+    (each.vendor, each.pattern) for each in LOG_TEXTS if each.id == "topic-denied" and each.vendor
 ]
 
 
 def log_text(line: str) -> tuple[LogText, re.Match[str]] | None:
     """Return the text that explains a line, with its match, or None; see also `denied_topic`."""
-    for text in _LOG_TEXTS:
+    for text in LOG_TEXTS:
         if text.cause and (match := text.pattern.search(line)):
             return text, match
     return None

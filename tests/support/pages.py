@@ -211,7 +211,15 @@ class _Run:
         path = os.environ["PATH"]
         if not any((Path(each) / "ros2").exists() for each in path.split(":")):
             _script(programs / "ros2", "")
-        kept = ("LANG", "LC_ALL", "LD_LIBRARY_PATH", "TMPDIR", "USER", "AMENT_PREFIX_PATH")
+        kept = (
+            "LANG",
+            "LC_ALL",
+            "LD_LIBRARY_PATH",
+            "TMPDIR",
+            "USER",
+            "AMENT_PREFIX_PATH",
+            "SROS_CYCLONEDDS_DIR",
+        )
         self.env = {
             **{name: os.environ[name] for name in kept if name in os.environ},
             "PATH": f"{programs}:{path}",

@@ -1,0 +1,54 @@
+"""Nodes of the demo that are started by hand; docs/tutorial.md runs them on Cyclone DDS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sros_tool.demo.by_hand import HandNode, security_of
+from sros_tool.demo.scenarios.model import Role
+from sros_tool.errors import SrosError, UsageError
+from tests.support.harness import sros
+
+TALKER = HandNode(Role.TALKER, "cyclone", "/chatter")
+
+
+def test_a_node_says_whether_it_is_secured(keystore: Path) -> None:
+    assert security_of(TALKER, {}).endswith("/chatter, domain 0: WITHOUT security")
+    variables = {
+        "ROS_SECURITY_ENABLE": "true",
+        "ROS_SECURITY_STRATEGY": "Enforce",
+        "ROS_SECURITY_KEYSTORE": str(keystore),
+        "ROS_SECURITY_ENCLAVE_OVERRIDE": "/a",
+        "ROS_DOMAIN_ID": "7",
+    }
+    assert security_of(TALKER, variables).endswith("domain 7: secured, in the enclave /a")
+    (keystore / "enclaves" / "a" / "key.pem").unlink()
+    with pytest.raises(SrosError, match="key.pem"):
+        security_of(TALKER, variables)
+    # As rcl does: without Enforce, the node runs without the enclave.
+    variables["ROS_SECURITY_STRATEGY"] = "Permissive"
+    assert "WITHOUT security" in security_of(TALKER, variables)
+
+
+def test_a_node_on_zenoh_says_its_configuration() -> None:
+    pytest.importorskip("zenoh")
+    node = HandNode(Role.LISTENER, "zenoh", "/chatter")
+    assert "WITHOUT security" in security_of(node, {"ROS_SECURITY_ENABLE": "true"})
+    assert security_of(node, {"ZENOH_SESSION_CONFIG_URI": "/a.json5"}).endswith("by /a.json5")
+    with pytest.raises(UsageError, match="only Zenoh has routers"):
+        HandNode(Role.ROUTER, "rclpy", "/chatter")
+
+
+@pytest.mark.parametrize("options", [["--json"], ["--scenario", "attacks"], ["--domain", "3"]])
+def test_options_that_a_node_does_not_take_are_refused(options: list[str]) -> None:
+    ended = sros("demo", "talker", *options)
+    assert ended.status == 2
+    assert f"a talker takes no {options[0]}" in ended.err
+
+
+def test_a_hostile_topic_is_refused_before_a_node_starts() -> None:
+    ended = sros("demo", "listener", "--topic", "/a\x1b[2J b")
+    assert ended.status == 2
+    assert "\x1b" not in ended.err

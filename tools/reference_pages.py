@@ -1,0 +1,126 @@
+"""Write docs/reference/: pages made from the program, on options, findings and texts in logs.
+
+`python -m tools.reference_pages` writes them; tests/test_pages.py compares them with the program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import click
+
+from sros_tool.checks.registry import KINDS
+from sros_tool.cli.program import FAMILIES, program
+from sros_tool.runtime.vendor_log import LOG_TEXTS
+from tools.steps import CHECKOUT
+
+FOLDER = CHECKOUT / "docs" / "reference"
+_MADE = "<!-- made by `python -m tools.reference_pages`; do not edit -->"
+
+
+def pages() -> Mapping[str, str]:
+    """Return the text of each page by its file name."""
+    return {"options.md": _options(), "findings.md": _findings(), "log_texts.md": _log_texts()}
+
+
+def _page(title: str, *parts: str) -> str:
+    return "\n\n".join([f"# {title}", _MADE, *parts]) + "\n"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "\\<").replace("*", "\\*")
+
+
+def _table(*heads: str, rows: Iterator[tuple[str, ...]]) -> str:
+    lines = [heads, ("---",) * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+# ── verbs and options ──────────────────────────────────────────────────────────────────────
+
+
+def _options() -> str:
+    parts = [
+        "What `sros VERB --help` prints, of all verbs. The exit status of every verb is 0 for yes "
+        "or done, 1 for no, denied, different or findings, 2 for what could not be asked or done.",
+    ]
+    for family, verbs in FAMILIES.items():
+        parts.append(f"## {family}")
+        for name in verbs:
+            command = program.get_command(click.Context(program), name)
+            assert command is not None
+            parts += _verb(f"sros {name}", command)
+    return _page("Verbs and options", *parts)
+
+
+def _verb(name: str, command: click.Command) -> Iterator[str]:
+    context = click.Context(command, info_name=name)
+    usage = " ".join([name, *command.collect_usage_pieces(context)])
+    yield f"### {name}"
+    yield f"```text\n{usage}\n```"
+    yield (
+        "\n\n".join(
+            " ".join(part.replace("\b", "").split()) for part in (command.help or "").split("\n\n")
+        )
+        .replace("<", "\\<")
+        .replace("*", "\\*")
+    )
+    if rows := [_row(each, context) for each in command.params if isinstance(each, click.Option)]:
+        yield _table("option", "meaning", rows=iter(rows))
+    if isinstance(command, click.Group):
+        for part, each in command.commands.items():
+            yield from _verb(f"{name} {part}", each)
+
+
+def _row(option: click.Option, context: click.Context) -> tuple[str, str]:
+    words, meaning = option.get_help_record(context) or (", ".join(option.opts), "")
+    return f"`{words.replace('|', ' or ')}`", _cell(meaning)
+
+
+# ── findings ───────────────────────────────────────────────────────────────────────────────
+
+
+def _findings() -> str:
+    families: dict[str, list[str]] = {}
+    for kind in KINDS.values():
+        family = kind.id.partition(".")[0]
+        text = (
+            f"### {kind.id}\n\n**{kind.severity}**: {_cell(kind.title)}.\n\n{_cell(kind.why)}\n\n"
+            f"*Remedy:* {_cell(kind.remedy)}\n\n*Source:* {_cell(kind.source)}"
+        )
+        families.setdefault(family, []).append(text)
+    parts = [
+        "What `sros check` finds, by id (`sros check --list`). `--include` and `--exclude` take "
+        "these ids.",
+    ]
+    for family, texts in families.items():
+        parts += [f"## {family}", *texts]
+    return _page("Findings", *parts)
+
+
+# ── texts in logs ──────────────────────────────────────────────────────────────────────────
+
+
+def _log_texts() -> str:
+    parts = [
+        "The security messages of DDS vendors, rcl and the RMWs, and what each means. `sros "
+        "explain KEYSTORE --log FILE` finds them in a log, and looks for the cause in the enclave. A text "
+        "is a regular expression that is searched in a line.",
+    ]
+    by_vendor: dict[str, list[tuple[str, ...]]] = {}
+    for each in LOG_TEXTS:
+        vendor = each.vendor.title if each.vendor else "rcl and RMWs, with every DDS"
+        causes = [fault.title for fault in each.faults]
+        meaning = each.cause or "; or ".join(causes) or "the text alone does not show a cause"
+        text = each.pattern.pattern.replace("`", "'").replace("|", "\\|")
+        row = (f"`{text}`", _cell(meaning), _cell(each.remedy or each.unseen))
+        by_vendor.setdefault(vendor, []).append(row)
+    for vendor, rows in by_vendor.items():
+        parts += [f"## {vendor}", _table("text", "meaning", "what to do", rows=iter(rows))]
+    return _page("Texts in logs, by vendor", *parts)
+
+
+if __name__ == "__main__":
+    FOLDER.mkdir(exist_ok=True)
+    for name, text in pages().items():
+        (FOLDER / name).write_text(text, "utf-8")
