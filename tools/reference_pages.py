@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 
 import click
@@ -28,7 +29,10 @@ def _page(title: str, *parts: str) -> str:
 
 
 def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|").replace("<", "\\<").replace("*", "\\*")
+    """Return a text of the program as Markdown on one line, also for a cell of a table."""
+    parts = " ".join(text.split()).replace("|", "\\|").split("`")
+    parts[::2] = [re.sub(r"[<*\[]", r"\\\g<0>", part) for part in parts[::2]]
+    return "`".join(parts)
 
 
 def _table(*heads: str, rows: Iterator[tuple[str, ...]]) -> str:
@@ -58,13 +62,8 @@ def _verb(name: str, command: click.Command) -> Iterator[str]:
     usage = " ".join([name, *command.collect_usage_pieces(context)])
     yield f"### {name}"
     yield f"```text\n{usage}\n```"
-    yield (
-        "\n\n".join(
-            " ".join(part.replace("\b", "").split()) for part in (command.help or "").split("\n\n")
-        )
-        .replace("<", "\\<")
-        .replace("*", "\\*")
-    )
+    help_parts = (command.help or "").replace("\b", "").split("\n\n")
+    yield "\n\n".join(map(_cell, help_parts))
     if rows := [_row(each, context) for each in command.params if isinstance(each, click.Option)]:
         yield _table("option", "meaning", rows=iter(rows))
     if isinstance(command, click.Group):
@@ -104,8 +103,8 @@ def _findings() -> str:
 def _log_texts() -> str:
     parts = [
         "The security messages of DDS vendors, rcl and the RMWs, and what each means. `sros "
-        "explain KEYSTORE --log FILE` finds them in a log, and looks for the cause in the enclave. A text "
-        "is a regular expression that is searched in a line.",
+        "explain KEYSTORE --log FILE` finds them in a log, and looks for the cause in the enclave. "
+        "A text is a regular expression that is searched in a line.",
     ]
     by_vendor: dict[str, list[tuple[str, ...]]] = {}
     for each in LOG_TEXTS:

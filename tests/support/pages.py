@@ -157,10 +157,11 @@ def fits(expected: tuple[str, ...], said: str, *, begun: bool = False) -> bool:
 class _Terminal:
     process: subprocess.Popen[bytes]
     output: Path
+    folder: Path
     shown: tuple[str, ...] = ()
 
     def said(self) -> str:
-        return self.output.read_text("utf-8", "replace")
+        return self.output.read_text("utf-8", "replace").replace(str(self.folder), HOME)
 
     def wait(self, more: tuple[str, ...], where: str) -> None:
         """Wait until the lines of the page have come."""
@@ -259,7 +260,7 @@ class _Run:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
             )
-        self.terminals[name] = _Terminal(process, output)
+        self.terminals[name] = _Terminal(process, output, self.folder / "home")
         self.terminals[name].wait(command.output, f"{self.page}:{command.line}: {command.text}")
 
     def command(self, command: Command) -> None:
