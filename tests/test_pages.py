@@ -9,6 +9,7 @@ import pytest
 
 from tests.support.children import python
 from tests.support.pages import PROJECT, PageError, alike, blocks, fits, outcome_of
+from tools import man_page
 from tools.reference_pages import FOLDER, pages
 
 PAGES = sorted(
@@ -47,6 +48,10 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
 def test_the_reference_is_made_from_the_program() -> None:
     for name, text in pages().items():
         assert (FOLDER / name).read_text("utf-8") == text, "run `python -m tools.reference_pages`"
+
+
+def test_the_manual_page_is_made_from_the_program() -> None:
+    assert man_page.PAGE.read_text("utf-8") == man_page.page(), "run `python -m tools.man_page`"
 
 
 def test_a_page_that_shows_something_else_is_found(tmp_path: Path) -> None:

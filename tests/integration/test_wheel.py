@@ -82,6 +82,11 @@ def test_other_programs_find_what_they_load(unpacked: Path) -> None:
     assert found["launch.frontend.launch_extension", "sros_tool"].value == "sros_tool.launch"
 
 
+def test_the_manual_page_is_in_it(unpacked: Path) -> None:
+    (page,) = unpacked.glob("*.data/data/share/man/man1/sros.1")
+    assert page.read_bytes() == (CHECKOUT / "man" / "sros.1").read_bytes()
+
+
 def test_every_file_of_the_package_is_in_it(unpacked: Path) -> None:
     listed = subprocess.run(
         ["git", "ls-files", "sros_tool", "policies", "keystore_templates"],

@@ -111,6 +111,9 @@ def blocks(text: str) -> Iterator[Block]:
             while not lines[number].rstrip().endswith("-->"):
                 number += 1
             comment = "\n".join(lines[start : number + 1])
+            number += 1
+            if not re.match(r"<!--\s*(run|file|terminal|not)\b", comment):
+                continue
             if not (found := _COMMENT.fullmatch(comment)):
                 raise PageError(f"line {start + 1}: a comment that is not understood: {comment}")
             value = found["text"].strip()
@@ -123,7 +126,8 @@ def blocks(text: str) -> Iterator[Block]:
                     terminal = value
                 case _:
                     skipped.append(found["words"] or "")
-        elif line.startswith("```"):
+            continue
+        if line.startswith("```"):
             start = number + 1
             number = lines.index("```", start)
             body = tuple(lines[start:number])
