@@ -24,6 +24,7 @@ from tools.steps import CHECKOUT, SetupError, output_of, say
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 EXTRAS = {
     "": "sros_tool.cli.program",
+    "docs": "furo",
     "fleet": "ansible",
     "pkcs11": "pkcs11",
     "ros": "rclpy",
@@ -49,9 +50,12 @@ _SMOKE: tuple[tuple[str, ...], ...] = (
 _PATIENCE = 1800
 
 
+_MANUAL = ".data/data/share/man/man1/sros.1"
+
+
 def problems_of(files: Mapping[str, bytes], *, wheel: bool) -> Iterator[str]:
     """Yield what should not be in a package, by the names and contents of its files."""
-    top = {name.split("/")[0] for name in files}
+    top = {name.split("/")[0] for name in files if not name.endswith(_MANUAL)}
     strange = {each for each in top if each != "sros_tool" and not each.endswith(".dist-info")}
     if wheel and strange:
         yield f"{', '.join(sorted(strange))}: not a part of the package"
