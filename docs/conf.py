@@ -17,7 +17,8 @@ extensions = ["myst_parser"]
 root_doc = "docs/index"
 include_patterns = [
     "*.md",
-    "docs/**/*.md", "docs/*.md",
+    "docs/**/*.md",
+    "docs/*.md",
     "policies/README.md",
     "ansible_collections/sros/fleet/README.md",
 ]

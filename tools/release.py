@@ -24,7 +24,6 @@ from tools.steps import CHECKOUT, SetupError, output_of, say
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 EXTRAS = {
     "": "sros_tool.cli.program",
-    "docs": "furo",
     "fleet": "ansible",
     "pkcs11": "pkcs11",
     "ros": "rclpy",

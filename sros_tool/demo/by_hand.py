@@ -22,8 +22,7 @@ from sros_tool.runtime.environment import ENCLAVE
 from sros_tool.runtime.events import Event, EventKind, parse_event
 from sros_tool.runtime.rcl_security import choose_loadable, domain_of
 
-ROLES = (Role.TALKER, Role.LISTENER, Role.ROUTER)
-SILENCE = 5.0
+_SILENCE = 5.0
 """Seconds after which a listener says that it heard nothing."""
 
 _LIBRARIES = {CYCLONE: "Cyclone DDS", RCLPY: "rclpy", ZENOH: "Zenoh"}
@@ -100,10 +99,10 @@ def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> None:
     """Say what the node reports, until it ends."""
     data = b""
     while len(data) < _LONGEST_LINE:
-        ready, _, _ = select.select([pipe], [], [], SILENCE)
+        ready, _, _ = select.select([pipe], [], [], _SILENCE)
         if not ready:
             if node.role is Role.LISTENER:
-                say(f"heard nothing for {SILENCE:.0f} s")
+                say(f"heard nothing for {_SILENCE:.0f} s")
             continue
         if not (more := os.read(pipe, 65536)):
             return

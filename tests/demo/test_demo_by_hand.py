@@ -25,7 +25,7 @@ def test_a_node_says_whether_it_is_secured(keystore: Path) -> None:
     }
     assert security_of(TALKER, variables).endswith("domain 7: secured, in the enclave /a")
     (keystore / "enclaves" / "a" / "key.pem").unlink()
-    with pytest.raises(SrosError, match="key.pem"):
+    with pytest.raises(SrosError, match=r"key\.pem"):
         security_of(TALKER, variables)
     # As rcl does: without Enforce, the node runs without the enclave.
     variables["ROS_SECURITY_STRATEGY"] = "Permissive"
