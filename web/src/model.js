@@ -138,7 +138,10 @@ export class Model {
     for (let hop = 1; front.length; hop += 1) {
       const reached = new Set();
       for (const bundle of front) {
+        const others = far.of.get(bundle);
         for (const tie of near.of.get(bundle)) {
+          // What only the enclave itself sends, or receives, is no flow to it.
+          if (hop === 1 && others.length && others.every((each) => each.enclave === tie.enclave)) continue;
           if (!hops.has(tie.enclave)) {
             hops.set(tie.enclave, hop);
             reached.add(tie.enclave);
