@@ -13,6 +13,7 @@ import pytest
 from sros_tool.errors import UsageError
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.units import (
+    FLEET_FILE,
     METRICS_FILE,
     TEMPLATE,
     Job,
@@ -100,6 +101,7 @@ def test_systemd_finds_nothing_wrong_in_the_jobs(passphrase: str, tmp_path: Path
         "/bin/true renew /srv/ks --all-expiring 30d",
         "/bin/true check keystore /srv/ks",
         f"/bin/true metrics /srv/ks -o {METRICS_FILE}",
+        f"/bin/true fleet status /srv/ks --prometheus -o {FLEET_FILE}",
     }
     renew = files["sros-renew.service"]
     assert ("LoadCredential=ca-passphrase:/etc/sros/passphrase\n" in renew) == bool(passphrase)
