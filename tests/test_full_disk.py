@@ -23,7 +23,6 @@ VERBS = (
     "create_keystore new",
     "create_enclave ks /c",
     "create_permission ks /b policy.xml",
-    "generate_artifacts -k ks -p policy.xml",
     "generate_artifacts -k ks -p new.xml",
     "generate_artifacts -k new -p new.xml",
     "renew ks /a --revoke-old",
