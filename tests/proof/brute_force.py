@@ -50,6 +50,7 @@ def topics() -> list[str]:
 
 
 TOPICS = topics()
+SHORT = frozenset(TOPICS)
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,8 @@ def breaches(requirement: Requirement, world: Finite) -> Iterator[tuple[str, ...
             for right, patterns in requirement.rights:
                 for name in WITH_PARTS:
                     needed = dds_names(right, name)
+                    if not SHORT.issuperset((*needed.publish, *needed.subscribe)):
+                        continue  # an action whose topics are too long to be tried
                     able = all(world.may(enclave, True, each) for each in needed.publish) and all(
                         world.may(enclave, False, each) for each in needed.subscribe
                     )
