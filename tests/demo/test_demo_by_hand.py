@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -9,6 +14,7 @@ import pytest
 from sros_tool.demo.by_hand import HandNode, security_of
 from sros_tool.demo.scenarios.model import Role
 from sros_tool.errors import SrosError, UsageError
+from tests.support.children import PATIENCE
 from tests.support.harness import sros
 
 TALKER = HandNode(Role.TALKER, "cyclone", "/chatter")
@@ -52,3 +58,26 @@ def test_a_hostile_topic_is_refused_before_a_node_starts() -> None:
     ended = sros("demo", "listener", "--topic", "/a\x1b[2J b")
     assert ended.status == 2
     assert "\x1b" not in ended.err
+
+
+@pytest.mark.zenoh
+def test_a_node_on_zenoh_ends_at_once_while_it_waits_for_a_router() -> None:
+    pytest.importorskip("zenoh")
+    program = [sys.executable, "-P", "-m", "sros_tool.demo.nodes.zenoh", "listener"]
+    variables = {**os.environ, "ZENOH_CONFIG_OVERRIDE": 'connect/endpoints=["tcp/127.0.0.1:1"]'}
+    with subprocess.Popen([*program, "--patience", "1000000"], env=variables) as node:
+        status, end = Path(f"/proc/{node.pid}/status"), time.monotonic() + PATIENCE
+        while not _catches(status.read_text("ascii"), signal.SIGTERM):
+            assert node.poll() is None and time.monotonic() < end
+            time.sleep(0.02)
+        node.terminate()
+        try:
+            assert node.wait(PATIENCE) == 0
+        finally:
+            node.kill()
+
+
+def _catches(status: str, number: signal.Signals) -> bool:
+    """Return whether a process catches a signal, by its status in /proc."""
+    line = next(each for each in status.splitlines() if each.startswith("SigCgt:"))
+    return bool(int(line.split()[1], 16) >> (number - 1) & 1)

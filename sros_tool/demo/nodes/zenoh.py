@@ -432,8 +432,8 @@ class _RefusedError(Exception):
     """No connection, although the port is open."""
 
 
-def _open(config: zenoh.Config, patience: float) -> zenoh.Session:
-    """Open a session, and wait until it is connected to its router.
+def _open(config: zenoh.Config, patience: float, stop: threading.Event) -> zenoh.Session | None:
+    """Open a session, and wait until it is connected to its router; return None if stopped before.
 
     Raises:
         _RefusedError: that took longer than ``patience`` seconds, and the router's port is open.
@@ -452,7 +452,8 @@ def _open(config: zenoh.Config, patience: float) -> zenoh.Session:
             reason = str(error).partition(" at /")[0]
         if time.monotonic() >= latest:
             break
-        time.sleep(_POLL_SECONDS)
+        if stop.wait(_POLL_SECONDS):
+            return None
     endpoint = json.loads(config.get_json("connect/endpoints"))[0]
     if _is_open(endpoint):
         raise _RefusedError(f"{reason} to {endpoint} within {patience:g} s, whose port is open")
@@ -492,7 +493,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.role == _FLOODER:
             _flood(json.loads(config.get_json("connect/endpoints"))[0], events, stop)
             return 0
-        session = _open(config, options.patience)
+        session = _open(config, options.patience, stop)
+        if session is None:
+            return 0
         stage = ProcessStage.ENDPOINT
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         name = options.role if options.role != "router" else "rmw_zenohd"
