@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import click
 
-from sros_tool.cli.program import FAMILIES, program
 from tools.steps import CHECKOUT
+from tools.verbs import families
 
 PAGE = CHECKOUT / "man" / "sros.1"
 
@@ -34,11 +34,9 @@ _END = """\
 def page() -> str:
     """Return the text of man/sros.1."""
     lines = [_BEGINNING]
-    for family, verbs in FAMILIES.items():
+    for family, verbs in families():
         lines.append(f".SH {family.upper()}\n")
-        for name in verbs:
-            command = program.get_command(click.Context(program), name)
-            assert command is not None
+        for name, command in verbs.items():
             lines += _verb(f"sros {name}", command)
     return "".join([*lines, _END])
 

@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping
 import click
 
 from sros_tool.checks.registry import KINDS
-from sros_tool.cli.program import FAMILIES, program
 from sros_tool.runtime.vendor_log import LOG_TEXTS
 from tools.steps import CHECKOUT
+from tools.verbs import families
 
 FOLDER = CHECKOUT / "docs" / "reference"
 _MADE = "<!-- made by `python -m tools.reference_pages`; do not edit -->"
@@ -48,11 +48,9 @@ def _options() -> str:
         "What `sros VERB --help` prints, of all verbs. The exit status of every verb is 0 for yes "
         "or done, 1 for no, denied, different or findings, 2 for what could not be asked or done.",
     ]
-    for family, verbs in FAMILIES.items():
+    for family, verbs in families():
         parts.append(f"## {family}")
-        for name in verbs:
-            command = program.get_command(click.Context(program), name)
-            assert command is not None
+        for name, command in verbs.items():
             parts += _verb(f"sros {name}", command)
     return _page("Verbs and options", *parts)
 

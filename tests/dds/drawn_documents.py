@@ -13,10 +13,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from random import Random
+from zoneinfo import ZoneInfo
 
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import AccessVerb, Refusal
+from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import NOW
 from tests.dds.drawn_words import (
     DOMAINS,
@@ -48,6 +51,18 @@ class Case:
     domain: int
     zone: str
     questions: tuple[Question, ...]
+
+    def access(self, vendor: Vendor) -> Access | Refusal:
+        """Return what a vendor makes of the documents."""
+        return Access.of_documents(
+            vendor,
+            self.governance_xml,
+            self.permissions_xml,
+            self.subject,
+            domain=self.domain,
+            at=NOW,
+            zone=ZoneInfo(self.zone),
+        )
 
 
 def documents(seed: int, count: int, *, now: datetime = NOW) -> Iterator[Case]:

@@ -25,15 +25,7 @@ LETTERS = st.sampled_from(["rt/a", "rt/b", "rt/*", "rt/[ab]"])
 
 
 def decisions(vendor: Vendor, case: Case) -> list[Decision]:
-    access = Access.of_documents(
-        vendor,
-        case.governance_xml,
-        case.permissions_xml,
-        case.subject,
-        domain=case.domain,
-        at=NOW,
-        zone=ZoneInfo(case.zone),
-    )
+    access = case.access(vendor)
     if isinstance(access, Refusal):
         return [access.decision() for _ in case.questions]
     return [access.decide(*question) for question in case.questions]

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from zoneinfo import ZoneInfo
 
 import pytest
 
-from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb, Refusal
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
-from tests.dds.decision_documents import NOW
 from tests.dds.drawn_documents import documents
 from tests.support.children import LONG
 
@@ -25,15 +22,7 @@ VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 def test_a_topic_is_in_the_set_if_it_is_allowed(vendor: Vendor) -> None:
     seen: Counter[bool] = Counter()
     for case in documents(11, 4000 if LONG else 250):
-        access = Access.of_documents(
-            vendor,
-            case.governance_xml,
-            case.permissions_xml,
-            case.subject,
-            domain=case.domain,
-            at=NOW,
-            zone=ZoneInfo(case.zone),
-        )
+        access = case.access(vendor)
         if isinstance(access, Refusal):
             continue
         asked = {topic for _, topic, *_ in case.questions if topic}

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from sros_tool.xml import parse
+from tests.support.checkout import CHECKOUT, known_files
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
 SECURITY = """
 from importlib.metadata import entry_points
@@ -27,20 +27,10 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A workspace with the files of this checkout that git knows, built by colcon."""
     pytest.importorskip("colcon_core")
     folder = tmp_path_factory.mktemp("workspace")
-    listed = subprocess.run(
-        ["git", "ls-files", "-z", "--", ".", ":!tests", ":!docs", ":!web"],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if listed.returncode:
-        pytest.skip("git does not know this checkout")
-    for name in listed.stdout.split("\0")[:-1]:
-        if (CHECKOUT / name).is_file():
-            place = folder / "src/sros" / name
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(CHECKOUT / name, place)
+    for name in known_files(".", ":!tests", ":!docs", ":!web"):
+        place = folder / "src/sros" / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(CHECKOUT / name, place)
     program = "from colcon_core.command import main; import sys; sys.exit(main())"
     command = [sys.executable, "-P", "-c", program, "--log-base", "log", "build"]
     environment = {**os.environ, "COLCON_HOME": str(folder / "home")}

@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 from sros_tool.cli.ros2 import SecurityCommand
+from tests.support.checkout import CHECKOUT, known_files
 from tools import release
-
-CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -88,16 +87,7 @@ def test_the_manual_page_is_in_it(unpacked: Path) -> None:
 
 
 def test_every_file_of_the_package_is_in_it(unpacked: Path) -> None:
-    listed = subprocess.run(
-        ["git", "ls-files", "sros_tool", "policies", "keystore_templates"],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if listed.returncode:
-        pytest.skip("git does not know this checkout")
-    names = [name for name in listed.stdout.split() if (CHECKOUT / name).is_file()]
+    names = known_files("sros_tool", "policies", "keystore_templates")
     assert len(names) > 100
     places = [name if name.startswith("sros_tool/") else f"sros_tool/{name}" for name in names]
     assert [name for name in places if not (unpacked / name).is_file()] == []
