@@ -1046,6 +1046,7 @@ def _policy_json(answer: Answer, policy: Path | None) -> dict[str, Any] | None:
                 "qualifier": each.qualifier.value,
                 "right": each.right,
                 "name": each.name,
+                "protection": each.group.protect.lower() if each.group.protect else None,
             }
             for each in answer.lines
         ],

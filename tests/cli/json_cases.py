@@ -287,6 +287,8 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks /a join"),
         Case("broken /b publish /x", 1),
         Case("/a publish /x --policy denied.xml", 1),
+        Case("/a publish /x --policy protected.xml"),
+        Case("/a publish /x --policy protected.xml --all-vendors"),
         Case("ks /a publish /x --all-vendors"),
         Case("ks /a publish /x --policy policy.xml --all-vendors"),
         Case("ks /a publish /nope --policy policy.xml --all-vendors", 1),
