@@ -78,14 +78,27 @@ def _read_open(path: Path, most: int) -> tuple[os.stat_result, bytes]:
 
     Without its content if it is not a regular file, as one that has just been exchanged.
     """
-    with open_at_once(path) as file:
-        state = os.fstat(file.fileno())
-        return state, file.read(most + 1) if stat.S_ISREG(state.st_mode) else b""
+    handle = _handle_at_once(path)
+    try:
+        state = os.fstat(handle)
+        if not stat.S_ISREG(state.st_mode):
+            return state, b""
+        parts, left = [], most + 1
+        while left and (part := os.read(handle, min(left, max(state.st_size + 1, 4096)))):
+            parts.append(part)
+            left -= len(part)
+        return state, b"".join(parts)
+    finally:
+        os.close(handle)
 
 
 def open_at_once(path: Path) -> BinaryIO:
     """Return a file open for reading; opening a pipe does not wait for its writer."""
-    return open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+    return open(_handle_at_once(path), "rb")
+
+
+def _handle_at_once(path: Path) -> int:
+    return os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
 
 
 _UTF_8 = ("UTF-8", "UTF8", "US-ASCII", "ASCII")

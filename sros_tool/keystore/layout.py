@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
+from typing import TypeAlias
 
 from sros_tool.errors import DocumentError, KeystoreError
 
@@ -234,15 +235,27 @@ def search_enclaves(root: Path) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]
 
 def _search(top: str, start: str) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
     """Return what `search_enclaves` does, of the folder ``start`` in the folder of enclaves."""
-    found: list[str] = []
     unread: list[UnreadPath] = []
-    for folder, files in _walk(start, unread):
-        if any(file in files for file in _OF_ENCLAVE):
-            found.append(folder[len(top) :].replace(os.sep, "/") or "/")
-    return tuple(sorted(found)), tuple(unread)
+    found = _names_in(top, _walk(start, unread))
+    return found, tuple(unread)
 
 
-def _walk(top: str, unread: list[UnreadPath]) -> Iterator[tuple[str, list[str]]]:
+_Walked: TypeAlias = tuple[str, list[str]]
+"""A folder, and the names of the files in it."""
+
+
+def _names_in(top: str, folders: Iterable[_Walked]) -> tuple[str, ...]:
+    """Return the sorted names of the enclaves among folders in the folder of enclaves ``top``."""
+    return tuple(
+        sorted(
+            folder[len(top) :].replace(os.sep, "/") or "/"
+            for folder, files in folders
+            if any(file in files for file in _OF_ENCLAVE)
+        )
+    )
+
+
+def _walk(top: str, unread: list[UnreadPath]) -> Iterator[_Walked]:
     """Yield each folder that can hold an enclave, with its files; add the others to ``unread``."""
     pending = [top]
     while pending:
@@ -315,18 +328,31 @@ def has_zenoh_files(root: Path) -> bool:
     )
 
 
-def check_readable(root: Path, names: Sequence[str] | None = None) -> None:
-    """Raise `KeystoreError` if this user cannot read every file of every enclave, or of ``names``.
+def readable_enclaves(root: Path) -> tuple[str, ...]:
+    """Return the sorted names of the enclaves, for a verb that writes.
 
-    A verb that writes would otherwise leave an enclave behind, such as with a replaced CA.
+    Raises:
+        KeystoreError: this user cannot read every file of all enclaves, so one would be left
+            behind, such as with a replaced CA.
     """
+    top = os.fspath(root / ENCLAVES)
     unread: list[UnreadPath] = []
-    tops = [root / ENCLAVES] if names is None else [enclave_path(root, name) for name in names]
-    walks = (_walk(os.fspath(top), unread) for top in tops)
+    folders = list(_walk(top, unread))
+    _refuse_unreadable(root, folders, unread)
+    return _names_in(top, folders)
+
+
+def check_readable(root: Path, names: Sequence[str]) -> None:
+    """Raise `KeystoreError` if this user cannot read every file of the enclaves ``names``."""
+    unread: list[UnreadPath] = []
+    walks = (_walk(os.fspath(enclave_path(root, name)), unread) for name in names)
     # The first folder of a walk is that of the enclave itself.
-    for folder, files in chain.from_iterable(
-        walk if names is None else islice(walk, 1) for walk in walks
-    ):
+    folders = list(chain.from_iterable(islice(walk, 1) for walk in walks))
+    _refuse_unreadable(root, folders, unread)
+
+
+def _refuse_unreadable(root: Path, folders: Iterable[_Walked], unread: list[UnreadPath]) -> None:
+    for folder, files in folders:
         for name in files:
             path = f"{folder}/{name}"
             if name.endswith(_FILE_TYPES) and not os.access(path, os.R_OK):

@@ -15,7 +15,6 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import Note
 from sros_tool.keystore.authorities.authority import Authority
-from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh.wanted import (
@@ -78,7 +77,8 @@ def keep_zenoh(
     if network is None:
         return KeptZenoh()
     root = transaction.root
-    wanted = zenoh_documents(root, network, domains, authority, now, change)
+    existing = transaction.enclaves
+    wanted = zenoh_documents(root, network, domains, authority, now, change, existing=existing)
     drifts = drifted(root, wanted, authority, change.gone)
     for each in drifts:
         if each.kind is Drift.STALE:
@@ -127,7 +127,7 @@ def _stage(
 
 def remove_zenoh(transaction: Transaction) -> tuple[str, ...]:
     """Stage the removal of all configurations of a keystore; return their enclaves."""
-    stale = list(stale_files(transaction.root, (), enclave_names(transaction.root)))
+    stale = list(stale_files(transaction.root, (), transaction.enclaves))
     for each in stale:
         _remove(transaction, each.path)
     return tuple(dict.fromkeys(each.enclave for each in stale))

@@ -486,7 +486,7 @@ def open_to_issue(
         fleet, entries = write_fleet(transaction, fleet, patterns, now)
         refuse_stale_domains(root, EnclaveDomains(domains, before), fleet, stated)
         notes = (*notes, *(left_enclaves(root, before, fleet) if before else ()))
-    names = enclave_names(root)
+    names = transaction.enclaves
     governed = Governed(template)
     if protections:
         governed = protected_as_stated(

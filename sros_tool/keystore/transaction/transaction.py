@@ -32,8 +32,8 @@ from sros_tool.keystore.layout import (
     RETIRED,
     REVOKED,
     STAGE,
-    check_readable,
     folder_mode,
+    readable_enclaves,
 )
 from sros_tool.keystore.transaction.lock import KeystoreLock, lock_new
 from sros_tool.keystore.transaction.recovery import complete, recover
@@ -66,12 +66,13 @@ class Transaction:
 
     Use it as a context manager; without `commit` nothing changes.  With ``fresh``, the keystore may
     be new; otherwise it must exist.  With ``dry_run`` nothing is written, and ``changes`` lists the
-    changes that would be made.
+    changes that would be made.  ``enclaves`` are the names of those before the change, sorted.
     """
 
     def __init__(self, root: Path, *, fresh: bool = False, dry_run: bool = False) -> None:
         self.root = root
         self.changes = Changes()
+        self.enclaves: tuple[str, ...] = ()
         self.dry_run = dry_run
         self._fresh = fresh
         self._new_root = fresh and not root.exists()
@@ -115,7 +116,7 @@ class Transaction:
             if self._fresh and not self._new_root:
                 self._refuse_folder_of_stranger()
             if self.dry_run:
-                check_readable(self.root)
+                self.enclaves = readable_enclaves(self.root)
             else:
                 self._begin()
         except BaseException:
@@ -138,7 +139,7 @@ class Transaction:
         self._lock = KeystoreLock(self._in)
         self._lock.acquire()
         recover(self._in)
-        check_readable(self.root)
+        self.enclaves = readable_enclaves(self.root)
         for path in (STAGE, f"{STAGE}/{ADDED}", f"{STAGE}/{AFTER}"):
             self._in.mkdir(path, 0o700)
         _LOG.info("began a transaction in the keystore '%s'", self.root)

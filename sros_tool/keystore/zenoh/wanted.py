@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -178,13 +179,16 @@ def zenoh_documents(
     authority: x509.Certificate,
     now: datetime | None,
     change: ZenohChange = NO_CHANGE,
+    *,
+    existing: tuple[str, ...] | None = None,
 ) -> ZenohDocuments:
     """Return the configurations that the enclaves of a keystore need; arguments as `keep_zenoh`.
 
-    Without ``now``, permissions that have expired count, too.
+    Without ``now``, permissions that have expired count, too.  ``existing`` are the enclaves of
+    the keystore, which are looked for if they are not given.
     """
     of_network = _domains(network, domains, root)
-    existing = enclave_names(root)
+    existing = enclave_names(root) if existing is None else existing
     names = sorted({*existing, *change.issued}.difference(change.gone))
     if network.router not in names:
         raise KeystoreError(
@@ -445,6 +449,8 @@ def _examples(name: str) -> Iterable[str]:
 
 
 def _present(path: Path) -> bytes | None:
+    if not os.path.lexists(path):
+        return None
     try:
         return read_bytes(path, "Zenoh configuration")
     except SrosError:
