@@ -3,17 +3,19 @@
 The source folder is the project's, so that a link holds in the checkout and on the site.
 """
 
+import sys
 import tomllib
 from pathlib import Path
 
 _PROJECT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(_PROJECT))  # autodoc imports sros_tool, which may not be installed
 
 project = "sros"
 author = "the sros developers"
 release = tomllib.loads((_PROJECT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
 version = release
 
-extensions = ["myst_parser"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
 include_patterns = [
     "*.md",
@@ -26,6 +28,10 @@ exclude_patterns = [".*", "web", "tests", "benchmarks", "build", "dist"]
 
 myst_heading_anchors = 4
 nitpicky = True
+nitpick_ignore_regex = [("py:.*", ".*")]  # types in signatures, of which most are not on the site
+default_role = "code"  # `name` in docstrings
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
 suppress_warnings = ["misc.highlighting_failure"]  # elided XML and JSON in examples
 
 html_theme = "furo"

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from pathlib import Path
 
 import pytest
 
+from sros_tool.keystore.template import load_template, parse_template, settings_values, with_values
 from tests.support.children import python
 from tests.support.pages import PROJECT, PageError, alike, blocks, fits, outcome_of
 from tools import man_page
 from tools.reference_pages import FOLDER, pages
+from tools.template_keys import KEYS, template_text
 
 PAGES = sorted(
     path.relative_to(PROJECT)
@@ -48,6 +51,20 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
 def test_the_reference_is_made_from_the_program() -> None:
     for name, text in pages().items():
         assert (FOLDER / name).read_text("utf-8") == text, "run `python -m tools.reference_pages`"
+
+
+def test_the_page_of_templates_has_the_keys_and_values_of_the_program() -> None:
+    written = settings_values(parse_template(template_text(), ""))
+    known = {key.path for key in KEYS}
+    for table in ("enclaves", "protection.topic"):  # the program writes their names into the key
+        known.remove(f"{table}.names")
+    assert known == {re.sub(r" [^ ]+\.", ".", each) for each in written}
+    template = load_template("production")
+    for key in KEYS:
+        if key.table in ("[authorities]", "[permissions]", "[protection]", "[protection.default]"):
+            for value in key.values if not isinstance(key.values, str) else ():
+                if key.name != "allow_unauthenticated_participants":
+                    assert with_values(template, [(key.path, value)])
 
 
 def test_the_manual_page_is_made_from_the_program() -> None:

@@ -1,4 +1,4 @@
-"""Write docs/reference/: pages made from the program, on options, findings and texts in logs.
+"""Write docs/reference/: pages made from the program, on options, findings, texts and templates.
 
 `python -m tools.reference_pages` writes them; tests/test_pages.py compares them with the program.
 """
@@ -11,8 +11,11 @@ from collections.abc import Iterator, Mapping
 import click
 
 from sros_tool.checks.registry import KINDS
+from sros_tool.keystore.template import load_template, settings_values, template_names
+from sros_tool.policy.protection import Level
 from sros_tool.runtime.vendor_log import LOG_TEXTS
 from tools.steps import CHECKOUT
+from tools.template_keys import ABOUT, KEYS, Key, without
 from tools.verbs import families
 
 FOLDER = CHECKOUT / "docs" / "reference"
@@ -21,7 +24,12 @@ _MADE = "<!-- made by `python -m tools.reference_pages`; do not edit -->"
 
 def pages() -> Mapping[str, str]:
     """Return the text of each page by its file name."""
-    return {"options.md": _options(), "findings.md": _findings(), "log_texts.md": _log_texts()}
+    return {
+        "options.md": _options(),
+        "findings.md": _findings(),
+        "log_texts.md": _log_texts(),
+        "template.md": _template(),
+    }
 
 
 def _page(title: str, *parts: str) -> str:
@@ -115,6 +123,55 @@ def _log_texts() -> str:
     for vendor, rows in by_vendor.items():
         parts += [f"## {vendor}", _table("text", "meaning", "what to do", rows=iter(rows))]
     return _page("Texts in logs, by vendor", *parts)
+
+
+# ── templates ──────────────────────────────────────────────────────────────────────────────
+
+
+def _template() -> str:
+    parts = [
+        "A keystore template is a TOML file with these keys; `sros create_keystore keystore "
+        "--template FILE` takes it. The keystore keeps them in its `sros.toml`, and `sros "
+        "update_keystore keystore --set protection.rtps=ENCRYPT` changes one later. A key that is "
+        "not known is refused. [Keystores](../keystores.md#templates) says which of the templates "
+        "that ship with sros is for what.",
+        "A *validity* is a duration that counts from the creation (`90d`; also `s`, `m`, `h`, `w` "
+        "and `y`, which is 365 days), an expiry (`2027-06-01`), or both ends "
+        "(`2026-12-01/2027-06-01`, `2026-12-01/90d`).",
+        "The *levels* are `NONE`; `SIGN`, against change; `ENCRYPT`, also against reading; and "
+        "both with `_WITH_ORIGIN_AUTHENTICATION`, which also proves which writer a message came "
+        "from.",
+    ]
+    for table in dict.fromkeys(key.table for key in KEYS):
+        parts.append(f"## `{table}`" if table else "## At the top of the file")
+        if table in ABOUT:
+            parts.append(ABOUT[table])
+        rows = (
+            (f"`{key.name}`", _values(key), without(key), key.meaning)
+            for key in KEYS
+            if key.table == table
+        )
+        parts.append(_table("key", "value", "without it", "meaning", rows=rows))
+    parts += ["## The templates that ship with sros", _shipped_templates()]
+    return _page("Keys of keystore templates", *parts)
+
+
+def _values(key: Key) -> str:
+    if isinstance(key.values, str):
+        return key.values
+    return "a level" if key.values == tuple(Level) else " or ".join(f"`{v}`" for v in key.values)
+
+
+def _shipped_templates() -> str:
+    names = template_names()
+    values = [settings_values(load_template(name)) for name in names]
+    paths = dict.fromkeys(path for each in values for path in each)
+    rows = (
+        (f"`{path}`", *(each.get(path, "") for each in values))
+        for path in paths
+        if path not in ("name", "description")
+    )
+    return _table("key", *(f"`{name}`" for name in names), rows=rows)
 
 
 if __name__ == "__main__":
