@@ -16,7 +16,6 @@ from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import (
     ENCRYPTED,
     ConfigurationDocument,
-    ZenohEndpoint,
     parse_configuration,
 )
 from sros_tool.zenoh.enforcement import PROPERTIES, AclRule, AclSubject, Enforcement
@@ -273,13 +272,13 @@ def _links(document: ConfigurationDocument) -> Iterator[Finding]:
         text = f"the protocols are {_listed(document)}"
         yield _at(document, PROTOCOLS_OPEN, f"{_LINK}/protocols", text)
     for each in document.listen:
-        if each.is_encrypted() and not _option(each, "enable_mtls", document.tls.mutual):
+        if each.is_encrypted() and not each.option("enable_mtls", document.tls.mutual):
             text = f"it listens at {each.text}, and enable_mtls is off"
             yield _at(document, NO_MUTUAL_TLS, f"{_TLS}/enable_mtls", text)
     yield from _names(document)
     closing = "close_link_on_expiration"
     for each in (each for _, endpoints in both for each in endpoints if each.is_encrypted()):
-        if not _option(each, closing, document.tls.closes_on_expiration):
+        if not each.option(closing, document.tls.closes_on_expiration):
             text = f"{closing} is off for {each.text}"
             yield _at(document, EXPIRED_STAYS, f"{_TLS}/{closing}", text)
             break
@@ -291,18 +290,12 @@ def _names(document: ConfigurationDocument) -> Iterator[Finding]:
         each
         for each in document.connect
         if each.is_encrypted()
-        and not _option(each, "verify_name_on_connect", document.tls.verifies_name)
+        and not each.option("verify_name_on_connect", document.tls.verifies_name)
     ]
     access = document.access
     if unverified and (not access.enabled or access.allows_by_default or _of_everybody(document)):
         text = f"verify_name_on_connect is off for {unverified[0].text}"
         yield _at(document, NAME_NOT_VERIFIED, f"{_TLS}/verify_name_on_connect", text)
-
-
-def _option(endpoint: ZenohEndpoint, name: str, otherwise: bool) -> bool:
-    """Return an option of TLS: an endpoint's own one counts in place of the section's."""
-    own = endpoint.options.get(name)
-    return otherwise if own is None else own == "true"
 
 
 def _listed(document: ConfigurationDocument) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 from lxml import etree
@@ -101,6 +101,27 @@ class DomainSet:
             first = 0 if part.first is None else part.first
             pairs.append((first, first if part.last is None else part.last))
         return DomainSet.of(*pairs)
+
+    @classmethod
+    def one_of_each_kind(
+        cls, listed: Collection[DomainSet], others: Iterable[DomainSet]
+    ) -> tuple[int, ...]:
+        """Return domains of which each is in other sets than the ones before it, sorted.
+
+        Only those in a ``listed`` set are returned, unless an end is open: vendors differ in which
+        domains these are.
+        """
+        sets = dict.fromkeys((*listed, *others))
+        borders = {0}
+        for part in (part for each in sets for part in each.ranges):
+            borders |= {
+                end + more for end in (part.first, part.last) if end is not None for more in (0, 1)
+            }
+        if any(part.first is None or part.last is None for each in sets for part in each.ranges):
+            return tuple(sorted(borders))
+        known = [each for each in sorted(borders) if any(each in one for one in listed)]
+        kinds = {tuple(each in one for one in sets): each for each in reversed(known)}
+        return tuple(sorted(kinds.values()))
 
     def only(self) -> int | None:
         """Return the domain, if the set has just one, else None."""

@@ -43,6 +43,7 @@ from sros_tool.translate_zenoh_back import rights_in_rules
 from sros_tool.xml import parse, read_bytes
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import parse_configuration
+from sros_tool.zenoh.enforcement import Enforcement
 
 _COMMON_NAME = re.compile(r"(?:^|[,/])\s*CN\s*=\s*(/[^,]*?)\s*(?:,|$)")
 
@@ -56,7 +57,8 @@ class RightsSource:
     part of it: a signature that does not verify, or permissions that are missing or malformed.
     ``fleet`` knows which enclave is whose, if the file or folder is for one.  ``protections`` are
     what a policy says about the protection of names; None for anything else.  ``documents`` are the
-    permissions of enclaves, as far as there are any.
+    permissions of enclaves, as far as there are any, and ``enforcers`` the access control of each
+    Zenoh process that checks others; ``router`` is the enclave of a keystore's router, or "".
     """
 
     path: Path
@@ -68,6 +70,8 @@ class RightsSource:
     fleet: Fleet | None = None
     protections: tuple[StatedProtection, ...] | None = None
     documents: Mapping[str, Permissions] = field(default_factory=dict)
+    enforcers: tuple[Enforcement, ...] = ()
+    router: str = ""
 
 
 def load_rights(path: Path, fleet: Fleet | None = None) -> RightsSource:
@@ -110,7 +114,7 @@ def load_zenoh_rights(root: Path) -> RightsSource:
     Those are of the router, and of peers, which are connected without it.
 
     Raises:
-        KeystoreError: there is no configuration of a router.
+        KeystoreError: there is no configuration of a router, or there are several.
         DocumentError: Zenoh would not accept a configuration.
     """
     files = {name: enclave_path(root, name) for name in enclave_names(root)}
@@ -121,6 +125,13 @@ def load_zenoh_rights(root: Path) -> RightsSource:
             "Without it, it is not known what Zenoh enforces.",
             f"Write it: `sros zenoh {quote(str(root))}`.",
         )
+    if len(routers) > 1:
+        raise KeystoreError(
+            f"keystore '{root}' has the files of several routers",
+            f"{ROUTER_FILE} is in {', '.join(routers[:5])}, and it is not known which one routes.",
+            "Remove those that no process uses, or write all files again: "
+            f"`sros zenoh {quote(str(root))}`.",
+        )
     found = [load_rights(files[name] / ROUTER_FILE) for name in routers]
     for name, folder in files.items():
         file = folder / SESSION_FILE
@@ -128,7 +139,7 @@ def load_zenoh_rights(root: Path) -> RightsSource:
             data = read_bytes(file, "Zenoh configuration")
             document = parse_configuration(data, str(file), lines=False)
             if document.mode is not Mode.PEER:
-                break  # those of a keystore have one mode, and clients are filtered by the router
+                continue  # clients are filtered by the router
             found.append(_zenoh_rights(file, data))
     return RightsSource(
         root,
@@ -137,6 +148,8 @@ def load_zenoh_rights(root: Path) -> RightsSource:
         None,
         True,
         tuple(dict.fromkeys(note for one in found for note in one.notes)),
+        enforcers=tuple(each for one in found for each in one.enforcers),
+        router=routers[0],
     )
 
 
@@ -146,7 +159,8 @@ def is_zenoh(data: bytes) -> bool:
 
 
 def _zenoh_rights(path: Path, data: bytes) -> RightsSource:
-    access = parse_configuration(data, str(path), lines=False).access
+    document = parse_configuration(data, str(path), lines=False)
+    access = document.access
     found = rights_in_rules(access)
     notes = []
     if not access.enabled or access.allows_by_default:
@@ -157,11 +171,27 @@ def _zenoh_rights(path: Path, data: bytes) -> RightsSource:
     if any(each.cert_common_names is None for each in access.subjects):
         text = "it has rules for processes without a name, which are no enclaves: they are left out"
         notes.append(Note("rights.zenoh-nameless", f"{path}: {text}; `sros check` shows them."))
+    if unclear := document.open_link():
+        text = f"{path}: {unclear}: whoever connects there has no name that a rule could ask for."
+        notes.append(Note("rights.zenoh-strangers", text))
+    if unclear := access.unclear():
+        notes.append(Note("rights.zenoh-conditions", f"{path}: {unclear}."))
+    if document.namespace:
+        text = f"{path}: it puts a namespace before the keys, which is not taken into account here."
+        notes.append(Note("rights.zenoh-namespace", text))
     if found.left_out:
         text = f"{path}: {len(found.left_out)} key expressions are no names of ROS, and left out, "
         text += f"such as {found.left_out[0][:80]}."
         notes.append(Note("rights.zenoh-no-name", text))
-    return RightsSource(path, "zenoh", found.rights, found.enclaves, True, tuple(notes))
+    return RightsSource(
+        path,
+        "zenoh",
+        found.rights,
+        found.enclaves,
+        True,
+        tuple(notes),
+        enforcers=(access,),
+    )
 
 
 def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:

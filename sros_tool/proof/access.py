@@ -6,9 +6,11 @@ that all worlds speak of the same names.
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import lru_cache
+from itertools import count
 
 from sros_tool.automata import NameSet
 from sros_tool.dds.decision.access import Access
@@ -19,6 +21,7 @@ from sros_tool.proof.worlds import TopicAccess, named, valid_topics
 from sros_tool.translate import SERVICE_ENDS
 from sros_tool.translate_zenoh import StatedRight
 from sros_tool.zenoh.access import Flow, Message
+from sros_tool.zenoh.enforcement import Enforcement, Remote
 from sros_tool.zenoh.key_expressions import names_of
 
 _IN, _OUT = Flow.INGRESS, Flow.EGRESS
@@ -62,26 +65,67 @@ def ros_access(stated: Iterable[StatedRight]) -> TopicAccess:
     return TopicAccess(side(True), side(False))
 
 
-KeysAs = Callable[[Iterable[str]], NameSet]
-"""Function that returns the topics for which key expressions stand."""
+def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int) -> TopicAccess:
+    """Return the topics that stand for the keys that an enclave may write and read on Zenoh.
 
-
-def zenoh_access(passing: Callable[[Flow, Message, KeysAs], NameSet], domain: int) -> TopicAccess:
-    """Return the topics that stand for the keys that an enclave may write and read.
-
-    ``passing`` returns the keys of messages that pass, with the function that it is given.
+    ``enforcers`` are the access control of the processes it has links to: each one passes on alone.
     """
+    remote = Remote(enclave)
 
-    def topics(writes: bool, begin: str) -> NameSet:
+    def topics(enforcer: Enforcement, writes: bool, begin: str) -> NameSet:
         def of(keys: Iterable[str]) -> NameSet:
             return NameSet.union(_topics(each, domain, begin) for each in keys)
 
-        first, *others = (passing(*each, of) for each in _USES[writes, begin])
+        first, *others = (enforcer.passing(remote, *each, of) for each in _USES[writes, begin])
         for other in others:
             first &= other
         return first & named(f"{begin}/*{_ENDS[begin]}")
 
-    return TopicAccess(*(NameSet.union(topics(w, each) for each in _ENDS) for w in (True, False)))
+    every = tuple(enforcers)
+    return TopicAccess(
+        *(
+            NameSet.union(topics(each, writes, begin) for each in every for begin in _ENDS)
+            for writes in (True, False)
+        )
+    )
+
+
+def is_enforced(
+    enforcers: Iterable[Enforcement], enclave: str, domain: int, topic: str, *, writes: bool
+) -> bool:
+    """Return whether an enforcer lets an enclave write or read a topic, as `decide` of it says."""
+    messages = zenoh_message(topic, domain, writes=writes)
+    remote = Remote(enclave)
+    return bool(messages) and any(
+        all(enforcer.decide(remote, *each).allowed for each in messages) for enforcer in enforcers
+    )
+
+
+def domains_of(enforcers: Iterable[Enforcement]) -> tuple[int, ...]:
+    """Return the ROS domains of the keys in rules: of those with the same rules the first one.
+
+    Where keys have a wildcard in place of the domain, one is added that no key names.
+    """
+    rules: dict[int, set[object]] = {}
+    wild = False
+    for number, enforcer in enumerate(enforcers):
+        subjects: dict[str, list[str]] = defaultdict(list)
+        for policy in enforcer.policies:
+            for each in policy.rules:
+                subjects[each] += policy.subjects
+        for rule in enforcer.rules:
+            what = number, frozenset(subjects[rule.id]), rule.allows, rule.flows, rule.messages
+            for key in rule.key_expressions:
+                begin, _, rest = key.partition("/")
+                wild |= "*" in begin
+                if _DOMAIN.match(begin):
+                    rules.setdefault(int(begin), set()).add((*what, rest))
+    kinds = {frozenset(rules[each]): each for each in sorted(rules, reverse=True)}
+    other = next(each for each in count() if each not in rules)
+    return tuple(sorted({*kinds.values(), *([other] if wild else [])}))
+
+
+_DOMAIN = re.compile(r"(?:0|[1-9][0-9]{0,8})\Z", re.ASCII)
 
 
 @lru_cache(maxsize=65536)

@@ -114,6 +114,8 @@ def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
     if isinstance(requirement, Protected):
         return
     may = not isinstance(requirement, Must)
+    if not may and any(each.enclave in world.idle for each in witness.uses):
+        return
     for use in witness.uses:
         if world.confirm(use.enclave, use.writes, use.topic) is not may:
             raise AssertionError(f"{world.title} decides otherwise on {use}, for {requirement}")
@@ -204,7 +206,9 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
     for right, names in requirement.rights:
         for name in names:
             for part in _parts_of(right):
-                own = world.side(part.writes).of.get(enclave, NameSet())
+                own = NameSet()
+                if enclave not in world.idle:
+                    own = world.side(part.writes).of.get(enclave, own)
                 topics = part.topics(name)
                 # Of a wildcard, only names that a node can have are asked for.
                 topic = (topics.valid() - own).example(limit, longest=world.longest)

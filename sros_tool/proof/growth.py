@@ -18,6 +18,7 @@ from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import matches, names_of
 from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError
@@ -28,6 +29,7 @@ from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import Right
 from sros_tool.policy.stated import StatedProtection
+from sros_tool.proof.access import domains_of, enforced_access, is_enforced
 from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource
 from sros_tool.proof.worlds import named, valid_topics
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
@@ -155,10 +157,8 @@ def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
             longest = vendor.traits.longest_topic_name
             found.append(_World(vendor.title, vendor.traits.style, domains, by_side, longest))
     if base.zenoh is not None or head.zenoh is not None:
-        sides = {
-            id(each): each.rights if each.zenoh is None else each.zenoh for each in (base, head)
-        }
-        found.append(_World(_ZENOH, Style.FNMATCH, (0,), _of_rights(sides)))
+        domains = domains_of((*base.enforcers, *head.enforcers)) or (0,)
+        found.append(_World(_ZENOH, Style.FNMATCH, domains, _on_zenoh(base, head)))
     return found
 
 
@@ -173,21 +173,15 @@ def _domains(
     base: AccessSource, head: AccessSource, governances: Iterable[Governance]
 ) -> tuple[int, ...]:
     """Return one domain of each kind: between two of them, all have the same rules as the first."""
-    sets = {rule.domains for each in governances for rule in each.domain_access_rules}
-    listed = sets.copy()
-    for side in (base, head):
-        for each in side.permissions.values():
-            sets.update(rule.domains for grant in each.grants for rule in grant.rules)
-    borders = {0}
-    for part in (part for each in sets for part in each.ranges):
-        borders |= {
-            end + more for end in (part.first, part.last) if end is not None for more in (0, 1)
-        }
-    if any(part.first is None or part.last is None for each in sets for part in each.ranges):
-        return tuple(sorted(borders))  # vendors differ in which domains these are
-    known = [each for each in sorted(borders) if any(each in one for one in listed)]
-    kinds = {tuple(each in one for one in sets): each for each in reversed(known)}
-    return tuple(sorted(kinds.values()))
+    listed = {rule.domains for each in governances for rule in each.domain_access_rules}
+    granted = {
+        rule.domains
+        for side in (base, head)
+        for each in side.permissions.values()
+        for grant in each.grants
+        for rule in grant.rules
+    }
+    return DomainSet.one_of_each_kind(listed, granted)
 
 
 def _of_vendor(
@@ -210,6 +204,29 @@ def _of_vendor(
             lambda verb, topic: found.decide(verb, topic).outcome.ok,
             found.join().outcome.ok,
         )
+
+    return access
+
+
+def _on_zenoh(*sides: AccessSource) -> Callable[[AccessSource, str, int], _Access]:
+    """Return the access that rules of Zenoh give, or for a side without them its rights."""
+    stated = _of_rights({id(each): each.rights for each in sides if each.zenoh is None})
+
+    def access(side: AccessSource, enclave: str, domain: int) -> _Access:
+        if side.zenoh is None:
+            return stated(side, enclave, domain)
+        if enclave == side.router:
+            return _NO_ACCESS
+        found = enforced_access(side.enforcers, enclave, domain)
+
+        def decide(verb: AccessVerb, topic: str) -> bool:
+            writes = verb is AccessVerb.PUBLISH
+            return is_enforced(side.enforcers, enclave, domain, topic, writes=writes)
+
+        writes, reads = (each & _ROS_TOPICS for each in (found.writes, found.reads))
+        topics = {AccessVerb.PUBLISH: writes, AccessVerb.SUBSCRIBE: reads}
+        joins = any(enclave in each.names() for each in side.enforcers)
+        return _Access(topics, decide, joins=joins)
 
     return access
 
@@ -242,7 +259,8 @@ def _of_rights(
             return any_of(allowed[verb]) and not any_of(denied[verb])
 
         def topics(verb: AccessVerb) -> NameSet:
-            return names_of(Style.FNMATCH, allowed[verb]) - names_of(Style.FNMATCH, denied[verb])
+            given = names_of(Style.FNMATCH, allowed[verb]) - names_of(Style.FNMATCH, denied[verb])
+            return given & _ROS_TOPICS
 
         return _Access({verb: topics(verb) for verb in _VERBS}, decide, joins=bool(own))
 
@@ -305,9 +323,10 @@ def _each_gain(
 ) -> Iterator[Gain]:
     stated = _Stated(old, new)
     names = set(new.permissions) | {each.enclave for each in new.rights}
+    names.update(*(each.names() for each in new.enforcers))
     for enclave in sorted(names if scope is None else names.intersection(scope)):
         for world in worlds:
-            if world.title != _ZENOH and _same(old, new, enclave):
+            if _same(old, new, enclave, world):
                 continue
             for domain in world.domains:
                 before, after = (world.access(side, enclave, domain) for side in (old, new))
@@ -327,8 +346,10 @@ def _each_gain(
                     )
 
 
-def _same(old: AccessSource, new: AccessSource, enclave: str) -> bool:
+def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> bool:
     """Return whether an enclave certainly has the same access on both sides."""
+    if world.title == _ZENOH:
+        return None not in (old.zenoh, new.zenoh) and old.enforcers == new.enforcers
     if old.governance and new.governance and old.governance != new.governance:
         return False
     one, other = old.permissions.get(enclave), new.permissions.get(enclave)
@@ -516,6 +537,20 @@ def _loosened(old: AccessSource, new: AccessSource, limit: SearchLimit) -> Itera
     """Yield what is protected less in ``new`` than in ``old``."""
     if old.governance and new.governance:
         yield from _looser_governance(old.governance, new.governance, limit)
+    if old.authorities is not None and new.authorities is not None:
+        for role, each in sorted(new.authorities - old.authorities):
+            yield SettingChange(
+                Effect.LOOSER,
+                f"{role} CA {each[:16]}...",
+                "unknown",
+                "trusted",
+                "whoever has its key can become any enclave"
+                if role == "identity"
+                else "whoever has its key can give any right",
+            )
+    if old.router and new.router and old.router != new.router:
+        text = "whoever plays the router reads and changes all that passes"
+        yield SettingChange(Effect.LOOSER, "router of Zenoh", old.router, new.router, text)
     if old.protections and new.protections is not None:
         yield from _no_longer_stated(old.protections, new.protections, limit)
 

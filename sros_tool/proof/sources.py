@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
@@ -15,7 +16,12 @@ from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
+    GOVERNANCE_P7S,
+    IDENTITY_CA_FILE,
+    PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
+    enclave_names,
+    enclave_path,
     has_zenoh_files,
     is_keystore,
     permissions_ca_for,
@@ -24,7 +30,12 @@ from sros_tool.keystore.reader import governance_of
 from sros_tool.keystore.rights import RightsSource, load_rights, load_zenoh_rights
 from sros_tool.names import expand
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import common_name, load_certificate, subject_text
+from sros_tool.pki.certificates import (
+    common_name,
+    fingerprints,
+    load_certificate,
+    subject_text,
+)
 from sros_tool.policy.document import PolicyFiles, read_policy
 from sros_tool.policy.model import Enclave, Policy, Source
 from sros_tool.policy.rights import Right, policy_rights
@@ -33,12 +44,16 @@ from sros_tool.proof.revisions import PREFIX, Revision, find_revision
 from sros_tool.translate import permissions_for
 from sros_tool.validity import iso, window
 from sros_tool.xml import parse, read_bytes
+from sros_tool.zenoh.enforcement import Enforcement
 
-_UNCERTAIN = {
+UNCERTAIN = {
     "rights.partitions",
     "rights.zenoh-open",
+    "rights.zenoh-conditions",
     "rights.zenoh-nameless",
+    "rights.zenoh-namespace",
     "rights.zenoh-no-name",
+    "rights.zenoh-strangers",
 }
 """Notes on what a comparison of rights leaves out: then it cannot say that nothing is added."""
 
@@ -49,8 +64,10 @@ class AccessSource:
 
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh"; ``shown`` is its name.
     ``permissions`` are what DDS would load for each enclave, or would if it were signed; ``rights``
-    are in ROS terms, ``zenoh`` those that rules of Zenoh give, or None without any.  ``scope`` are
-    the enclaves that it is for; None for all.  ``governance`` is None if it has none of its own.
+    are in ROS terms, ``zenoh`` those that rules of Zenoh give, or None without any; ``enforcers``
+    are these rules, ``router`` is the enclave of the router.  ``scope`` are the enclaves that it is
+    for; None for all.  ``governance`` is None if it has none of its own.  ``authorities`` are the
+    CAs that its enclaves trust, pairs of role and fingerprint; None if it does not say.
     """
 
     shown: str
@@ -58,7 +75,10 @@ class AccessSource:
     rights: frozenset[Right]
     permissions: Mapping[str, Permissions]
     zenoh: frozenset[Right] | None = None
+    enforcers: tuple[Enforcement, ...] = ()
+    router: str = ""
     governance: Governance | None = None
+    authorities: frozenset[tuple[str, str]] | None = None
     scope: frozenset[str] | None = None
     notes: tuple[Note, ...] = ()
     fleet: Fleet | None = None
@@ -102,7 +122,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
             return _of_policies(str(path), [_read(each, fleet) for each in files])
     source = load_rights(path, fleet)
     for note in source.notes:
-        if not source.sound or note.id in _UNCERTAIN:
+        if not source.sound or note.id in UNCERTAIN:
             raise DocumentError(
                 f"'{path}' cannot be compared: {note.text.rstrip('.')}",
                 "What it gives is not certain.",
@@ -114,20 +134,15 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
 
 
 def _of_source(path: Path, source: RightsSource) -> AccessSource:
-    governance: Governance | None = None
-    zenoh: frozenset[Right] | None = None
-    if source.kind == "keystore":
-        governance = governance_of(path)
-        if has_zenoh_files(path):
-            found = load_zenoh_rights(path)
-            for note in found.notes:
-                if note.id in _UNCERTAIN:
-                    raise DocumentError(f"'{path}' cannot be compared: {note.text.rstrip('.')}")
-            zenoh = found.rights
-    elif source.kind == "enclave" and (path / GOVERNANCE_FILE).exists():
-        governance = _governance(path / GOVERNANCE_FILE)
-    elif source.kind == "zenoh":
-        zenoh = source.rights
+    side = AccessSource(
+        str(path),
+        source.kind,
+        source.rights,
+        {name: _without_dates(each) for name, each in source.documents.items()},
+        scope=source.scope,
+        notes=source.notes,
+        fleet=source.fleet,
+    )
     for enclave, each in source.documents.items():
         if len(each.grants) > 1:
             raise DocumentError(
@@ -135,17 +150,57 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
                 "Vendors differ in which one of them counts.",
                 "Sign one grant for each enclave.",
             )
-    return AccessSource(
-        str(path),
-        source.kind,
-        source.rights,
-        {name: _without_dates(each) for name, each in source.documents.items()},
-        zenoh,
-        governance,
-        source.scope,
-        source.notes,
-        source.fleet,
-    )
+    if source.kind == "zenoh":
+        return replace(side, zenoh=source.rights, enforcers=source.enforcers)
+    if source.kind == "enclave":
+        has_one = (path / GOVERNANCE_FILE).exists()
+        governance = _governance(path / GOVERNANCE_FILE) if has_one else None
+        return replace(side, governance=governance, authorities=_authorities([path]))
+    if source.kind != "keystore":
+        return side
+    folders = [enclave_path(path, name) for name in enclave_names(path)]
+    side = replace(side, governance=_of_all(path, folders), authorities=_authorities(folders))
+    if not has_zenoh_files(path):
+        return side
+    found = load_zenoh_rights(path)
+    for note in found.notes:
+        if note.id in UNCERTAIN:
+            raise DocumentError(f"'{path}' cannot be compared: {note.text.rstrip('.')}")
+    return replace(side, zenoh=found.rights, enforcers=found.enforcers, router=found.router)
+
+
+def _of_all(root: Path, folders: Iterable[Path]) -> Governance:
+    """Return the governance of a keystore, after a check that each enclave loads the same one.
+
+    Raises:
+        DocumentError: an enclave has another one, such as an earlier one with less protection.
+    """
+    wanted = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document")).document
+    same: set[bytes] = set()
+    for each in folders:
+        file = each / GOVERNANCE_FILE
+        data = read_bytes(file, "governance document") if file.exists() else b""
+        if not data or data in same:
+            continue
+        if smime.parse(data).document != wanted:
+            raise DocumentError(
+                f"'{root}' cannot be compared: '{file}' is not the governance of the keystore",
+                "What the enclave and its peers protect is not certain.",
+                f"`sros check {quote(str(root))}` shows what is wrong with it.",
+            )
+        same.add(data)
+    return governance_of(root)
+
+
+def _authorities(folders: Iterable[Path]) -> frozenset[tuple[str, str]]:
+    """Return role and fingerprint of the CAs that the enclaves in folders trust."""
+    found = {
+        (role, read_bytes(folder / file, "certificate"))
+        for folder in folders
+        for role, file in (("identity", IDENTITY_CA_FILE), ("permissions", PERMISSIONS_CA_FILE))
+        if (folder / file).exists()
+    }
+    return frozenset((role, each) for role, pem in found for each in fingerprints(pem))
 
 
 def _governance(file: Path) -> Governance:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
+from itertools import product
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.automata import NameSet
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import DomainRule, TopicRule
+from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
+from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError
-from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
-from sros_tool.explain.zenoh import ZenohEvaluator
+from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave, load_enclave
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.layout import (
@@ -26,21 +29,29 @@ from sros_tool.keystore.layout import (
     is_keystore,
 )
 from sros_tool.keystore.protection import with_stated
-from sros_tool.keystore.rights import load_rights
+from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Policy, Source
 from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.policy.stated import stated_protections
-from sros_tool.proof.access import KeysAs, dds_access, ros_access, zenoh_access, zenoh_message
+from sros_tool.proof.access import (
+    dds_access,
+    domains_of,
+    enforced_access,
+    is_enforced,
+    ros_access,
+    zenoh_message,
+)
 from sros_tool.proof.places import Place, Places, topics_of
+from sros_tool.proof.sources import UNCERTAIN
 from sros_tool.proof.worlds import LONGEST, TopicAccess, World
 from sros_tool.translate import governance_for, permissions_for
 from sros_tool.translate_zenoh import remote_rights, stated_rights
 from sros_tool.validity import window
-from sros_tool.zenoh.access import AccessControl, Flow, Message
-from sros_tool.zenoh.enforcement import Remote
+from sros_tool.zenoh.access import AccessControl
+from sros_tool.zenoh.enforcement import Enforcement
 
 _ZENOH = "zenoh"
 """The world that is no vendor of DDS."""
@@ -120,7 +131,7 @@ def policy_system(policy: Policy, *, at: datetime, domain: int = 0, world: str =
     for vendor in MEASURED:
         if world in ("", vendor.value):
             access = {
-                name: Access(vendor, governance, each, f"CN={name}", domain=domain, at=at)
+                name: (Access(vendor, governance, each, f"CN={name}", domain=domain, at=at),)
                 for name, each in signed.items()
             }
             worlds.append(_dds_world(vendor, access, stated))
@@ -145,42 +156,44 @@ def _planned_zenoh(
     """
     rules = {each.common_name: AccessControl((each,)) for each in control.remotes}
 
-    def allows(name: str, flow: Flow, message: Message, key: str) -> bool:
-        return name in rules and rules[name].allows(name, flow, message, key)
-
-    found = {each.path: ros_access(stated_rights(each)) for each in policy.enclaves}
-    return World("Zenoh", found, confirm=_on_zenoh(allows, domain), stated=stated)
-
-
-def _on_zenoh(
-    allows: Callable[[str, Flow, Message, str], bool], domain: int
-) -> Callable[[str, bool, str], bool]:
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
         messages = zenoh_message(topic, domain, writes=writes)
-        return bool(messages) and all(allows(enclave, *each) for each in messages)
+        own = rules.get(enclave)
+        return own is not None and bool(messages) and all(own.allows(enclave, *e) for e in messages)
 
-    return confirm
+    found = {each.path: ros_access(stated_rights(each)) for each in policy.enclaves}
+    return World("Zenoh", found, confirm=confirm, stated=stated)
 
 
 def _dds_world(
-    vendor: Vendor, access: Mapping[str, Access | None], stated: Mapping[str, TopicAccess]
+    vendor: Vendor,
+    access: Mapping[str, Sequence[Access]],
+    stated: Mapping[str, TopicAccess],
+    *,
+    title: str = "",
+    idle: Collection[str] = (),
 ) -> World:
-    """Return the world of a vendor; an enclave without access takes no part."""
+    """Return the world of a vendor; an enclave may do what one of its accesses gives."""
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
         verb = AccessVerb.PUBLISH if writes else AccessVerb.SUBSCRIBE
-        own = access.get(enclave)
-        return own is not None and own.decide(verb, topic).outcome.ok
+        return any(each.decide(verb, topic).outcome.ok for each in access.get(enclave, ()))
 
-    nothing = TopicAccess(NameSet(), NameSet())
-    running = [each for each in access.values() if each is not None]
+    def topics(some: Sequence[Access]) -> TopicAccess:
+        every = [dds_access(each) for each in some]
+        if len(every) == 1:
+            return every[0]
+        writes, reads = ([getattr(e, side) for e in every] for side in ("writes", "reads"))
+        return TopicAccess(NameSet.union(writes), NameSet.union(reads))
+
     return World(
-        vendor.title,
-        {name: dds_access(each) if each else nothing for name, each in access.items()},
+        title or vendor.title,
+        {name: topics(some) for name, some in access.items()},
         confirm=confirm,
         stated=stated,
-        weak=_weak(running),
+        weak=_weak(each for some in access.values() for each in some),
         needed=_OF_EVERY_NODE,
+        idle=idle,
         longest=vendor.traits.longest_topic_name or LONGEST,
     )
 
@@ -226,27 +239,82 @@ def _stated(enclaves: Iterable[str], rights: Iterable[Right]) -> dict[str, Topic
 # ── a keystore ─────────────────────────────────────────────────────────────────────────────
 
 
+_MOST_DOMAINS = 20
+_MOST_GOVERNANCES = 4
+
+
 def _keystore_system(
     root: Path, at: datetime, zone: tzinfo, domain: int | None, world: str
 ) -> System:
+    """Return the worlds of a keystore: one of each vendor for each kind of domain.
+
+    Its documents decide what an enclave may do, whether or not its key is here and its files would
+    be loaded now: the robot may have others.  Permissions that become valid later count as well,
+    and the governance of each enclave for all.
+    """
     names = enclave_names(root)
     source = load_rights(root)
     rights = frozenset(each for each in source.rights if each.qualifier is ALLOW)
     stated = _stated(names, rights)
     loaded = {name: load_enclave(name, enclave_path(root, name), at=at) for name in names}
-    if domain is None:
-        known = (each.domains for each in loaded.values() if each.domains)
-        domain = next((each.ranges[0].first or 0 for each in known if each.ranges), 0)
-    context = JoinContext(domain, at, zone)
+    for name, each in loaded.items():
+        if not each.permissions and (file := enclave_path(root, name) / PERMISSIONS_FILE).exists():
+            raise KeystoreError(
+                f"what enclave {name} may do is not known: '{file}' cannot be read",
+                "",
+                f"`sros check {quote(str(root))}` shows what is wrong with it.",
+            )
+    documents = {each.governance for each in loaded.values()} - {b""}
+    if names and not documents:
+        raise KeystoreError(
+            f"keystore '{root}' has no governance that can be read",
+            "Without it, it is not known what is protected, and whose rights are asked for.",
+            f"`sros check {quote(str(root))}` shows what is wrong with it.",
+        )
+    if len(documents) > _MOST_GOVERNANCES:
+        raise KeystoreError(
+            f"keystore '{root}' has more than {_MOST_GOVERNANCES} different governances",
+            "",
+            f"`sros check {quote(str(root))}` shows them; a keystore has one.",
+        )
+    listed = {
+        rule.domains for each in documents for rule in parse_governance(each).domain_access_rules
+    }
+    grants = {name: each.grants for name, each in source.documents.items()}
+    granted = {rule.domains for some in grants.values() for each in some for rule in each.rules}
+    domains = (domain,) if domain is not None else DomainSet.one_of_each_kind(listed, granted)
+    domains = domains or (0,)
+    if len(domains) > _MOST_DOMAINS:
+        raise KeystoreError(
+            f"the rights in keystore '{root}' differ between more than {_MOST_DOMAINS} ROS domains",
+            "",
+            "Name one with --domain.",
+        )
+    moments = {name: (at, *_later(grants.get(name, ()), at)) for name in names}
     worlds = []
-    for vendor in MEASURED:
-        if world in ("", vendor.value):
-            access = {
-                name: Evaluator(vendor, each, context).access for name, each in loaded.items()
-            }
-            worlds.append(_dds_world(vendor, access, stated))
+    for vendor, number in product(MEASURED, domains):
+        if world not in ("", vendor.value):
+            continue
+        title = vendor.title if len(domains) == 1 else f"{vendor.title} in domain {number}"
+        access: dict[str, tuple[Access, ...]] = {}
+        idle = []
+        for name, enclave in loaded.items():
+            now = Evaluator(vendor, enclave, JoinContext(number, at, zone)).access
+            if now is not None and len(moments[name]) == len(documents) == 1:
+                access[name] = (now,)
+                continue
+            if now is None:
+                idle.append(name)
+            # Those who read and write enforce rights by their governance, too.
+            possible = (_possible(enclave, grants.get(name, ()), each) for each in documents)
+            found = (
+                Evaluator(vendor, each, JoinContext(number, moment, zone)).access
+                for each, moment in product(possible, moments[name])
+            )
+            access[name] = tuple(each for each in found if each is not None)
+        worlds.append(_dds_world(vendor, access, stated, title=title, idle=idle))
     if world == _ZENOH or (not world and has_zenoh_files(root)):
-        worlds.append(_zenoh_world(root, at, domain, stated))
+        worlds += _zenoh_worlds(root, domain, stated)
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}
     places = {
         name: [Place(each, Source(files[name], 0)) for each in rights if each.enclave == name]
@@ -255,29 +323,67 @@ def _keystore_system(
     return System(str(root), tuple(worlds), Places(places), rights)
 
 
-def _zenoh_world(root: Path, at: datetime, domain: int, stated: Mapping[str, TopicAccess]) -> World:
-    """Return the world of Zenoh as the router enforces it: a session obeys only if it wants to.
+def _possible(enclave: LoadedEnclave, grants: Sequence[Grant], governance: bytes) -> LoadedEnclave:
+    """Return an enclave with its permissions, and with nothing that keeps it from starting."""
+    subject = enclave.subject or next((each.subject for each in grants), "")
+    return replace(enclave, subject=subject, governance=governance, state=None)
+
+
+_MOST_MOMENTS = 10
+
+
+def _later(grants: Iterable[Grant], at: datetime) -> tuple[datetime, ...]:
+    """Return a moment in the validity of each grant that is not valid yet."""
+    found = []
+    for each in grants:
+        with suppress(ValueError, OverflowError):
+            begin, end = map(datetime.fromisoformat, (each.not_before, each.not_after))
+            begin, end = (one if one.tzinfo else one.replace(tzinfo=UTC) for one in (begin, end))
+            if at < begin < end:
+                found.append(begin + (end - begin) / 2)
+    return tuple(dict.fromkeys(found))[:_MOST_MOMENTS]
+
+
+def _zenoh_worlds(
+    root: Path, domain: int | None, stated: Mapping[str, TopicAccess]
+) -> Iterator[World]:
+    """Yield the worlds of Zenoh as others enforce it: a session obeys itself only if it wants to.
 
     Raises:
-        KeystoreError: there are no configurations of Zenoh, or the router's opens no session.
+        KeystoreError: there are no configurations of Zenoh, or it is not certain what they enforce.
     """
-    router = ZenohEvaluator(root, at=at, domain=domain).router
-    if router.process is None:
-        raise KeystoreError(
-            f"what Zenoh enforces in keystore '{root}' is not known",
-            f"{router.problem}.",
-            "Name a vendor of DDS with --vendor to decide for it alone.",
-        )
-    rules = router.process.access
+    found = load_zenoh_rights(root)
+    for note in found.notes:
+        if note.id in UNCERTAIN:
+            raise KeystoreError(
+                f"what Zenoh enforces in keystore '{root}' is not known: {note.text.rstrip('.')}",
+                "",
+                "Write its files again with `sros zenoh`, or name a vendor of DDS with --vendor.",
+            )
+    enforcers = found.enforcers
+    domains = (domain,) if domain is not None else domains_of(enforcers) or (0,)
+    for each in domains:
+        title = "Zenoh" if len(domains) == 1 else f"Zenoh in domain {each}"
+        yield _enforced(title, enforcers, {*stated} - {found.router}, each, stated)
 
-    def access(name: str) -> TopicAccess:
-        def passing(flow: Flow, message: Message, of: KeysAs) -> NameSet:
-            return rules.passing(Remote(name), flow, message, of)
 
-        return zenoh_access(passing, domain)
+def _enforced(
+    title: str,
+    enforcers: Sequence[Enforcement],
+    enclaves: Iterable[str],
+    domain: int,
+    stated: Mapping[str, TopicAccess],
+) -> World:
+    """Return the world of a domain on Zenoh, of enclaves and of all other names in the rules."""
+    names = {*enclaves, *(name for each in enforcers for name in each.names())}
 
-    def allows(name: str, flow: Flow, message: Message, key: str) -> bool:
-        return rules.decide(Remote(name), flow, message, key).allowed
+    def confirm(enclave: str, writes: bool, topic: str) -> bool:
+        return is_enforced(enforcers, enclave, domain, topic, writes=writes)
 
-    found = {name: access(name) for name in stated if name != router.enclave}
-    return World("Zenoh", found, confirm=_on_zenoh(allows, domain), stated=stated)
+    nothing = TopicAccess(NameSet(), NameSet())
+    return World(
+        title,
+        {name: enforced_access(enforcers, name, domain) for name in names},
+        confirm=confirm,
+        stated={name: stated.get(name, nothing) for name in names},
+    )

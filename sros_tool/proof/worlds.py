@@ -213,6 +213,7 @@ class World:
         stated: Mapping[str, TopicAccess],
         weak: Mapping[Level, NameSet] = MappingProxyType({}),
         needed: Sequence[tuple[bool, str]] = (),
+        idle: Collection[str] = (),
         longest: int = LONGEST,
     ) -> None:
         """Take the access of each enclave.
@@ -222,6 +223,8 @@ class World:
 
         ``weak`` are the topics that are protected less than a level demands; without a level, there
         are none.  ``needed`` are topics that every node has to write (True) and read (False).
+        ``idle`` are enclaves in which no process starts with their files as they are: they may do
+        what their rights give, and are able to do nothing.
         """
         self.title = title
         self.confirm = confirm
@@ -231,6 +234,7 @@ class World:
         self._writers = Side({each: access[each].writes for each in self.enclaves})
         self._readers = Side({each: access[each].reads for each in self.enclaves})
         self.needed = tuple(needed)
+        self.idle = frozenset(idle)
         self._weak = weak
         self._readers_of: dict[str, list[str]] = {}
         self._shared: dict[tuple[str, str], str | None] = {}

@@ -82,6 +82,11 @@ class ZenohEndpoint:
         pairs = (each.partition("=") for each in self.text.partition("#")[2].split(";") if each)
         return {name: value for name, _, value in pairs}
 
+    def option(self, name: str, otherwise: bool) -> bool:
+        """Return an option of TLS: its own one, or else that of the section."""
+        own = self.options.get(name)
+        return otherwise if own is None else own == "true"
+
 
 @dataclass(frozen=True, slots=True)
 class TlsOptions:
@@ -124,6 +129,18 @@ class ConfigurationDocument:
     access: Enforcement = field(default_factory=Enforcement)
     unknown: tuple[str, ...] = ()
     lines: Mapping[str, int] = field(default_factory=dict, compare=False, repr=False)
+
+    def open_link(self) -> str:
+        """Return where a process without a certificate gets a connection, as a clause, or ""."""
+        for each in (*self.listen, *self.connect):
+            if self.protocols is not None and each.protocol not in self.protocols:
+                continue  # it is refused
+            if not each.is_encrypted():
+                return f"it has the endpoint {each.text[:80]!r} without TLS"
+        for each in self.listen:
+            if each.is_encrypted() and not each.option("enable_mtls", self.tls.mutual):
+                return f"it asks for no certificate at {each.text[:80]!r}"
+        return ""
 
     def line_of(self, path: str) -> int:
         """Return the line of a setting, or else of the nearest one that contains it, or 1."""

@@ -122,6 +122,21 @@ class Enforcement:
         ids = {each for one in self._matching(remote) for each in self._combinations[one]}
         return tuple(each for each in self.subjects if each.id in ids)
 
+    def names(self) -> frozenset[str]:
+        """Return the common names that subjects state: those of enclaves that rules are for."""
+        return frozenset(n for each in self.subjects for n in each.cert_common_names or ())
+
+    def unclear(self) -> str:
+        """Return why names alone do not decide what passes, as a clause; "" if they do."""
+        for each in self.subjects:
+            stated = {name for name in PROPERTIES if getattr(each, name) is not None}
+            if each.cert_common_names is not None and len(stated) > 1:
+                more = ", ".join(sorted(stated - {"cert_common_names"}))
+                return f"its subject {each.id[:80]!r} has conditions besides the name: {more}"
+        if any(not each.allows for each in self.rules):
+            return "it has denials, which do not hold for messages with wildcards"
+        return ""
+
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
         """Return whether a message from or to a remote process passes.
 

@@ -1,0 +1,220 @@
+"""Keystores in which a requirement seems to hold, or nothing seems to be new, and it is not so."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+from sros_tool.pki import smime
+from tests.support.harness import sros
+
+POLICY = """<policy version="0.2.0"><enclaves>
+<enclave path="/web"><profiles><profile ns="/" node="web">
+<topics publish="ALLOW"><topic>/status</topic></topics>
+</profile></profiles></enclave>
+<enclave path="/mux"><profiles><profile ns="/" node="mux">
+<topics publish="ALLOW"><topic>/cmd_vel</topic></topics>
+</profile></profiles></enclave>
+</enclaves></policy>"""
+REQUIREMENTS = '[[only]]\npublish = ["/cmd_vel"]\nenclaves = ["/mux"]\n'
+WEB = "enclaves/web/permissions.p7s"
+ROUTER = "enclaves/router/router.json5"
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sound")
+    (folder / "robot.xml").write_text(POLICY)
+    (folder / "req.toml").write_text(REQUIREMENTS)
+    for words in ("create_keystore ks", "generate_artifacts -k ks -p robot.xml", "zenoh ks"):
+        sros(*words.split(), cwd=folder).ok()
+    assert required(folder, "ks") == (0, "nothing found\n")
+    assert sros("diff_policy", "--no-new-access", "ks", "ks", cwd=folder).status == 0
+    return folder
+
+
+def required(folder: Path, name: str) -> tuple[int, str]:
+    words = ("--requirements", "req.toml", "--include", "requirement.*")
+    ended = sros("check", name, *words, cwd=folder)
+    return ended.status, ended.out + ended.err
+
+
+def signed(keystore: Path, file: str, change: Callable[[bytes], bytes]) -> None:
+    """Let the permissions CA sign a changed document in place of a file."""
+    authority = x509.load_pem_x509_certificate(
+        (keystore / "public/permissions_ca.cert.pem").read_bytes()
+    )
+    key = load_pem_private_key((keystore / "private/permissions_ca.key.pem").read_bytes(), None)
+    document = change(smime.parse((keystore / file).read_bytes()).document)
+    (keystore / file).unlink()
+    (keystore / file).write_bytes(smime.sign(document, authority, key))  # type: ignore[arg-type]
+
+
+def drives(document: bytes) -> bytes:
+    return document.replace(b"rt/status", b"rt/cmd_vel")
+
+
+def in_another_domain(keystore: Path) -> None:
+    def more(document: bytes) -> bytes:
+        rule = re.search(rb"<allow_rule>.*?</allow_rule>", document, re.DOTALL)
+        assert rule
+        other = drives(rule[0].replace(b"<id>0<", b"<id>7<"))
+        return document.replace(rule[0], rule[0] + other)
+
+    signed(keystore, WEB, more)
+    for each in ("", "/web", "/mux", "/router"):
+        file = f"enclaves{each}/governance.p7s"
+        signed(keystore, file, lambda old: old.replace(b"<id>0<", b"<id>0</id><id>7<"))
+
+
+def from_later_on(keystore: Path) -> None:
+    begin = re.compile(rb"(<not_before>)\d{4}")
+    signed(keystore, WEB, lambda old: begin.sub(rb"\g<1>2035", drives(old)))
+
+
+def without_keys(keystore: Path) -> None:
+    signed(keystore, WEB, drives)
+    for each in ("web", "mux", "router"):
+        (keystore / "enclaves" / each / "key.pem").unlink()
+    shutil.rmtree(keystore / "private")
+
+
+def rules(keystore: Path, change: Callable[[dict[str, object]], None]) -> None:
+    document = json.loads((keystore / ROUTER).read_text())
+    change(document)
+    (keystore / ROUTER).write_text(json.dumps(document))
+
+
+def a_name_without_an_enclave(keystore: Path) -> None:
+    def ghost(document: dict) -> None:  # type: ignore[type-arg]
+        access = document["access_control"]
+        allowed = next(each for each in access["policies"] if each["subjects"] == ["/mux"])
+        access["subjects"].append({"id": "ghost", "cert_common_names": ["/ghost"]})
+        access["policies"].append({**allowed, "subjects": ["ghost"]})
+
+    rules(keystore, ghost)
+
+
+def a_link_without_tls(keystore: Path) -> None:
+    text = (keystore / ROUTER).read_text().replace('"tls/', '"tcp/').replace('"tls"\n', '"tcp"\n')
+    (keystore / ROUTER).write_text(text)
+
+
+def no_certificate_asked_for(keystore: Path) -> None:
+    text = (keystore / ROUTER).read_text()
+    (keystore / ROUTER).write_text(text.replace('"enable_mtls": true', '"enable_mtls": false'))
+
+
+def a_subject_with_a_condition(keystore: Path) -> None:
+    def narrowed(document: dict) -> None:  # type: ignore[type-arg]
+        subject = {"id": "more", "cert_common_names": ["/web"], "interfaces": ["lo"]}
+        access = document["access_control"]
+        access["subjects"].append(subject)
+        access["policies"].append({**access["policies"][0], "subjects": ["more"]})
+
+    rules(keystore, narrowed)
+
+
+def a_weaker_governance_of_one_enclave(keystore: Path) -> None:
+    weak = "enclaves/mux/governance.p7s"
+    signed(keystore, weak, lambda old: old.replace(b">true<", b">false<"))
+
+
+def another_authority(keystore: Path) -> None:
+    other = (keystore / "public/permissions_ca.cert.pem").read_bytes()
+    file = keystore / "enclaves/mux/identity_ca.cert.pem"
+    content = file.read_bytes()
+    file.unlink()
+    file.write_bytes(content + other)
+
+
+def another_router(keystore: Path) -> None:
+    for each in ("router.json5", "router.p7s"):
+        (keystore / "enclaves/router" / each).rename(keystore / "enclaves/web" / each)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (in_another_domain, "/web: may publish /cmd_vel, but"),
+        (from_later_on, "/web: may publish /cmd_vel, but"),
+        (without_keys, "/web: may publish /cmd_vel, but"),
+        (a_name_without_an_enclave, "/ghost: may publish /cmd_vel, but"),
+        (a_weaker_governance_of_one_enclave, "/router: may publish /cmd_vel, and so may /web"),
+        (a_link_without_tls, "is not known"),
+        (no_certificate_asked_for, "is not known"),
+        (a_subject_with_a_condition, "is not known"),
+    ],
+)
+def test_no_requirement_holds_that_does_not(
+    sound: Path, change: Callable[[Path], None], said: str
+) -> None:
+    keystore = sound / f"req-{change.__name__}"
+    shutil.copytree(sound / "ks", keystore, symlinks=True)
+    change(keystore)
+    status, text = required(sound, keystore.name)
+    assert status == (2 if said == "is not known" else 1), text
+    assert said in text
+    assert "Traceback" not in text
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "said"),
+    [
+        (a_name_without_an_enclave, 1, "+ /ghost publish topic /cmd_vel; with Zenoh"),
+        (another_authority, 1, "+ less protection: identity CA"),
+        (another_router, 1, "+ less protection: router of Zenoh /router -> /web"),
+        (a_weaker_governance_of_one_enclave, 2, "is not the governance of the keystore"),
+        (a_link_without_tls, 2, "without TLS"),
+        (no_certificate_asked_for, 2, "it asks for no certificate"),
+        (a_subject_with_a_condition, 2, "conditions besides the name: interfaces"),
+    ],
+)
+def test_new_access_is_found_or_not_compared(
+    sound: Path, change: Callable[[Path], None], status: int, said: str
+) -> None:
+    keystore = sound / f"new-{change.__name__}"
+    shutil.copytree(sound / "ks", keystore, symlinks=True)
+    change(keystore)
+    ended = sros("diff_policy", "--no-new-access", "ks", keystore.name, cwd=sound)
+    assert ended.status == status, ended
+    assert said in ended.out + ended.err
+
+
+def test_an_enclave_that_does_not_start_is_not_able_to_do_anything(sound: Path) -> None:
+    keystore = sound / "idle"
+    shutil.copytree(sound / "ks", keystore, symlinks=True)
+    (sound / "must.toml").write_text('[[must]]\npublish = ["/cmd_vel"]\nenclave = "/mux"\n')
+    words = ("check", "idle", "--requirements", "must.toml", "--include", "requirement.*")
+    assert sros(*words, cwd=sound).status == 0
+    (keystore / "enclaves/mux/key.pem").unlink()
+    ended = sros(*words, cwd=sound)
+    assert "/mux: may not publish /cmd_vel, but" in ended.out
+    assert ended.status == 1
+
+
+def test_rules_of_zenoh_are_compared_key_by_key(sound: Path) -> None:
+    """One part of a name is less than all of them, and one domain less than two."""
+    for name, key in (
+        ("part", "0/status/*/*/*"),
+        ("all", "0/status/**"),
+        ("seven", "7/status/*/*"),
+    ):
+        shutil.copy(sound / "ks" / ROUTER, sound / f"{name}.json5")
+        text = (sound / f"{name}.json5").read_text()
+        (sound / f"{name}.json5").write_text(text.replace('"0/status/*/*"', f'"{key}"'))
+    shutil.copy(sound / "ks" / ROUTER, sound / "zero.json5")
+    words = ("diff_policy", "--no-new-access")
+    assert sros(*words, "part.json5", "part.json5", cwd=sound).status == 0
+    assert sros(*words, "all.json5", "part.json5", cwd=sound).status == 0
+    for base, head in (("part", "all"), ("zero", "seven")):
+        ended = sros(*words, f"{base}.json5", f"{head}.json5", cwd=sound)
+        assert ended.status == 1, ended
+        assert "+ /web publish topic /status" in ended.out
