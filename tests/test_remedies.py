@@ -19,13 +19,14 @@ from tests.explain.test_log import LOGS
 from tests.support.harness import sros
 
 PACKAGE = Path(sros_tool.__file__).parent
+FILLED_IN = re.compile(r"\{[\w.]*\}")
 OPTIONAL = re.compile(r"\[.*?\]|\.\.\.")
 
 
 def text_of(node: ast.AST) -> str | None:
     """Return the text of a string; what is filled in later is the word `value`."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
-        return re.sub(r"\{[\w.]*\}", "value", node.value)
+        return FILLED_IN.sub("value", node.value) if "{" in node.value else node.value
     if isinstance(node, ast.JoinedStr):
         parts = (
             text_of(each) if isinstance(each, ast.Constant) else "value" for each in node.values
@@ -42,7 +43,9 @@ def named_commands() -> Iterator[tuple[str, str]]:
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             text = text_of(node)
-            for command in re.findall(r"`(?:[^`]*&& )?(sros [^`]+)`", text or ""):
+            if text is None or "sros " not in text:
+                continue
+            for command in re.findall(r"`(?:[^`]*&& )?(sros [^`]+)`", text):
                 if not re.search(r"-\w*value|valuevalue", command):  # an option filled in later
                     yield command, f"{path.relative_to(PACKAGE)}:{getattr(node, 'lineno', 0)}"
 

@@ -115,7 +115,9 @@ def _exists(path: str | None) -> bool:
 
 def _run(command: str, arguments: list[str]) -> int:
     folder = VENV / "bin"
-    env = {name: value for name, value in os.environ.items() if name != "PYTHONHOME"}
+    # Compiled once, and not again by each of the hundreds of programs that the tests start.
+    unwanted = ("PYTHONHOME", "PYTHONDONTWRITEBYTECODE")
+    env = {name: value for name, value in os.environ.items() if name not in unwanted}
     env["VIRTUAL_ENV"] = str(VENV)
     env["PATH"] = f"{folder}{os.pathsep}{env.get('PATH', os.defpath)}"
     if command == "setup":

@@ -11,14 +11,13 @@ from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, field, fields
 from enum import StrEnum
 from typing import Any
-from xml.sax.saxutils import escape
 
 from lxml import etree
 
 from sros_tool.dds.domains import DomainSet, domain_lines, read_domains
 from sros_tool.dds.permissions import XSI
 from sros_tool.errors import DocumentError
-from sros_tool.xml import parse, tag_of
+from sros_tool.xml import escape, parse, tag_of
 
 _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd"
 

@@ -7,14 +7,13 @@ omg_shared_ca_permissions of 20170901).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from xml.sax.saxutils import escape, quoteattr
 
 from lxml import etree
 
 from sros_tool.dds.domains import DomainSet, domain_lines, read_domains
 from sros_tool.errors import DocumentError
 from sros_tool.validity import Window, iso, parse_iso
-from sros_tool.xml import parse, tag_of
+from sros_tool.xml import escape, parse, quoted, tag_of
 
 _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
@@ -112,7 +111,7 @@ def render_permissions(permissions: Permissions) -> bytes:
     ]
     for each in permissions.grants:
         lines += [
-            f"    <grant name={quoteattr(each.name)}>",
+            f"    <grant name={quoted(each.name)}>",
             f"      <subject_name>{escape(each.subject)}</subject_name>",
             "      <validity>",
             f"        <not_before>{escape(each.not_before)}</not_before>",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from textwrap import wrap
-from xml.sax.saxutils import escape
 
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.layout import (
@@ -20,6 +19,7 @@ from sros_tool.report.layout import (
     Scene,
 )
 from sros_tool.report.picture import Overlay, OverlaySide, Picture, WireLevel, counted
+from sros_tool.xml import escape
 
 _HEAD, _SAID = 40, 19
 _STYLE = """\

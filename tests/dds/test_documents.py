@@ -6,6 +6,7 @@ import re
 import string
 from base64 import b64encode
 from pathlib import Path
+from xml.sax import saxutils
 
 import pytest
 from hypothesis import given
@@ -33,9 +34,11 @@ from sros_tool.dds.permissions import (
     render_permissions,
 )
 from sros_tool.errors import DocumentError
+from sros_tool.xml import escape, quoted
 from tests.dds.decision_documents import allow, grant, publish
 from tests.dds.decision_documents import governance as decided_governance
 from tests.dds.decision_documents import permissions as decided
+from tests.support.children import python
 
 domains = st.lists(st.integers(0, MAX_DOMAIN), min_size=1, max_size=4).map(
     lambda ids: DomainSet.of(*((each, each) for each in ids))
@@ -228,3 +231,17 @@ def document_of(topics: tuple[str, ...]) -> bytes:
     rule = Rule(True, DomainSet.of((0, 0)), (Criteria(topics),))
     date = "2026-01-01T00:00:00Z"
     return render_permissions(Permissions((Grant("/a", "CN=/a", date, date, (rule,)),)))
+
+
+@given(st.text(st.sampled_from("a&<>\"'\n\r\t;é\u2028")))
+def test_texts_are_written_as_the_standard_library_writes_them(text: str) -> None:
+    assert escape(text) == saxutils.escape(text)
+    assert quoted(text) == saxutils.quoteattr(text)
+
+
+def test_a_node_starts_without_what_it_does_not_need() -> None:
+    """A demo starts dozens of them."""
+    words = "import sys, sros_tool.demo.nodes.cyclone; print(*sys.modules)"
+    found = python("-c", words).stdout.split()
+    assert "sros_tool.dds.permissions" in found
+    assert {"http.client", "ssl", "urllib.request"}.isdisjoint(found)
