@@ -372,7 +372,7 @@ def explain_access(
         load_enclave(enclave, enclave_path(root, enclave), at=at), root=root, policy=own
     )
     if domain is None:
-        domain = choose_domain(loaded.domains, None, root) if loaded.domains else 0
+        domain = choose_domain(loaded.joined_domains, None, root) if loaded.joined_domains else 0
     answer = Evaluator(Vendor(vendor), loaded, JoinContext(domain, at, zone)).explain(question)
     decision = answer.decision
     _, colon, reason = decision.text.partition(": ")

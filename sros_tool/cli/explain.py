@@ -18,6 +18,7 @@ from sros_tool.cli.common import (
     coloured,
     complete_keystore_and_enclave,
     domain_of,
+    fleet_option,
     json_option,
     keystore_from_environment,
     moment_of,
@@ -125,9 +126,12 @@ def _complete_enclave(
 
 _IGNORED = {
     "": ("infrastructure", "patterns", "robots"),
-    "--who": ("infrastructure", "policy", "all_vendors"),
+    "--who": ("infrastructure", "policy", "fleet_file", "all_vendors"),
     "--reach": ("patterns", "robots", "kind", "all_vendors", "moment", "domain", "time_zone"),
-    "--log": ("infrastructure", "patterns", "robots", "kind", "policy", "vendor", "all_vendors"),
+    "--log": (
+        *("infrastructure", "patterns", "robots", "kind", "policy", "fleet_file"),
+        *("vendor", "all_vendors"),
+    ),
 }
 """The parameters that have no effect, for each of the options that choose a mode."""
 _GOES_WITH = {"infrastructure": "--reach only", "patterns": "--who only", "robots": "--who only"}
@@ -178,6 +182,7 @@ Example:
     metavar="FILE",
     help="Policy that the permissions were made from; without a keystore, explain this policy.",
 )
+@fleet_option("The robots that placeholders of --policy stand for. [default: the keystore's]")
 @click.option(
     "--vendor",
     type=click.Choice([*(each.value for each in Vendor), ZENOH]),
@@ -221,6 +226,7 @@ def explain(
     kind: str | None,
     keystore: Path | None,
     policy: Path | None,
+    fleet_file: Path | None,
     vendor: str | None,
     all_vendors: bool,
     moment: str | None,
@@ -248,14 +254,17 @@ def explain(
         raise UsageError("--who, --reach and --log exclude each other")
     mode = "--who" if who else "--reach" if reach else "--log" if log is not None else ""
     _refuse_ignored(mode)
+    if fleet_file and not policy:
+        raise UsageError("--fleet goes with --policy only", "", "Leave it out.")
     root, rest = _split(words, keystore, verb=0 if who else 1)
     if reach:
         if vendor not in (None, ZENOH):
             text = "It follows the rights, which are the same for all vendors of DDS."
             raise UsageError("--reach takes no --vendor but zenoh", text, "Leave it out.")
         of_zenoh = bool(_why_zenoh(vendor, root))
-        return _show_reach(reach, root, rest, policy, infrastructure, as_json, zenoh=of_zenoh)
-    context = _ContextOptions(moment, domain, time_zone)
+        stated = policy, fleet_file
+        return _show_reach(reach, root, rest, stated, infrastructure, as_json, zenoh=of_zenoh)
+    context = _ContextOptions(moment, domain, time_zone, fleet_file)
     if log is not None:
         return _show_log(log, root, rest, context, as_json)
     zenoh = "" if all_vendors else _why_zenoh(vendor, root)
@@ -294,10 +303,14 @@ def _is_word(words: tuple[str, ...], place: int) -> bool:
 
 
 class _ContextOptions:
-    """The options --at, --domain and --time-zone, with their defaults."""
+    """The options --at, --domain, --time-zone and --fleet, with their defaults."""
 
-    def __init__(self, moment: str | None, domain: str | None, zone: str | None) -> None:
+    def __init__(
+        self, moment: str | None, domain: str | None, zone: str | None, fleet_file: Path | None
+    ) -> None:
         from sros_tool.cli.common import local_zone, named_zone
+
+        self._fleet_file = fleet_file
 
         self.at = moment_of(moment)
         self._domain = ros_domain() if domain is None else domain_of(domain)
@@ -312,6 +325,20 @@ class _ContextOptions:
         if chosen is None:
             chosen = choose_domain(domains, None, Path()) if domains else 0
         return JoinContext(chosen, self.at, self._zone)
+
+    def fleet(self, root: Path | None) -> Fleet | None:
+        """Return the fleet for the placeholders of a policy, if there is one."""
+        return _fleet_of(self._fleet_file, root)
+
+
+def _fleet_of(file: Path | None, root: Path | None) -> Fleet | None:
+    """Return the fleet in a file, or else that of the keystore ``root``."""
+    from sros_tool.fleet.document import read_fleet
+    from sros_tool.keystore.fleet import load_fleet
+
+    if file:
+        return read_fleet(file)
+    return load_fleet(root) if root else None
 
 
 def _vendor_of(name: str | None) -> tuple[Vendor, str]:
@@ -353,11 +380,11 @@ def _show_answer(
 
     question = _question(rest, kind)
     enclave = _enclave(root, rest[0], policy, options)
-    context = options.context(enclave.domains)
+    context = options.context(enclave.joined_domains)
     chosen, why = _vendor_of(vendor)
     evaluator = Evaluator(chosen, enclave, context)
     taken: list[Note] = []
-    if not kind and (action := _action_meant(evaluator, question, policy)):
+    if not kind and (action := _action_meant(evaluator, question, policy, options)):
         taken = _taken_for_action(question, action)
         question = action
     answer = evaluator.explain(question)
@@ -424,7 +451,7 @@ def _enclave(
     """Load an enclave from a keystore, from its folder, or from a policy alone."""
     from dataclasses import replace
 
-    own = _policy_of(policy, name)
+    own = _policy_of(policy, name, root, options)
     if root is None and not policy and not _is_enclave(Path(name)):
         root = keystore_from_environment()
     enclave = _signed_enclave(root, name, options, planned=own is not None)
@@ -432,21 +459,23 @@ def _enclave(
         assert own is not None
         enclave = _planned_enclave(own, root, options)
     elif own is None and policy:
-        own = _policy_of(policy, enclave.name)
+        own = _policy_of(policy, enclave.name, root, options)
     return replace(enclave, root=root, policy=own)
 
 
-def _policy_of(policy: Path | None, enclave: str) -> Enclave | None:
-    """Return the enclave in the policy file, or None without a file.
+def _policy_of(
+    policy: Path | None, enclave: str, root: Path | None, options: _ContextOptions
+) -> Enclave | None:
+    """Return the enclave in the policy file, for the fleet if there is one; None without a file.
 
     Raises `PolicyError` if the file does not have an enclave of this name.
     """
     if policy is None:
         return None
     from sros_tool.errors import PolicyError
-    from sros_tool.policy.document import read_policy
+    from sros_tool.fleet.expansion import read_policy_for
 
-    read = read_policy(policy)
+    read = read_policy_for(policy, options.fleet(root))
     found = read.enclave(enclave)
     if found is None and not _is_enclave(Path(enclave)):
         from sros_tool.keystore.missing import likely_names
@@ -543,7 +572,9 @@ def _provenance_notes(answer: Answer, policy: Path | None) -> list[Note]:
     return [Note(f"explain.policy-{answer.provenance}", text)]
 
 
-def _action_meant(evaluator: Evaluator, question: Question, policy: Path | None) -> Question | None:
+def _action_meant(
+    evaluator: Evaluator, question: Question, policy: Path | None, options: _ContextOptions
+) -> Question | None:
     """Return the question about an action, if that is what the rights show the name to be.
 
     The rights of the enclave come first; those of the policy and of the keystore are read only if
@@ -564,7 +595,7 @@ def _action_meant(evaluator: Evaluator, question: Question, policy: Path | None)
         for path in (policy, root if root and is_keystore(root) else None):
             if path:
                 with suppress(SrosError, OSError):
-                    found |= load_rights(path).rights
+                    found |= load_rights(path, options.fleet(root) if policy else None).rights
     return about_action(question, found)
 
 
@@ -628,11 +659,11 @@ def _show_zenoh_answer(
             "It decides by the files of the router and of other enclaves.",
             "Name the keystore before the enclave.",
         )
-    context = options.context(enclave.domains)
+    context = options.context(enclave.joined_domains)
     # The permissions are the source of the files, so what they decide says what has to be changed.
     stated = Evaluator(Vendor.STANDARD, enclave, context)
     taken: list[Note] = []
-    if not kind and (action := _action_meant(stated, question, policy)):
+    if not kind and (action := _action_meant(stated, question, policy, options)):
         taken = _taken_for_action(question, action)
         question = action
     with progress("reading"):
@@ -1213,17 +1244,21 @@ def _show_reach(
     enclave: str,
     root: Path | None,
     rest: tuple[str, ...],
-    policy: Path | None,
+    stated: tuple[Path | None, Path | None],
     infrastructure: bool,
     as_json: bool,
     *,
     zenoh: bool,
 ) -> int:
-    """Print which enclaves one enclave can influence and learn from; return 0."""
+    """Print which enclaves one enclave can influence and learn from; return 0.
+
+    ``stated`` are the files of a policy and of its fleet.
+    """
     from sros_tool.keystore.missing import likely_names
     from sros_tool.keystore.rights import load_rights, load_zenoh_rights
     from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network
 
+    policy, fleet_file = stated
     if root is None and len(rest) == 1:
         root, rest = Path(rest[0]), ()
     if rest:
@@ -1233,7 +1268,8 @@ def _show_reach(
             raise UsageError("--reach on Zenoh takes no --policy", "It reads the files of Zenoh.")
         source = load_zenoh_rights(root or keystore_from_environment())
     else:
-        source = load_rights(root or policy or keystore_from_environment())
+        fleet = _fleet_of(fleet_file, None)
+        source = load_rights(root or policy or keystore_from_environment(), fleet)
     without, questions = ((), ()) if infrastructure else (OF_EVERY_NODE, QUESTIONS)
     network = Network(source.rights, without=without, questions=questions, **_uncontrolled(source))
     if source.kind == "keystore" or zenoh:
@@ -1368,7 +1404,7 @@ def _show_log(
 
     text = read_log(log)
     findings = explain_log(
-        text, find, lambda enclave: options.context(enclave.domains), str(root or "")
+        text, find, lambda enclave: options.context(enclave.joined_domains), str(root or "")
     )
     if as_json:
         notes = as_plain(_LOG_NOTES if findings else ())

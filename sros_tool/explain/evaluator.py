@@ -88,6 +88,11 @@ class LoadedEnclave:
     root: Path | None = None
     policy: Enclave | None = None
 
+    @property
+    def joined_domains(self) -> DomainSet | None:
+        """The domains of its permissions, too, if they exist: `sros run` takes one of these."""
+        return (self.state.joined_domains() if self.state else None) or self.domains
+
     def problems(self, traits: VendorTraits) -> tuple[Problem, ...]:
         """Return the faults, except in documents, that keep a vendor's process from starting."""
         if self.state is None or self.at is None:

@@ -57,7 +57,7 @@ def who(
 
     def _outcome(name: str) -> EnclaveOutcome:
         enclave = load_enclave(name, enclave_path(root, name), at=at)
-        answer = Evaluator(vendor, enclave, context(enclave.domains)).answer(question)
+        answer = Evaluator(vendor, enclave, context(enclave.joined_domains)).answer(question)
         decision = answer.decision
         return EnclaveOutcome(
             name, answer.outcome, decision.reason, decision.text, decision.expression or ""

@@ -190,6 +190,17 @@ def test_a_policy_with_placeholders_needs_a_fleet(made: Path) -> None:
         assert "policy" not in done.err
 
 
+def test_a_policy_with_placeholders_explains_the_enclaves_of_its_keystore(made: Path) -> None:
+    asked = ("/r7/lift", "execute", "/hall/r7/lift/raise", "--policy", "robot.xml")
+    signed = sros("explain", "ks", *asked, cwd=made).ok()
+    assert "from      robot.xml:9: ALLOW execute raise" in signed.out
+    planned = sros("explain", *asked, "--fleet", "fleet.toml", cwd=made).ok()
+    assert "from      robot.xml:9: ALLOW execute raise" in planned.out
+    assert "Name the fleet's file with --fleet FILE" in sros("explain", *asked, cwd=made).err
+    other = sros("explain", "ks", *asked[:3], "--fleet", "fleet.toml", cwd=made)
+    assert "--fleet goes with --policy only" in other.err
+
+
 def test_the_rights_of_every_node_are_not_next_to_the_policy(made: Path, tmp_path: Path) -> None:
     include = '<xi:include href="{}" xpointer="xpointer(/profile/*)"/>'
     for file, ships in (("common/node.xml", True), ("common/x.xml", False)):
