@@ -177,6 +177,8 @@ class Automaton:
 
     def _accepts(self, name: str) -> bool:
         reached = 1
+        if reached & self.endless_bits:
+            return True
         for letter in name:
             if letter not in self._moves:
                 self._moves[letter] = _moves(

@@ -82,6 +82,32 @@ class Verdict:
     empty: tuple[str, ...] = ()
 
 
+class Worlds:
+    """Worlds in which requirements are decided; those that give the same have one decision.
+
+    The engine of each world confirms the witness.
+    """
+
+    def __init__(self, worlds: Iterable[World]) -> None:
+        self._first_alike: dict[World, World] = {}
+        for world in worlds:
+            others = self._first_alike.values()
+            alike = (each for each in others if world.gives_as(each))
+            self._first_alike[world] = next(alike, world)
+
+    def decide(
+        self, requirement: Requirement, limit: SearchLimit
+    ) -> Iterator[tuple[World, Verdict]]:
+        """Yield each world with its decision; raises what `decide` raises."""
+        known: dict[World, Verdict] = {}
+        for world, first in self._first_alike.items():
+            if first is world:
+                known[world] = decide(requirement, world, limit)
+            elif witness := known[first].witness:
+                _confirm(requirement, witness, world)
+            yield world, known[first]
+
+
 def decide(requirement: Requirement, world: World, limit: SearchLimit | None = None) -> Verdict:
     """Return the decision on a requirement; decisions for one question share ``limit``.
 

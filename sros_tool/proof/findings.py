@@ -11,7 +11,7 @@ from sros_tool.checks.requirements import NOT_ON_ZENOH, VACUOUS, VIOLATED
 from sros_tool.names import is_expression
 from sros_tool.policy.model import Source
 from sros_tool.policy.rights import KIND_OF
-from sros_tool.proof.decide import Use, Verdict, Witness, decide
+from sros_tool.proof.decide import Use, Verdict, Witness, Worlds
 from sros_tool.proof.places import Place
 from sros_tool.proof.requirements import (
     Apart,
@@ -96,8 +96,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     """
     violations, vacuous = [], []
     limit = SearchLimit(MOST_STEPS)
+    worlds = Worlds(system.worlds)
     for requirement in requirements:
-        verdicts = [(world, decide(requirement, world, limit)) for world in system.worlds]
+        verdicts = list(worlds.decide(requirement, limit))
         broken = [(world, each.witness) for world, each in verdicts if each.witness]
         if broken:
             witness = min((each for _, each in broken), key=lambda each: len(each.uses))

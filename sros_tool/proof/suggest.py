@@ -17,7 +17,7 @@ from sros_tool.names import READING_SERVICES, expression_problem, is_expression
 from sros_tool.policy.model import RIGHTS, Source
 from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import Right
-from sros_tool.proof.decide import OTHER_SIDE, decide
+from sros_tool.proof.decide import OTHER_SIDE, Worlds
 from sros_tool.proof.findings import MOST_STEPS
 from sros_tool.proof.flow import influencers
 from sros_tool.proof.requirements import (
@@ -50,9 +50,10 @@ def suggest(rights: Iterable[Right], worlds: Sequence[World]) -> tuple[Requireme
     """
     found: list[Requirement] = []
     limit = SearchLimit(MOST_STEPS)
+    all_worlds = Worlds(worlds)
     for each in islice(_candidates(_Stated(rights), worlds), _MOST):
-        verdicts = (decide(each, world, limit) for world in worlds)
-        if not any(verdict.witness or verdict.empty for verdict in verdicts):
+        verdicts = all_worlds.decide(each, limit)
+        if not any(verdict.witness or verdict.empty for _, verdict in verdicts):
             last = _joined(found[-1], each) if found else None
             found[-1:] = [last] if last else [*found[-1:], each]
     return tuple(found)

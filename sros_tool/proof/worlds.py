@@ -10,7 +10,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from string import ascii_letters, digits
 from types import MappingProxyType
 
@@ -231,13 +231,29 @@ class World:
         self.stated = stated
         self.longest = longest
         self.enclaves = tuple(sorted(access))
-        self._writers = Side({each: access[each].writes for each in self.enclaves})
-        self._readers = Side({each: access[each].reads for each in self.enclaves})
+        self._access = access
         self.needed = tuple(needed)
         self.idle = frozenset(idle)
         self._weak = weak
         self._readers_of: dict[str, list[str]] = {}
         self._shared: dict[tuple[str, str], str | None] = {}
+
+    def gives_as(self, other: World) -> bool:
+        """Return whether all decisions are those of ``other``: both have equal sets."""
+        return (
+            (self.longest, self.needed, self.idle) == (other.longest, other.needed, other.idle)
+            and self.stated == other.stated
+            and self._weak == other._weak
+            and self._access == other._access
+        )
+
+    @cached_property
+    def _writers(self) -> Side:
+        return Side({each: self._access[each].writes for each in self.enclaves})
+
+    @cached_property
+    def _readers(self) -> Side:
+        return Side({each: self._access[each].reads for each in self.enclaves})
 
     def side(self, writes: bool) -> Side:
         """Return what enclaves may write, or what they may read."""

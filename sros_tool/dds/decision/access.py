@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from enum import Enum, auto
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import groupby, takewhile
 from string import ascii_letters, digits
 
@@ -183,8 +183,8 @@ class _GrantRules:
         self._verbs = verbs
 
     @cached_property
-    def _index(self) -> tuple[Sequence[_Entry], ExpressionIndex]:
-        """The topics of the rules in order, and their index: many are never asked about."""
+    def _entries(self) -> Sequence[_Entry]:
+        """The topics of the rules in order."""
         traits = self._traits
         entries: list[_Entry] = []
         count = 0
@@ -202,16 +202,20 @@ class _GrantRules:
                     for expression in each.topics
                     if _trimmed(traits, expression) or traits.crashes_on_empty_texts
                 ]
-        texts = (_usable_expression(traits, entry.expression) for entry in entries)
-        return entries, ExpressionIndex(traits.style, texts)
+        return entries
+
+    @cached_property
+    def _index(self) -> ExpressionIndex:
+        """The index of the entries, which are asked about seldom, or often."""
+        texts = (_usable_expression(self._traits, each.expression) for each in self._entries)
+        return ExpressionIndex(self._traits.style, texts)
 
     def ask(self, topic: str, partitions: tuple[str, ...]) -> RuleVerdict:
         """Return the verdict on an endpoint of ``topic`` in ``partitions`` (none: default)."""
         wanted = partitions or _DEFAULT_PARTITION
         passed = 0
-        entries, topics = self._index
-        for position in topics.matching(topic):
-            entry = entries[position]
+        for position in self._index.matching(topic):
+            entry = self._entries[position]
             if entry.criteria == passed:
                 continue  # only the first matching topic of a criteria counts
             passed = entry.criteria
@@ -222,17 +226,15 @@ class _GrantRules:
 
     def ask_topic(self, topic: str) -> RuleVerdict:
         """Return the verdict on a topic, whatever the partitions."""
-        entries, topics = self._index
-        position = topics.first(topic)
+        position = self._index.first(topic)
         if position is None:
             return self._otherwise
-        return entries[position].verdict(fits=True)
+        return self._entries[position].verdict(fits=True)
 
     def names(self) -> NameSet:
         """Return the topics that `ask` allows in the default partition."""
-        entries, _ = self._index
         rules: list[tuple[NameSet, bool]] = []
-        for _, some in groupby(entries, key=lambda each: each.criteria):
+        for _, some in groupby(self._entries, key=lambda each: each.criteria):
             group = list(some)
             fits = self._fits(group[0], _DEFAULT_PARTITION)
             if fits or self._traits.topic_decides:
@@ -248,7 +250,7 @@ class _GrantRules:
 
     def topic_names(self) -> NameSet:
         """Return the topics that `ask_topic` allows."""
-        return NameSet.first(self._deciding(self._index[0]), self._otherwise.allowed)
+        return NameSet.first(self._deciding(self._entries), self._otherwise.allowed)
 
     def _deciding(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
         """Yield the topics of entries, joined as long as their verdict is the same, with it."""
@@ -258,8 +260,8 @@ class _GrantRules:
             yield self._names_of(some), allowed
 
     def _names_of(self, entries: Iterable[_Entry]) -> NameSet:
-        texts = (_usable_expression(self._traits, each.expression) for each in entries)
-        return names_of(self._traits.style, texts)
+        texts = tuple([_usable_expression(self._traits, each.expression) for each in entries])
+        return _of_texts(self._traits.style, texts)
 
     def _fits(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
         style, named = self._traits.style, entry.partitions
@@ -270,6 +272,10 @@ class _GrantRules:
         if self._traits.deny_partitions is DenyPartitions.IGNORED:
             return True
         return any(_named(style, named, each) for each in wanted)
+
+
+_of_texts = lru_cache(maxsize=8192)(names_of)
+"""Several vendors, and several enclaves, have the same names."""
 
 
 def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
