@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -51,12 +53,21 @@ from sros_tool.xml import read_bytes
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """A running process: its command, environment, and start time."""
+    """A running process: its command, environment, and start time.
+
+    ``has_loaded`` is whether it has loaded the libraries of ROS 2 or of a DDS.
+    """
 
     pid: int
     command: tuple[str, ...]
     environment: Mapping[str, str]
     started: datetime
+    has_loaded: bool = False
+
+    @property
+    def is_node(self) -> bool:
+        """Whether it runs ROS nodes."""
+        return self.has_loaded or "--ros-args" in self.command
 
     @property
     def label(self) -> str:
@@ -83,10 +94,13 @@ class RuntimeState:
     clock: datetime | None = None
 
 
-def running_processes(proc: Path = Path("/proc")) -> Iterator[Process]:
-    """Yield the processes whose environment this user may read, except this process."""
+def running_processes(now: datetime, proc: Path = Path("/proc")) -> Iterator[Process]:
+    """Yield the processes whose environment this user may read, except this process.
+
+    ``now`` is the time on the clock of this machine.
+    """
     ticks = os.sysconf("SC_CLK_TCK")
-    begin = _boot_time(proc)
+    begin = now - timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
     for folder in sorted(proc.glob("[0-9]*"), key=lambda each: int(each.name)):
         if int(folder.name) == os.getpid():
             continue
@@ -98,20 +112,13 @@ def running_processes(proc: Path = Path("/proc")) -> Iterator[Process]:
             numbers = (folder / "stat").read_text().rpartition(")")[2].split()
             started = begin + timedelta(seconds=int(numbers[19]) / ticks)
             command = tuple(_words(folder / "cmdline"))
-            yield Process(int(folder.name), command, environment, started)
+            has_loaded = bool(_LIBRARIES.search((folder / "maps").read_text(errors="replace")))
+            yield Process(int(folder.name), command, environment, started, has_loaded)
 
 
 def _words(path: Path) -> list[str]:
     text = path.read_bytes().decode("utf-8", "replace")
     return [word for word in text.split("\0") if word]
-
-
-def _boot_time(proc: Path) -> datetime:
-    with suppress(OSError, StopIteration, ValueError):
-        lines = (proc / "stat").read_text().splitlines()
-        seconds = next(line.split()[1] for line in lines if line.startswith("btime "))
-        return datetime.fromtimestamp(int(seconds), UTC)
-    return datetime.fromtimestamp(0, UTC)
 
 
 RMW_NOT_INSTALLED = FindingKind(
@@ -194,6 +201,7 @@ MIXED_VENDORS = FindingKind(
 _NOT_DDS = ("rmw_email", "rmw_iceoryx")
 _ZENOH_ROUTER = "rmw_zenohd"
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
+_LIBRARIES = re.compile(r"/lib(?:rcl|ddsc|fastrtps|fastdds)\.so")
 _TOLERANCE = timedelta(minutes=2)
 _LOADED = ("cert.pem", "permissions.p7s", "governance.p7s", "crl.pem", "identity_ca.cert.pem")
 
@@ -236,6 +244,8 @@ def _clock(state: RuntimeState) -> Iterator[Finding]:
 
 def _processes(state: RuntimeState) -> Iterator[Finding]:
     secured_here = _is_secured(state.environment)
+    secured = [each.environment for each in state.processes if _is_secured(each.environment)]
+    domains = {_domain(each) for each in [*secured, *([state.environment] if secured_here else [])]}
     rmws: dict[str, list[str]] = {}
     for process in state.processes:
         environment = process.environment
@@ -248,7 +258,7 @@ def _processes(state: RuntimeState) -> Iterator[Finding]:
             yield from _outdated(process)
             yield from _runs_unsecured(process)
             yield from _zenoh_process(process)
-        elif secured_here and _is_node_in_same_domain(process, state.environment):
+        elif process.is_node and _domain(environment) in domains:
             text = f"in domain {_domain(environment)}, with {ENABLE} not 'true'"
             yield PROCESS_UNSECURED.found(process.label, text)
     if secured_here:
@@ -309,7 +319,7 @@ def _zenoh_process(process: Process) -> Iterator[Finding]:
 def _runs_unsecured(process: Process) -> Iterator[Finding]:
     environment = process.environment
     root = environment.get(KEYSTORE, "")
-    if "--ros-args" not in process.command or (root and not Path(root).is_absolute()):
+    if not process.is_node or (root and not Path(root).is_absolute()):
         return
     with suppress(SrosError):  # with Enforce it did not start, or its files are gone since
         choice = choose_loadable(environment, enclave_argument(process.command))
@@ -324,11 +334,6 @@ def _is_secured(environment: Mapping[str, str]) -> bool:
 
 def _is_daemon(process: Process) -> bool:
     return any(mark in word for word in process.command for mark in _DAEMON)
-
-
-def _is_node_in_same_domain(process: Process, environment: Mapping[str, str]) -> bool:
-    """Return whether a process runs ROS nodes (``--ros-args``) in the same domain."""
-    return "--ros-args" in process.command and _domain(process.environment) == _domain(environment)
 
 
 def _domain(environment: Mapping[str, str]) -> str:
@@ -523,7 +528,10 @@ def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
         yield ENABLE_MISSPELT.found(ENABLE, _value(environment, ENABLE))
     elif enable is None and (strategy or environment.get(KEYSTORE) or environment.get(ENCLAVE)):
         named = [name for name in (STRATEGY, KEYSTORE, ENCLAVE) if environment.get(name)]
-        yield NOT_ENABLED.found(ENABLE, f"{', '.join(named)} are set, and {ENABLE} is not")
+        yield NOT_ENABLED.found(
+            ENABLE,
+            f"{' and '.join(named)} {'is' if len(named) == 1 else 'are'} set, and {ENABLE} is not",
+        )
     if strategy not in (None, "", "Enforce", "Permissive"):
         yield STRATEGY_MISSPELT.found(STRATEGY, _value(environment, STRATEGY))
     for name in sorted(environment):

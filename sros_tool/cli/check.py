@@ -376,8 +376,9 @@ def _findings_here(
     from sros_tool.runtime.rmw import rmw_implementations
 
     zone = local_zone(environment)
-    rmws, processes = rmw_implementations(environment), tuple(running_processes())
-    state = RuntimeState(environment, moment, zone, processes, rmws, insecure_rmws, now())
+    clock = now()
+    rmws, processes = rmw_implementations(environment), tuple(running_processes(clock))
+    state = RuntimeState(environment, moment, zone, processes, rmws, insecure_rmws, clock)
     return runtime_findings(state)
 
 

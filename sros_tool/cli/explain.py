@@ -8,6 +8,7 @@ from contextlib import suppress
 from datetime import tzinfo
 from functools import cache
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -411,6 +412,7 @@ def _show_answer(
         _echo(lines)
         _echo(_beside_lines(zenoh))
     notes = [
+        *_policy_alone(root, enclave, policy),
         *taken,
         *_provenance_notes(answer, policy),
         *_other_type(evaluator, answer, kind),
@@ -425,6 +427,20 @@ def _show_answer(
             notes.append(Note("explain.vendors-differ", f"{_differences(measured)}."))
     print_notes(notes)
     return 0 if answer.allowed else 1
+
+
+def _policy_alone(root: Path | None, enclave: LoadedEnclave, policy: Path | None) -> list[Note]:
+    """Return a note if a policy was asked although a keystore is set in the environment."""
+    from sros_tool.runtime.environment import KEYSTORE
+
+    default = os.environ.get(KEYSTORE)
+    if not default or root is not None or enclave.signed or policy is None:
+        return []
+    text = (
+        f"this is what the policy '{policy}' says. To ask what is signed, name the keystore: "
+        f"`sros explain {quote(default)} {enclave.name} ...`."
+    )
+    return [Note("explain.policy-alone", text)]
 
 
 def _question(rest: tuple[str, ...], kind: str | None) -> Question:

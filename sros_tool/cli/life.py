@@ -158,6 +158,12 @@ def _print_replaced(result: Renewal) -> None:
             else f"the replaced certificates work until {end} at the latest"
         )
         click.echo(f"{what}, unless revoked: see --revoke-old", err=True)
+    if result.renewed and not result.restart:
+        click.echo(
+            "exports and running processes still have the earlier certificates and permissions: "
+            "export again, and restart, before those expire",
+            err=True,
+        )
     print_restart(result.restart, result.zenoh)
     print_remarks(result.remarks)
 
@@ -552,6 +558,8 @@ def _step_json(step: RotationStep, remarks: Sequence[str], dry_run: bool) -> dic
 def _print_step(
     step: RotationStep, status: RotationStatus, *, together: bool, same_key: bool
 ) -> None:
+    from sros_tool.keystore.lifecycle.rotation.state import EXPORT_FIRST
+
     if not step.changes:
         done = (
             "the last rotation is complete"
@@ -580,7 +588,7 @@ def _print_step(
             if together
             else "at any time; processes before and after the restart communicate"
         )
-        click.echo(f"Restart all processes {how}.", err=True)
+        click.echo(f"Restart all processes {how}. {EXPORT_FIRST}", err=True)
     for remark in status.remarks:
         click.echo(remark, err=True)
 

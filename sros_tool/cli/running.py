@@ -334,13 +334,19 @@ def run(
     elif found.needs_pin and pin is not None:
         environment[_FAST_DDS_PIN] = pin
     print_notes(found.notes)
-    if enclave_argument(command) != name:
+    names_it = enclave_argument(command) == name or _is_demo(command)
+    if not names_it:
         print_notes(found.enclave_notes)
     sys.stdout.flush()
     sys.stderr.flush()
     for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them, and COMMAND would too
         signal.signal(ignored, signal.SIG_DFL)
     os.execve(program, command, environment)
+
+
+def _is_demo(command: Sequence[str]) -> bool:
+    """Return whether a command is a node of `sros demo`, which names its enclave itself."""
+    return Path(command[0]).name == "sros" and list(command[1:2]) == ["demo"]
 
 
 def _enclave_of_node(file: Path, command: Sequence[str]) -> str:

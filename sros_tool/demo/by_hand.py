@@ -10,6 +10,7 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +19,12 @@ from sros_tool.demo.backend import CYCLONE, RCLPY, ZENOH, zenoh_backend
 from sros_tool.demo.network import end_with_starter
 from sros_tool.demo.scenarios.model import Role
 from sros_tool.errors import SrosError, UsageError
-from sros_tool.runtime.environment import ENCLAVE
+from sros_tool.runtime.environment import ENABLE, ENCLAVE
 from sros_tool.runtime.events import Event, EventKind, parse_event
 from sros_tool.runtime.rcl_security import choose_loadable, domain_of
 
 _SILENCE = 5.0
-"""Seconds after which a listener says that it heard nothing."""
+"""Seconds after which a node says that it heard nothing, or is not connected."""
 
 _LIBRARIES = {CYCLONE: "Cyclone DDS", RCLPY: "rclpy", ZENOH: "Zenoh"}
 _MODULES = {CYCLONE: "cyclone", RCLPY: "ros", ZENOH: "zenoh"}
@@ -58,6 +59,8 @@ def security_of(node: HandNode, environment: Mapping[str, str]) -> str:
         kind = "ROUTER" if node.role is Role.ROUTER else "SESSION"
         uri = environment.get(f"ZENOH_{kind}_CONFIG_URI", "")
         security = f"configured by {uri}" if uri else "WITHOUT security"
+        if not uri and environment.get(ENABLE) == "true":
+            security += ", as Zenoh ignores ROS_SECURITY_*: add --rmw rmw_zenoh_cpp to `sros run`"
     else:
         choice = choose_loadable(environment)
         name = environment.get(ENCLAVE) or "/"
@@ -86,29 +89,48 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
     if node.backend == RCLPY:  # what it logs of its messages is said here already
         command += ["--ros-args", "--log-level", "warn", "--"]
     command += ["--report", f"/proc/self/fd/{writing}"]
+    stopped = threading.Event()
+
+    def stop(*_: object) -> None:
+        stopped.set()
+        process.terminate()
+
     with subprocess.Popen(command, pass_fds=[writing], preexec_fn=end_with_starter()) as process:
         os.close(writing)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda *_: process.terminate())
+            signal.signal(number, stop)
         with open(events, "rb", buffering=0) as pipe:
             _tell(node, pipe.fileno(), say)
-        return process.wait()
+        status = process.wait()
+    if stopped.is_set():
+        say("stopped")
+    elif status and node.backend == RCLPY:
+        say("`sros doctor` says whether rclpy on this machine can be secured")
+    return status
 
 
 def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> None:
     """Say what the node reports, until it ends."""
     data = b""
+    connected = node.backend != ZENOH
     while len(data) < _LONGEST_LINE:
         ready, _, _ = select.select([pipe], [], [], _SILENCE)
         if not ready:
-            if node.role is Role.LISTENER:
+            if not connected:
+                say(
+                    f"not connected for {_SILENCE:.0f} s: no router runs (`sros demo router` "
+                    "starts one), or it refuses this node"
+                )
+            elif node.role is Role.LISTENER:
                 say(f"heard nothing for {_SILENCE:.0f} s")
             continue
         if not (more := os.read(pipe, 65536)):
             return
         *lines, data = (data + more).split(b"\n")
         for line in lines:
-            if text := _line(parse_event(line, Path("the node's report"))):
+            event = parse_event(line, Path("the node's report"))
+            connected = connected or event.kind is EventKind.READY
+            if text := _line(event):
                 say(text)
     raise SrosError("a node reported too long a message", f"It is over {_LONGEST_LINE} bytes long.")
 
@@ -120,7 +142,7 @@ def _line(event: Event) -> str:
         case EventKind.HEARD:
             return f"heard  {event.text}"
         case EventKind.REFUSED | EventKind.FAILED:
-            return f"{event.kind}: {event.text}"
+            return f"{event.kind}: {' '.join(event.text.split())}"
         case EventKind.READY:
             return "ready"
         case _:

@@ -25,6 +25,14 @@ def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
     if revocation := _revocation(root, name):
         return _was_revoked(root, revocation)
     what = f"enclave {name} does not exist in keystore '{root}'"
+    names = sorted(there)
+    if below := [each for each in names if name and each.startswith(f"{name}/")]:
+        number = "1 enclave" if len(below) == 1 else f"{len(below)} enclaves"
+        return KeystoreError(
+            what,
+            f"It is the namespace of {number}, such as {below[0]}.",
+            f"Name one of them; a verb that takes several also has --match '{name}/*'.",
+        )
     meant = likely_names(name, there)
     if meant:
         return KeystoreError(what, "", f"Perhaps you mean {' or '.join(meant)}.")
@@ -32,7 +40,6 @@ def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
         check_enclave_name(name)
     except InvalidNameError as error:
         return error
-    names = sorted(there)
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     why = f"The keystore has {', '.join(names[:_SHOWN]) or 'no enclave'}{more}."
     if not any((root / part).exists() for part in (PUBLIC, PRIVATE, SETTINGS)):

@@ -274,9 +274,10 @@ def _missing_remedy(file: Path) -> str:
     tail = file.parts[file.parts.index(common) :] if common in file.parts else ()
     if not tail or not policies_dir().joinpath(*tail).is_file():
         return ""
+    place = Path(*file.parts[: len(file.parts) - len(tail)])
     return (
-        "It ships with sros: `sros policies --copy DIR` writes DIR/common, whose place is next to "
-        "the policy."
+        "It ships with sros. Put it there: `sros policies --copy shipped && cp -r shipped/common "
+        f"{quote(str(place))}`."
     )
 
 

@@ -525,6 +525,12 @@ LOG_TEXTS: tuple[LogText, ...] = (
         r"(?P<topic>\S+) (?P<how>denied by default rule|found in deny_rule)",
         refuses=Refused.TOPIC,
     ),
+    _text(  # the nodes of `sros demo`
+        "topic-denied", _CYCLONE,
+        r"cannot create (?:topic|a (?:writer|reader) on) (?P<topic>\S+)\. "
+        r"(?P<how>Not Allowed By Security)",
+        refuses=Refused.TOPIC,
+    ),
     # ── refusals without a cause ───────────────────────────────────────────────────────────
     _text("refusal", _FAST, r"validate_local_identity|verifying CA certificate",
           refuses=Refused.PARTICIPANT),
@@ -627,11 +633,11 @@ PEER = re.compile(r"check_remote_data|remote (?:writer|reader)")
 
 DIRECTIONS: Mapping[str, re.Pattern[str]] = {
     "writer": re.compile(
-        r"Writer is not|local writer|check_create_datawriter|datawriter_sec"
+        r"Writer is not|local writer|create a writer on|check_create_datawriter|datawriter_sec"
         r"|associated Writer|DATA_WRITER|create(?:_p| p|P)ublisher|register_local_writer"
     ),
     "reader": re.compile(
-        r"Reader is not|local reader|check_create_datareader|datareader_sec"
+        r"Reader is not|local reader|create a reader on|check_create_datareader|datareader_sec"
         r"|associated Reader|DATA_READER|create(?:_s| s|S)ubscri|register_local_reader"
     ),
     "client": re.compile(r"create(?:_c| c|C)lient"),

@@ -75,7 +75,7 @@ def test_the_status_is_about_the_nodes_of_ros(
 ) -> None:
     monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis(stacks))
     # Other tests run secured processes on this machine, and doctor looks at those, too.
-    monkeypatch.setattr(runtime, "running_processes", lambda: iter(()))
+    monkeypatch.setattr(runtime, "running_processes", lambda _: iter(()))
     ended = sros("doctor", env={})
     assert ended.status == status
     assert said in ended.out.rpartition("\n\n")[2]

@@ -178,7 +178,7 @@ def test_it_finds_out_what_a_path_is(bench: Bench, tmp_path: Path) -> None:
 def test_the_runtime_and_the_keystore_it_names(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runtime, "running_processes", lambda: iter(()))
+    monkeypatch.setattr(runtime, "running_processes", lambda _: iter(()))
     env = {"ROS_SECURITY_ENABLE": "True", "ROS_SECURITY_KEYSTORE": str(bench.root)}
     ended = sros("check", env=env)
     assert ended.status == 1

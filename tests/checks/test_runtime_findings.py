@@ -162,23 +162,45 @@ def test_variables_of_old_and_in_small_letters(
     assert ids(having(**{name: "x"})(sound_one, bench)) == {"runtime.variable-misspelt"}
 
 
-def test_real_processes_are_read() -> None:
+def test_an_open_node_is_found_next_to_a_secured_one_from_a_shell_without_security(
+    sound_one: RuntimeState,
+) -> None:
+    secured = sound_one.processes[0]
+    open_node = replace(secured, pid=9, environment={"ROS_DOMAIN_ID": "0"})
+    shell = replace(sound_one, environment={"PATH": "/usr/bin"})
+    assert ids(replace(shell, processes=(secured, open_node))) == {"runtime.process-unsecured"}
+    quiet = replace(open_node, command=("python3", "talker.py"))
+    assert ids(replace(shell, processes=(secured, quiet))) == set()
+    loaded = replace(quiet, has_loaded=True)
+    assert ids(replace(shell, processes=(secured, loaded))) == {"runtime.process-unsecured"}
+    elsewhere = replace(open_node, environment={"ROS_DOMAIN_ID": "1"})
+    assert ids(replace(shell, processes=(secured, elsewhere))) == set()
+    assert ids(replace(shell, processes=(open_node,))) == set()
+
+
+def test_real_processes_are_read(tmp_path: Path) -> None:
     environment = {**os.environ, ENCLAVE: "/sros_test_of_processes"}
-    command = [sys.executable, "-c", "import time; time.sleep(600)"]
-    before = datetime.now(UTC) - timedelta(seconds=2)
-    child = subprocess.Popen(command, env=environment)
+    (tmp_path / "librcl.so").write_bytes(b"x" * 4096)
+    script = (
+        "import mmap, time; file = open('librcl.so', 'rb');"
+        "loaded = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ); time.sleep(600)"
+    )
+    command = [sys.executable, "-c", script]
+    before = datetime.now(UTC) - timedelta(seconds=0.1)  # the kernel counts hundredths
+    child = subprocess.Popen(command, env=environment, cwd=tmp_path)
     try:
 
         def seen() -> Any:
-            mine = (each for each in running_processes() if each.pid == child.pid)
-            return next((each for each in mine if each.environment.get(ENCLAVE)), None)
+            mine = (each for each in running_processes(datetime.now(UTC)) if each.pid == child.pid)
+            return next((e for e in mine if e.environment.get(ENCLAVE) and e.has_loaded), None)
 
         found = wait_for(seen, "the process with its environment")
         assert found is not None
         assert found.environment[ENCLAVE] == "/sros_test_of_processes"
         assert found.command[1] == "-c"
-        assert before < found.started < datetime.now(UTC) + timedelta(seconds=2)
-        assert os.getpid() not in {each.pid for each in running_processes()}
+        assert before < found.started < datetime.now(UTC) + timedelta(seconds=0.1)
+        assert found.is_node
+        assert os.getpid() not in {each.pid for each in running_processes(datetime.now(UTC))}
     finally:
         child.kill()
         child.wait()

@@ -240,7 +240,7 @@ def test_what_a_verb_prints_beside_a_graph(
 
 
 def test_what_doctor_prints(made_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime, "running_processes", lambda: iter(()))
+    monkeypatch.setattr(runtime, "running_processes", lambda _: iter(()))
     seen = Seen()
     for stacks, status in (((RMW, CYCLONE), 1), ((RMW,), 1), ((CYCLONE,), 0)):
         monkeypatch.setattr(doctor, "examine", lambda *_, found=stacks: Diagnosis(found))

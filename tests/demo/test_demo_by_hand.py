@@ -42,6 +42,7 @@ def test_a_node_on_zenoh_says_its_configuration() -> None:
     pytest.importorskip("zenoh")
     node = HandNode(Role.LISTENER, "zenoh", "/chatter")
     assert "WITHOUT security" in security_of(node, {"ROS_SECURITY_ENABLE": "true"})
+    assert "--rmw rmw_zenoh_cpp" in security_of(node, {"ROS_SECURITY_ENABLE": "true"})
     assert security_of(node, {"ZENOH_SESSION_CONFIG_URI": "/a.json5"}).endswith("by /a.json5")
     with pytest.raises(UsageError, match="only Zenoh has routers"):
         HandNode(Role.ROUTER, "rclpy", "/chatter")

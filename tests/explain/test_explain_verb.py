@@ -477,6 +477,16 @@ def test_a_change_invents_no_node(by_policy: bool, tmp_path: Path) -> None:
     assert '<profile ns="/" node="*">' in found.out
 
 
+def test_a_policy_that_is_asked_in_place_of_the_keystore_of_the_environment_is_said(
+    whole: Path,
+) -> None:
+    asked = (ENCLAVE, "publish", "/chatter", "--policy", POLICY)
+    note = "note [explain.policy-alone]"
+    assert note in explain(*asked, env={"ROS_SECURITY_KEYSTORE": str(whole)}).err
+    assert note not in explain(*asked).err
+    assert note not in explain(whole, *asked, env={"ROS_SECURITY_KEYSTORE": str(whole)}).err
+
+
 def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> None:
     node = read_policy(POLICY).enclaves[0].all_profiles()[0]
     found = explain(whole, ENCLAVE, "publish", "/nothing")

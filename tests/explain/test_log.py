@@ -519,6 +519,13 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
         assert ended.err.strip() == said
 
 
+def test_what_the_nodes_of_the_demo_print_names_the_topic() -> None:
+    for what, verb in (("topic", "use"), ("a writer on", "publish"), ("a reader on", "subscribe")):
+        (found,) = explained(f"refused: cannot create {what} rt/chatter. Not Allowed By Security.")
+        assert found.id == "topic-denied"
+        assert f"may not {verb} /chatter" in found.cause, found.cause
+
+
 def test_what_tells_more_counts() -> None:
     log = (
         "[SECURITY Error] rt/other topic not found in allow rule. -> Function "

@@ -49,6 +49,14 @@ def test_where_nobody_is_meant_the_error_says_who_is_there(tmp_path: Path) -> No
     assert "/x and 1 more. If it is not a typo, create it with `sros create_enclave " in text
 
 
+def test_a_namespace_is_not_taken_for_an_enclave_that_is_missing() -> None:
+    text = str(no_such_enclave(Path("robot"), "/r1", ["/r1/base", "/r1/arm", "/r10"]))
+    assert text == (
+        "enclave /r1 does not exist in keystore 'robot'. It is the namespace of 2 enclaves, such "
+        "as /r1/arm. Name one of them; a verb that takes several also has --match '/r1/*'."
+    )
+
+
 def test_an_export_gets_it_from_its_keystore(tmp_path: Path) -> None:
     text = str(no_such_enclave(tmp_path, "/camera", THERE))
     assert f"export it with `sros distribute_key KEYSTORE /camera {tmp_path}`." in text

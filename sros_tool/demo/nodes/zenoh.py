@@ -486,7 +486,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     signal.signal(signal.SIGINT, end)
     signal.signal(signal.SIGTERM, end)
-    zenoh.init_log_from_env_or("error,zenoh_link_tls=warn")
+    # It warns of each connection that names are not verified, as the configuration says.
+    zenoh.init_log_from_env_or("error,zenoh_link_tls=warn,zenoh_link_tls::utils=error")
     stage = ProcessStage.PARTICIPANT
     try:
         config = _configuration(os.environ, router=options.role == "router")

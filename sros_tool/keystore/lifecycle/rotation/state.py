@@ -256,13 +256,17 @@ def _expiry_remarks(states: Sequence[AuthorityStatus], now: datetime) -> list[st
     return remarks
 
 
+EXPORT_FIRST = "Where they run from an export, export the enclaves again first."
+
+
 def _restart_remarks(root: Path, rotation: Rotation) -> list[str]:
     """Return remarks on the processes to restart at the stage DISTRIBUTE or REISSUE, by vendor."""
     files = [each.file for each in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
         return [
             "All vendors: restart the processes one by one, at any time; processes before and "
-            "after the restart communicate. Continue when all have been restarted."
+            "after the restart communicate. Continue when all have been restarted.",
+            EXPORT_FIRST,
         ]
     hindrance = _fast_dds_hindrance(root, files)
     remarks = [
@@ -284,7 +288,7 @@ def _restart_remarks(root: Path, rotation: Rotation) -> list[str]:
             "Revocations at this stage are signed by both CAs, if the key of the old CA is "
             "available."
         )
-    return remarks
+    return [*remarks, EXPORT_FIRST]
 
 
 def crls_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
