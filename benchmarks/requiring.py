@@ -1,4 +1,4 @@
-"""Benchmark of ``sros check --requirements`` on a policy of many enclaves."""
+"""Benchmarks of decisions for all names, on a policy of many enclaves."""
 
 from __future__ import annotations
 
@@ -33,7 +33,26 @@ def requiring(folder: Path, enclaves: int, rounds: int) -> list[Figure]:
 
     taken = statistics.median(work() for _ in range(rounds))
     name = f"sros check: 50 requirements, {enclaves} enclaves and names: CPU"
-    return [(name, taken, f"{LIMIT:g} s", taken < LIMIT)]
+    return [(name, taken, f"{LIMIT:g} s", taken < LIMIT), _comparing(policy, enclaves, rounds)]
+
+
+def _comparing(policy: Path, enclaves: int, rounds: int) -> Figure:
+    """Measure finding the one right that a changed policy adds."""
+    from sros_tool.proof.growth import compare_access
+    from sros_tool.proof.sources import load_side
+
+    changed = policy.with_name("changed.xml")
+    changed.write_text(policy.read_text().replace("/own_0/*", "/own_[0x]/*"))
+
+    def work() -> float:
+        begin = time.process_time()
+        found = compare_access(load_side(policy), load_side(changed))
+        taken = time.process_time() - begin
+        assert len(found.added) == 1
+        return taken
+
+    name = f"sros diff_policy --no-new-access, {enclaves} enclaves: CPU"
+    return name, statistics.median(work() for _ in range(rounds)), "-", True
 
 
 def required_policy(count: int) -> str:
