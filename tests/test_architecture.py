@@ -221,6 +221,17 @@ def circle(modules: Modules) -> list[str]:
     return []
 
 
+def test_a_package_of_many_modules_lists_them() -> None:
+    """Whoever opens such a package finds what stands where; the smaller ones are read at once."""
+    missing = {}
+    for first in PACKAGE.rglob("__init__.py"):
+        modules = {each.stem for each in first.parent.glob("*.py")} - {"__init__"}
+        if len(modules) > 25:
+            listed = ast.get_docstring(ast.parse(first.read_text())) or ""
+            missing[first.parent.name] = modules - set(re.findall(r"`(\w+)`", listed))
+    assert missing == {"cli": set()}
+
+
 def test_no_module_imports_itself_through_others() -> None:
     assert circle(modules_of("sros_tool")) == []
 

@@ -1,4 +1,16 @@
-"""The program ``sros``: parses the command line, calls one function, shows its result."""
+"""The program ``sros``: parses the command line, calls one function, shows its result.
+
+`program` lists the verbs; the modules of the verbs, by what they are about:
+
+- keystores: `keystore` (with the JSON of `written`), `inspect`, `life`, `zenoh` and `zenoh_from`
+- robots: `deployment`, `fleet`, `units`, `metrics`
+- processes: `running` (with `enclave_environment` and `containers`), `demo`
+- policies: `policy` (with `new_access`), `view`
+- robots that run: `generate_policy` and `audit` (with `observing`)
+- answers: `explain` (with `explain_zenoh`), `check`
+
+All share `common` and `progress`.  `ros2` has the same verbs as ``ros2 security``.
+"""
 
 from __future__ import annotations
 
