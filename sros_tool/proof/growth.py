@@ -76,7 +76,8 @@ class NewReach:
 class Growth:
     """What HEAD adds to BASE, and what it removes; ``reach`` and ``removed`` follow from these.
 
-    ``reach`` has at most 10,000 pairs; ``reach_known`` is False if only some enclaves are compared.
+    ``reach`` has at most 10,000 pairs; ``reach_known`` is False if only some enclaves are compared,
+    or if there are more than 200,000 hops between them.
     ``worlds`` are what was decided.
     """
 
@@ -108,11 +109,13 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     worlds = _worlds(base, head)
     added = tuple(_gains(base, head, worlds, scope, limit))
     removed = tuple(_gains(head, base, worlds, scope, limit))
+    sides = (_edges(base), _edges(head)) if added and scope is None else ({}, {})
+    known = scope is None and None not in sides
     return Growth(
         added,
         removed,
-        tuple(islice(_new_reach(base, head), _MOST_REACH)) if added and scope is None else (),
-        scope is None,
+        tuple(islice(_new_reach(*sides), _MOST_REACH)),
+        known,
         tuple(dict.fromkeys(_loosened(base, head, limit))),
         tuple(
             replace(e, effect=Effect.TIGHTER) for e in dict.fromkeys(_loosened(head, base, limit))
@@ -439,8 +442,9 @@ class _Stated:
         )
         name, action = topic, "write" if verb is AccessVerb.PUBLISH else "read"
         if right:
-            begin, _, end = expression.partition(right.name)
-            name, action = topic[len(begin) : len(topic) - len(end)], right.right
+            at = expression.find(right.name)  # a name in permissions can be empty
+            end = len(expression) - at - len(right.name)
+            name, action = topic[at : len(topic) - end], right.right
         return Gain(
             (enclave,),
             action,
@@ -477,11 +481,13 @@ _ROS_TOPICS = NameSet.union(
 _Edges = Mapping[str, Mapping[str, Hop]]
 """By source and target: a hop from one enclave to another."""
 _MOST_REACH = 10_000
+_MOST_HOPS = 200_000
 
 
-def _new_reach(base: AccessSource, head: AccessSource) -> Iterator[NewReach]:
-    """Yield whom enclaves can influence in ``head`` and not in ``base``, over new hops."""
-    before, after = _edges(base), _edges(head)
+def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach]:
+    """Yield whom enclaves can influence after and not before, over new hops; none if unknown."""
+    if before is None or after is None:
+        return
     changed = {
         source for source, of in after.items() if not of.keys() <= before.get(source, {}).keys()
     }
@@ -502,9 +508,17 @@ def _new_reach(base: AccessSource, head: AccessSource) -> Iterator[NewReach]:
             yield NewReach(source, target, tuple(path))
 
 
-def _edges(side: AccessSource) -> _Edges:
+def _edges(side: AccessSource) -> _Edges | None:
+    """Return all hops, or None if there are too many to follow them."""
     network = _network(side)
-    return {each: {hop.target: hop for hop in network.hops(each)} for each in network.enclaves}
+    found: dict[str, Mapping[str, Hop]] = {}
+    left = _MOST_HOPS
+    for each in network.enclaves:
+        found[each] = {hop.target: hop for hop in network.hops(each)}
+        left -= len(found[each])
+        if left < 0:
+            return None
+    return found
 
 
 def _reached(edges: _Edges, start: str) -> dict[str, Hop]:

@@ -23,6 +23,8 @@ from sros_tool.policy.protection import Level
 LONGEST = 255
 """Longest name of a topic in bytes: the limit of DDS in ROS 2 (rmw, validate_full_topic_name.h)."""
 _LAST = "\U0010ffff"
+_OF_A_STEP = 4
+"""Comparisons of the ends of wildcards that take as long as a step of a search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +111,7 @@ class Side:
         self._wild: dict[Automaton, list[str]] = defaultdict(list)
         self._any: list[str] = []
         self._found: dict[str, Sequence[str]] = {}
+        self._met: dict[Automaton, frozenset[str]] = {}
         for enclave, names in of.items():
             around = names.around()
             if around is None:
@@ -135,6 +138,7 @@ class Side:
         if own is None:
             alike = [each for each in self._wild if each.matches(topics.expression)]
         else:
+            limit.spend(len(self._wild) // _OF_A_STEP)
             alike = [each for each in self._wild if each.may_meet(own)]
         wild = {enclave for each in alike for enclave in self._wild[each]}.union(self._any)
         return [
@@ -173,12 +177,21 @@ class Side:
             return sorted(self.of)
         found = set(self._any)
         for own in automata:
-            for topic in self._matching(own, limit):
-                found.update(self.exact[topic])
-            for each, enclaves in self._wild.items():
-                if each.may_meet(own):
-                    found.update(enclaves)
+            if own not in self._met:
+                self._met[own] = self._meeting(own, limit)
+            found.update(self._met[own])
         return sorted(found)
+
+    def _meeting(self, own: Automaton, limit: SearchLimit) -> frozenset[str]:
+        limit.spend(len(self._wild) // _OF_A_STEP)
+        found: set[str] = set()
+        for topic in self._matching(own, limit):
+            found.update(self.exact[topic])
+        for each, enclaves in self._wild.items():
+            if each.may_meet(own):
+                found.update(enclaves)
+        limit.spend(len(found))  # they are kept
+        return frozenset(found)
 
     def users_of(self, topic: str) -> list[str]:
         """Return the enclaves that may use one topic, sorted."""

@@ -12,7 +12,10 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
+from sros_tool.automata import Automaton, SearchLimit
+from sros_tool.errors import DocumentError
 from sros_tool.pki import smime
+from sros_tool.proof.worlds import Side, Topics, named
 from tests.support.harness import sros
 
 POLICY = """<policy version="0.2.0"><enclaves>
@@ -218,3 +221,32 @@ def test_rules_of_zenoh_are_compared_key_by_key(sound: Path) -> None:
         ended = sros(*words, f"{base}.json5", f"{head}.json5", cwd=sound)
         assert ended.status == 1, ended
         assert "+ /web publish topic /status" in ended.out
+
+
+def test_a_name_without_letters_is_compared(tmp_path: Path) -> None:
+    """The topic of a foreign document can be empty, which Cyclone DDS takes for all of them."""
+    text = (
+        "<dds><permissions><grant name='g'><subject_name>CN=/web</subject_name><validity>"
+        "<not_before>2020-01-01T00:00:00</not_before><not_after>2040-01-01T00:00:00</not_after>"
+        "</validity><allow_rule><domains><id>0</id></domains><publish><topics>{}</topics></publish>"
+        "</allow_rule><default>DENY</default></grant></permissions></dds>"
+    )
+    (tmp_path / "base.xml").write_text(text.format("<topic>rt/a</topic>"))
+    (tmp_path / "head.xml").write_text(text.format("<topic>**</topic><topic></topic>"))
+    words = ("diff_policy", "--no-new-access", "base.xml", "head.xml")
+    ended = sros(*words, cwd=tmp_path)
+    assert ended.status in (1, 2), ended
+    assert "/web" in ended.out + ended.err
+
+
+def test_wildcards_that_are_compared_count() -> None:
+    """A policy of many wildcards and many requirements must not take hours."""
+    wild = {f"/e{each}": named(f"rt/{each}*") for each in range(1000)}
+    side, topics = Side(wild), Topics("rt", "/x*", "")
+    for ask in (
+        lambda limit: side.meeting(topics, limit),
+        lambda limit: side.perhaps_meeting([Automaton.sequence([None])], limit),
+    ):
+        with pytest.raises(DocumentError, match="so many wildcards"):
+            ask(SearchLimit(100))
+        assert ask(SearchLimit(10_000)) is not None
