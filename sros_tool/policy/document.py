@@ -84,8 +84,15 @@ class IncludedFile:
     linked: bool = False
 
 
+class MissingFileError(DocumentError):
+    """There is no such file where policies are read from."""
+
+
 PolicyFiles = Callable[[Path], bytes]
-"""Function that returns the content of a policy file; it raises `DocumentError` without one."""
+"""Function that returns the content of a policy file.
+
+It raises `MissingFileError` if there is none, and `DocumentError` if that is not certain.
+"""
 
 
 @dataclass(slots=True)
@@ -236,7 +243,7 @@ class Includer:
             return file.exists()
         try:
             self.load(file)
-        except DocumentError:
+        except MissingFileError:
             return False
         return True
 

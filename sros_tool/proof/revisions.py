@@ -14,11 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sros_tool.errors import DocumentError, UnavailableError, UsageError
+from sros_tool.policy.document import MissingFileError
 from sros_tool.policy.model import Source
 
 PREFIX = "git:"
 _MOST_BYTES = 32 * 1024 * 1024
+_MOST_FILES = 300  # of a folder
 _WAIT = 60  # seconds
+_FILE_MODES = (b"100644", b"100755", b"100664")
+_FOLDER_MODE, _LINK_MODE = b"040000", b"120000"
 _NOWHERE = Path("/dev/null/git")
 """No file can be there, so that no link or file of the disk is taken for one of a revision."""
 _SAFE = ("--no-pager", "-c", "core.fsmonitor=false", "-c", "core.hooksPath=/dev/null")
@@ -56,10 +60,15 @@ class Revision:
         spec = f"{self.commit}:{self.path}"
         if _git(["cat-file", "-t", spec]).strip() != b"tree":
             return (self,)
+        self._check_size(spec, str(self))
         listed = _git(["ls-tree", "--full-tree", "-z", "--name-only", spec]).decode(
             errors="replace"
         )
         names = sorted(each for each in listed.split("\0") if each.endswith(".xml"))
+        if len(names) > _MOST_FILES:
+            raise DocumentError(
+                f"'{self}' has more than {_MOST_FILES} files", "", "Name one of them."
+            )
         below = f"{self.path}/" if self.path else ""
         return tuple(Revision(self.name, self.commit, below + each) for each in names)
 
@@ -67,14 +76,40 @@ class Revision:
         """Return the content of a file that has a `place` in this revision.
 
         Raises:
-            DocumentError: the revision has no such file, or it is too large.
+            MissingFileError: the revision has no such file.
+            DocumentError: it is too large, or no file but for instance a link: where a link leads
+                to is not followed, so that what is there is not certain.
         """
-        spec = f"{self.commit}:{file.relative_to(_NOWHERE)}"
-        if _git(["cat-file", "-t", spec]).strip() != b"blob":
-            raise DocumentError(f"'{self.shown(str(file))}' is no file")
-        if int(_git(["cat-file", "-s", spec])) > _MOST_BYTES:
-            raise DocumentError(f"'{self.shown(str(file))}' is larger than {_MOST_BYTES} bytes")
+        path, shown = str(file.relative_to(_NOWHERE)), self.shown(str(file))
+        words = ["ls-tree", "--full-tree", "-z", self.commit, "--", path]
+        mode = _git(words, "--literal-pathspecs").partition(b" ")[0]
+        if not mode:
+            self._check_folders(path)
+            raise MissingFileError(f"'{shown}' does not exist")
+        if mode not in _FILE_MODES:
+            what = "a symbolic link" if mode == _LINK_MODE else "no file"
+            raise DocumentError(f"'{shown}' is {what}", "", "Name a file of the revision itself.")
+        spec = f"{self.commit}:{path}"
+        self._check_size(spec, shown)
         return _git(["cat-file", "blob", spec])
+
+    def _check_folders(self, path: str) -> None:
+        """Raise `DocumentError` if a missing path leads through what is no folder, such as a link.
+
+        On disk there could be a file.
+        """
+        for parent in reversed(Path(path).parents[:-1]):
+            words = ["ls-tree", "--full-tree", "-z", self.commit, "--", str(parent)]
+            mode = _git(words, "--literal-pathspecs").partition(b" ")[0]
+            if not mode:
+                return
+            if mode != _FOLDER_MODE:
+                raise DocumentError(f"'{PREFIX}{self.name}:{parent}' is no folder of the revision")
+
+    @staticmethod
+    def _check_size(spec: str, shown: str) -> None:
+        if int(_git(["cat-file", "-s", spec])) > _MOST_BYTES:
+            raise DocumentError(f"'{shown}' is larger than {_MOST_BYTES} bytes")
 
     def shown(self, text: str) -> str:
         """Return a text with the places of this revision as a user would name them."""
@@ -123,16 +158,16 @@ def find_revision(text: str) -> Revision:
     return Revision(name, found, "" if path == "." else path)
 
 
-def _git(arguments: Sequence[str]) -> bytes:
+def _git(arguments: Sequence[str], *options: str) -> bytes:
     """Return what git prints.
 
     Raises:
-        DocumentError: git fails, and says why; nothing is raised for a quiet failure.
+        DocumentError: git fails; of a command that is asked to be quiet only if it says why.
         UnavailableError: git is not installed.
     """
     try:
         done = subprocess.run(
-            ["git", *_SAFE, *arguments],
+            ["git", *_SAFE, *options, *arguments],
             env={**os.environ, **_ENVIRONMENT},
             stdin=subprocess.DEVNULL,
             capture_output=True,
@@ -144,6 +179,7 @@ def _git(arguments: Sequence[str]) -> bytes:
     except subprocess.TimeoutExpired as error:
         raise DocumentError(f"git does not answer within {_WAIT} seconds") from error
     said = done.stderr[:500].decode(errors="replace").strip()
-    if done.returncode and said:
-        raise DocumentError(f"git cannot read it: {said.removeprefix('fatal: ')}")
+    if done.returncode and (said or "--quiet" not in arguments):
+        why = said.removeprefix("fatal: ") or f"it ended with status {done.returncode}"
+        raise DocumentError(f"git cannot read it: {why}")
     return done.stdout

@@ -305,12 +305,22 @@ def test_a_revision_is_read_with_its_own_includes(repository: Path) -> None:
         ("git:main:../robot.xml", "outside of the repository"),
         ("git:main", "names no policy at a revision"),
         ("git::robot.xml", "names no policy at a revision"),
-        ("git:main:policies/link.xml", "Unable to compare"),
+        ("git:main:policies/link.xml", "is a symbolic link"),
+        ("git:main:policies/fallback.xml", "is a symbolic link"),
+        ("git:main:policies/through.xml", "is no folder of the revision"),
         ("git:main:policies/away.xml", "leaves the folder of the policy"),
     ],
 )
 def test_revisions_that_cannot_be_read(repository: Path, what: str, said: str) -> None:
     (repository / "policies" / "link.xml").symlink_to("robot.xml")
+    (repository / "policies" / "more.xml").symlink_to("common/more.xml")
+    (repository / "policies" / "linked").symlink_to("common")
+    for name, there in (("fallback", "more.xml"), ("through", "linked/more.xml")):
+        # On disk they give rights, so that a fallback without any would hide them.
+        other = INCLUDE.replace("common/more.xml", there).replace(
+            "/>", "><xi:fallback/></xi:include>"
+        )
+        write(repository / "policies", f"{name}.xml", "/x", "vel", other)
     away = INCLUDE.replace("common/more.xml", "../../etc/passwd")
     write(repository / "policies", "away.xml", "/x", "vel", away)
     git(repository, "add", "-A")
