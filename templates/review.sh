@@ -25,6 +25,17 @@ if [ -n "$SROS_BASE" ]; then
         printf '### Rights: the policy is new, so all of its access is new\n' >>"$SROS_SUMMARY"
         if [ "$SROS_NEW_ACCESS" != allow ]; then worst 1; fi
     else
+        earlier=$before/tree/$SROS_REQUIREMENTS
+        if [ -n "$SROS_REQUIREMENTS" ] && [ -f "$earlier" ] &&
+            ! cmp -s "$earlier" "$SROS_REQUIREMENTS"; then
+            printf '### The requirements change: these are decided as they were before\n\n' \
+                >>"$SROS_SUMMARY"
+            sros check policy "$SROS_POLICY" --requirements "$earlier" --include 'requirement.*' \
+                --format markdown >>"$SROS_SUMMARY" || {
+                code=$?
+                if [ "$code" -gt 1 ] || [ "$SROS_NEW_ACCESS" != allow ]; then worst "$code"; fi
+            }
+        fi
         sros diff_policy "$before/tree/$SROS_POLICY" "$SROS_POLICY" --format markdown \
             >>"$SROS_SUMMARY" || { code=$?; if [ "$code" -gt 1 ]; then worst "$code"; fi; }
         sros diff_policy --no-new-access "$before/tree/$SROS_POLICY" "$SROS_POLICY" \

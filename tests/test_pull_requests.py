@@ -130,6 +130,7 @@ def run_action(origin: Origin, clone: Path, **inputs: str) -> tuple[int, str, di
         values[f"inputs.{name}"] = expanded(given, values)
     install, review = action["runs"]["steps"]
     assert "pip" in install["run"]
+    assert not re.search(r"python3 (?!-I )", install["run"] + review["run"])
     environment = {name: expanded(text, values) for name, text in review["env"].items()}
     ended = subprocess.run(
         ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c", review["run"]],
@@ -145,6 +146,9 @@ def run_action(origin: Origin, clone: Path, **inputs: str) -> tuple[int, str, di
         check=False,
     )
     assert "Traceback" not in ended.stderr
+    begin, *printed, end = ended.stdout.splitlines()
+    assert begin.removeprefix("::stop-commands::") == end.strip(":")
+    assert not printed
     outputs = dict(line.split("=", 1) for line in files["GITHUB_OUTPUT"].read_text().splitlines())
     for name, spec in action["outputs"].items():
         assert spec["value"] == f"${{{{ steps.{review['id']}.outputs.{name} }}}}"
@@ -187,6 +191,30 @@ def test_the_action_on_pull_requests(origin: Origin, tmp_path: Path) -> None:
 
     status, said, _ = run_action(origin, origin.clone(tmp_path / "broken", "broken"), **ALL)
     assert status != 0, said
+
+
+def test_requirements_that_a_pull_request_drops_are_decided(origin: Origin, tmp_path: Path) -> None:
+    clone = origin.clone(tmp_path / "dropped", "wider")
+    file = clone / ALL["requirements"]
+    file.write_text(REQUIREMENTS.replace("/mux", "/*"))
+    status, said, _ = run_action(origin, clone, **ALL)
+    assert status == 1, said
+    assert "requirements change" in said
+    assert "but only /mux may publish /cmd_vel" in said
+    shutil.rmtree(tmp_path / "dropped.temp")
+    status, said, _ = run_action(origin, clone, **ALL, new_access="allow")
+    assert status == 0, said
+
+
+def test_the_installation_runs_nothing_of_the_pull_request(tmp_path: Path) -> None:
+    install, _ = yaml.safe_load((PROJECT / "action.yml").read_text())["runs"]["steps"]
+    (line,) = (each for each in install["run"].splitlines() if "-m venv" in each)
+    for name in ("venv", "ensurepip", "secrets"):
+        (tmp_path / f"{name}.py").write_text("open('sprung', 'w')")
+    words = line.replace('"$RUNNER_TEMP/sros"', "--help")
+    environment = {"PATH": os.environ["PATH"]}
+    subprocess.run(words, shell=True, cwd=tmp_path, env=environment, check=True)
+    assert not (tmp_path / "sprung").exists()
 
 
 def test_what_cannot_be_compared_fails(origin: Origin, tmp_path: Path) -> None:
@@ -250,11 +278,12 @@ def test_the_hooks(origin: Origin, tmp_path: Path) -> None:
     """Each as it is, but with the sros of this checkout, so that nothing has to be installed."""
     hooks = yaml.safe_load((PROJECT / ".pre-commit-hooks.yaml").read_text())
     arguments: dict[str, list[str]] = {
-        "sros-policy": [],
+        "sros-policy": ["--"],
         "sros-requirements": [ALL["policy"], "--requirements", ALL["requirements"]],
         "sros-no-new-access": [f"git:{origin.base}:{ALL['policy']}", ALL["policy"]],
     }
     assert [each["id"] for each in hooks] == list(arguments)
+    assert hooks[0]["args"] == ["--"], "a file of the pull request is no option"
     local = [{**each, "language": "system", "args": arguments[each["id"]]} for each in hooks]
     failing: dict[str, set[str]] = {
         "main": set(),
