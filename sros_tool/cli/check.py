@@ -16,6 +16,7 @@ import click
 
 from sros_tool import __version__
 from sros_tool.cli.common import (
+    KEYSTORE_VARIABLE,
     PATH,
     check_one_format,
     check_output,
@@ -336,6 +337,12 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
             raise UsageError("no policy is named", "", "Name a file, or a folder of policies.")
         return [f for path in paths for f in policy_findings(path, at)]
     if family == "keystore":
+        if not paths and not os.environ.get(KEYSTORE_VARIABLE) and not Path(family).exists():
+            raise UsageError(
+                "there is no folder 'keystore' here",
+                f"No other keystore is named, and {KEYSTORE_VARIABLE} is not set.",
+                "Go to the folder of the keystore, or name its path.",
+            )
         roots = paths or (keystore_from_environment(),)
         return [
             finding

@@ -289,7 +289,8 @@ def _lines(found: FleetStatus, moment: datetime, robots: Sequence[str]) -> Itera
     if found.overdue:
         yield f"{_number(len(found.overdue), 'robot')} confirmed too long ago"
     if found.unassigned:
-        yield f"{_number(found.unassigned, 'enclave')} of no robot: nothing is known of them"
+        whom = "it" if found.unassigned == 1 else "them"
+        yield f"{_number(found.unassigned, 'enclave')} of no robot: nothing is known of {whom}"
     rows = [("robot", "state", "confirmed", "what")]
     rows += [
         (each.robot, _word(each.state), _age(each, moment), "; ".join(_summary(each, found.stage)))

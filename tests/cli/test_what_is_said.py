@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -159,3 +160,24 @@ def test_what_a_template_accepts_is_counted_and_fails_in_ci(tmp_path: Path) -> N
     assert "an enclave that may do everything [keystore.allow-everything]" in ended.out
     assert "1 warning, and 1 weakness that the template accepts (--strict" in ended.err
     assert sros("check", tmp_path / "ks", "--strict").status == 1
+
+
+def test_a_keystore_that_is_not_here_is_not_taken_for_the_word(tmp_path: Path) -> None:
+    ended = sros("check", "keystore", cwd=tmp_path, env={"ROS_SECURITY_KEYSTORE": None})
+    assert ended.status == 2
+    assert "there is no folder 'keystore' here" in ended.err
+
+
+def test_a_policy_without_the_common_part_says_how_to_get_it(tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(
+        '<policy version="0.2.0" xmlns:xi="http://www.w3.org/2001/XInclude"><enclaves>'
+        '<enclave path="/a"><profiles><profile ns="/" node="a">'
+        '<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/>'
+        "</profile></profiles></enclave></enclaves></policy>"
+    )
+    said = sros("check", policy).out
+    assert f"`sros policies --copy shipped && cp -r shipped/common {tmp_path}`" in said
+    sros("policies", "--copy", tmp_path / "shipped").ok()
+    shutil.copytree(tmp_path / "shipped" / "common", tmp_path / "common")
+    assert sros("check", policy).status == 0
