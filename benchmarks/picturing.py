@@ -19,7 +19,7 @@ from pathlib import Path
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Context, PictureSource, compose
-from sros_tool.report.layout import scenes_of
+from sros_tool.report.folding import Folding
 from sros_tool.report.page import render_page
 from sros_tool.report.picture import SourceTitle
 from sros_tool.report.sources import common_rights
@@ -63,12 +63,13 @@ def _picture(file: Path) -> tuple[str, PictureSource]:
 
 def _page(file: Path) -> str:
     picture = compose(_picture(file)[1], Context(common_rights()))
-    return render_page(picture, scenes_of(picture), _NOW)
+    folding = Folding.of(picture)
+    return render_page(picture, folding.scenes(), _NOW, folding.picture)
 
 
 def _svg(file: Path) -> str:
     picture = compose(_picture(file)[1], Context(common_rights()))
-    return render_svg(picture, scenes_of(picture)[0])
+    return render_svg(picture, Folding.of(picture).scenes()[0])
 
 
 def _median(work: Callable[[], object], rounds: int) -> float:

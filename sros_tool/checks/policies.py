@@ -706,15 +706,16 @@ def _policy_findings(policy: Policy, distribution: str) -> Iterator[Finding]:
 
 
 def policy_file_findings(
-    path: Path, distribution: str = "", fleet: Fleet | None = None
+    path: Path, distribution: str = "", fleet: Fleet | None = None, policy: Policy | None = None
 ) -> Iterator[Finding]:
     """Yield all findings in a policy file; a file that cannot be read is a finding too.
 
     ``distribution`` is the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
-    ``fleet`` has the robots that its placeholders stand for.
+    ``fleet`` has the robots that its placeholders stand for.  ``policy`` is what was read from the
+    file, if it has been read already.
     """
     try:
-        policy = read_policy_for(path, fleet)
+        policy = policy or read_policy_for(path, fleet)
     except SrosError as error:
         yield from _unreadable(path, error)
         return

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,14 +33,15 @@ from sros_tool.errors import SrosError, UsageError
 from sros_tool.values import as_plain, versioned
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from datetime import datetime
 
     from click.shell_completion import CompletionItem
 
     from sros_tool.checks.kind import Finding as Checked
-    from sros_tool.fleet.model import Fleet
+    from sros_tool.fleet.model import Fleet, Robot
     from sros_tool.report.compose import PictureSource
+    from sros_tool.report.folding import Folding
     from sros_tool.report.picture import Picture, PicturedFinding
 
 _FORMATS = ("html", "svg", "dot", "mermaid", "json")
@@ -164,6 +167,10 @@ def view(
 
     The page is one file that needs no network. No format contains keys or paths of this machine.
     """
+    from dataclasses import replace
+
+    from sros_tool.report.folding import Folding
+
     check_one_format()
     if hops and not words:
         raise UsageError("--hops is for --focus only", "", "Name what to look at with --focus.")
@@ -171,8 +178,10 @@ def view(
     written = _format("json" if as_json else form, output, graphviz)
     if output:
         check_output(output, force=force or dry_run)
-    with progress("drawing"):
-        picture, read = _picture(sources, observed, template, hosts, moment, fleets_of(fleet_files))
+    with progress("drawing"), _without_collection():
+        picture, read, robots = _picture(
+            sources, observed, template, hosts, moment, fleets_of(fleet_files)
+        )
         if words:
             from sros_tool.report.focus import focused
 
@@ -181,7 +190,9 @@ def view(
             picture = _with_requirements(
                 picture, requirements, sources, template, moment, fleets_of(fleet_files)[0]
             )
-        document = _rendered(picture, written, everything, graphviz, moment, hops)
+        folding = Folding.of(picture, robots)
+        picture = replace(picture, equal=folding.equal, different=folding.different)
+        document = _rendered(picture, folding, written, everything, graphviz, moment, hops)
     if written != "json":
         for line in picture.headlines:
             click.echo(visible_line(line), err=True)
@@ -202,6 +213,21 @@ def view(
         click.launch(output.absolute().as_uri())
 
 
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Do not look for cycles of objects, which takes half of the time of a large picture.
+
+    Pictures are values without cycles.
+    """
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
+
+
 def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
     ending = output.suffix.lower() if output else ""
     found = form or _ENDINGS.get(ending, ending.removeprefix("."))
@@ -219,8 +245,8 @@ def _picture(
     hosts: tuple[str, ...],
     moment: datetime,
     fleets: tuple[Fleet | None, Fleet | None],
-) -> tuple[Picture, Sequence[PictureSource]]:
-    """Return the picture, and the sources whose rights are in it."""
+) -> tuple[Picture, Sequence[PictureSource], Mapping[str, Robot]]:
+    """Return the picture, the sources whose rights are in it, and the robots by their enclaves."""
     from dataclasses import replace
 
     from sros_tool.report.compose import Context, compose, overlay, union
@@ -233,10 +259,10 @@ def _picture(
             "",
             "Name one SOURCE and --observed, or two SOURCEs.",
         )
-    read = [
-        added(read_source(path, now=moment, fleet=fleet), path, _checked(path, moment, fleet))
-        for path, fleet in zip(sources, fleets, strict=False)
-    ]
+    read = []
+    for path, fleet in zip(sources, fleets, strict=False):
+        source = read_source(path, now=moment, fleet=fleet)
+        read.append(added(source, path, _checked(path, source, moment, fleet)))
     if template:
         _check_no_governance(sources, read)
         read = [
@@ -245,26 +271,27 @@ def _picture(
             else replace(each, governance=template_governance(template, each.protections))
             for each in read
         ]
-    robots: dict[str, str] = {}
+    robots: dict[str, Robot] = {}
     for path, fleet, source in zip(sources, fleets, read, strict=False):
         robots |= _robots(path, fleet, source)
-    context = Context(common_rights(), robots | _hosts(hosts))
+    places = {enclave: robot.name for enclave, robot in robots.items()}
+    context = Context(common_rights(), places | _hosts(hosts))
     if observed:
         seen = union([read_source(path, now=moment) for path in observed])
-        return overlay(read[0], seen, "use", context), (read[0], seen)
+        return overlay(read[0], seen, "use", context), (read[0], seen), robots
     if len(read) == 1:
-        return compose(read[0], context), read
+        return compose(read[0], context), read, robots
     kinds = [each.origin.kind for each in read]
     if kinds[1] == "observation":
-        return overlay(read[0], read[1], "use", context), read
+        return overlay(read[0], read[1], "use", context), read, robots
     if kinds[0] == kinds[1]:
-        return overlay(read[0], read[1], "change", context), read
+        return overlay(read[0], read[1], "change", context), read, robots
     if "zenoh" in kinds:
         first, second = sorted(read, key=lambda each: each.origin.kind == "zenoh")
-        return overlay(first, second, "worlds", context), read
+        return overlay(first, second, "worlds", context), read, robots
     # Drift is shown from the side of the policy, whichever was named first.
     first, second = sorted(read, key=lambda each: each.origin.kind != "policy")
-    return overlay(first, second, "drift", context), read
+    return overlay(first, second, "drift", context), read, robots
 
 
 def _with_requirements(
@@ -318,14 +345,22 @@ def _check_no_governance(sources: tuple[Path, ...], read: list[PictureSource]) -
             )
 
 
-def _checked(path: Path, moment: datetime, fleet: Fleet | None) -> list[PicturedFinding]:
+def _checked(
+    path: Path, source: PictureSource, moment: datetime, fleet: Fleet | None
+) -> list[PicturedFinding]:
     """Return the findings of `sros check` for a source, or none if it cannot be checked."""
+    from sros_tool.checks.policies import policy_file_findings
     from sros_tool.checks.targets import Circumstances, path_findings
     from sros_tool.cli.common import local_zone
     from sros_tool.report.picture import PicturedFinding
 
+    at = Circumstances(moment, local_zone(os.environ), fleet=fleet)
     try:
-        found = path_findings(path, Circumstances(moment, local_zone(os.environ), fleet=fleet))
+        found = (
+            list(policy_file_findings(path, fleet=fleet, policy=source.policy))
+            if source.policy
+            else path_findings(path, at)
+        )
     except SrosError:
         return []
     return [
@@ -355,7 +390,7 @@ def _hosts(words: tuple[str, ...]) -> dict[str, str]:
     return found
 
 
-def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str, str]:
+def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str, Robot]:
     """Map the enclaves of a source to their robots, by which they are grouped."""
     from sros_tool.fleet.enclaves import robot_of
     from sros_tool.fleet.expansion import FleetPolicy
@@ -370,30 +405,26 @@ def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str,
     if fleet is None:
         return {}
     found = ((name, robot_of(fleet, name)) for name in {each.enclave for each in source.rights})
-    return {name: robot.name for name, robot in found if robot}
+    return {name: robot for name, robot in found if robot}
 
 
 def _rendered(
     picture: Picture,
+    folding: Folding,
     form: str,
     everything: bool,
     graphviz: bool,
     moment: datetime,
     hops: int | None,
 ) -> str:
-    from sros_tool.report.flow_layout import HOPS, flow_scene
-    from sros_tool.report.layout import scenes_of
-
     if form == "json":
         return json_text(versioned(as_plain(picture))) + "\n"
     placed = form in ("html", "svg") and not graphviz
-    scenes = scenes_of(picture, placed=placed)
-    if picture.focus:
-        scenes = (flow_scene(picture, hops or HOPS, placed=placed), *scenes)
+    scenes = folding.scenes(placed=placed, hops=hops or 0)
     if form == "html":
         from sros_tool.report.page import render_page
 
-        return render_page(picture, scenes, moment)
+        return render_page(picture, scenes, moment, folding.picture)
     scene = next((each for each in scenes if everything and each.id == "all"), scenes[0])
     if form == "svg" and not graphviz:
         from sros_tool.report.svg import render_svg

@@ -34,7 +34,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW, RIGHTS, Source
+from sros_tool.policy.model import ALLOW, RIGHTS, Policy, Source
 from sros_tool.policy.rights import Right, parts, policy_rights
 from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.translate import grant_rights
@@ -59,6 +59,7 @@ class RightsSource:
     what a policy says about the protection of names; None for anything else.  ``documents`` are the
     permissions of enclaves, as far as there are any, and ``enforcers`` the access control of each
     Zenoh process that checks others; ``router`` is the enclave of a keystore's router, or "".
+    ``policy`` is what a policy file holds.
     """
 
     path: Path
@@ -72,6 +73,7 @@ class RightsSource:
     documents: Mapping[str, Permissions] = field(default_factory=dict)
     enforcers: tuple[Enforcement, ...] = ()
     router: str = ""
+    policy: Policy | None = None
 
 
 def load_rights(path: Path, fleet: Fleet | None = None) -> RightsSource:
@@ -104,7 +106,8 @@ def load_rights(path: Path, fleet: Fleet | None = None) -> RightsSource:
             written = read_policy(path, placeholders=True)
             fleet = fleet.with_enclaves(FleetPolicy(written, fleet).patterns)
         stated = stated_protections(policy.enclaves)
-        return RightsSource(path, "policy", policy_rights(policy), None, True, (), fleet, stated)
+        rights = policy_rights(policy)
+        return RightsSource(path, "policy", rights, None, True, (), fleet, stated, policy=policy)
     return _document_rights(path, "permissions", path)
 
 

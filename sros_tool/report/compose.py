@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.names import ACTION_SEPARATOR, is_expression
-from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Qualifier
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier
 from sros_tool.policy.patterns import Names, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import (
     KIND_OF,
@@ -30,6 +30,7 @@ from sros_tool.policy.stated import StatedProtection
 from sros_tool.report.picture import (
     UNKNOWN,
     Edge,
+    Lack,
     Name,
     Overlay,
     OverlayDifference,
@@ -53,6 +54,7 @@ _OVERLAYS = {
     "worlds": Overlay("worlds", "not in the rules of Zenoh", "only in the rules of Zenoh"),
 }
 """Every kind of overlay."""
+_ONE_WAY = ("publish", "subscribe")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +63,7 @@ class PictureSource:
 
     ``nodes`` maps enclaves to their nodes; ``enclaves`` has the enclaves with their certificates;
     ``scope`` has the enclaves that the source is about, or None for all.  ``protections`` are what
-    a policy says about the protection of names.
+    a policy says about the protection of names, and ``policy`` is that policy.
     """
 
     origin: SourceTitle
@@ -73,6 +75,7 @@ class PictureSource:
     findings: tuple[PicturedFinding, ...] = ()
     scope: frozenset[str] | None = None
     protections: tuple[StatedProtection, ...] = ()
+    policy: Policy | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,6 +192,7 @@ def _picture(
 ) -> Picture:
     edges = tuple(sorted(edges, key=edge_order))
     governance = next((each.governance for each in reversed(sources) if each.governance), None)
+    sides = _sides(edges)
     said = next((each.protections for each in reversed(sources) if each.protections), ())
     demanded = _Demanded(() if governance else said)
     names = sorted({(edge.kind, edge.name) for edge in edges})
@@ -201,8 +205,10 @@ def _picture(
                 kind,
                 name,
                 namespace_of(name),
-                demanded.protection(kind, name) or protection_of(governance, kind, name),
+                protection := demanded.protection(kind, name)
+                or protection_of(governance, kind, name),
                 is_expression(name),
+                _lack(protection, *sides[kind, name]),
             )
             for kind, name in names
         ),
@@ -210,6 +216,26 @@ def _picture(
         validities=tuple(sorted({each for source in sources for each in source.validities})),
         findings=tuple(dict.fromkeys(each for source in sources for each in source.findings)),
     )
+
+
+def _sides(edges: Iterable[Edge]) -> Mapping[tuple[str, str], list[bool]]:
+    """Map names to whether an enclave may send to them, and whether one may receive from them."""
+    found: dict[tuple[str, str], list[bool]] = defaultdict(lambda: [False, False])
+    for edge in edges:
+        if edge.qualifier is ALLOW:
+            # Who publishes feedback serves an action, who subscribes to it is a client of it.
+            sends = edge.sends != (edge.kind == "actions" and edge.right in _ONE_WAY)
+            found[edge.kind, edge.name][0 if sends else 1] = True
+    return found
+
+
+def _lack(protection: Protection, sends: bool, receives: bool) -> Lack:
+    """Return the side of a name that nobody may take."""
+    if sends and not receives and protection.read_control:
+        return Lack.RECEIVER
+    if receives and not sends and protection.write_control:
+        return Lack.SENDER
+    return Lack.NOTHING
 
 
 def edge_order(edge: Edge) -> tuple[str, int, str, str, tuple[str, ...], str]:
@@ -428,6 +454,10 @@ def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = (
     A wildcard that matches no known name is drawn as a name.  ``common`` are the rights that every
     node of any enclave needs.
     """
+    needed = {
+        right: [e.name for e in common if e.right == right and e.kind == KIND_OF[right]]
+        for right in RIGHT_ORDER
+    }
     topics: dict[tuple[str, str, str, str], _Found] = defaultdict(lambda: defaultdict(set))
     for each in unfolded(rights):
         by = each.name if is_expression(each.name) else ""
@@ -451,7 +481,7 @@ def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = (
                 right,
                 qualifier,
                 _by(found[qualifier]),
-                common=qualifier is ALLOW and _is_common(right, name, common),
+                common=qualifier is ALLOW and _is_common(name, needed[right]),
             )
         )
     for (enclave, action, qualifier), members in whole.items():
@@ -490,11 +520,8 @@ def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
     )
 
 
-def _is_common(right: str, name: str, common: Sequence[Right]) -> bool:
-    return any(
-        right == each.right and KIND_OF[right] == each.kind and matches(each.name, name)
-        for each in common
-    )
+def _is_common(name: str, common: Sequence[str]) -> bool:
+    return any(matches(each, name) for each in common)
 
 
 # ── protection ──────────────────────────────────────────────────────────────────────────

@@ -145,6 +145,8 @@ def _link_label(picture: Picture, link: Link) -> str:
         text += " by *"
     if link.violates:
         text += ": breaks a requirement"
+    if link.differs:
+        text += ": not so of the equal ones"
     if picture.overlay and link.mark is not OverlaySide.BOTH:
         said = picture.overlay.first if link.mark is OverlaySide.FIRST else picture.overlay.second
         text += f": {said}"

@@ -24,6 +24,7 @@ from sros_tool.report.layout import (
     Link,
     Scene,
     bottom_of,
+    enclave_notes,
     frames_of,
     height_of,
     linked,
@@ -190,7 +191,7 @@ class _Draft:
         members: dict[tuple[bool, str], list[str]] = defaultdict(list)
         for (before, path), node in self._nodes.items():
             members[before, node].append(path)
-        unseen = {each.path for each in self._picture.enclaves if not each.observed}
+        noted = enclave_notes(self._picture)
         for (before, node), paths in sorted(members.items()):
             side = self._flow.before if before else self._flow.after
             group, notes = "", []
@@ -200,7 +201,7 @@ class _Draft:
             else:
                 group = self._groups[node]
                 label = node.removeprefix(group.rstrip("/") + "/") or node
-                notes = ["never observed"] if node in unseen else []
+                notes = list(noted.get(node, ()))
             lines = wrapped(label, SIDE_LETTERS)
             yield Card(
                 id=f"{'s' if before else 'l'}{node}",
@@ -247,7 +248,7 @@ class _Draft:
 
     def links(self, cards: Mapping[str, Card]) -> list[Link]:
         """Return all links, without the places of their ends."""
-        found: dict[tuple[str, str, str, bool, str, bool], set[str]] = defaultdict(set)
+        found: dict[tuple[str, str, str, bool, str, bool, bool], set[str]] = defaultdict(set)
         for stage in self._stages:
             for number, (_, left, right) in enumerate(stage.bundles):
                 names = f"n{stage.column} {number}"
@@ -260,6 +261,7 @@ class _Draft:
                             bool(tie.by),
                             tie.mark.value,
                             tie.violates,
+                            tie.differs,
                         )
                         found[key].add(tie.right)
         links = [
@@ -273,11 +275,9 @@ class _Draft:
                 (cards[source] if cards[source].role == "names" else cards[target]).level,
                 wildcard,
                 OverlaySide(mark),
-                violates,
+                *more,
             )
-            for (source, target, qualifier, wildcard, mark, violates), rights in sorted(
-                found.items()
-            )
+            for (source, target, qualifier, wildcard, mark, *more), rights in sorted(found.items())
         ]
         return [*links, *self._further_links(cards)]
 

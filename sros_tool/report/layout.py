@@ -10,7 +10,7 @@ the pool-adjacent-violators algorithm).  The same input always gives the same la
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
@@ -19,6 +19,7 @@ from sros_tool.report.picture import (
     SENDS,
     Bundle,
     Edge,
+    Lack,
     OverlaySide,
     Picture,
     Tie,
@@ -27,6 +28,7 @@ from sros_tool.report.picture import (
     counted,
     fold,
     is_plain,
+    lack_text,
 )
 
 _SIDE_WIDTH, _NAMES_WIDTH, _GUTTER = 184, 330, 110
@@ -71,7 +73,8 @@ _COMMON = {
     "dds": "used by every node",
 }
 """The note on a card of names that every node may use, if those rights are not drawn."""
-OWN = "own:"
+OWN, OTHERS = "own:", ("other of", "others of")
+"""Words on cards that the legend explains."""
 SENDERS, LISTENERS = "may send", "may receive"
 _NAMES = "topics, services, actions"
 
@@ -114,8 +117,8 @@ class Card:
     ``column`` counts from 0, names are in odd columns; an enclave that sends and listens has a card
     on both sides.  A card in the focus of the picture is ``chosen``.  ``lines``
     is the text, ``notes`` smaller text below it.  ``members`` are all enclaves or names of the
-    card.  Only cards of names have ``kind``, ``level`` and ``tags`` (letters of onlookers); only
-    cards of enclaves have ``group``.
+    card.  Only cards of names have ``kind``, ``level``, ``lacks`` and ``tags`` (letters of
+    onlookers); only cards of enclaves have ``group``.
     """
 
     id: str
@@ -133,6 +136,7 @@ class Card:
     group: str = ""
     tags: str = ""
     chosen: bool = False
+    lacks: Lack = Lack.NOTHING
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +144,7 @@ class Link:
     """An arrow from the right edge of one card to the left edge of another card.
 
     ``rights`` is its label, such as publish; ``wildcard`` says that only wildcards give the right,
-    ``violates`` that it breaks a requirement.
+    ``violates`` that it breaks a requirement, ``differs`` that units like this one do not have it.
     """
 
     source: str
@@ -153,6 +157,7 @@ class Link:
     wildcard: bool
     mark: OverlaySide
     violates: bool = False
+    differs: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,27 +180,38 @@ class Frame:
     height: int
 
 
-def scenes_of(picture: Picture, *, placed: bool = True) -> tuple[Scene, ...]:
+DrawnAs = Mapping[tuple[str, str], Sequence[str]]
+"""The real names behind the kind and the text of names that are drawn as one."""
+
+
+def scenes_of(
+    picture: Picture, *, placed: bool = True, drawn_as: DrawnAs | None = None
+) -> tuple[Scene, ...]:
     """Return the scenes of a picture, starting with the overview.
 
     With few enclaves, the first scene leaves out the rights that every node needs, and the second
     one has everything.  With many enclaves, the first scene has the groups and the links between
     them, and each group has another scene with its neighbours.  Without ``placed``, scenes have no
-    y and no frames, for formats that place cards themselves.
+    y and no frames, for formats that place cards themselves.  ``drawn_as`` are names to count in
+    place of those that are drawn.
     """
     groups = {each.path: each.group for each in picture.enclaves}
     titles = sorted(set(groups.values()))
     essential = [edge for edge in picture.edges if not edge.common]
     if len(groups) <= _MOST_ENCLAVES or len(titles) < 2 or len(titles) > len(groups) // 2:
-        scenes = [_scene(picture, "essential", "Overview", essential, str, placed=placed)]
+        scenes = [_scene(picture, "essential", "Overview", essential, str, drawn_as, placed=placed)]
         if len(essential) < len(picture.edges):
             title = "With what every node needs"
-            scenes.append(_scene(picture, "all", title, picture.edges, str, placed=placed))
+            scenes.append(
+                _scene(picture, "all", title, picture.edges, str, drawn_as, placed=placed)
+            )
         return tuple(scenes)
     # Group ids begin with a colon; enclave names never do.
     outside = {path: f":{group}" for path, group in groups.items()}
     overview = outside.__getitem__
-    scenes = [_scene(picture, "essential", "Overview", essential, overview, placed=placed)]
+    scenes = [
+        _scene(picture, "essential", "Overview", essential, overview, drawn_as, placed=placed)
+    ]
     for title in titles:
 
         def owner(path: str, title: str = title) -> str:
@@ -203,7 +219,9 @@ def scenes_of(picture: Picture, *, placed: bool = True) -> tuple[Scene, ...]:
 
         touched = {(e.kind, e.name) for e in essential if groups[e.enclave] == title}
         edges = [edge for edge in essential if (edge.kind, edge.name) in touched]
-        scenes.append(_scene(picture, f"group {title}", title, edges, owner, placed=placed))
+        scenes.append(
+            _scene(picture, f"group {title}", title, edges, owner, drawn_as, placed=placed)
+        )
     return tuple(scenes)
 
 
@@ -213,6 +231,7 @@ def _scene(
     title: str,
     edges: Sequence[Edge],
     owner: Callable[[str], str],
+    drawn_as: DrawnAs | None,
     *,
     placed: bool,
 ) -> Scene:
@@ -224,8 +243,16 @@ def _scene(
         everybody[edge.kind, edge.name].add(owner(edge.enclave))
     draft = _Draft(picture, edges, owner, members, everybody)
     scene = draft.placed(name, title) if placed else draft.scene(name, title)
-    shown = len({(edge.kind, edge.name) for edge in edges})
-    return replace(scene, hidden=len(picture.names) - shown, shown=shown)
+    shown = _real({(edge.kind, edge.name) for edge in edges}, drawn_as or {})
+    hidden = _real({(each.kind, each.name) for each in picture.names}, drawn_as or {}) - shown
+    return replace(scene, hidden=hidden, shown=shown)
+
+
+def _real(names: Iterable[tuple[str, str]], drawn_as: DrawnAs) -> int:
+    """Return the number of names that are drawn, each once."""
+    return len(
+        {(kind, real) for kind, name in names for real in drawn_as.get((kind, name), (name,))}
+    )
 
 
 class _Draft:
@@ -246,29 +273,29 @@ class _Draft:
         self._members = members
         self._everybody = everybody
         self._groups = {each.path: each.group for each in picture.enclaves}
-        self._unseen = {each.path for each in picture.enclaves if not each.observed}
+        self._notes = enclave_notes(picture)
         bundles = fold(picture.names, edges, owner)
         self._looking = _onlookers(bundles)
         self._tags = {side: chr(ord("A") + n) for n, side in enumerate(self._looking)}
-        self._own: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
+        self._own: dict[str, list[Bundle]] = defaultdict(list)
         self._bundles: list[Bundle] = []
         for bundle in bundles:
             alone = self._alone(bundle) if len(bundles) > _FEW_BUNDLES else ""
             if alone:
-                self._own[alone][bundle.kind] += len(bundle.names)
+                self._own[alone].append(bundle)
             else:
                 self._bundles.append(bundle)
         if len(self._bundles) > _MOST_BUNDLES:
             self._bundles = list(coarsened(self._bundles))
-        self._ties: dict[tuple[str, str, Qualifier, bool, OverlaySide, bool], set[str]]
+        self._ties: dict[tuple[str, str, Qualifier, bool, OverlaySide, bool, bool], set[str]]
         self._ties = defaultdict(set)
         for number, bundle in enumerate(self._bundles):
             for tie in bundle.ties:
                 if not self._looks(tie):
                     side, names = f"{'s' if tie.sends else 'l'}{tie.node}", f"n{number}"
                     ends = (side, names) if tie.sends else (names, side)
-                    key = (*ends, tie.qualifier, bool(tie.by), tie.mark, tie.violates)
-                    self._ties[key].add(tie.right)
+                    marks = tie.mark, tie.violates, tie.differs
+                    self._ties[*ends, tie.qualifier, bool(tie.by), *marks].add(tie.right)
 
     def _looks(self, tie: Tie) -> bool:
         """Return whether the tie is shown as a letter instead of a line."""
@@ -348,7 +375,7 @@ class _Draft:
             label = node.removeprefix(group) or node
         if first and (own := self._own.get(node)):
             notes += _own_text(own)
-        notes += ["never observed"] if node in self._unseen else []
+        notes += self._notes.get(node, ())
         notes += [
             f"{reach} {counted(self._looking[node, right], 'name')}: see {tag}"
             for (other, right), tag in self._tags.items()
@@ -395,9 +422,9 @@ class _Draft:
                     (cards[source] if cards[source].role == "names" else cards[target]).level,
                     wildcard,
                     mark,
-                    violates,
+                    *more,
                 )
-                for (source, target, qualifier, wildcard, mark, violates), rights in sorted(
+                for (source, target, qualifier, wildcard, mark, *more), rights in sorted(
                     self._ties.items()
                 )
             ],
@@ -429,11 +456,17 @@ def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
 # ── text on cards ───────────────────────────────────────────────────────────────────────
 
 
-def _own_text(own: Mapping[str, int]) -> list[str]:
+def _own_text(own: Iterable[Bundle]) -> list[str]:
     """Return lines like ``own: 3 topics, 2 services`` for names that only one enclave uses."""
-    found = [counted(number, KIND_NAMES[kind]) for kind, number in own.items() if number]
+    kinds, lacks = Counter[str](), Counter[Lack]()
+    for bundle in own:
+        kinds[bundle.kind] += len(bundle.names)
+        lacks[bundle.lacks] += len(bundle.names)
+    found = [counted(number, KIND_NAMES[kind]) for kind, number in kinds.items()]
     lines = [f"{OWN} {', '.join(found[:2])}"]
-    return [*lines, ", ".join(found[2:])] if found[2:] else lines
+    lines += [", ".join(found[2:])] if found[2:] else []
+    sides = (Lack.SENDER, Lack.RECEIVER)
+    return [*lines, *(f"{lacks[each]} without a {each}" for each in sides if lacks[each])]
 
 
 def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -451,11 +484,21 @@ def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return names[:_SHOWN_NAMES], (f"and {len(names) - _SHOWN_NAMES} more {kind}s",)
 
 
+def enclave_notes(picture: Picture) -> Mapping[str, tuple[str, ...]]:
+    """Map enclaves to what is noted on their cards."""
+    return {
+        each.path: (each.note,) * bool(each.note) + ("never observed",) * (not each.observed)
+        for each in picture.enclaves
+    }
+
+
 def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = ()) -> Card:
     """Return the card of a bundle, without x, y and width; ``more`` are further notes."""
     titles, notes = _names_title(bundle)
     lines = tuple(line for title in titles for line in wrapped(title, _NAMES_LETTERS))
     notes += more
+    if bundle.lacks:
+        notes += (lack_text(bundle.kind, bundle.lacks),)
     return Card(
         id=card,
         role="names",
@@ -469,6 +512,7 @@ def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = (
         members=bundle.names,
         kind=bundle.kind,
         level=bundle.protection.level,
+        lacks=bundle.lacks,
     )
 
 

@@ -20,7 +20,7 @@ from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.reach import OF_EVERY_NODE
 from sros_tool.report.layout import Scene
-from sros_tool.report.picture import Bundle, Picture, PicturedEnclave, fold
+from sros_tool.report.picture import Bundle, Picture, PicturedEnclave, fold, lack_text
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
 
@@ -28,8 +28,13 @@ _ASSETS = Path(__file__).with_name("assets")
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
-def render_page(picture: Picture, scenes: tuple[Scene, ...], now: datetime) -> str:
-    """Return the HTML page of a picture with its scenes; ``now`` is the date of its findings."""
+def render_page(
+    picture: Picture, scenes: tuple[Scene, ...], now: datetime, drawn: Picture | None = None
+) -> str:
+    """Return the HTML page of a picture with its scenes.
+
+    ``now`` is the date of its findings, ``drawn`` the picture in which equal units are one.
+    """
     script, style = asset("view.js"), asset("view.css")
     origins = ", ".join(f"{each.kind} {each.title}" for each in picture.origins)
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
@@ -38,7 +43,7 @@ def render_page(picture: Picture, scenes: tuple[Scene, ...], now: datetime) -> s
         Template(asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),
         style,
         script,
-        _data(picture, scenes),
+        _data(picture, scenes, drawn or picture),
     )
 
 
@@ -86,7 +91,7 @@ def _digest(text: str) -> str:
 # ── data ───────────────────────────────────────────────────────────────────────────────────
 
 
-def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
+def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[str, Any]:
     """Return the script's data: bundles of names, which need much less space than edges."""
     return {
         "headlines": picture.headlines,
@@ -95,6 +100,8 @@ def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
         "enclaves": [_enclave(each) for each in picture.enclaves],
         "bundles": [_bundle(each) for each in fold(picture.names, picture.edges, apart=True)],
         "scenes": [_scene(each) for each in scenes],
+        "equal": as_plain(picture.equal),
+        "rows": [_row(each) for each in fold(drawn.names, drawn.edges)],
         "differences": as_plain(picture.differences),
         "validities": as_plain(picture.validities),
         "findings": as_plain(picture.findings),
@@ -116,12 +123,29 @@ def _bundle(bundle: Bundle) -> dict[str, Any]:
     ties = [_with_deny(as_plain(tie)) for tie in bundle.ties]
     for tie in ties:
         tie["enclave"] = tie.pop("node")
+        del tie["differs"]
     return {
         "kind": bundle.kind,
         "names": bundle.names,
         "asks": bundle.asks,
+        "lacks": lack_text(bundle.kind, bundle.lacks) if bundle.lacks else "",
         "protection": as_plain(bundle.protection),
         "ties": _table(ties),
+    }
+
+
+def _row(bundle: Bundle) -> dict[str, Any]:
+    """Return a row of the table of names: who may send, who may receive, and who is denied."""
+    ties = [tie for tie in bundle.ties if tie.qualifier is ALLOW]
+    return {
+        "kind": bundle.kind,
+        "names": bundle.names,
+        "level": bundle.protection.level.value,
+        "lacks": lack_text(bundle.kind, bundle.lacks) if bundle.lacks else "",
+        "common": all(tie.common for tie in bundle.ties),
+        "senders": sorted({tie.node for tie in ties if tie.sends}),
+        "receivers": sorted({tie.node for tie in ties if not tie.sends}),
+        "denied": sorted({tie.node for tie in bundle.ties if tie.qualifier is not ALLOW}),
     }
 
 

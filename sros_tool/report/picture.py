@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from sros_tool.names import READING_SERVICES
@@ -75,7 +75,7 @@ class Edge:
     ``by`` are the expressions that match the name, empty if the right has the exact name.
     ``parts`` are the parts of an action, such as feedback, if the right is not for the whole
     action.  ``common`` marks rights that every node needs to start, ``violates`` those by which a
-    requirement does not hold.
+    requirement does not hold, ``differs`` those that units like this one do not have.
     """
 
     enclave: str
@@ -88,6 +88,7 @@ class Edge:
     mark: OverlaySide = OverlaySide.BOTH
     common: bool = False
     violates: bool = False
+    differs: bool = False
 
     @property
     def sends(self) -> bool:
@@ -100,15 +101,41 @@ class Edge:
         return "to the name" if self.sends else "from the name"
 
 
+class Lack(StrEnum):
+    """The side of a name that no enclave may take, although one may take the other side."""
+
+    NOTHING = ""
+    SENDER = "sender"
+    RECEIVER = "receiver"
+
+
 @dataclass(frozen=True, slots=True)
 class Name:
-    """A topic, service or action; or a ``wildcard`` without any known name."""
+    """A topic, service or action; or a ``wildcard`` without any known name.
+
+    ``lacks`` is the side that nobody may take: of a service, who serves it is the receiver.
+    """
 
     kind: str
     name: str
     namespace: str
     protection: Protection
     wildcard: bool = False
+    lacks: Lack = Lack.NOTHING
+
+
+_LACKING = {
+    "topics": ("publish", "subscribe"),
+    "dds": ("publish", "subscribe"),
+    "services": ("call", "serve"),
+    "actions": ("call", "execute"),
+}
+
+
+def lack_text(kind: str, lacks: Lack) -> str:
+    """Return what nobody may do with a name of this kind, such as ``nobody may publish``."""
+    sends, receives = _LACKING[kind]
+    return f"nobody may {sends if lacks is Lack.SENDER else receives}"
 
 
 def asks(name: Name | Edge) -> bool:
@@ -128,13 +155,17 @@ class Statement:
     mark: OverlaySide = OverlaySide.BOTH
 
 
+@shows(
+    *("path", "group", "nodes", "statements", "subject", "issuer", "serial", "key"),
+    *("problems", "observed"),
+)
 @dataclass(frozen=True, slots=True)
 class PicturedEnclave:
     """An enclave in a picture; ``group`` is its host or its namespace.
 
     ``subject``, ``issuer``, ``serial`` and ``key`` describe its certificate; "" without one.
     ``problems`` keep a process from using it.  In an overlay of use, an enclave that was not
-    ``observed`` counts as neither used nor unused.
+    ``observed`` counts as neither used nor unused.  ``note`` stands on its card.
     """
 
     path: str
@@ -147,6 +178,7 @@ class PicturedEnclave:
     key: str = ""
     problems: tuple[str, ...] = ()
     observed: bool = True
+    note: str = ""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -255,7 +287,8 @@ class PicturedViolation:
     uses: tuple[PicturedUse, ...]
 
 
-_SAID = 5  # violations that the headlines say; the list of findings has all
+_SAID = 5  # violations, and units that differ, that the headlines say; JSON has all
+_SHOWN = 2  # rights that they say of one unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,6 +309,46 @@ class Requirements:
         return (*said, *more, *((holds,) if self.hold else ()))
 
 
+@dataclass(frozen=True, slots=True, order=True)
+class EqualUnits:
+    """Robots, namespaces or enclaves (``what``) that are equal but for their names.
+
+    ``label`` stands for each of them in the paths and names that are drawn, like ``{r01…r50}``.
+    """
+
+    label: str
+    what: str
+    members: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        """The units in words, like ``r01 … r50: 50 equal robots``."""
+        first, last = self.members[0], self.members[-1]
+        return f"{first} … {last}: {len(self.members)} equal {self.what}s"
+
+
+@dataclass(frozen=True, slots=True)
+class DifferentUnit:
+    """A unit, or the label of several, that is nearly equal to those of the label ``usual``.
+
+    ``more`` and ``fewer`` are the enclaves and rights that it has and lacks, in words.
+    """
+
+    unit: str
+    usual: str
+    more: tuple[str, ...]
+    fewer: tuple[str, ...]
+
+    def sentence(self) -> str:
+        """Return what differs in a sentence without a full stop."""
+        parts = []
+        for has, found in (("it has", self.more), ("it lacks", self.fewer)):
+            more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+            parts += [f"{has} {'; '.join(found[:_SHOWN])}{more}"] if found else []
+        usual = self.usual.strip("{}").replace("…", " … ")
+        return f"{self.unit.strip('{}')} differs from {usual}: {', and '.join(parts)}"
+
+
 @dataclass(frozen=True, slots=True)
 class Picture:
     """The rights in a system, with their protection, validity and findings.
@@ -294,12 +367,18 @@ class Picture:
     findings: tuple[PicturedFinding, ...] = ()
     focus: tuple[Focus, ...] = ()
     requirements: Requirements | None = None
+    equal: tuple[EqualUnits, ...] = ()
+    different: tuple[DifferentUnit, ...] = ()
 
     @property
     def headlines(self) -> tuple[str, ...]:
         """The answers that the picture gives, as sentences without a full stop."""
         found = self.requirements.sentences() if self.requirements else ()
-        return (*(each.sentence for each in self.focus), *found)
+        equal = (f"{each.title} are drawn as one" for each in self.equal)
+        more = len(self.different) - _SAID
+        different = [each.sentence() for each in self.different[:_SAID]]
+        different += [f"{more} more differ"] if more > 0 else []
+        return (*(each.sentence for each in self.focus), *found, *equal, *different)
 
 
 def counted(number: int, thing: str) -> str:
@@ -319,6 +398,7 @@ class Tie:
     mark: OverlaySide
     common: bool
     violates: bool = False
+    differs: bool = False
 
     @property
     def sends(self) -> bool:
@@ -328,7 +408,8 @@ class Tie:
 
 def is_plain(tie: Tie) -> bool:
     """Return whether a tie is neither denied, nor different, nor against a requirement."""
-    return tie.qualifier is ALLOW and tie.mark is OverlaySide.BOTH and not tie.violates
+    same = tie.mark is OverlaySide.BOTH and not tie.differs
+    return tie.qualifier is ALLOW and same and not tie.violates
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,7 +417,7 @@ class Bundle:
     """Sorted names of the same kind and protection, with the same ties.
 
     In a ``partial`` bundle, each tie is for only some of the names.  ``asks`` are services whose
-    requests change nothing.
+    requests change nothing.  ``lacks`` is the side that nobody may take.
     """
 
     kind: str
@@ -345,6 +426,7 @@ class Bundle:
     ties: tuple[Tie, ...]
     partial: bool = False
     asks: bool = False
+    lacks: Lack = Lack.NOTHING
 
 
 def fold(
@@ -371,18 +453,27 @@ def fold(
                 edge.mark,
                 edge.common,
                 edge.violates,
+                edge.differs,
             )
         )
-    bundles: dict[tuple[str, Protection, frozenset[Tie], bool], list[str]] = defaultdict(list)
+    bundles: dict[tuple[str, Protection, frozenset[Tie], bool, Lack], list[str]]
+    bundles = defaultdict(list)
     for name in names:
         if found := ties.get((name.kind, name.name)):
-            key = (name.kind, name.protection, frozenset(found), apart and asks(name))
-            bundles[key].append(name.name)
+            asking = apart and asks(name)
+            bundles[name.kind, name.protection, frozenset(found), asking, name.lacks].append(
+                name.name
+            )
     folded = (
         Bundle(
-            kind, protection, tuple(sorted(members)), tuple(sorted(found, key=_order)), asks=asking
+            kind,
+            protection,
+            tuple(sorted(members)),
+            tuple(sorted(found, key=_order)),
+            asks=asking,
+            lacks=lacks,
         )
-        for (kind, protection, found, asking), members in bundles.items()
+        for (kind, protection, found, asking, lacks), members in bundles.items()
     )
     return tuple(sorted(folded, key=lambda each: (_KINDS.index(each.kind), each.names)))
 
@@ -397,7 +488,7 @@ def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
         plain = all(map(is_plain, bundle.ties))
         senders = frozenset((tie.node, tie.right) for tie in bundle.ties if tie.sends)
         apart = None if plain and senders else bundle.ties
-        found[bundle.kind, bundle.protection, senders, apart].append(bundle)
+        found[bundle.kind, bundle.protection, senders, apart, bundle.lacks].append(bundle)
     return tuple(_joined(each) for each in found.values())
 
 
@@ -405,9 +496,10 @@ def _joined(bundles: Sequence[Bundle]) -> Bundle:
     ties = sorted({tie for bundle in bundles for tie in bundle.ties}, key=_order)
     names = sorted(name for bundle in bundles for name in bundle.names)
     partial = any(bundle.ties != bundles[0].ties for bundle in bundles)
-    return Bundle(bundles[0].kind, bundles[0].protection, tuple(names), tuple(ties), partial)
+    return replace(bundles[0], names=tuple(names), ties=tuple(ties), partial=partial, asks=False)
 
 
 def _order(tie: Tie) -> tuple[object, ...]:
     right = RIGHT_ORDER[tie.right]
-    return right, tie.node, tie.qualifier, tie.by, tie.parts, tie.mark, tie.common, tie.violates
+    marks = tie.mark, tie.common, tie.violates, tie.differs
+    return right, tie.node, tie.qualifier, tie.by, tie.parts, *marks

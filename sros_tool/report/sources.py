@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -19,7 +19,6 @@ from cryptography import x509
 from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, SrosError
-from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.model import Fleet
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
@@ -74,17 +73,18 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
     source = PictureSource(
         SourceTitle(_base_name(path), read.kind), read.rights, findings=findings, scope=read.scope
     )
-    if read.kind == "policy":
-        nodes = _nodes(read_policy_for(path, fleet))
-        source = replace(source, nodes=nodes, protections=read.protections or ())
+    if read.policy:
+        nodes, stated = _nodes(read.policy), read.protections or ()
+        source = replace(source, nodes=nodes, protections=stated, policy=read.policy)
     elif read.kind == "keystore":
         source = _with_keystore(source, path, now)
     elif read.kind == "enclave":
         source = _with_enclave(source, path, now)
+    places = _places(path)
     return replace(
         with_findings(replace(source, findings=()), path, source.findings),
         enclaves=tuple(
-            replace(each, problems=tuple(_without_path(text, path) for text in each.problems))
+            replace(each, problems=tuple(_without_path(text, places) for text in each.problems))
             for each in source.enclaves
         ),
     )
@@ -98,7 +98,8 @@ def with_findings(
     A finding keeps its enclave only if the source has an enclave of that name.
     """
     known = {each.path for each in source.enclaves} | {each.enclave for each in source.rights}
-    found = tuple(_without_paths(_placed(each, known), path) for each in findings)
+    places = _places(path)
+    found = tuple(_without_paths(_placed(each, known), places) for each in findings)
     return replace(source, findings=tuple(dict.fromkeys((*source.findings, *found))))
 
 
@@ -253,15 +254,19 @@ def _placed(finding: PicturedFinding, known: Set[str]) -> PicturedFinding:
     return replace(finding, enclave="", text=f"{finding.enclave}: {finding.text}")
 
 
-def _without_paths(finding: PicturedFinding, path: Path) -> PicturedFinding:
-    text, remedy = (_without_path(each, path) for each in (finding.text, finding.remedy))
+def _without_paths(finding: PicturedFinding, places: Mapping[str, str]) -> PicturedFinding:
+    text, remedy = (_without_path(each, places) for each in (finding.text, finding.remedy))
     return replace(finding, text=text, remedy=remedy)
 
 
-def _without_path(text: str, path: Path) -> str:
-    """Return ``text`` with every form of the source's path replaced by its base name."""
-    places = {str(path), str(path.absolute()), os.path.realpath(path)}
-    for place in sorted(places, key=len, reverse=True):
-        if "/" in place and place != "/":
-            text = text.replace(place, _base_name(path))
+def _places(path: Path) -> Mapping[str, str]:
+    """Map every form of the path of a source to its base name, the longest first."""
+    places = sorted({str(path), str(path.absolute()), os.path.realpath(path)}, key=len)
+    return {place: _base_name(path) for place in reversed(places) if "/" in place and place != "/"}
+
+
+def _without_path(text: str, places: Mapping[str, str]) -> str:
+    """Return ``text`` with the base name of the source instead of its path."""
+    for place, name in places.items():
+        text = text.replace(place, name)
     return _LINK.sub(r"\1", text)

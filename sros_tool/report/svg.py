@@ -11,6 +11,7 @@ from sros_tool.report.layout import (
     LEVEL_NAMES,
     LINE,
     ONLOOKERS,
+    OTHERS,
     OWN,
     PAD,
     SMALL,
@@ -18,7 +19,14 @@ from sros_tool.report.layout import (
     Link,
     Scene,
 )
-from sros_tool.report.picture import Overlay, OverlaySide, Picture, WireLevel, counted
+from sros_tool.report.picture import (
+    Overlay,
+    OverlaySide,
+    Picture,
+    WireLevel,
+    counted,
+    lack_text,
+)
 from sros_tool.xml import escape
 
 _HEAD, _SAID = 40, 19
@@ -40,11 +48,14 @@ letter-spacing:.06em}
 .paper{fill:var(--paper)}.card rect{fill:var(--card);stroke:var(--rule)}
 .enclave rect,.group rect{stroke:var(--soft)}\
 .chosen rect{stroke:var(--sign);stroke-width:2.5}.frame{fill:var(--frame)}
+.lacking rect{stroke:var(--open);stroke-dasharray:5 3}.small.lack{fill:var(--open)}
 .link{fill:none;stroke:var(--line);stroke-width:1.5;marker-end:url(#to)}
 .wild{stroke-width:1;stroke-opacity:.75}
 .sign{stroke-dasharray:9 3}.none{stroke-dasharray:2 3}
 .first{stroke:var(--first);stroke-width:2.25;marker-end:url(#to1)}
 .second{stroke:var(--second);stroke-width:2.25;marker-end:url(#to2)}
+.differs{stroke:var(--sign);stroke-width:3;stroke-opacity:1;marker-end:url(#odd)}
+.tipodd{fill:var(--sign)}
 .deny{stroke:var(--deny);stroke-width:1.75;stroke-opacity:1;marker-end:url(#no)}
 .violates{stroke:var(--deny);stroke-width:3;stroke-opacity:1;marker-end:url(#bad)}
 .tip{fill:var(--line)}.tipbad{fill:var(--deny)}.tip1{fill:var(--paper);stroke:var(--first);stroke-width:1.2}.tip2{fill:var(--second)}
@@ -64,6 +75,8 @@ markerUnits="userSpaceOnUse" orient="auto"><path class="tip1" d="M1 1L7 4L1 7z"/
 markerUnits="userSpaceOnUse" orient="auto"><path class="tip2" d="M0 4L4 0L8 4L4 8z"/></marker>
 <marker id="bad" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="11" markerHeight="11" \
 markerUnits="userSpaceOnUse" orient="auto"><path class="tipbad" d="M0 0.5L8 4L0 7.5z"/></marker>
+<marker id="odd" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="11" markerHeight="11" \
+markerUnits="userSpaceOnUse" orient="auto"><path class="tipodd" d="M0 0.5L8 4L0 7.5z"/></marker>
 <marker id="no" viewBox="0 0 14 14" refX="13" refY="7" markerWidth="14" markerHeight="14" \
 markerUnits="userSpaceOnUse" orient="0"><path class="cross" d="M7 1.5a5.5 5.5 0 1 0 .01 0z\
 M3.2 10.8L10.8 3.2"/></marker>"""
@@ -117,7 +130,9 @@ def render_svg(picture: Picture, scene: Scene) -> str:
     rank = {OverlaySide.BOTH: 0, OverlaySide.FIRST: 1, OverlaySide.SECOND: 2}
     for link in sorted(
         scene.links,
-        key=lambda each: (each.violates, each.qualifier is not ALLOW, rank[each.mark]),
+        key=lambda each: (
+            *(each.violates, each.qualifier is not ALLOW, each.differs, rank[each.mark]),
+        ),
     ):
         lines.append(_link(link, cards, picture.overlay))
     lines += [line for card in scene.cards for line in _card(card)]
@@ -158,6 +173,8 @@ def _link_text(link: Link, overlay: Overlay | None) -> str:
         text += " (by a wildcard)"
     if link.violates:
         text += ": breaks a requirement"
+    if link.differs:
+        text += ": not so of the equal ones"
     if overlay and link.mark is not OverlaySide.BOTH:
         text += f": {overlay.first if link.mark is OverlaySide.FIRST else overlay.second}"
     return f"{text}, {LEVEL_NAMES[link.level]}"
@@ -168,6 +185,7 @@ def _link_classes(link: Link) -> str:
     classes = ["link", link.level.value]
     classes += ["wild"] if link.wildcard else []
     classes += [link.mark.value] if link.mark is not OverlaySide.BOTH else []
+    classes += ["differs"] if link.differs else []
     classes += ["violates"] if link.violates else []
     classes += ["deny"] if link.qualifier is not ALLOW else []
     return " ".join(classes)
@@ -183,7 +201,8 @@ def _link(link: Link, cards: dict[str, Card], overlay: Overlay | None) -> str:
 
 def _card(card: Card) -> Iterable[str]:
     names = card.role == "names"
-    kind = f"card {card.role}{' chosen' if card.chosen else ''}"
+    lacks = lack_text(card.kind, card.lacks) if card.lacks else ""
+    kind = f"card {card.role}{' chosen' if card.chosen else ''}{' lacking' if lacks else ''}"
     yield (
         f'<g class="{kind}" transform="translate({card.x} {card.y})">'
         f"<title>{escape(', '.join(card.members))}</title>"
@@ -204,7 +223,8 @@ def _card(card: Card) -> Iterable[str]:
         right = card.width - (32 if card.level in _LOCKS else 12) - 18 * number
         yield f'<text class="tag" x="{right}" y="{PAD + 12}" text-anchor="end">{tag}</text>'
     for note in card.notes:
-        yield f'<text class="small" x="{x}" y="{y - 1}">{escape(note)}</text>'
+        lack = " lack" if note == lacks else ""
+        yield f'<text class="small{lack}" x="{x}" y="{y - 1}">{escape(note)}</text>'
         y += SMALL
     yield "</g>"
 
@@ -236,10 +256,13 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
         rows.append(('<path class="link deny" d="M0 -4h40"/>', "denied"))
     if any(link.violates for link in scene.links):
         rows.append(('<path class="link violates" d="M0 -4h40"/>', "breaks a requirement"))
+    if any(link.differs for link in scene.links):
+        rows.append(('<path class="link differs" d="M0 -4h40"/>', "not so of the equal ones"))
     if picture.overlay:
         rows.append(('<path class="link first" d="M0 -4h40"/>', picture.overlay.first))
         rows.append(('<path class="link second" d="M0 -4h40"/>', picture.overlay.second))
     yield _row(rows)
+    yield from _card_legend(picture, scene)
     if any(note.startswith(OWN) for card in scene.cards for note in card.notes):
         yield _row([("", f"{OWN} names that no other enclave may use")])
     if scene.onlookers:
@@ -252,10 +275,31 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
         )
 
 
+def _card_legend(picture: Picture, scene: Scene) -> Iterable[str]:
+    """Yield the lines of the legend for cards that are marked, and for labels of equal ones."""
+    rows = []
+    if any(card.chosen for card in scene.cards):
+        rows.append((_BOX.format("chosen"), "in focus: information goes to it from the left"))
+    if any(card.lacks for card in scene.cards):
+        rows.append((_BOX.format("lacking"), "nobody may send, or nobody may receive"))
+    if rows:
+        yield _row(rows)
+    for each in picture.equal[:_MOST_LABELS]:
+        of_each = f"each of {len(each.members)} {each.what}s, which are equal but for their names"
+        yield _row([("", f"{each.label}: {of_each}")])
+    if any(word in line for word in OTHERS for card in scene.cards for line in card.lines):
+        yield _row([("", f"{{1 {OTHERS[0]} …}}: such a name of another one of them")])
+
+
+_BOX = '<g class="card {}"><rect y="-11" width="34" height="14" rx="4"/></g>'
+_MOST_LABELS = 8
+
+
 def _row(rows: Iterable[tuple[str, str]]) -> str:
     x, found = 0, []
     for drawn, text in rows:
         room = 68 if "M20 -4h40" in drawn else (48 if "h40" in drawn else (20 if drawn else 0))
+        room = 42 if "<rect" in drawn else room
         found.append(
             f'<g transform="translate({x} 0)">{drawn}'
             f'<text class="small" x="{room}" y="0">{escape(text)}</text></g>'

@@ -46,6 +46,9 @@ POLICIES = {
     "denied.xml": policy_text({"/a": _DENIED, "/b": publish("/x")}),
     "wild.xml": policy_text({"/a": _WILD, "/b": publish("/x")}),
     "large.xml": policy_text({"/a": publish(*(f"/{'n' * 60}/x{i}" for i in range(900)))}),
+    "equal.xml": policy_text(
+        {f"/r{n}": publish(*(f"/r{n}/{e}" for e in ("xyq" if n == 4 else "xyz"))) for n in range(5)}
+    ),
     "old.xml": _OLD,
     "odd.xml": _OLD.replace("</profiles>", '<profile ns="/" node="b*"/></profiles>'),
 }
@@ -316,6 +319,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("--log quiet.log"),
     ),
     "view": (
+        Case("equal.xml"),
         Case("ks"),
         Case("policy.xml"),
         Case("policy.xml denied.xml"),

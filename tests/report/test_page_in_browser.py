@@ -32,7 +32,7 @@ from tests.report.pictures import (
     large_policy,
     new_page,
 )
-from tests.support.harness import sros
+from tests.support.harness import policy_text, sros
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -324,6 +324,8 @@ def test_everything_can_be_done_with_the_keyboard(browser: Browser, robot_page: 
         page.keyboard.press("Escape")
         page.focus("#tab-map")
         page.keyboard.press("ArrowRight")
+        assert page.locator("#panel-names").is_visible()
+        page.keyboard.press("ArrowRight")
         assert page.locator("#panel-timeline").is_visible()
         page.keyboard.press("ArrowRight")
         assert page.locator("#panel-findings").is_visible()
@@ -379,6 +381,9 @@ def test_axe_finds_nothing(browser: Browser, robot_page: Path, built: Path, size
         check_contrast("timeline")
         page.click("#tab-findings")
         check("findings")
+        page.click("#tab-names")
+        check("table")
+        check_contrast("table")
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -400,7 +405,7 @@ def test_no_text_leaves_its_card_and_nothing_is_wider_than_the_window(
             assert page.evaluate(outside) == []
         page.select_option("#filter-enclave", "/mobile_robot/planner")
         assert page.evaluate(outside) == []
-        for tab in ("map", "timeline", "findings"):
+        for tab in ("map", "names", "timeline", "findings"):
             page.click(f"#tab-{tab}")
             wide = page.evaluate("document.documentElement.scrollWidth")
             assert wide <= width, tab
@@ -423,7 +428,7 @@ def test_names_cannot_run_script(browser: Browser, tmp_path: Path) -> None:
                 if page.locator("text=What reaches it").count():
                     page.click("text=What reaches it")
                     page.click("#back")
-        for tab in ("timeline", "findings", "map"):
+        for tab in ("names", "timeline", "findings", "map"):
             page.click(f"#tab-{tab}")
         assert page.evaluate("window.broken") is None
         assert page.locator("img, #map script, body > script + script + script").count() == 0
@@ -451,17 +456,19 @@ def test_a_hundred_enclaves_and_a_thousand_names_can_be_explored(
     sros("view", source, "-o", path).ok()
     assert path.stat().st_size < 2_000_000
     with opened(browser, path) as page:
-        assert page.locator("#map .card.group").count() >= 10
-        page.click("#map .card.group >> nth=2")
-        assert page.locator("#map .card.enclave").count() >= 10
+        # Nine robots are equal, and drawn as one next to the one that differs.
+        assert "9 equal namespaces are drawn as one" in page.inner_text("#headlines")
+        assert page.locator("#map .card.enclave").count() < 50
+        page.click("#map .card.enclave:has-text('part3') >> nth=-1")
+        assert "9 ENCLAVES ALIKE" in details(page)
+        page.click("#details .link-button >> nth=1")
+        assert page.inner_text("#details h2") == "/robot1/part3"
         page.fill("#search", "/robot7/part3/t4")
         page.keyboard.press("Enter")
         assert "/robot7/part3" in details(page)
 
 
 def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -> None:
-    from tests.support.harness import policy_text
-
     allowed = group("topics", "publish", "/x", "/unused") + group("topics", "subscribe", "/z*")
     used = group("topics", "publish", "/x", "/forbidden") + group("topics", "subscribe", "/z1")
     (tmp_path / "robot.xml").write_text(policy_text({"/a": allowed}))
@@ -504,6 +511,25 @@ def test_a_focus_says_its_answer_and_shows_what_leads_to_it(
         assert texts(page, "#map .card.chosen") == {"/cmd_vel"}
         assert "/scan" not in " ".join(texts(page, "#map .card"))
         assert {"2 HOPS BEFORE", "MAY SEND", "MAY RECEIVE"} == texts(page, "#map text.head")
+
+
+def test_the_table_has_every_name_and_those_that_only_one_side_may_use(
+    browser: Browser, tmp_path: Path
+) -> None:
+    policy, path = tmp_path / "robot.xml", tmp_path / "table.html"
+    enclaves = {"/a": group("topics", "publish", "/lost", "/used")}
+    enclaves["/b"] = group("topics", "subscribe", "/used")
+    policy.write_text(policy_text(enclaves))
+    sros("view", policy, "-o", path).ok()
+    with opened(browser, path) as page:
+        page.click("#tab-names")
+        assert "1 name that only one side may use." in page.inner_text("#names")
+        rows = page.locator("#names tbody tr")
+        assert ["/lost" in each for each in rows.all_inner_texts()] == [True, False]
+        page.check("#only-lacking")
+        assert "nobody may subscribe" in "".join(rows.all_inner_texts()) and rows.count() == 1
+        page.click("#names .link-button")
+        assert "nobody may subscribe" in details(page)
 
 
 def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:

@@ -133,7 +133,8 @@ def test_what_one_enclave_has_alone_is_drawn_where_there_is_little(tmp_path: Pat
     own = {"/a": group("topics", "publish", "/x") + group("topics", "subscribe", "/y")}
     scene = scenes_of(picture_of(tmp_path, own))[0]
     assert [card.members for card in scene.cards if card.kind] == [("/x",), ("/y",)]
-    assert not [note for card in scene.cards for note in card.notes]
+    notes = [note for card in scene.cards for note in card.notes]
+    assert notes == ["nobody may subscribe", "nobody may publish"]
 
 
 def test_what_differs_is_never_folded_into_an_enclave(tmp_path: Path) -> None:

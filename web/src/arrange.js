@@ -50,8 +50,9 @@ export function namesCard(id, bundle, notes = []) {
     level: bundle.protection.level,
     members: bundle.names,
     lines: shown.flatMap((name) => wrapped(name, 35)),
-    notes: [...(rest ? [`and ${rest} more ${KINDS[bundle.kind]}s`] : []), ...notes],
+    notes: [...(rest ? [`and ${rest} more ${KINDS[bundle.kind]}s`] : []), ...notes, ...(bundle.lacks ? [bundle.lacks] : [])],
     tags: "",
+    lacks: bundle.lacks,
   };
   return { ...card, width: widthOf(card, 62, 130), height: height(card) };
 }

@@ -173,6 +173,7 @@ export function nameDetails(model, kind, name, act) {
       ]),
     );
   }
+  if (bundle.lacks) parts.push(el("p", {}, chip("warning", bundle.lacks)));
   for (const [title, wanted] of [
     [kind === "topics" || kind === "dds" ? "May publish" : "May call", (tie) => !tie.deny && sends(tie)],
     [kind === "topics" || kind === "dds" ? "May listen" : kind === "actions" ? "May carry out, or listen" : "May serve", (tie) => !tie.deny && !sends(tie)],
@@ -201,6 +202,17 @@ export function nameDetails(model, kind, name, act) {
     parts.push(section("With the very same rights", list));
   }
   return parts;
+}
+
+// Equal enclaves on one card: each of them can be looked at.
+export function equalDetails(card, act) {
+  const items = card.members.map((path) => el("li", {}, link(path, () => act.enclave(path))));
+  return [
+    el("p", { class: "kind", text: `${counted(card.members.length, "enclave")} alike` }),
+    el("h2", { text: card.lines.map((text) => text.trim()).join(""), tabindex: "-1" }),
+    el("p", { class: "soft", text: "Their rights are equal but for their own names." }),
+    section("Enclaves", longList(items)),
+  ];
 }
 
 // Several names on one card: which of them is meant?

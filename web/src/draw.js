@@ -20,6 +20,7 @@ const TIPS = [
   ["to1", "tip1", "M1 1L7 4L1 7z", 8, 7, "auto"],
   ["to2", "tip2", "M0 4L4 0L8 4L4 8z", 8, 7, "auto"],
   ["bad", "tipbad", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
+  ["odd", "tipodd", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
   ["no", "cross", "M7 1.5a5.5 5.5 0 1 0 .01 0zM3.2 10.8L10.8 3.2", 14, 13, "0"],
 ];
 const horizontal = linkHorizontal().x((point) => point[0]).y((point) => point[1]);
@@ -34,7 +35,7 @@ export function pathOf(link, cards) {
 export function linkText(link, overlay) {
   const said = `${link.deny ? "DENY" : "ALLOW"} ${link.rights.join(", ")}`;
   const marked = markText(overlay, link.mark);
-  return [said, link.wildcard && "by a wildcard", link.open && "as everybody may", link.violates && "breaks a requirement", marked, LEVELS[link.level]]
+  return [said, link.wildcard && "by a wildcard", link.open && "as everybody may", link.violates && "breaks a requirement", link.differs && "not so of the equal ones", marked, LEVELS[link.level]]
     .filter(Boolean)
     .join(", ");
 }
@@ -100,14 +101,14 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
     .attr("text-anchor", (head) => head.anchor)
     .text((head) => head.text.toUpperCase());
   const cards = new Map(scene.cards.map((card) => [card.id, card]));
-  const rank = (link) => (link.violates ? 4 : link.deny ? 3 : { both: 0, first: 1, second: 2 }[link.mark]);
+  const rank = (link) => (link.violates ? 5 : link.deny ? 4 : link.differs ? 3 : { both: 0, first: 1, second: 2 }[link.mark]);
   const links = root
     .append("g")
     .selectAll("path")
     .data([...scene.links].sort((a, b) => rank(a) - rank(b)))
     .join("path")
     .attr("class", (link) =>
-      ["link", link.level, link.wildcard && "wild", link.mark !== "both" && link.mark, link.violates && "violates", link.deny && "deny"]
+      ["link", link.level, link.wildcard && "wild", link.mark !== "both" && link.mark, link.differs && "differs", link.violates && "violates", link.deny && "deny"]
         .filter(Boolean)
         .join(" "),
     )
@@ -118,7 +119,7 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
     .selectAll("g")
     .data(scene.cards)
     .join("g")
-    .attr("class", (card) => `card ${card.role}${card.chosen ? " chosen" : ""}`)
+    .attr("class", (card) => `card ${card.role}${card.chosen ? " chosen" : ""}${card.lacks ? " lacking" : ""}`)
     .attr("transform", (card) => `translate(${card.x} ${card.y})`)
     .attr("role", "button")
     .attr("tabindex", (_, number) => (number ? -1 : 0))
@@ -183,7 +184,8 @@ function drawCard(group, card, problems) {
     y += 16;
   }
   for (const text of card.notes) {
-    group.append("text").attr("class", "small").attr("x", names ? 32 : 12).attr("y", y - 1).text(`${text} `);
+    const kind = card.lacks && text.startsWith("nobody may ") ? "small lack" : "small";
+    group.append("text").attr("class", kind).attr("x", names ? 32 : 12).attr("y", y - 1).text(`${text} `);
     y += 14;
   }
   [...card.tags].reverse().forEach((tag, number) => {
@@ -227,7 +229,7 @@ function moved(event, card, drawn, choose) {
 }
 
 // What the symbols of this scene mean, as items of a list.
-export function legend(scene, overlay, make) {
+export function legend(scene, overlay, equal, make) {
   const items = [];
   const icon = (path, kind, wide) =>
     make.svg("svg", { class: "icon", width: wide ? 46 : 15, height: 15, "aria-hidden": "true" }, make.svg("path", { class: kind, d: path, transform: "translate(1 1)" }));
@@ -246,8 +248,23 @@ export function legend(scene, overlay, make) {
   if (scene.links.some((link) => link.wildcard)) line("wild", "by a wildcard only");
   if (scene.links.some((link) => link.deny)) line("deny", "denied");
   if (scene.links.some((link) => link.violates)) line("violates", "breaks a requirement");
+  if (scene.links.some((link) => link.differs)) line("differs", "not so of the equal ones");
+  const box = (kind, text) => add(icon("M1 1h40v12h-40z", `box ${kind}`, true), text);
+  if (scene.cards.some((card) => card.chosen)) box("chosen", "in focus");
+  if (scene.cards.some((card) => card.lacks)) box("lacking", "nobody may send, or nobody may receive");
   if (overlay && scene.links.some((link) => link.mark === "first")) line("first", overlay.first);
   if (overlay && scene.links.some((link) => link.mark === "second")) line("second", overlay.second);
+  for (const each of equal) {
+    if (!scene.cards.some((card) => [...card.lines, card.group ?? ""].some((text) => text.includes(each.label)))) continue;
+    const text = `${each.label}: each of ${each.members.length} ${each.what}s, which are equal but for their names`;
+    items.push(make.el("li", {}, make.el("span", { class: "label", text })));
+  }
+  if (scene.cards.some((card) => card.lines.some((text) => /{\d+ others? of /.test(text)))) {
+    items.push(make.el("li", {}, make.el("span", { text: "{1 other of …}: such a name of another one of them" })));
+  }
+  if (scene.cards.some((card) => card.notes.some((text) => text.startsWith("own:")))) {
+    items.push(make.el("li", {}, make.el("span", { text: "own: names that no other enclave may use" })));
+  }
   for (const each of scene.onlookers) {
     const tag = make.el("b", { class: "tag", text: each.tag });
     add(tag, `${ONLOOKERS[each.right]} ${each.enclave.replace(/^:/, "")}`);

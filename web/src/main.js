@@ -1,10 +1,11 @@
 // Puts the page together: tabs, search, filters, the map, and what was chosen.
 
 import { MOST_BUNDLES, columns, flowScene } from "./arrange.js";
-import { cardDetails, enclaveDetails, findingItem, nameDetails } from "./details.js";
+import { cardDetails, enclaveDetails, equalDetails, findingItem, nameDetails } from "./details.js";
 import { byId, counted, el, svg } from "./dom.js";
 import { drawScene, legend } from "./draw.js";
 import { Model } from "./model.js";
+import { namesTable } from "./table.js";
 import { timeline } from "./timeline.js";
 import { KINDS, LEVELS, markText } from "./words.js";
 
@@ -12,6 +13,7 @@ const model = new Model(JSON.parse(byId("picture").textContent));
 const state = { scene: 0, filters: {}, flow: null, chosen: null, zoom: 0, drawing: null, shown: null };
 const FILTERS = ["enclave", "namespace", "direction", "protection", "mark"];
 const MOST_FOUND = 12;
+const MOST_FINDINGS = 100;
 const problemsOf = new Map(
   model.enclaves.map((each) => [
     each.path,
@@ -53,7 +55,7 @@ function showMap() {
   const scene = currentScene();
   state.shown = scene;
   state.drawing = drawScene(byId("map"), scene, { overlay: model.overlay, problems, choose });
-  byId("legend").replaceChildren(...legend(scene, model.overlay, { el, svg }));
+  byId("legend").replaceChildren(...legend(scene, model.overlay, model.equal, { el, svg }));
   const are = scene.hidden === 1 ? "is" : "are";
   const left = scene.id === "essential" ? `that only every node needs ${are} left out` : `${are} not in this view`;
   const summary = scene.shown
@@ -65,12 +67,25 @@ function showMap() {
   if (state.flow) byId("hops-number").textContent = Math.min(state.flow.hops, scene.most);
   zoom(0);
   light();
+  showFocus();
+}
+
+// What was asked about is in sight.
+function showFocus() {
+  const { cards, id } = state.shown;
+  const asked = id === "focus" && cards.find((card) => card.chosen);
+  if (!asked) return;
+  const canvas = byId("canvas");
+  canvas.scrollLeft = (asked.x + asked.width / 2) * state.zoom - canvas.clientWidth / 2;
+  canvas.scrollTop = (asked.y + asked.height / 2) * state.zoom - canvas.clientHeight / 2;
 }
 
 function zoom(step) {
   const { width } = state.shown;
   const room = byId("canvas").clientWidth - 2;
-  if (step === 0) state.zoom = Math.min(1.15, Math.max(0.72, room / width));
+  // On a small screen the letters stay readable, and the map is moved instead.
+  const least = window.innerWidth <= 720 ? 0.9 : 0.72;
+  if (step === 0) state.zoom = Math.min(1.15, Math.max(least, room / width));
   else state.zoom = Math.min(2.5, Math.max(0.05, state.zoom * (step > 0 ? 1.2 : 1 / 1.2)));
   byId("map").setAttribute("width", Math.round(width * state.zoom));
   byId("map").setAttribute("height", Math.round(state.shown.height * state.zoom));
@@ -84,6 +99,7 @@ function fit() {
   state.zoom = Math.max(0.05, Math.min(1.15, (canvas.clientWidth - 2) / width, tall / height));
   byId("map").setAttribute("width", Math.floor(width * state.zoom));
   byId("map").setAttribute("height", Math.floor(height * state.zoom));
+  canvas.scrollIntoView({ block: "nearest" });
 }
 
 function light() {
@@ -91,7 +107,7 @@ function light() {
   const belongs = chosen && {
     enclave: (card) => card.role !== "names" && card.members.includes(chosen.path),
     name: (card) => card.role === "names" && card.kind === chosen.kind && card.members.includes(chosen.name),
-    card: (card) => card.role === "names" && card.kind === chosen.card.kind && card.members[0] === chosen.card.members[0],
+    card: (card) => (card.role === "names") === (chosen.card.role === "names") && card.kind === chosen.card.kind && card.members[0] === chosen.card.members[0],
   }[chosen.type];
   // In a flow everything belongs to what was asked for.
   const found = state.drawing.highlight(state.flow ? null : belongs);
@@ -121,7 +137,7 @@ function choose(card) {
     if (at >= 0) setScene(at);
     return;
   }
-  if (card.role === "enclave") act.enclave(card.members[0]);
+  if (card.role === "enclave" && card.members.length === 1) act.enclave(card.members[0]);
   else if (card.members.length === 1) act.name(card.kind, card.members[0]);
   else chosen({ type: "card", card });
 }
@@ -131,7 +147,7 @@ function chosen(what) {
   const content = {
     enclave: () => enclaveDetails(model, what.path, act),
     name: () => nameDetails(model, what.kind, what.name, act),
-    card: () => cardDetails(what.card, act),
+    card: () => (what.card.role === "names" ? cardDetails : equalDetails)(what.card, act),
   }[what.type]();
   byId("details-content").replaceChildren(...content);
   document.body.classList.add("with-details");
@@ -230,9 +246,28 @@ function fillLists() {
     act.enclave(path);
   };
   const none = el("p", { class: "soft", text: "There are no findings." });
-  const list = el("ul", { class: "plain cards" }, sorted.map((each) => findingItem(each, onEnclave)));
+  const item = (each) => findingItem(each, onEnclave);
+  const list = el("ul", { class: "plain cards" }, sorted.slice(0, MOST_FINDINGS).map(item));
+  if (sorted.length > MOST_FINDINGS) {
+    const rest = sorted.slice(MOST_FINDINGS);
+    const more = el("button", { type: "button", text: `Show ${rest.length} more` });
+    more.addEventListener("click", () => more.parentElement.replaceWith(...rest.map(item)));
+    list.append(el("li", {}, more));
+  }
   byId("findings").replaceChildren(sorted.length ? list : none);
   byId("tab-findings").textContent = sorted.length ? `Findings (${sorted.length})` : "Findings";
+  const lacking = model.bundles.filter((each) => each.lacks && !each.ties.every((tie) => tie.common));
+  const onName = (kind, name) => {
+    showTab("map");
+    act.name(kind, name);
+  };
+  byId("names").replaceChildren(
+    ...namesTable(
+      model.rows,
+      lacking.reduce((sum, each) => sum + each.names.length, 0),
+      (kind, name) => model.bundle(kind, name) && (() => onName(kind, name)),
+    ),
+  );
   byId("timeline").replaceChildren(...timeline(model.validities, onEnclave));
   byId("tab-differences").hidden = !model.overlay;
   if (!model.overlay) return;
