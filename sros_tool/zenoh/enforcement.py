@@ -99,6 +99,8 @@ class AccessDecision:
     why: str
 
 
+_OF_HISTORY = (Message.PUT, Message.QUERY)
+
 _Combination = tuple[str | None, ...]
 """One value for each of `PROPERTIES`, None for any."""
 
@@ -135,6 +137,32 @@ class Enforcement:
                 return f"its subject {each.id[:80]!r} has conditions besides the name: {more}"
         if any(not each.allows for each in self.rules):
             return "it has denials, which do not hold for messages with wildcards"
+        for each in self.subjects:
+            if key := self._only_history(each.id):
+                return f"its subject {each.id[:80]!r} gets the history of {key[:80]!r} alone"
+        return ""
+
+    def _only_history(self, subject: str) -> str:
+        """Return a key whose history (``@adv``) a subject gets without the key itself, or ""."""
+        keys: dict[Flow, list[str]] = {each: [] for each in Flow}
+        history: dict[Flow, set[str]] = {each: set() for each in Flow}
+        for rule in self.rules_of(subject):
+            for flow, message in product(rule.flows, rule.messages):
+                if message not in _OF_HISTORY:
+                    continue
+                # Who asks for a history gets what the other flow lets pass.
+                other = Flow.EGRESS if flow is Flow.INGRESS else Flow.INGRESS
+                for key in rule.key_expressions:
+                    begin, of_history, _ = key.partition("/@adv")
+                    if of_history:
+                        history[flow if message is Message.PUT else other].add(begin)
+                    elif message is Message.PUT:
+                        keys[flow].append(key)
+        for flow, begins in history.items():
+            exact = set(keys[flow])
+            for begin in sorted(begins - exact):
+                if not any(includes(key, begin) for key in keys[flow]):
+                    return begin
         return ""
 
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
