@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import signal
@@ -62,6 +63,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the slowest modules."""
     rank = {name: number for number, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+def pytest_collection_finish() -> None:
+    """Take what stays until the end from the garbage collector, which looked at it every time."""
+    gc.collect()
+    gc.freeze()
 
 
 for each in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):

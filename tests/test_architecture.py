@@ -456,18 +456,16 @@ def used_names(name: str, modules: Modules, known: Modules) -> set[tuple[str, st
                 found.add((node.module, alias.name))
                 aliases[alias.asname or alias.name] = f"{node.module}.{alias.name}"
     whole = [module for module in aliases.values() if module in known]
+    folder = f"{name.rpartition('.')[0]}."
+    beside = [each for each in known if each.startswith(folder) and each != name]
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
             # Of any module that is here whole: it may be asked as the variable of a loop.
             found |= {(module, node.attr) for module in whole}
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             # A table of verbs, or of what is imported late, names what stands next to it.
-            beside = f"{name.rpartition('.')[0]}."
-            found |= {
-                (each, node.value)
-                for each in known
-                if node.value.isidentifier() and each.startswith(beside) and each != name
-            }
+            if node.value.isidentifier():
+                found |= {(each, node.value) for each in beside}
     return {(module, each) for module, each in found if module != name}
 
 

@@ -14,13 +14,17 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
+from sros_tool.demo.nodes import cyclone
 from sros_tool.demo.wire import Capture
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.events import Event, EventKind, read_events
 from sros_tool.runtime.netns import enter_isolation, try_isolation
-from tests.support.children import LATE, PATIENCE, python
+from tests.support.children import LATE, PATIENCE, Forked, python
+
+Running = subprocess.Popen[bytes] | Forked
 
 ENOUGH = 11
 """Messages after which somebody is heard, and is no longer waited for."""
@@ -184,7 +188,7 @@ def open_capture(texts: list[str]) -> Capture | None:
         return None
 
 
-def start(node: Node, domain: int, folder: Path) -> tuple[subprocess.Popen[bytes], Path]:
+def start(node: Node, domain: int, folder: Path) -> tuple[Running, Path]:
     """The process of a node, the file that it reports to, and beside that its errors (.err)."""
     report = folder / f"{node.name}.jsonl"
     report.touch()
@@ -192,13 +196,14 @@ def start(node: Node, domain: int, folder: Path) -> tuple[subprocess.Popen[bytes
     environment["ROS_DOMAIN_ID"] = str(domain)
     if node.keystore:
         environment |= secured_environment(Path(node.keystore), node.enclave, domain)
-    command = [*node.through, sys.executable, "-m", "sros_tool.demo.nodes.cyclone", node.role]
-    command += ["--topic", node.topic, "--text", node.text, "--period", "0.1"]
+    arguments = [node.role, "--topic", node.topic, "--text", node.text, "--period", "0.1"]
+    arguments += ["--report", str(report)]
+    if not node.through:
+        work = partial(cyclone.main, arguments)
+        return Forked(work, env=environment, errors=report.with_suffix(".err")), report
+    command = [*node.through, sys.executable, "-m", "sros_tool.demo.nodes.cyclone"]
     with report.with_suffix(".err").open("wb") as errors:
-        process = subprocess.Popen(
-            [*command, "--report", str(report)], env=environment, stderr=errors
-        )
-    return process, report
+        return subprocess.Popen([*command, *arguments], env=environment, stderr=errors), report
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from subprocess import Popen
 
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
@@ -26,7 +25,7 @@ from sros_tool.keystore.lifecycle.update import UpdateStage, update_keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.events import EventKind, read_events
 from sros_tool.runtime.netns import enter_isolation, try_isolation
-from tests.integration.converse import SETTLED, SILENCE, Node, start
+from tests.integration.converse import SETTLED, SILENCE, Node, Running, start
 from tests.support.children import LATE, PATIENCE, wait_for
 
 ENOUGH = 5
@@ -39,7 +38,7 @@ class Nodes:
         self._root = root
         self._domain = domain
         self._folder = folder
-        self._processes: dict[str, tuple[Popen[bytes], Path]] = {}
+        self._processes: dict[str, tuple[Running, Path]] = {}
 
     def start(self, role: str, number: int) -> str:
         node = Node(role, f"{role} {number}", self._root, f"/{role}", text=f"from {role} {number};")

@@ -120,7 +120,9 @@ def test_a_weakness_makes_its_rows_fail_and_no_others(
 
 @needs_isolation
 def test_interrupted_attacks_leave_nothing(backend: Backend, tmp_path: Path) -> None:
-    process = demo(backend, folder=tmp_path)
+    rows = [row for row in ATTACKS.rows if not row.removed]
+    words = [word for row in rows if LONG or row in rows[:6] for word in ("--only", row.name)]
+    process = demo(backend, *words, folder=tmp_path)
     deadline = time.monotonic() + PATIENCE
     while len(list(tmp_path.glob("sros-demo-*/rows/row_*/*.jsonl"))) < 10:
         assert time.monotonic() < deadline

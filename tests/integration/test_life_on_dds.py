@@ -23,6 +23,7 @@ from tests.integration.fastdds import build, fastdds_vendor, isolated
 from tests.integration.vendor_oracle import MATCH_SECONDS
 from tests.support.children import LATE, run
 from tests.support.harness import policy_text, publish
+from tests.support.long_form import ONLY_LONG
 
 pytestmark = pytest.mark.dds
 
@@ -136,7 +137,7 @@ def copy(root: Path, name: str) -> Path:
     return Path(shutil.copytree(root, root.with_name(name), symlinks=True))
 
 
-@pytest.mark.parametrize("template", ["development", "production"])
+@pytest.mark.parametrize("template", [pytest.param("development", marks=ONLY_LONG), "production"])
 def test_a_renewed_enclave_talks_with_one_not_yet_renewed(
     template: str, ask: Ask, tmp_path: Path
 ) -> None:
@@ -155,7 +156,7 @@ def test_a_renewed_enclave_talks_with_one_not_yet_renewed(
     )
 
 
-@pytest.mark.parametrize("template", ["development", "production"])
+@pytest.mark.parametrize("template", [pytest.param("development", marks=ONLY_LONG), "production"])
 def test_a_revoked_enclave_is_no_longer_heard(template: str, ask: Ask, tmp_path: Path) -> None:
     """Neither with its last certificate nor with an earlier one; one made anew is."""
     root = tmp_path / "ks"

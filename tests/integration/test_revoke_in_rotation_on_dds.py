@@ -28,6 +28,7 @@ from tests.integration.test_life_on_dds import (
     probe,
 )
 from tests.support import made_by_ros2
+from tests.support.long_form import ONLY_LONG
 
 __all__ = ["ask", "probe"]
 
@@ -72,7 +73,7 @@ def vendor(request: pytest.FixtureRequest) -> str:
         # Whether there is a list already decides whether Fast DDS asks for one of every CA.
         (RotationStage.DISTRIBUTE, "production", False),
         (RotationStage.REISSUE, "production", True),
-        (RotationStage.REISSUE, "sros2", True),
+        pytest.param(RotationStage.REISSUE, "sros2", True, marks=ONLY_LONG),
     ],
 )
 def test_a_revocation_takes_effect_in_every_stage(

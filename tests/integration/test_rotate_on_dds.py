@@ -18,6 +18,7 @@ from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rota
 from sros_tool.keystore.template import load_template
 from tests.integration.test_life_on_dds import HEARD, SILENT, Question, ask_fast, compare, probe
 from tests.support.children import python
+from tests.support.long_form import ONLY_LONG
 
 __all__ = ["probe"]
 
@@ -48,7 +49,12 @@ def restarts(root: Path, steps: dict[str, dict[str, bool]]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("template", "revoked"), [("production", False), ("production", True), ("sros2", False)]
+    ("template", "revoked"),
+    [
+        ("production", True),
+        ("sros2", False),
+        pytest.param("production", False, marks=ONLY_LONG),
+    ],
 )
 def test_the_stages_on_cyclone(template: str, revoked: bool, tmp_path: Path) -> None:
     """It trusts one CA at a time: after the stage reissue, all have to be restarted together."""
@@ -93,7 +99,12 @@ def moments(root: Path, steps: int) -> list[Path]:
 
 @pytest.mark.parametrize(
     ("template", "revoked"),
-    [("production", False), ("production", True), ("sros2", False), ("sros2", True)],
+    [
+        ("production", True),
+        ("sros2", False),
+        pytest.param("production", False, marks=ONLY_LONG),
+        pytest.param("sros2", True, marks=ONLY_LONG),
+    ],
 )
 def test_the_stages_on_fast_dds(template: str, revoked: bool, probe: Path, tmp_path: Path) -> None:
     """It trusts all CAs of a file: everybody talks, whoever was restarted since the last stage."""

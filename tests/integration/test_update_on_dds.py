@@ -39,14 +39,13 @@ from tests.integration.test_life_on_dds import (
 )
 from tests.integration.test_rotate_on_dds import ALL, TOGETHER, restarts
 from tests.integration.test_rotate_on_dds import DOMAIN as LIVE
-from tests.support.children import LONG
 from tests.support.harness import policy_text
+from tests.support.long_form import ONLY_LONG
 
 __all__ = ["ask", "probe"]
 
 pytestmark = pytest.mark.dds
 
-WHY = "only in the long form: it waits for as long again"
 POLICY = policy_text(
     {
         f"/{role}": f'<{kind} {right}="ALLOW"><{item}>{name}</{item}></{kind}>'
@@ -111,7 +110,7 @@ def test_which_governance_disturbs(ask: Ask, tmp_path: Path) -> None:
     ("template", "other"),
     [
         ("development", "production"),
-        pytest.param("production", "development", marks=pytest.mark.skipif(not LONG, reason=WHY)),
+        pytest.param("production", "development", marks=ONLY_LONG),
     ],
 )
 def test_the_stages_on_cyclone(template: str, other: str, tmp_path: Path) -> None:

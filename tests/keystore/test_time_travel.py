@@ -47,7 +47,7 @@ TEMPLATE = replace(
     permissions_validity=timedelta(days=270),
     revocation_validity=timedelta(days=150),
 )
-ENCLAVES, CHANGED = (200, 3) if LONG else (15, 1)  # of which so many get new rights each month
+ENCLAVES, CHANGED = (200, 3) if LONG else (8, 1)  # of which so many get new rights each month
 ROTATION = {60: RotationStage.DISTRIBUTE, 63: RotationStage.REISSUE, 68: RotationStage.RETIRE}
 REVOKED = {*range(1, MONTHS + 1, 6), 62, 65}  # so there is one in every stage
 PERSONAL = ("cert.pem", "permissions.p7s", "key.pem")
