@@ -444,10 +444,10 @@ def public_names(tree: ast.Module) -> set[str]:
 
 def used_names(name: str, modules: Modules, known: Modules) -> set[tuple[str, str]]:
     """Return what the module `name` takes from each of the `known` modules, also later on."""
-    tree = modules[name]
+    nodes = list(ast.walk(modules[name]))
     found: set[tuple[str, str]] = set()
     aliases: dict[str, str] = {}
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             for alias in node.names:
                 aliases[alias.asname or alias.name] = alias.name
@@ -458,14 +458,13 @@ def used_names(name: str, modules: Modules, known: Modules) -> set[tuple[str, st
     whole = [module for module in aliases.values() if module in known]
     folder = f"{name.rpartition('.')[0]}."
     beside = [each for each in known if each.startswith(folder) and each != name]
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Attribute):
             # Of any module that is here whole: it may be asked as the variable of a loop.
             found |= {(module, node.attr) for module in whole}
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+        elif isinstance(node, ast.Constant) and (word := str(node.value)).isidentifier():
             # A table of verbs, or of what is imported late, names what stands next to it.
-            if node.value.isidentifier():
-                found |= {(each, node.value) for each in beside}
+            found |= {(each, word) for each in beside}
     return {(module, each) for module, each in found if module != name}
 
 

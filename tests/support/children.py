@@ -34,9 +34,11 @@ _Value = TypeVar("_Value")
 def some_steps(steps: Sequence[int]) -> Sequence[int]:
     """Return the steps at which to stop a process: of many every third, and of 50 every fifth.
 
-    In the long form all.
+    The last one always is among them; in the long form all are.
     """
-    return steps if LONG or len(steps) < 20 else steps[:: 3 if len(steps) < 50 else 5]
+    if LONG or len(steps) < 20:
+        return steps
+    return steps[:: -3 if len(steps) < 50 else -5][::-1]
 
 
 def run(
