@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from sros_tool.report.picture import Picture, PicturedFinding
 
 _FORMATS = ("html", "svg", "dot", "mermaid", "json")
+_WITH_FINDINGS = ("html", "json")
+"""The formats that show the findings of `sros check`."""
 _ENDINGS = {".htm": "html", ".mmd": "mermaid", ".gv": "dot"}
 
 
@@ -180,7 +182,13 @@ def view(
         check_output(output, force=force or dry_run)
     with progress("drawing"), _without_collection():
         picture, read, robots = _picture(
-            sources, observed, template, hosts, moment, fleets_of(fleet_files)
+            sources,
+            observed,
+            template,
+            hosts,
+            moment,
+            fleets_of(fleet_files),
+            with_findings=written in _WITH_FINDINGS,
         )
         if words:
             from sros_tool.report.focus import focused
@@ -245,6 +253,8 @@ def _picture(
     hosts: tuple[str, ...],
     moment: datetime,
     fleets: tuple[Fleet | None, Fleet | None],
+    *,
+    with_findings: bool,
 ) -> tuple[Picture, Sequence[PictureSource], Mapping[str, Robot]]:
     """Return the picture, the sources whose rights are in it, and the robots by their enclaves."""
     from dataclasses import replace
@@ -262,7 +272,8 @@ def _picture(
     read = []
     for path, fleet in zip(sources, fleets, strict=False):
         source = read_source(path, now=moment, fleet=fleet)
-        read.append(added(source, path, _checked(path, source, moment, fleet)))
+        found = _checked(path, source, moment, fleet) if with_findings else []
+        read.append(added(source, path, found))
     if template:
         _check_no_governance(sources, read)
         read = [

@@ -24,7 +24,7 @@ from collections.abc import (
     Set,
 )
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 from sros_tool.fleet.model import Robot
 from sros_tool.policy.model import ALLOW
@@ -128,18 +128,19 @@ class _Unit:
         return self.what == _ENCLAVE
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Text:
     """A text in parts, between which units are named, each with the number of its value."""
 
     parts: tuple[str, ...]
     named: tuple[tuple[int, int], ...] = ()
 
-    @property
+    @cached_property
     def units(self) -> tuple[int, ...]:
+        """The units that are named, in their order."""
         return tuple(unit for unit, _ in self.named)
 
-    @property
+    @cached_property
     def form(self) -> tuple[object, ...]:
         """What is left without the units: the same for texts that differ in units alone."""
         return self.parts, tuple(number for _, number in self.named)
