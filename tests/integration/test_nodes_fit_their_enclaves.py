@@ -39,6 +39,7 @@ from sros_tool.policy.model import Enclave
 from sros_tool.resources import policies_dir
 from sros_tool.translate import dds_names
 from tests.integration.test_policies_live import all_dds_endpoints, observed_in, run_script, without
+from tests.support.long_form import ONLY_LONG
 
 pytestmark = [
     pytest.mark.dds,
@@ -271,6 +272,8 @@ def test_it_would_see_a_node_under_another_name(cast: list[Casting]) -> None:
 # ── the nodes of the shipped policies ──────────────────────────────────────────────────────
 
 SYSTEMS = ("add_two_ints", "composition", "fibonacci", "mobile_robot", "talker_listener")
+WITH_MOST = ("composition", "mobile_robot")
+"""Those that have all that the others have: topics, services, actions, many nodes in a process."""
 
 
 @pytest.fixture(scope="module")
@@ -314,7 +317,13 @@ def is_of_every_node(name: str, *, managed: bool) -> bool:
     return basic or "/_action/" in name or (managed and own in states)
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize(
+    "system",
+    [
+        *WITH_MOST,
+        *(pytest.param(each, marks=ONLY_LONG) for each in SYSTEMS if each not in WITH_MOST),
+    ],
+)
 def test_the_nodes_of_a_shipped_policy_are_denied_nothing(system: str, keystore: Path) -> None:
     enclaves = read_policy(policies_dir() / f"{system}.xml").enclaves
     processes = {each.path: nodes_of(each) for each in enclaves}

@@ -16,6 +16,7 @@ import pytest
 
 from tests.support.children import run
 from tests.support.harness import policy_text, publish, sros
+from tests.support.long_form import ONLY_LONG
 
 pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
 
@@ -24,7 +25,12 @@ PROCESS = Path(__file__).with_name("zenoh_process.py")
 
 
 @pytest.mark.parametrize(
-    ("mode", "name"), [("client", "ks"), ("peer", "ks"), ("client", 'a|b="c" \\d=é\n#$x\u2028')]
+    ("mode", "name"),
+    [
+        pytest.param("client", "ks", marks=ONLY_LONG),
+        ("peer", "ks"),
+        ("client", 'a|b="c" \\d=é\n#$x\u2028'),
+    ],
 )
 def test_a_session_opens_with_the_environment_and_not_without(
     mode: str, name: str, tmp_path: Path
