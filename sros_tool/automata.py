@@ -11,6 +11,7 @@ Names are texts of any characters but NUL, which no DDS and no file can have in 
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -402,12 +403,16 @@ class SearchLimit:
         """
         self._left -= steps
         if self._left < 0:
-            raise DocumentError(
-                "it cannot be decided which names so many wildcards match",
-                "The names that they have in common, and not in common, are too many to be told "
-                "apart, such as with many '?' after a '*'.",
-                "Replace wildcards by the names that they stand for, or by fewer wildcards.",
-            )
+            raise _too_many()
+
+
+def _too_many() -> DocumentError:
+    return DocumentError(
+        "it cannot be decided which names so many wildcards match",
+        "The names that they have in common, and not in common, are too many to be told apart, "
+        "such as with many '?' after a '*'.",
+        "Replace wildcards by the names that they stand for, or by fewer wildcards.",
+    )
 
 
 class NameSet:
@@ -517,7 +522,7 @@ class NameSet:
                 return name
         limit = limit or SearchLimit()
         best: str | None = None
-        for search in _searches(self._node):
+        for search in _searches(self._node, limit):
             found = search.shortest(limit, longest)
             if found is not None and (best is None or _length(found) < _length(best)):
                 best = found
@@ -528,7 +533,7 @@ class NameSet:
         if next(self.stated(), None) is not None:
             return False
         limit = limit or SearchLimit()
-        return all(each.shortest(limit, None) is None for each in _searches(self._node))
+        return all(each.shortest(limit, None) is None for each in _searches(self._node, limit))
 
     def issubset(self, other: NameSet, limit: SearchLimit | None = None) -> bool:
         """Return whether ``other`` has every name of this set; raises what `example` raises."""
@@ -595,10 +600,13 @@ def _reduced(node: _Node, known: Mapping[Automaton, bool]) -> _Node | bool:
     ``known`` says of automata whether they accept these names.
     """
     if isinstance(node, _Some):
-        if any(known.get(each) for each in node.automata):
+        few, many = sorted((known, node.automata), key=len)
+        met = [each for each in few if each in many]
+        if any(known[each] for each in met):
             return True
-        left = node.automata.difference(known)
-        return _Some(automata=left) if left else False
+        if len(met) == len(node.automata):
+            return False
+        return _Some(automata=node.automata.difference(met)) if met or node.exact else node
     if isinstance(node, _Not):
         inner = _reduced(node.of, known)
         return not inner if isinstance(inner, bool) else _Not(inner)
@@ -632,7 +640,13 @@ def _reduced(node: _Node, known: Mapping[Automaton, bool]) -> _Node | bool:
     return _First(tuple(rules), last) if rules else last
 
 
-def _searches(node: _Node) -> Iterator[_Search]:
+_OF_A_STEP = 16
+"""So many automata are looked at in the time of one step of a search."""
+_MOST_AUTOMATA = 8192
+"""With more of them, a search could take gigabytes."""
+
+
+def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
     """Yield searches that together find every name of a set that is not exact in it.
 
     Each considers the names of one automaton, and only the other automata that may have names in
@@ -641,10 +655,14 @@ def _searches(node: _Node) -> Iterator[_Search]:
     """
     leaves = tuple(_leaves(node))
     automata = sorted({each for leaf in leaves for each in leaf.automata}, key=_order)
+    if len(automata) > _MOST_AUTOMATA:
+        raise _too_many()
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
     everything = {each: True for each in automata if each.endless_bits & 1}
     around = _around(node, lambda each: (len(each.automata), 0))
     for own in automata if around is None else sorted(around.automata, key=_order):
+        if others := len(automata) // _OF_A_STEP:
+            limit.spend(others)
         known = {each: False for each in automata if not own.may_meet(each)}
         left = _reduced(node, {**known, **everything, own: True})
         if left is not False:
@@ -652,6 +670,41 @@ def _searches(node: _Node) -> Iterator[_Search]:
     if around is None and not everything and _reduced(node, dict.fromkeys(automata, False)):
         left = _reduced(node, {})
         yield _Search(_Not(_Some()) if isinstance(left, bool) else left, exact)
+
+
+def _needed(node: _Node) -> frozenset[Automaton]:
+    """Return automata without which no name is in a set without exact names."""
+    match node:
+        case _Some():
+            return node.automata if len(node.automata) == 1 else frozenset()
+        case _Not():
+            return _excepted(node.of)
+        case _Every():
+            return frozenset[Automaton]().union(*map(_needed, node.of))
+        case _AtLeast():
+            counts = Counter(each for one in node.of for each in _needed(one))
+            spare = len(node.of) - node.count
+            return frozenset(each for each, number in counts.items() if number > spare)
+        case _First(last=False):
+            return _in_all(_needed(each) for each, says in node.of if says)
+    return frozenset()
+
+
+def _excepted(node: _Node) -> frozenset[Automaton]:
+    """Return automata without which every name is in a set without exact names."""
+    match node:
+        case _Not():
+            return _needed(node.of)
+        case _Every():
+            return _in_all(map(_excepted, node.of))
+        case _First(last=True):
+            return _in_all(_needed(each) for each, says in node.of if not says)
+    return frozenset()
+
+
+def _in_all(sets: Iterable[frozenset[Automaton]]) -> frozenset[Automaton]:
+    first, *others = [*sets] or [frozenset[Automaton]()]
+    return first.intersection(*others)
 
 
 def _within(own: Automaton, left: _Node | bool) -> _Node:
@@ -674,7 +727,7 @@ class _Search:
         self._node = node
         found = {each for leaf in _leaves(node) for each in leaf.automata}
         self._machine = _machine(tuple(sorted(found, key=_order)))
-        self._needed = [each for each in found if _reduced(node, {each: False}) is False]
+        self._needed = _needed(node)
         self._taken = _Taken(name for name in taken if node.truth(_asked_of(name)))
 
     def shortest(self, limit: SearchLimit, longest: int | None) -> str | None:

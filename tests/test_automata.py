@@ -178,4 +178,14 @@ def test_ten_thousand_names_take_no_search() -> None:
 def test_equal_wildcards_take_no_search() -> None:
     wild = [f"rt/{number}*x*?" for number in range(40)]
     names = names_of(Style.FNMATCH, wild) - names_of(Style.FNMATCH, [*wild, "rt/y*"])
-    assert names.is_empty(SearchLimit(0))
+    assert names.is_empty(SearchLimit(2 * len(wild)))  # to compare each with the others
+
+
+def test_looking_at_thousands_of_wildcards_counts() -> None:
+    wild = names_of(Style.FNMATCH, [f"rt/x{i}*" for i in range(900)])
+    none = names_of(Style.FNMATCH, ["rt/y?"])
+    with pytest.raises(DocumentError, match="so many wildcards"):
+        (none - wild).is_empty(SearchLimit(50))
+    many = names_of(Style.FNMATCH, [f"rt/x{i}*" for i in range(9000)])
+    with pytest.raises(DocumentError, match="so many wildcards"):
+        (none - many).is_empty()
