@@ -95,11 +95,10 @@ def check_enclave_name(name: str) -> str:
     """
     problem = _enclave_problem(name)
     if problem:
-        raise InvalidNameError(
-            f"{name!r} is not a valid enclave name",
-            problem,
-            "Use an absolute name of letters, digits and underscores, such as /robot/camera.",
-        )
+        remedy = "Use an absolute name of letters, digits and underscores, such as /robot/camera."
+        if is_expression(name) and re.fullmatch(r"[\w/*?]+", name, re.ASCII):
+            remedy += f" A verb that takes several also has --match '{name}'."
+        raise InvalidNameError(f"{name!r} is not a valid enclave name", problem, remedy)
     return name
 
 

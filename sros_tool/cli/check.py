@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from sros_tool import __version__
 from sros_tool.cli.common import (
@@ -107,7 +108,7 @@ severity or higher is shown, else 0.""",
     type=click.Choice(["note", "warning", "error", "never"]),
     default="warning",
     show_default=True,
-    help="Lowest severity that makes the exit status 1.",
+    help="Lowest severity that makes the exit status 1; a lower one than --severity is shown, too.",
 )
 @click.option(
     "--strict", is_flag=True, help="Report findings that the keystore's template accepts."
@@ -209,7 +210,10 @@ def check(
         if form == "sarif":
             raise UsageError("--needs-renewal has no SARIF output", "", "Use --json.")
         return _needs_renewal(root, needs_renewal, at.now, form)
-    selection = FindingFilter(include, exclude, Severity[severity.upper()], strict, vendor or "")
+    lowest = Severity[severity.upper()]
+    if _is_named("fail_on") and fail_on != "never":  # nothing fails that is not shown
+        lowest = min(lowest, Severity[fail_on.upper()])
+    selection = FindingFilter(include, exclude, lowest, strict, vendor or "")
     if as_list:
         if form in ("sarif", "markdown"):
             raise UsageError(f"--list has no {form} output", "", "Use --json.")
@@ -240,6 +244,12 @@ def check(
     else:
         _SHOW[form](chosen, selection)
     return 1 if fail_on != "never" and chosen.fails(Severity[fail_on.upper()]) else 0
+
+
+def _is_named(parameter: str) -> bool:
+    """Return whether the command line has the option of this parameter."""
+    source = click.get_current_context().get_parameter_source(parameter)
+    return source is ParameterSource.COMMANDLINE
 
 
 def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:

@@ -220,7 +220,13 @@ Example:
     help="With --reach, count /parameter_events too, which all nodes share, and requests that only"
     " ask, such as get_parameters.",
 )
-@click.option("--log", metavar="FILE", help="Explain the lines of a DDS log; - is standard input.")
+@click.option(
+    "--log",
+    "logs",
+    metavar="FILE",
+    multiple=True,
+    help="Explain the lines of one DDS log; - is standard input.",
+)
 @json_option
 def explain(
     words: tuple[str, ...],
@@ -238,7 +244,7 @@ def explain(
     robots: tuple[str, ...],
     reach: str | None,
     infrastructure: bool,
-    log: str | None,
+    logs: tuple[str, ...],
     as_json: bool,
 ) -> int:
     """Show whether DDS or Zenoh lets an enclave do something, by which rule, and how to change it.
@@ -251,9 +257,11 @@ def explain(
     The exit status is 0 if it is allowed (with --who: to any enclave), and 1 if it is denied; with
     --log, 1 if the log reports a fault.
     """
-    if sum((who, bool(reach), log is not None)) > 1:
+    if sum((who, bool(reach), bool(logs))) > 1:
         raise UsageError("--who, --reach and --log exclude each other")
-    mode = "--who" if who else "--reach" if reach else "--log" if log is not None else ""
+    if len(logs) > 1:
+        raise UsageError("--log takes one log", "", "Ask once for each log.")
+    mode = "--who" if who else "--reach" if reach else "--log" if logs else ""
     _refuse_ignored(mode)
     if fleet_file and not policy:
         raise UsageError("--fleet goes with --policy only", "", "Leave it out.")
@@ -266,8 +274,8 @@ def explain(
         stated = policy, fleet_file
         return _show_reach(reach, root, rest, stated, infrastructure, as_json, zenoh=of_zenoh)
     context = _ContextOptions(moment, domain, time_zone, fleet_file)
-    if log is not None:
-        return _show_log(log, root, rest, context, as_json)
+    if logs:
+        return _show_log(logs[0], root, rest, context, as_json)
     zenoh = "" if all_vendors else _why_zenoh(vendor, root)
     if who and zenoh:
         return _show_zenoh_who(root, rest, kind, zenoh, context, (patterns, robots), as_json)

@@ -488,6 +488,12 @@ def check_keystore(root: Path) -> None:
     """Raise `KeystoreError` if ``root`` is no keystore."""
     if not is_keystore(root):
         refuse_earlier(root)
+        if root.is_file():
+            raise KeystoreError(
+                f"'{root}' is not a valid keystore",
+                "It is a file.",
+                "Name the folder of a keystore.",
+            )
         raise KeystoreError(
             f"'{root}' is not a valid keystore",
             "It does not exist."

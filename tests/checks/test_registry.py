@@ -145,6 +145,7 @@ def test_text_json_and_status(bench: Bench) -> None:
         (("--exclude", "keystore.folder-open"), 0, False),
         (("--include", "keystore.*"), 1, True),
         (("--severity", "note", "--fail-on", "note"), 1, True),
+        (("--severity", "error", "--fail-on", "warning"), 1, True),
     ],
 )
 def test_thresholds(options: tuple[str, ...], status: int, shown: bool, bench: Bench) -> None:
