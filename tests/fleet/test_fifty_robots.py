@@ -210,7 +210,7 @@ def test_the_rights_of_every_node_are_not_next_to_the_policy(made: Path, tmp_pat
         (tmp_path / "robot.xml").write_text(text)
         ended = sros("check", tmp_path / "robot.xml", "--fleet", made / "fleet.toml")
         assert f"{file}' does not exist" in ended.out
-        assert ("sros policies --copy DIR" in ended.out) is ships
+        assert ("sros policies --copy shipped" in ended.out) is ships
 
 
 def test_findings_that_are_the_same_for_many_robots_are_said_once(made: Path) -> None:
