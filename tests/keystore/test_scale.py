@@ -6,7 +6,6 @@ folders that are read, not in seconds.
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -87,11 +86,12 @@ def test_one_enclave_costs_what_one_costs(root: Path, tmp_path: Path) -> None:
     ):
         with folders_read() as listed:
             sros(*words).ok()
-        others = [each for each in listed if os.fspath(root / "enclaves/r3") in each]
+        others = [each for each in listed if f"{root / 'enclaves/r3'}/" in f"{each}/"]
         assert others == [], words
     with folders_read() as listed:
         sros("list_enclaves", root).ok()
-    assert len([each for each in listed if os.fspath(root / "enclaves/r3") in each]) == EACH + 1
+    of_robot = [each for each in listed if f"{root / 'enclaves/r3'}/" in f"{each}/"]
+    assert len(of_robot) == EACH + 1
 
 
 def test_revoking_a_robot_and_renewing_the_others(root: Path) -> None:
