@@ -451,7 +451,8 @@ def check_requirements(
         requirements: The TOML file of the requirements.
         vendor: The only vendor of DDS to decide for, or "zenoh"; every measured one and Zenoh by
             default.
-        domain: The ROS domain id of the robot; by default the first one of the keystore.
+        domain: The only ROS domain id to decide for; by default one of each kind that the
+            documents of a keystore tell apart.
         now: The time at which permissions have to be valid; the current time by default.
         zone: The time zone of the robot, in which some vendors read dates.
 

@@ -131,6 +131,8 @@ def _summary(growth: Growth) -> str:
         pairs = len(growth.reach)
         text = "1 enclave can influence another one"
         parts.append((text if pairs == 1 else f"{pairs} pairs of enclaves can influence") + " now")
+    if growth.added and growth.reach_unknown:
+        parts.append(f"whom that lets enclaves influence is not known: {growth.reach_unknown}")
     return "; ".join(parts) + gone
 
 
@@ -181,7 +183,7 @@ def _growth_json(base: AccessSource, head: AccessSource, growth: Growth) -> dict
             }
             for each in growth.reach
         ],
-        "reach_known": growth.reach_known,
+        "reach_known": not growth.reach_unknown,
         "less_protection": [_change_json(each) for each in growth.lost],
         "removed": [_gain_json(each) for each in growth.removed],
         "more_protection": [

@@ -76,15 +76,14 @@ class NewReach:
 class Growth:
     """What HEAD adds to BASE, and what it removes; ``reach`` and ``removed`` follow from these.
 
-    ``reach`` has at most 10,000 pairs; ``reach_known`` is False if only some enclaves are compared,
-    or if there are more than 200,000 hops between them.
+    ``reach`` has at most 10,000 pairs; ``reach_unknown`` says why it was not followed, if so.
     ``worlds`` are what was decided.
     """
 
     added: tuple[Gain, ...]
     removed: tuple[Gain, ...]
     reach: tuple[NewReach, ...]
-    reach_known: bool
+    reach_unknown: str
     lost: tuple[SettingChange, ...]
     """The protection that is less; `SettingChange` says what it was and what it is."""
     gained: tuple[SettingChange, ...]
@@ -110,12 +109,14 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     added = tuple(_gains(base, head, worlds, scope, limit))
     removed = tuple(_gains(head, base, worlds, scope, limit))
     sides = (_edges(base), _edges(head)) if added and scope is None else ({}, {})
-    known = scope is None and None not in sides
+    unknown = "only some enclaves are compared" if scope is not None else ""
+    if None in sides:
+        unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
     return Growth(
         added,
         removed,
         tuple(islice(_new_reach(*sides), _MOST_REACH)),
-        known,
+        unknown,
         tuple(dict.fromkeys(_loosened(base, head, limit))),
         tuple(
             replace(e, effect=Effect.TIGHTER) for e in dict.fromkeys(_loosened(head, base, limit))

@@ -126,7 +126,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
             raise DocumentError(
                 f"'{path}' cannot be compared: {note.text.rstrip('.')}",
                 "What it gives is not certain.",
-                f"`sros check {path}` shows what is wrong with it.",
+                f"`sros check {quote(str(path))}` shows what is wrong with it.",
             )
     if source.kind == "policy":
         return _of_policies(str(path), [_read(path, fleet)])

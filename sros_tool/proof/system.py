@@ -17,7 +17,7 @@ from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant
-from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave, load_enclave
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.model import Fleet
@@ -290,7 +290,7 @@ def _keystore_system(
             "",
             "Name one with --domain.",
         )
-    moments = {name: (at, *_later(grants.get(name, ()), at)) for name in names}
+    moments = {name: (at, *_later(name, grants.get(name, ()), at)) for name in names}
     worlds = []
     for vendor, number in product(MEASURED, domains):
         if world not in ("", vendor.value):
@@ -332,16 +332,26 @@ def _possible(enclave: LoadedEnclave, grants: Sequence[Grant], governance: bytes
 _MOST_MOMENTS = 10
 
 
-def _later(grants: Iterable[Grant], at: datetime) -> tuple[datetime, ...]:
-    """Return a moment in the validity of each grant that is not valid yet."""
-    found = []
+def _later(name: str, grants: Iterable[Grant], at: datetime) -> tuple[datetime, ...]:
+    """Return a moment in the validity of each grant of an enclave that is not valid yet.
+
+    Raises:
+        KeystoreError: there are too many moments to decide for all.
+    """
+    validities = []
     for each in grants:
-        with suppress(ValueError, OverflowError):
-            begin, end = map(datetime.fromisoformat, (each.not_before, each.not_after))
-            begin, end = (one if one.tzinfo else one.replace(tzinfo=UTC) for one in (begin, end))
-            if at < begin < end:
-                found.append(begin + (end - begin) / 2)
-    return tuple(dict.fromkeys(found))[:_MOST_MOMENTS]
+        with suppress(UsageError):  # it ends before it begins
+            validities.append(each.validity)
+    later = (each for each in validities if at < each.not_before)
+    found = {each.not_before + (each.not_after - each.not_before) / 2 for each in later}
+    if len(found) > _MOST_MOMENTS:
+        raise KeystoreError(
+            f"the permissions of enclave {name} become valid at more than {_MOST_MOMENTS}"
+            " different times",
+            "",
+            "Sign them again with create_permission or generate_artifacts.",
+        )
+    return tuple(sorted(found))
 
 
 def _zenoh_worlds(

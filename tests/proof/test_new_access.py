@@ -188,6 +188,23 @@ def test_a_denial_that_is_gone_and_whom_it_lets_be_influenced(tmp_path: Path) ->
     assert [len(each["path"]) for each in value["reach"]] == [1, 2]
 
 
+def test_reach_that_is_not_followed_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path, "base.xml", "/x", "vel", "")
+    write(tmp_path, "head.xml", "/web_*", "vel", "")
+    words = ("diff_policy", "--no-new-access", "base.xml", "head.xml")
+    assert "can influence" in sros(*words, cwd=tmp_path).out
+    monkeypatch.setattr("sros_tool.proof.growth._MOST_HOPS", 0)
+    ended = sros(*words, cwd=tmp_path)
+    assert ended.status == 1
+    assert "can influence" not in ended.out
+    unknown = "influence is not known: there are more than 0 hops between enclaves"
+    assert unknown in ended.err
+    assert unknown in sros(*words, "--format", "markdown", cwd=tmp_path).out
+    assert json.loads(sros(*words, "--json", cwd=tmp_path).out)["reach_known"] is False
+
+
 def test_less_protection_is_found(tmp_path: Path) -> None:
     protected = '<topics publish="ALLOW"><topic>/image{}<?sros protect="{}"?></topic></topics>'
     write(tmp_path, "base.xml", "/x", "vel", protected.format("*", "encrypt"))
@@ -356,3 +373,29 @@ def test_nothing_that_a_repository_configures_is_run(repository: Path) -> None:
     missing.rename(repository / "kept")
     assert sros("diff_policy", "--no-new-access", *sides, cwd=repository).status == 2
     assert not (repository / "sprung").exists()
+
+
+def test_a_folder_of_too_many_policies_is_refused(repository: Path) -> None:
+    for each in range(300):
+        (repository / "policies" / f"more{each}.xml").write_text("<policy version='0.2.0'/>")
+    git(repository, "add", "-A")
+    git(repository, "commit", "-q", "-m", "many")
+    words = ("diff_policy", "--no-new-access")
+    ended = sros(*words, "git:main~1:policies", "git:main:policies", cwd=repository)
+    assert ended.status == 2
+    assert "'git:main:policies' has more than 300 files" in ended.err
+
+
+def test_a_git_that_fails_without_a_word_is_no_missing_file(
+    repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = shutil.which("git")
+    fake = repository / "bin" / "git"
+    fake.parent.mkdir()
+    fake.write_text(f'#!/bin/sh\ncase "$*" in *ls-tree*) exit 9;; esac\nexec {real} "$@"\n')
+    fake.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{fake.parent}:{os.environ['PATH']}")
+    sides = ("git:main:policies/robot.xml", "policies/robot.xml")
+    ended = sros("diff_policy", "--no-new-access", *sides, cwd=repository)
+    assert ended.status == 2
+    assert "git cannot read it: it ended with status 9" in ended.err
