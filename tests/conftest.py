@@ -10,8 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from hypothesis import HealthCheck, settings
 
+from sros_tool.pki import keys
 from tests.support.children import LONG
 from tests.support.harness import policy_text, publish, sros
 
@@ -22,7 +24,7 @@ settings.register_profile(
     "sros",
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
-    max_examples=1000 if LONG else 50,
+    max_examples=1000 if LONG else 20,
 )
 settings.load_profile("sros")
 
@@ -75,6 +77,22 @@ for each in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
     # Whoever starts the tests in the background may have had them ignored, and children inherit it.
     if signal.getsignal(each) is signal.SIG_IGN:
         signal.signal(each, signal.SIG_DFL)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def decrypt_each_key_once() -> Iterator[None]:
+    """A passphrase is slow to try, and most tests use copies of the same encrypted keys."""
+    decrypt = keys._decrypted
+    known: dict[tuple[bytes, str], PrivateKeyTypes] = {}
+
+    def decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
+        if (pem, passphrase) not in known:
+            known[pem, passphrase] = decrypt(pem, name, passphrase)
+        return known[pem, passphrase]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(keys, "_decrypted", decrypted)
+        yield
 
 
 @pytest.fixture(autouse=True)

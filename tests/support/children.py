@@ -140,7 +140,12 @@ class Forked:
         if self.poll() is None:
             os.kill(self._id, signal.SIGTERM)
 
-    def wait(self, timeout: float) -> int:
+    def kill(self) -> None:
+        """Send SIGKILL, unless the process has ended."""
+        if self.poll() is None:
+            os.kill(self._id, signal.SIGKILL)
+
+    def wait(self, timeout: float = PATIENCE) -> int:
         """Wait at most ``timeout`` seconds for the end; return the exit status."""
         end = time.monotonic() + timeout
         while (status := self.poll()) is None:

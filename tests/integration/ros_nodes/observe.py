@@ -15,28 +15,26 @@ import subprocess
 import sys
 import time
 from collections.abc import Collection
-from pathlib import Path
 from typing import Any
 
 from sros_tool.names import NODE_SERVICES, expand
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
 from sros_tool.translate import dds_names
+from tests.integration.ros_nodes.run_nodes import Nodes
 
 Process = list[dict[str, Any]] | dict[str, Any]
-RUN_NODES = Path(__file__).with_name("run_nodes.py")
 PATIENCE_S = 240.0
 STILL_S = 1.0
 """The graph counts as complete when it has not changed for this long, and lacks nothing known."""
 
 
-def start(enclave: str, process: Process) -> subprocess.Popen[str]:
-    if isinstance(process, dict):
-        command = process["command"]
-    else:
-        command = [sys.executable, str(RUN_NODES), json.dumps(process)]
+def start(enclave: str, process: Process) -> subprocess.Popen[bytes] | Nodes:
     # Simulated time, so that the nodes subscribe to /clock as well.
-    command = [*command, "--ros-args", "--enclave", enclave, "-p", "use_sim_time:=true"]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=end_with_parent)
+    words = ("--ros-args", "--enclave", enclave, "-p", "use_sim_time:=true")
+    if isinstance(process, list):
+        return Nodes(process, *words)
+    return subprocess.Popen([*process["command"], *words], stdout=subprocess.DEVNULL,
+                            preexec_fn=end_with_parent)  # fmt: skip
 
 
 def describe(observer: Any, name: str, ns: str) -> dict[str, Any]:
@@ -141,11 +139,9 @@ def main() -> None:
     os.environ["ROS_DOMAIN_ID"] = str(task["domain"])
     processes = [start(enclave, process) for enclave, process in task["processes"].items()]
     try:
-        for process, what in zip(processes, task["processes"].values(), strict=True):
-            if isinstance(what, dict):
-                continue  # it is seen in the graph when it is ready
-            if process.stdout is None or process.stdout.readline() != "ready\n":
-                raise SystemExit("a node did not start")
+        for process in processes:
+            if isinstance(process, Nodes):  # others are seen in the graph when they are ready
+                process.wait_until_ready()
         print(json.dumps(observe(task["processes"])))
     finally:
         for process in processes:

@@ -23,21 +23,15 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+from tests.integration.ros_nodes.run_nodes import Nodes
 from tests.support.children import PATIENCE, wait_for
 
-RUN_NODES = Path(__file__).with_name("run_nodes.py")
 OBSERVER = b"sros_tool.graph.observer"
 
 
-def start(process: dict[str, Any]) -> subprocess.Popen[str]:
-    command = [sys.executable, str(RUN_NODES), json.dumps(process["nodes"])]
-    command += ["--ros-args", "--enclave", process["enclave"], *process.get("arguments", ())]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=end_with_parent)
-
-
-def wait_until_ready(running: subprocess.Popen[str]) -> None:
-    if running.stdout is None or running.stdout.readline() != "ready\n":
-        raise SystemExit("a node did not start")
+def start(process: dict[str, Any]) -> Nodes:
+    words = ("--ros-args", "--enclave", process["enclave"], *process.get("arguments", ()))
+    return Nodes(process["nodes"], *words)
 
 
 class Command:
@@ -101,7 +95,7 @@ def run(command: dict[str, Any], visitors: list[dict[str, Any]], folder: str) ->
         come, go = each["visits"]
         running.wait_until_said(come)
         visitor = start(each)
-        wait_until_ready(visitor)
+        visitor.wait_until_ready()
         running.wait_until_said(go)
         visitor.kill()
         visitor.wait()
@@ -123,7 +117,7 @@ def main() -> None:
     steady = [start(each) for each in task["processes"] if "visits" not in each]
     try:
         for process in steady:
-            wait_until_ready(process)
+            process.wait_until_ready()
         ended: list[dict[str, Any]] = []
         for together in task["commands"]:
             with ThreadPoolExecutor(len(together)) as pool:

@@ -10,7 +10,10 @@ type, and so does every service and every action.  Prints ``ready`` and runs unt
 from __future__ import annotations
 
 import json
+import os
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -23,6 +26,8 @@ from rclpy.parameter_client import AsyncParameterClient
 from std_msgs.msg import String
 from test_msgs.action import Fibonacci
 from test_msgs.srv import BasicTypes
+
+from tests.support.children import Forked
 
 
 def make_node(spec: dict[str, Any]) -> Any:
@@ -47,14 +52,35 @@ def make_node(spec: dict[str, Any]) -> Any:
     return node
 
 
-def main() -> None:
-    rclpy.init(args=sys.argv)
+def run(nodes: list[dict[str, Any]], words: Sequence[str]) -> int:
+    """Run nodes until the process is ended; ``words`` are what follows the program."""
+    rclpy.init(args=["run_nodes", *words])
     executor = SingleThreadedExecutor()
-    for spec in json.loads(sys.argv[1]):
+    for spec in nodes:
         executor.add_node(make_node(spec))
     print("ready", flush=True)
     executor.spin()
+    return 0
+
+
+class Nodes(Forked):
+    """A forked process of nodes: rclpy, which is slow to import, is imported once for all."""
+
+    def __init__(self, nodes: list[dict[str, Any]], *words: str) -> None:
+        reader, writer = os.pipe()
+
+        def work() -> int:
+            os.dup2(writer, sys.stdout.fileno())
+            return run(nodes, words)
+
+        super().__init__(work, env=dict(os.environ), errors=Path("/dev/stderr"))
+        os.close(writer)
+        self._said = os.fdopen(reader)
+
+    def wait_until_ready(self) -> None:
+        if self._said.readline() != "ready\n":
+            raise SystemExit("a node did not start")
 
 
 if __name__ == "__main__":
-    main()
+    run(json.loads(sys.argv[1]), sys.argv[2:])
