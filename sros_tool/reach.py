@@ -24,7 +24,7 @@ from sros_tool.names import ACTION_SEPARATOR, READING_SERVICES, is_expression
 from sros_tool.policy.model import DENY
 from sros_tool.policy.patterns import common_name, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import Right
-from sros_tool.translate import SERVICE_ENDS, dds_names
+from sros_tool.topics import SERVICE_ENDS, dds_names
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,71 +24,12 @@ from sros_tool.dds.permissions import (
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expand, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Qualifier
 from sros_tool.policy.patterns import covers
-from sros_tool.policy.rights import ACTION_PARTS, GOAL, Right
+from sros_tool.policy.rights import Right
+from sros_tool.topics import GOAL, TOPIC_ENDS, dds_names, service_of
 from sros_tool.validity import Window
 
 if TYPE_CHECKING:
     from sros_tool.policy.protection import DomainProtection, TopicProtection
-
-SERVICE_ENDS = {"rq": "Request", "rr": "Reply"}
-"""Prefix and suffix of the DDS topics of a service: requests and replies."""
-
-_TOPIC = ("rt", "")
-_REQUESTS, _REPLIES = SERVICE_ENDS.items()
-_Ends = tuple[tuple[str, str], ...]
-_DDS_NAMES: dict[str, tuple[_Ends, _Ends]] = {
-    "publish": ((_TOPIC,), ()),
-    "subscribe": ((), (_TOPIC,)),
-    "request": ((_REQUESTS,), (_REPLIES,)),
-    "reply": ((_REPLIES,), (_REQUESTS,)),
-}
-"""Prefix and suffix of the DDS topics of a right: the written topics, and the read topics."""
-
-_DDS_NAMES |= {
-    action: (
-        tuple((begin, inside + end) for part, inside in of for begin, end in _DDS_NAMES[part][0]),
-        tuple((begin, inside + end) for part, inside in of for begin, end in _DDS_NAMES[part][1]),
-    )
-    for action, of in ACTION_PARTS.items()
-}
-
-
-class DdsNames(NamedTuple):
-    """The DDS topics of one right: the topics to publish, and the topics to subscribe."""
-
-    publish: tuple[str, ...]
-    subscribe: tuple[str, ...]
-
-
-def dds_names(right: str, fqn: str) -> DdsNames:
-    """Return the DDS topics that ``right`` on the absolute ROS name ``fqn`` needs.
-
-    ``right`` is publish or subscribe (topics), request or reply (services), call or execute
-    (actions).  Source: ROS 2 design "Topic and Service name mapping to DDS".
-    """
-    written, read = _DDS_NAMES[right]
-    return DdsNames(
-        tuple([begin + fqn + end for begin, end in written]),
-        tuple([begin + fqn + end for begin, end in read]),
-    )
-
-
-def service_of(topic: str) -> tuple[str, str]:
-    """Return the service of a DDS topic, and ``rq`` for a request or ``rr`` for a reply topic.
-
-    Both are "" if the topic does not belong to a service.
-    """
-    begin, name = topic[:2], topic[2:]
-    end = SERVICE_ENDS.get(begin)
-    if (
-        end is None
-        or not name.startswith("/")
-        or not name.endswith(end)
-        or len(name) < len(end) + 2
-    ):
-        return "", ""
-    return name.removesuffix(end), begin
-
 
 # ── ROS → DDS ──────────────────────────────────────────────────────────────────────────────
 
@@ -129,7 +70,7 @@ class _Topics:
         self.subscribe: set[str] = set()
 
     def add(self, right: str, names: Iterable[str]) -> None:
-        written, read = _DDS_NAMES[right]
+        written, read = TOPIC_ENDS[right]
         for begin, end in written:
             self.publish.update([f"{begin}{name}{end}" for name in names])
         for begin, end in read:

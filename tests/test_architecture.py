@@ -17,7 +17,7 @@ PROJECT = Path(__file__).parents[1]
 PACKAGE = PROJECT / "sros_tool"
 
 LAYERS = {
-    1: {"automata", "errors", "faults", "names", "owners", "validity", "values"}
+    1: {"automata", "errors", "faults", "names", "owners", "topics", "validity", "values"}
     | {"xml", "files", "folders", "parallel", "resources", "prometheus", "markdown"},
     2: {"pki", "policy", "dds", "zenoh"},
     3: {"fleet", "translate", "translate_zenoh", "translate_zenoh_back"},

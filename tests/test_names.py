@@ -17,7 +17,7 @@ from sros_tool.names import (
     expression_problem,
     is_expression,
 )
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 
 ENCLAVE = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+", re.ASCII)
 token = st.from_regex(r"\A[A-Za-z_][A-Za-z0-9_]{0,5}\Z")

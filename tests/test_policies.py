@@ -15,7 +15,7 @@ from sros_tool.names import MAX_COMMON_NAME, expand
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import DENY, Enclave, Group, Profile
 from sros_tool.resources import policies_dir
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 
 POLICIES = policies_dir()
 TOP_LEVEL = sorted(POLICIES.glob("*.xml"))

@@ -28,13 +28,8 @@ from sros_tool.policy.protection import (
     NamedProtection,
     TopicProtection,
 )
-from sros_tool.translate import (
-    dds_names,
-    governance_for,
-    needed_expressions,
-    permissions_for,
-    ros_rights,
-)
+from sros_tool.topics import dds_names
+from sros_tool.translate import governance_for, needed_expressions, permissions_for, ros_rights
 from sros_tool.validity import window
 
 DOMAINS = DomainSet.parse("0,7")

@@ -20,7 +20,8 @@ from sros_tool.policy.model import RIGHTS as RIGHTS_OF
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, Rules
 from sros_tool.resources import policies_dir
-from sros_tool.translate import dds_names, permissions_for
+from sros_tool.topics import dds_names
+from sros_tool.translate import permissions_for
 from sros_tool.translate_zenoh import (
     StatedRight,
     as_router,

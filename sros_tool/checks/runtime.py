@@ -35,17 +35,10 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.pki import smime
-from sros_tool.runtime.environment import (
-    DOMAIN,
-    ENABLE,
-    ENCLAVE,
-    KEYSTORE,
-    STRATEGY,
-    domain_from,
-    enclave_argument,
-)
+from sros_tool.runtime.environment import enclave_argument
 from sros_tool.runtime.rcl_security import choose_loadable
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
+from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
 from sros_tool.runtime.zenoh_environment import ROUTER_URI, SESSION_URI
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes

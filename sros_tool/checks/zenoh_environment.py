@@ -9,8 +9,8 @@ from pathlib import Path
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.checks.zenoh import MALFORMED, document_findings
 from sros_tool.errors import SrosError
-from sros_tool.runtime.environment import ENABLE
 from sros_tool.runtime.rmw import RMW
+from sros_tool.runtime.variables import ENABLE
 from sros_tool.runtime.zenoh_environment import (
     NO_CONFIGURATION,
     OVERRIDE,

@@ -169,8 +169,8 @@ def _enclaves(
     from sros_tool.keystore.layout import enclave_names
     from sros_tool.keystore.rights import load_rights
     from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
-    from sros_tool.runtime.environment import domain_from
     from sros_tool.runtime.rmw import vendor_here
+    from sros_tool.runtime.variables import domain_from
     from sros_tool.translate import governance_for
 
     everything = {**os.environ, **environment}

@@ -524,7 +524,7 @@ def local_zone(environment: Mapping[str, str]) -> tzinfo:
 
 def ros_domain() -> int | None:
     """Return the domain ID in $ROS_DOMAIN_ID, or None if it is not set."""
-    from sros_tool.runtime.environment import domain_from
+    from sros_tool.runtime.variables import domain_from
 
     return domain_from(os.environ)
 
@@ -534,7 +534,7 @@ def domain_of(text: str | None) -> int | None:
 
     Raises `UsageError`.
     """
-    from sros_tool.runtime.environment import DOMAIN, domain_from
+    from sros_tool.runtime.variables import DOMAIN, domain_from
 
     if text == "":
         raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")

@@ -464,7 +464,7 @@ def sign_request(
     from sros_tool.keystore.layout import PERMISSIONS
     from sros_tool.keystore.reader import load_ca_certificate
     from sros_tool.pki.certificates import digest
-    from sros_tool.runtime.environment import domain_from
+    from sros_tool.runtime.variables import domain_from
 
     root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
     if len(rest) != 1:
@@ -546,7 +546,7 @@ def _certify(
 ) -> None:
     """Certify the keys of several requests, and print what was done."""
     from sros_tool.keystore.delivery.signing import certify_requests
-    from sros_tool.runtime.environment import domain_from
+    from sros_tool.runtime.variables import domain_from
 
     done = certify_requests(
         root,

@@ -81,13 +81,9 @@ def loadable_environment(
     from sros_tool.keystore.reader import open_enclave
     from sros_tool.names import check_enclave_name
     from sros_tool.pki.token import MODULE_VARIABLE
-    from sros_tool.runtime.environment import (
-        DOMAIN,
-        choose_domain,
-        domain_from,
-        secured_environment,
-    )
+    from sros_tool.runtime.environment import choose_domain, secured_environment
     from sros_tool.runtime.rmw import RMW, rmw_implementations
+    from sros_tool.runtime.variables import DOMAIN, domain_from
     from sros_tool.runtime.zenoh_environment import REFUSING_ZENOH, RMW_ZENOH
 
     if domain_text == "":

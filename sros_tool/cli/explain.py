@@ -439,7 +439,7 @@ def _show_answer(
 
 def _policy_alone(root: Path | None, enclave: LoadedEnclave, policy: Path | None) -> list[Note]:
     """Return a note if a policy was asked although a keystore is set in the environment."""
-    from sros_tool.runtime.environment import KEYSTORE
+    from sros_tool.runtime.variables import KEYSTORE
 
     default = os.environ.get(KEYSTORE)
     if not default or root is not None or enclave.signed or policy is None:

@@ -89,7 +89,7 @@ def observer_environment(
     enclave: str | None, keystore: Path | None, domain: str | None
 ) -> dict[str, str]:
     """Return the environment variables to set for the observer: its domain, its enclave if any."""
-    from sros_tool.runtime.environment import DOMAIN, domain_from
+    from sros_tool.runtime.variables import DOMAIN, domain_from
 
     if enclave is None:
         if keystore is not None:
@@ -161,7 +161,7 @@ def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
     from sros_tool.graph.observe import identity_of
     from sros_tool.keystore.layout import enclave_names, enclave_path, is_keystore
     from sros_tool.pki.certificates import load_certificate
-    from sros_tool.runtime.environment import ENABLE, KEYSTORE
+    from sros_tool.runtime.variables import ENABLE, KEYSTORE
     from sros_tool.xml import read_bytes
 
     root = Path(environment.get(KEYSTORE, ""))
@@ -205,7 +205,7 @@ def _until_signalled() -> Iterator[Callable[[], bool]]:
 
 def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
     """Return the observer's failure as the error that its DDS output explains."""
-    from sros_tool.runtime.environment import ENCLAVE
+    from sros_tool.runtime.variables import ENCLAVE
     from sros_tool.runtime.vendor_log import (
         endpoint_refusal,
         missing_security,
@@ -244,7 +244,7 @@ def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
 
 def why_empty(environment: Mapping[str, str], seconds: float, rmw: str, enclave: str | None) -> str:
     """Return the likely reasons why no node was observed, and a remedy."""
-    from sros_tool.runtime.environment import DOMAIN, ENABLE, KEYSTORE
+    from sros_tool.runtime.variables import DOMAIN, ENABLE, KEYSTORE
 
     merged = {**os.environ, **environment}
     looked = f"Observed domain {merged.get(DOMAIN) or 0} for {seconds:.0f} s with {rmw}. "

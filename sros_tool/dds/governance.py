@@ -14,7 +14,8 @@ from typing import Any
 
 from lxml import etree
 
-from sros_tool.dds.domains import DomainSet, domain_lines, read_domains
+from sros_tool.dds.domain_elements import domain_lines, read_domains
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import XSI
 from sros_tool.errors import DocumentError
 from sros_tool.xml import escape, parse, tag_of

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 from lxml import etree
 
-from sros_tool.dds.domains import DomainSet, domain_lines, read_domains
+from sros_tool.dds.domain_elements import domain_lines, read_domains
+from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError
 from sros_tool.validity import Window, iso, parse_iso
 from sros_tool.xml import escape, parse, quoted, tag_of

@@ -32,7 +32,7 @@ from sros_tool.keystore.template import Template
 from sros_tool.names import ACTION_SEPARATOR, NODE_SERVICES
 from sros_tool.pki import smime
 from sros_tool.policy.patterns import matches
-from sros_tool.translate import dds_names, service_of
+from sros_tool.topics import dds_names, service_of
 
 _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events", "rt/clock", "ros_discovery_info")
 _NODE_MARK = ("rr", f"/{NODE_SERVICES[0]}Reply")

@@ -34,9 +34,10 @@ from sros_tool.errors import SrosError
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.template import Template
-from sros_tool.runtime.environment import DOMAIN, secured_environment
+from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.stacks import ProbeEnclave
-from sros_tool.translate import dds_names
+from sros_tool.runtime.variables import DOMAIN
+from sros_tool.topics import dds_names
 from sros_tool.validity import Window
 from sros_tool.zenoh.configuration import Mode
 

@@ -41,7 +41,7 @@ from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.runtime.netns import Isolation, try_isolation
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 from sros_tool.values import versioned
 
 _DEFAULT_DOMAIN = 80

@@ -15,7 +15,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
 )
 from sros_tool.keystore.lifecycle.zenoh import set_zenoh
-from sros_tool.runtime.environment import DOMAIN
+from sros_tool.runtime.variables import DOMAIN
 from sros_tool.runtime.zenoh_environment import (
     OVERRIDE,
     ROUTER_URI,

@@ -19,7 +19,7 @@ from sros_tool.keystore.reader import Problem
 from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Profile, Qualifier, Source
 from sros_tool.policy.rights import Right
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 
 if TYPE_CHECKING:
     from sros_tool.explain.change import PolicyChange

@@ -44,7 +44,7 @@ from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, order
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 
 _DENY_RULE = "deny-rule"
 _USE = "use"

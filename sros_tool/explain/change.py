@@ -22,7 +22,8 @@ from sros_tool.names import NODE_SERVICES, is_expression
 from sros_tool.policy.document import write_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.rights import Right, profile_rights
-from sros_tool.translate import dds_names, grant_rights
+from sros_tool.topics import dds_names
+from sros_tool.translate import grant_rights
 
 _NO_RULE = frozenset({"no-rule", "default"})
 

@@ -47,7 +47,7 @@ from sros_tool.runtime.vendor_log import (
     labelled_line,
     log_lines,
 )
-from sros_tool.translate import service_of
+from sros_tool.topics import service_of
 
 _NEAR_LINES = 3
 """The number of lines after a denial that still belong to it."""

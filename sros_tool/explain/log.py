@@ -45,7 +45,8 @@ from sros_tool.runtime.zenoh_log import (
     dropped_messages,
     zenoh_text,
 )
-from sros_tool.translate import SERVICE_ENDS, grant_rights
+from sros_tool.topics import SERVICE_ENDS
+from sros_tool.translate import grant_rights
 from sros_tool.translate_from_zenoh import name_of_key
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))

@@ -14,7 +14,7 @@ from sros_tool.errors import UsageError
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expression_problem, is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
-from sros_tool.translate import dds_names, service_of
+from sros_tool.topics import dds_names, service_of
 
 _JOIN = "join"
 TYPES = ("topic", "service", "action")

@@ -20,7 +20,7 @@ from sros_tool.graph.observation import (
     make_observation,
 )
 from sros_tool.names import expand
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 
 UNSHOWN = ("/",)
 """The enclaves of a node whose enclave the graph does not show."""

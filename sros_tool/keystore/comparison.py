@@ -14,7 +14,7 @@ from sros_tool.errors import UsageError
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.names import is_expression
 from sros_tool.policy.patterns import common_name, covers, overlap
-from sros_tool.translate import service_of
+from sros_tool.topics import service_of
 from sros_tool.validity import Span, duration_text, span_text, window
 from sros_tool.zenoh.network import ZenohNetwork
 

@@ -12,9 +12,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from sros_tool.names import ACTION_SEPARATOR, ACTION_SERVICES, ACTION_TOPICS, expand
+from sros_tool.names import expand
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Profile, Qualifier
 from sros_tool.policy.patterns import ComparisonLimit, Names
+from sros_tool.topics import ACTION_PARTS, GOAL
 from sros_tool.values import shows
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
@@ -25,21 +26,6 @@ RIGHT_ORDER = {right: number for number, right in enumerate(KIND_OF)}
 
 WHOLE = {"request": "call", "reply": "execute"}
 """The right to an action, for each right to its services."""
-
-ACTION_PARTS: dict[str, tuple[tuple[str, str], ...]] = {
-    action: tuple(
-        [(of_services, f"{ACTION_SEPARATOR}{each}") for each in ACTION_SERVICES]
-        + [(of_topics, f"{ACTION_SEPARATOR}{each}") for each in ACTION_TOPICS]
-    )
-    for action, of_services, of_topics in (
-        ("call", "request", "subscribe"),
-        ("execute", "reply", "publish"),
-    )
-}
-"""The parts of a right to an action: pairs of a right and a suffix of the action's name."""
-
-GOAL = f"{ACTION_SEPARATOR}send_goal"
-"""The suffix of the service by which an action is recognised."""
 
 
 @shows("enclave", "qualifier", "kind", "right", "name")

@@ -18,7 +18,7 @@ from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.policy.model import ALLOW
 from sros_tool.proof.places import topics_of
 from sros_tool.proof.worlds import TopicAccess, named, valid_topics
-from sros_tool.translate import SERVICE_ENDS
+from sros_tool.topics import SERVICE_ENDS
 from sros_tool.translate_zenoh import StatedRight
 from sros_tool.zenoh.access import Flow, Message
 from sros_tool.zenoh.enforcement import Enforcement, Remote

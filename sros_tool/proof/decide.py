@@ -30,7 +30,7 @@ from sros_tool.proof.requirements import (
     Widest,
 )
 from sros_tool.proof.worlds import Meeting, Topics, World, shortest
-from sros_tool.translate import dds_names, service_of
+from sros_tool.topics import dds_names, service_of
 
 
 @dataclass(frozen=True, slots=True)

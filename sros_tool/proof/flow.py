@@ -17,7 +17,7 @@ from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.proof.worlds import World, named
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
-from sros_tool.translate import SERVICE_ENDS
+from sros_tool.topics import SERVICE_ENDS
 
 _IGNORED = NameSet.union(
     named(each)

@@ -33,7 +33,8 @@ from sros_tool.proof.access import domains_of, enforced_access, is_enforced
 from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource
 from sros_tool.proof.worlds import named, valid_topics
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
-from sros_tool.translate import SERVICE_ENDS, dds_names, governance_for
+from sros_tool.topics import SERVICE_ENDS, dds_names
+from sros_tool.translate import governance_for
 
 _VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 _ZENOH = "Zenoh"

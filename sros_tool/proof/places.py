@@ -11,7 +11,7 @@ from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import ALLOW, Enclave, Policy, Source
 from sros_tool.policy.rights import Right
 from sros_tool.proof.decide import Use
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 
 
 @dataclass(frozen=True, slots=True)

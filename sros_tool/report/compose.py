@@ -45,7 +45,8 @@ from sros_tool.report.picture import (
     Validity,
     WireLevel,
 )
-from sros_tool.translate import dds_names, protected_topics
+from sros_tool.topics import dds_names
+from sros_tool.translate import protected_topics
 
 _OVERLAYS = {
     "use": Overlay("use", "allowed, never observed", "observed, not allowed"),

@@ -21,7 +21,7 @@ from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_text, unguarded
 from sros_tool.report.compose import PictureSource, edge_order, namespace_of, protection_of
 from sros_tool.report.picture import Edge, Focus, Influence, Name, Picture, asks, counted
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 
 ENCLAVE = "enclave"
 _VERBS = {

@@ -19,36 +19,9 @@ from pathlib import Path
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
+from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.runtime.zenoh_environment import REFUSING_ZENOH
 from sros_tool.values import yaml_text
-
-KEYSTORE = "ROS_SECURITY_KEYSTORE"
-ENABLE = "ROS_SECURITY_ENABLE"
-STRATEGY = "ROS_SECURITY_STRATEGY"
-ENCLAVE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
-DOMAIN = "ROS_DOMAIN_ID"
-
-_DOMAIN_ID = re.compile(r"(?:0|[1-9]\d*)\Z", re.ASCII)
-
-
-def domain_from(environment: Mapping[str, str]) -> int | None:
-    """Return ROS_DOMAIN_ID as a number, or None if it is unset or empty.
-
-    Raises:
-        UsageError: It is not a domain id; rcl would not start either.
-    """
-    text = environment.get(DOMAIN, "")
-    if not text:
-        return None
-    # rcl reads a leading zero as octal (strtoul with base 0): 010 would be domain 8 to a node.
-    domain = DomainSet.parse(text, DOMAIN).only() if _DOMAIN_ID.match(text) else None
-    if domain is None:
-        raise UsageError(
-            f"{DOMAIN} is {text!r}, which is not a domain id",
-            "A domain id is one whole number from 0 to 230, without leading zeros.",
-            "Correct the variable, or unset it.",
-        )
-    return domain
 
 
 def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:

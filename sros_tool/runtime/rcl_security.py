@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sros_tool.errors import SrosError
 from sros_tool.runtime.cyclone import ENCLAVE_FILES
-from sros_tool.runtime.environment import ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
+from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
 
 
 @dataclass(frozen=True)

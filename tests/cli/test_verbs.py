@@ -23,7 +23,8 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, issue_ca, pem
 from sros_tool.pki.keys import generate_key
 from sros_tool.resources import policies_dir
-from sros_tool.runtime.environment import DOMAIN, REFUSING, render_refusal
+from sros_tool.runtime.environment import REFUSING, render_refusal
+from sros_tool.runtime.variables import DOMAIN
 from sros_tool.validity import Window
 from tests.support.children import finish, python, run, wait_for
 from tests.support.harness import (

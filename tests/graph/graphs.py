@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
 from sros_tool.names import expand
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 
 SERVICES = (
     "describe_parameters",

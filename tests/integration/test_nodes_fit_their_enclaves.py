@@ -37,7 +37,7 @@ from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave
 from sros_tool.resources import policies_dir
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 from tests.integration.test_policies_live import all_dds_endpoints, observed_in, run_script, without
 from tests.support.long_form import ONLY_LONG
 

@@ -27,7 +27,8 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC, expand
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Group, Policy, Profile
 from sros_tool.resources import policies_dir
-from sros_tool.translate import dds_names, permissions_for
+from sros_tool.topics import dds_names
+from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from tests.support.children import python
 

@@ -14,7 +14,7 @@ from itertools import product
 from sros_tool.names import READING_SERVICES
 from sros_tool.policy.patterns import matches
 from sros_tool.proof.requirements import Apart, AtMost, Must, Nobody, Only, Requirement, Widest
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 
 LETTERS = "abc"
 LONGEST = 4

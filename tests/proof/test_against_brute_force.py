@@ -21,7 +21,7 @@ from sros_tool.proof.requirements import (
     Widest,
 )
 from sros_tool.proof.system import policy_system
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 from tests.proof.brute_force import TOPICS, Finite, breaches, finite
 from tests.support.children import LONG
 

@@ -23,7 +23,8 @@ from sros_tool.policy.document import write_policy
 from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Profiles, Qualifier
 from sros_tool.proof.growth import Gain, compare_access
 from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource, load_side
-from sros_tool.translate import SERVICE_ENDS, dds_names, governance_for
+from sros_tool.topics import SERVICE_ENDS, dds_names
+from sros_tool.translate import governance_for
 from tests.support.children import LONG
 from tests.support.harness import sros
 

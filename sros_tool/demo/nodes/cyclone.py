@@ -15,7 +15,6 @@ import os
 import signal
 import sys
 import time
-import uuid
 from collections.abc import Callable, Mapping, Sequence
 from types import FrameType
 
@@ -30,7 +29,7 @@ from sros_tool.errors import SrosError
 from sros_tool.runtime.cyclone import Participant, Reader, SecurityRefusedError, Writer
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 from sros_tool.runtime.rcl_security import choose_loadable, domain_of
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 
 _POLL_SECONDS = 0.02
 
@@ -129,7 +128,7 @@ class _Client:
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         self._service = _Service(participant, options.service, server=False)
         self._options, self._events = options, events
-        self._name = uuid.uuid4().hex
+        self._name = os.urandom(16).hex()
         self._asked = self._right = 0
         self._due = time.monotonic() + options.period
 
@@ -193,7 +192,7 @@ class _ActionClient:
         self._feedback = participant.reader(f"rt{action}/feedback")
         self._status = participant.reader(f"rt{action}/status")
         self._options, self._events = options, events
-        self._name = uuid.uuid4().hex
+        self._name = os.urandom(16).hex()
         self._sent = self._right = 0
         self._steps: dict[str, int] = {}
         self._succeeded: set[str] = set()

@@ -65,7 +65,7 @@ from sros_tool.errors import DocumentError, SrosError
 from sros_tool.files import parse_toml
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
-from sros_tool.runtime.environment import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
+from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.xml import read_bytes
 
 _PARTIES: Mapping[Relation, tuple[str, ...]] = {

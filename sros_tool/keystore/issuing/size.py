@@ -11,7 +11,8 @@ from sros_tool.pki.certificates import common_name, issue_ca, subject_text
 from sros_tool.pki.keys import generate_key
 from sros_tool.policy.model import Enclave
 from sros_tool.policy.rights import Right
-from sros_tool.translate import dds_names, permissions_for
+from sros_tool.topics import dds_names
+from sros_tool.translate import permissions_for
 from sros_tool.validity import window
 
 _LINE = len("<topic></topic>\r\n")

@@ -19,7 +19,7 @@ from typing import Any
 
 from sros_tool.names import NODE_SERVICES, expand
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
-from sros_tool.translate import dds_names
+from sros_tool.topics import dds_names
 from tests.integration.ros_nodes.run_nodes import Nodes
 
 Process = list[dict[str, Any]] | dict[str, Any]
