@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from sros_tool.zenoh.network import ZenohNetwork
 
 _DONE = {"create": "wrote", "replace": "replaced", "remove": "removed"}
+_FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer needed"}
 
 
 @click.command(
@@ -75,7 +76,9 @@ not be done, such as for rights that Zenoh cannot enforce.""",
 )
 @click.option("--domain", metavar="IDS", help="ROS domains; usually those of the keystore.")
 @click.option("--off", is_flag=True, help="Remove the files, and keep none in step any more.")
-@click.option("--check", "only_check", is_flag=True, help="Write nothing; say what is out of date.")
+@click.option(
+    "--check", "only_check", is_flag=True, help="Write nothing; say what is missing or out of date."
+)
 @click.option(
     "--from",
     "existing",
@@ -143,16 +146,15 @@ def zenoh(
     changed = dict.fromkeys(map(_document, actions))
     if as_json:
         print_json(_json(result, network, changed, dry_run=dry_run or only_check))
-    elif only_check:
-        for path in changed:
-            click.echo(visible(f"out of date: {root / path}"))
-    elif dry_run:
+    elif dry_run and not only_check:
         print_plan(root, result.changes)
     else:
         for name in result.created:
-            click.echo(f"created enclave {name}")
+            click.echo(f"{'missing:' if only_check else 'created'} enclave {name}")
         for path in changed:
-            click.echo(visible(f"{_DONE[actions.get(path, 'replace')]} {root / path}"))
+            action = actions.get(path, "replace")
+            word = f"{_FOUND[action]}:" if only_check else _DONE[action]
+            click.echo(visible(f"{word} {root / path}"))
     if not result.changes:
         click.echo("the files of Zenoh are up to date", err=True)
     if not (dry_run or only_check):

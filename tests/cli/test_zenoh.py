@@ -124,11 +124,25 @@ def test_what_was_changed_is_out_of_date_and_written_again(
         file.write_bytes(b"x")
     before = snapshot(folder)
     checked = sros("zenoh", "ks", "--check", cwd=folder)
-    assert (checked.status, checked.out) == (1, f"out of date: ks/{path}\n")
+    word = "missing" if change == "missing" else "out of date"
+    assert (checked.status, checked.out) == (1, f"{word}: ks/{path}\n")
     assert snapshot(folder) == before
     verb = "wrote" if change == "missing" else "replaced"
     assert sros("zenoh", "ks", cwd=folder).ok().out == f"{verb} ks/{path}\n"
     sros("zenoh", "ks", "--check", cwd=folder).ok()
+
+
+def test_what_was_never_written_is_missing(folder: Path) -> None:
+    before = snapshot(folder)
+    checked = sros("zenoh", "ks", "--check", "--router", "/way", cwd=folder)
+    lines = checked.out.splitlines()
+    assert (checked.status, lines[0]) == (1, "missing: enclave /way")
+    assert f"missing: ks/{SESSION}" in lines
+    assert {line.partition(":")[0] for line in lines} == {"missing"}
+    assert snapshot(folder) == before
+    sros("zenoh", "ks", cwd=folder).ok()
+    unwanted = sros("zenoh", "ks", "--off", "--check", cwd=folder)
+    assert f"no longer needed: ks/{SESSION}" in unwanted.out.splitlines()
 
 
 def test_a_dry_run_says_what_is_written(folder: Path) -> None:
