@@ -36,7 +36,8 @@ class FindingKind:
     ``id`` is stable and has the form ``family.name``.  ``title`` is a clause; ``why``, ``source``
     and ``remedy`` are sentences.  ``source`` says where the rule comes from: a section of a
     specification, a vendor and version, ROS.  ``group`` is an id that several kinds share.
-    ``vendors`` are the affected DDS vendors; empty means all.
+    ``vendors`` are the affected DDS vendors; empty means all.  A ``prominent`` note is shown where
+    warnings are, and counts as the note that it is.
     """
 
     id: str
@@ -47,6 +48,7 @@ class FindingKind:
     remedy: str
     group: str = ""
     vendors: tuple[Vendor, ...] = ()
+    prominent: bool = False
 
     @property
     def family(self) -> str:

@@ -47,7 +47,8 @@ class FindingFilter:
 
     With ``vendor``, findings about only other vendors, or about differences between vendors, are
     left out.  ``include`` and ``exclude`` hold ids, ids of groups, or patterns with ``*`` and
-    ``?``; an empty ``include`` means all.  ``severity`` is the lowest severity that is shown.
+    ``?``; an empty ``include`` means all.  ``severity`` is the lowest severity that is shown.  A
+    prominent note is shown where warnings are.
 
     A weakness that the keystore's template chose, such as the single CA of template sros2, is
     accepted: it counts as a note, and is summarised in one line if notes are not shown.  With
@@ -79,14 +80,18 @@ class FindingFilter:
             return False
         return included and not any(_matches(kind, each) for each in self.exclude)
 
+    def _shows(self, finding: Finding) -> bool:
+        level = WARNING if finding.kind.prominent else NOTE
+        return max(finding.severity, level) >= self.severity
+
     def choose(self, findings: Iterable[Finding]) -> ChosenFindings:
         """Return the shown findings, the worst first, and the accepted ones that are not shown."""
         wanted = [each for each in findings if self.wants(each.kind)]
         if self.strict:
             wanted = [replace(each, accepted="") for each in wanted]
-        shown = [each for each in wanted if each.severity >= self.severity]
+        shown = [each for each in wanted if self._shows(each)]
         shown.sort(key=lambda each: (-each.severity, each.file, each.line or 0))
-        hidden = [each for each in wanted if each.severity < self.severity]
+        hidden = [each for each in wanted if not self._shows(each)]
         accepted = [each for each in hidden if each.accepted and each.kind.severity > NOTE]
         return ChosenFindings(tuple(shown), tuple(accepted), len(hidden) - len(accepted))
 

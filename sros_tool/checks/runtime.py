@@ -191,6 +191,19 @@ MIXED_VENDORS = FindingKind(
     "Use the same RMW for all secured nodes that communicate.",
 )
 
+NOT_SECURED = FindingKind(
+    "runtime.not-secured",
+    NOTE,
+    "security is not enabled here: nodes start open",
+    "Everybody on the network hears these nodes and can send to them. That nothing else is found "
+    "here says nothing about their security.",
+    "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
+    "Start nodes with `sros run ROOT NAME -- COMMAND...`, or set the variables with "
+    '`eval "$(sros env ROOT NAME)"`.',
+    prominent=True,
+)
+
+_MOST_NODES = 20
 _NOT_DDS = ("rmw_email", "rmw_iceoryx")
 _ZENOH_ROUTER = "rmw_zenohd"
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
@@ -239,6 +252,7 @@ def _processes(state: RuntimeState) -> Iterator[Finding]:
     secured_here = _is_secured(state.environment)
     secured = [each.environment for each in state.processes if _is_secured(each.environment)]
     domains = {_domain(each) for each in [*secured, *([state.environment] if secured_here else [])]}
+    open_nodes: list[str] = []
     rmws: dict[str, list[str]] = {}
     for process in state.processes:
         environment = process.environment
@@ -254,6 +268,9 @@ def _processes(state: RuntimeState) -> Iterator[Finding]:
         elif process.is_node and _domain(environment) in domains:
             text = f"in domain {_domain(environment)}, with {ENABLE} not 'true'"
             yield PROCESS_UNSECURED.found(process.label, text)
+        elif process.is_node and _is_open(environment):
+            open_nodes.append(f"{process.label} in domain {_domain(environment)}"[:100])
+    yield from _not_secured(state.environment, open_nodes)
     if secured_here:
         rmws.setdefault(state.environment.get(RMW) or DEFAULT_RMW, []).append("this environment")
     if len({_vendor(rmw) for rmw in rmws}) > 1:
@@ -323,6 +340,23 @@ def _runs_unsecured(process: Process) -> Iterator[Finding]:
 def _is_secured(environment: Mapping[str, str]) -> bool:
     """Return whether security is on."""
     return environment.get(ENABLE) == "true"
+
+
+def _is_open(environment: Mapping[str, str]) -> bool:
+    """Return whether security is off, and a session file of rmw_zenoh does not replace it."""
+    if _is_secured(environment):
+        return False
+    return not is_zenoh(environment) or bool(enforces_nothing(environment, SESSION_URI))
+
+
+def _not_secured(environment: Mapping[str, str], nodes: list[str]) -> Iterator[Finding]:
+    """Yield a finding, with the open nodes that run, unless the variables ask for security."""
+    asks = environment.get(ENABLE) not in (None, "", "false") or _asks_in_vain(environment)
+    if asks or not _is_open(environment):
+        return
+    more = f" and {len(nodes) - _MOST_NODES} more" if len(nodes) > _MOST_NODES else ""
+    running = f"; running without it: {', '.join(nodes[:_MOST_NODES])}{more}" if nodes else ""
+    yield NOT_SECURED.found(ENABLE, _value(environment, ENABLE) + running)
 
 
 def _is_daemon(process: Process) -> bool:
@@ -515,12 +549,18 @@ def _check_variables(state: RuntimeState) -> Iterator[Finding]:
     yield from _enclave(state, root, domain)
 
 
+def _asks_in_vain(environment: Mapping[str, str]) -> list[str]:
+    """Return the variables that configure security, where nothing says whether to enable it."""
+    if ENABLE in environment:
+        return []
+    return [name for name in (STRATEGY, KEYSTORE, ENCLAVE) if environment.get(name)]
+
+
 def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
     enable, strategy = environment.get(ENABLE), environment.get(STRATEGY)
     if enable not in (None, "", "true", "false"):
         yield ENABLE_MISSPELT.found(ENABLE, _value(environment, ENABLE))
-    elif enable is None and (strategy or environment.get(KEYSTORE) or environment.get(ENCLAVE)):
-        named = [name for name in (STRATEGY, KEYSTORE, ENCLAVE) if environment.get(name)]
+    elif named := _asks_in_vain(environment):
         yield NOT_ENABLED.found(
             ENABLE,
             f"{' and '.join(named)} {'is' if len(named) == 1 else 'are'} set, and {ENABLE} is not",

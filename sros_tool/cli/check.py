@@ -77,7 +77,8 @@ Example:
   $ sros check robot.xml --requirements robot.requirements.toml
 
 Findings that the keystore's template accepts count as notes and share one line; with --strict,
-for example in CI, they count like all others. Exit status: 1 if a finding of the --fail-on
+for example in CI, they count like all others. Where security is not enabled at all, `check runtime`
+shows a note, which counts with --fail-on note. Exit status: 1 if a finding of the --fail-on
 severity or higher is shown, else 0.""",
 )
 @click.argument("targets", metavar="[policy|keystore|runtime] [PATH]...", nargs=-1, type=PATH)

@@ -126,6 +126,7 @@ def session_written_since(state: RuntimeState, bench: Bench) -> RuntimeState:
 CASES: dict[str, Change] = {
     "runtime.enable-misspelt": having(**{ENABLE: "True"}),
     "runtime.not-enabled": having(**{ENABLE: None}),
+    "runtime.not-secured": having(**dict.fromkeys((ENABLE, STRATEGY, KEYSTORE, ENCLAVE))),
     "runtime.variable-misspelt": having(ROS_SECURTY_ENABLE="true"),
     "runtime.strategy-misspelt": having(**{STRATEGY: "enforce"}),
     "runtime.not-enforced": having(**{STRATEGY: None}),

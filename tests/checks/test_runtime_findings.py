@@ -13,16 +13,20 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from sros_tool.checks.kind import ERROR, WARNING
+from sros_tool.checks.kind import ERROR, NOTE, WARNING
+from sros_tool.checks.registry import FindingFilter
 from sros_tool.checks.runtime import RuntimeState, running_processes, runtime_findings
 from tests.checks.bench import DAY, Bench
 from tests.checks.runtime_cases import (
     CASES,
     DOMAIN,
+    ENABLE,
     ENCLAVE,
     KEYSTORE,
     OVERRIDE,
+    SESSION,
     SOUND,
+    STRATEGY,
     having,
     on_zenoh,
     running,
@@ -55,9 +59,38 @@ def test_nothing_in_a_sound_setting(sound_one: RuntimeState) -> None:
     assert ids(sound_one) == set()
 
 
-def test_nothing_without_any_security() -> None:
-    state = RuntimeState({"PATH": "/usr/bin", "ROS_DISTRO": "jazzy"}, datetime.now(UTC))
-    assert ids(state) == set()
+@pytest.mark.parametrize("variables", [{}, {ENABLE: "false", KEYSTORE: "/ks"}, {ENABLE: ""}])
+def test_nothing_but_that_nothing_is_secured(variables: dict[str, str]) -> None:
+    environment = {"PATH": "/usr/bin", "ROS_DISTRO": "jazzy", **variables}
+    (found,) = runtime_findings(RuntimeState(environment, datetime.now(UTC)))
+    assert (found.id, found.severity) == ("runtime.not-secured", NOTE)
+    assert "running" not in found.text
+
+
+def test_without_security_each_open_node_is_named(sound_one: RuntimeState, bench: Bench) -> None:
+    node = replace(sound_one.processes[0], environment={DOMAIN: "3"})
+    nodes = tuple(replace(node, pid=pid) for pid in range(100, 130))
+    other = replace(node, command=("/usr/bin/editor",))
+    state = replace(sound_one, environment={}, processes=(*nodes, other))
+    (found,) = runtime_findings(state)
+    assert found.text.startswith(
+        "ROS_SECURITY_ENABLE is not set; running without it: process 100 (talker) in domain 3, "
+    )
+    assert "editor" not in found.text
+    assert found.text.endswith("process 119 (talker) in domain 3 and 10 more")
+    for severity, shown in ((NOTE, True), (WARNING, True), (ERROR, False)):
+        chosen = FindingFilter(severity=severity).choose([found])
+        assert bool(chosen.shown) is shown
+        assert not chosen.fails(WARNING)
+
+
+def test_a_session_file_of_zenoh_is_security_without_ros_variables(
+    sound_one: RuntimeState, bench: Bench
+) -> None:
+    unset = dict.fromkeys((ENABLE, STRATEGY, KEYSTORE, ENCLAVE))
+    assert ids(replace(on_zenoh(**unset)(sound_one, bench), processes=())) == set()
+    without_file = replace(on_zenoh(**unset, **{SESSION: None})(sound_one, bench), processes=())
+    assert ids(without_file) == {"runtime.not-secured"}
 
 
 @pytest.mark.parametrize("expected", CASES)
@@ -168,14 +201,16 @@ def test_an_open_node_is_found_next_to_a_secured_one_from_a_shell_without_securi
     secured = sound_one.processes[0]
     open_node = replace(secured, pid=9, environment={"ROS_DOMAIN_ID": "0"})
     shell = replace(sound_one, environment={"PATH": "/usr/bin"})
-    assert ids(replace(shell, processes=(secured, open_node))) == {"runtime.process-unsecured"}
+    both = {"runtime.process-unsecured", "runtime.not-secured"}
+    assert ids(replace(shell, processes=(secured, open_node))) == both
     quiet = replace(open_node, command=("python3", "talker.py"))
-    assert ids(replace(shell, processes=(secured, quiet))) == set()
+    alone = {"runtime.not-secured"}
+    assert ids(replace(shell, processes=(secured, quiet))) == alone
     loaded = replace(quiet, has_loaded=True)
-    assert ids(replace(shell, processes=(secured, loaded))) == {"runtime.process-unsecured"}
+    assert ids(replace(shell, processes=(secured, loaded))) == both
     elsewhere = replace(open_node, environment={"ROS_DOMAIN_ID": "1"})
-    assert ids(replace(shell, processes=(secured, elsewhere))) == set()
-    assert ids(replace(shell, processes=(open_node,))) == set()
+    assert ids(replace(shell, processes=(secured, elsewhere))) == alone
+    assert ids(replace(shell, processes=(open_node,))) == alone
 
 
 def test_real_processes_are_read(tmp_path: Path) -> None:
