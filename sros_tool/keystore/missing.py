@@ -8,7 +8,7 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.errors import InvalidNameError, KeystoreError, SrosError
-from sros_tool.keystore.layout import PRIVATE, PUBLIC, REVOKED, SETTINGS
+from sros_tool.keystore.layout import FLEET, PRIVATE, PUBLIC, REVOKED, SETTINGS
 from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.names import check_enclave_name
 
@@ -72,8 +72,8 @@ def _was_revoked(root: Path, entry: Entry) -> SrosError:
         f"enclave {entry.enclave} of keystore '{root}' was revoked at {entry.time}{reason}",
         f"Its files are in '{folder}'." if folder.is_dir() else "",
         f"To use it again, with another key: `sros generate_artifacts -k {quote(str(root))} -e "
-        f"{entry.enclave} "
-        "-p POLICY_FILE`.",
+        f"{entry.enclave} -p POLICY_FILE{' --fleet FLEET_FILE' if (root / FLEET).exists() else ''}`"
+        ".",
     )
 
 

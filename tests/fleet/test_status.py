@@ -187,6 +187,18 @@ def test_a_robot_that_was_revoked(field: Field) -> None:
     assert field.states() == {"r1": "current", "r2": "current", "r3": "none"}
 
 
+def test_a_revoked_robot_comes_back_by_the_commands_that_errors_name(field: Field) -> None:
+    made = ("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    field.run("revoke", "ks", "--robot", "r3")
+    for refused in (made, ("distribute_key", "ks", "/r3/base", "r3")):
+        said = field.run(*refused, status=2).err
+        command = said.rpartition("`sros ")[2].rpartition("`")[0]
+        named = {"POLICY_FILE": "policy.xml", "FLEET_FILE": "fleet.toml"}
+        words = [named.get(word, word) for word in command.split()]
+        assert "created enclave /r3/base" in field.run(*words).out, command
+        field.run("revoke", "ks", "/r3/base")
+
+
 def test_a_changed_policy(field: Field) -> None:
     (field.folder / "policy.xml").write_text(POLICY.replace("/y", "/z").replace("}/x", "}/new"))
     field.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")

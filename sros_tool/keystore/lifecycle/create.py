@@ -291,7 +291,7 @@ def generate_artifacts(
             keystore = open_to_issue(
                 transaction, domain, keyring, now, fleet, patterns, wanted, protections
             )
-            again = _revoked_before(keystore, wanted, enclaves, root)
+            again = _revoked_before(keystore, wanted, enclaves, root, fleet)
             creation = write_enclaves(
                 transaction,
                 keystore,
@@ -338,7 +338,11 @@ def _domains_of(fleet: Fleet | None, domain: int | None) -> DomainSet:
 
 
 def _revoked_before(
-    keystore: _Keystore, wanted: Iterable[str], named: Collection[str], root: Path
+    keystore: _Keystore,
+    wanted: Iterable[str],
+    named: Collection[str],
+    root: Path,
+    fleet: Fleet | None,
 ) -> list[Note]:
     """Return a note for each revoked enclave that is created again because it is ``named``.
 
@@ -352,9 +356,10 @@ def _revoked_before(
         raise KeystoreError(
             f"a policy names {', '.join(unasked)}, revoked in keystore '{root}'",
             "Its policy would create it again, and `distribute_key --all` would export it.",
-            "Remove it from the policy; or, to have it again with another key and the rights of "
-            f"the policy, name it, too: `sros generate_artifacts -k {quote(str(root))} -e "
-            f"{' '.join(unasked)} -p POLICY_FILE`.",
+            f"Remove it from the policy{' or its robot from the fleet file' if fleet else ''}; or, "
+            "to have it again with another key and the rights of the policy, name it, too: "
+            f"`sros generate_artifacts -k {quote(str(root))} -e {' '.join(unasked)} -p POLICY_FILE"
+            f"{' --fleet FLEET_FILE' if fleet else ''}`.",
         )
     return [
         Note(
