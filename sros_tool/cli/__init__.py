@@ -53,7 +53,7 @@ def main(arguments: list[str] | None = None, *, name: str = "sros") -> None:
         _give_up_stdout()
         sys.exit(NOT_DONE)
     except BaseException as error:
-        status = report_error(error, arguments)
+        status = report_error(error, arguments, name)
         try:
             if sys.stdout:
                 sys.stdout.flush()

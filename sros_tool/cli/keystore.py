@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from shlex import quote
@@ -138,12 +139,16 @@ def create_permission(
 
     root, rest = split_root(words)
     if len(rest) < (1 if every or patterns or robots else 2):
-        raise UsageError("create_permission takes a keystore, one or more enclaves and a policy")
-    *given, file = rest
+        raise UsageError(
+            "create_permission takes a keystore, one or more enclaves and a policy", "", _ORDER
+        )
+    *given, last = rest
+    file = PATH.convert(last, None, None)
+    _check_order(root, given, file)
     result = create(
         root,
         chosen_enclaves(root, given, patterns, robots, every=every),
-        policy_for(PATH.convert(file, None, None), fleet_file),
+        policy_for(file, fleet_file),
         now=now(),
         domain=ros_domain(),
         revoke_old=revoke_old,
@@ -151,6 +156,26 @@ def create_permission(
         dry_run=dry_run,
     )
     _show(result, dry_run, as_json)
+
+
+_ORDER = "Write them in this order: `sros create_permission ROOT NAME... POLICY_FILE`."
+
+
+def _check_order(root: Path, names: Sequence[str], file: Path) -> None:
+    """Raise `UsageError` if a keystore, enclave or policy stands where another one belongs."""
+    from sros_tool.keystore.layout import is_keystore
+
+    paths = [
+        each
+        for each in names
+        if is_keystore(Path(each)) or (not each.startswith("/") and os.path.lexists(each))
+    ]
+    if not (paths or file.is_dir() or root.is_file()):
+        return
+    wrong, place = (paths[0], "an enclave") if paths else (str(file), "the policy file")
+    if not root.is_dir():
+        wrong, place = str(root), "the keystore"
+    raise UsageError(f"'{wrong}' stands where {place} belongs", "", _ORDER)
 
 
 class _SeveralEnclavesAndPolicies(SeveralValues):

@@ -254,10 +254,11 @@ _PHRASES = {
 }
 
 
-def report_error(error: BaseException, arguments: Sequence[str]) -> int:
+def report_error(error: BaseException, arguments: Sequence[str], name: str = "sros") -> int:
     """Print what is wrong, why, and what to do; return the exit status.
 
     ``arguments`` are the words of the command line: messages begin with what its verb does.
+    ``name`` is what help calls the program.
     """
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else 1
@@ -270,7 +271,8 @@ def report_error(error: BaseException, arguments: Sequence[str]) -> int:
         error.show()
         return NOT_DONE
     if isinstance(error, click.UsageError):
-        return _usage(error)
+        where = error.ctx.command_path if error.ctx else _named_command(arguments, name)
+        return _print_error(f"{where}: {error.format_message()} See `{where} --help`.")
     if isinstance(error, SrosError):
         return _print_error(_prefixed(str(error), arguments))
     if isinstance(error, OSError):
@@ -278,10 +280,14 @@ def report_error(error: BaseException, arguments: Sequence[str]) -> int:
     return _defect(error, arguments)
 
 
-def _usage(error: click.UsageError) -> int:
-    message = error.format_message()
-    where = error.ctx.command_path if error.ctx else "sros"
-    return _print_error(f"{where}: {message} See `{where} --help`.")
+def _named_command(arguments: Sequence[str], name: str) -> str:
+    """Return the command that words name; click does not say it for an option without a value."""
+    command: click.Command | None = program
+    for word in arguments:
+        if isinstance(command, click.Group) and not word.startswith("-"):
+            command = command.get_command(click.Context(command), word)
+            name += f" {command.name}" if command else ""
+    return name
 
 
 def _print_error(text: str) -> int:
