@@ -183,11 +183,22 @@ def made_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def copied(case: Case, made: Path, folder: Path) -> Path:
+    """Copy all files of a made folder, and of its folders those that a case names."""
+    words = f"{case.words} {case.before}"
+    others = [each.name for each in made.iterdir() if each.is_dir() and each.name not in words]
+
+    def left_out(where: str, names: list[str]) -> list[str]:
+        return others if where == str(made) else []
+
+    return Path(shutil.copytree(made, folder, symlinks=True, ignore=left_out))
+
+
 def both_ways(verb: str, case: Case, made: Path, place: Path) -> Ended:
     """Run a case without and with --json, each in a new copy of the folder; return the second."""
     ended = []
     for number, option in enumerate(([], ["--json"])):
-        folder = Path(shutil.copytree(made, place / str(number), symlinks=True))
+        folder = copied(case, made, place / str(number))
         for before in case.before:
             sros(*before.split(), cwd=folder).ok()
         ended.append(sros(*verb.split(), *case.words.split(), *option, cwd=folder))
@@ -289,16 +300,17 @@ DRY_RUNS = [
 def test_a_dry_run_says_what_would_be_done(
     verb: str, case: Case, made_folder: Path, tmp_path: Path
 ) -> None:
-    folder = Path(shutil.copytree(made_folder, tmp_path / "made", symlinks=True))
+    folder = copied(case, made_folder, tmp_path / "made")
+    before = snapshot(folder)
     words = [each for each in case.words.split() if each != "--dry-run"]
     would = json.loads(sros(*verb.split(), *words, "--dry-run", "--json", cwd=folder).out)
-    assert snapshot(folder) == snapshot(made_folder)
+    assert snapshot(folder) == before
     done = json.loads(sros(*verb.split(), *words, "--json", cwd=folder).out or "{}")
     if not done:  # what needs a choice is shown by a dry run, and refused
         return
     assert (would["dry_run"], done["dry_run"]) == (True, False)
     if done.get("accepted") is False:
-        assert (done["changes"], snapshot(folder)) == ([], snapshot(made_folder))
+        assert (done["changes"], snapshot(folder)) == ([], before)
         return
     assert would["changes"] == done["changes"]
     named = [[_named(each) for each in shown.get("enclaves", ())] for shown in (would, done)]

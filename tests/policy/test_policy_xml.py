@@ -248,7 +248,7 @@ def test_includes_give_what_lxml_gives_or_are_refused(odd: bool) -> None:
     read = 0
 
     @given(folders(odd))
-    @settings(max_examples=2 * settings().max_examples)
+    @settings(max_examples=5 * settings().max_examples)
     def compare(files: dict[str, str]) -> None:
         nonlocal read
         with tempfile.TemporaryDirectory() as name:
