@@ -34,9 +34,15 @@ ROS_PACKAGES = {"graph", "demo"}
 ROS_MODULES = {"runtime/probe_child.py"}
 
 
+@cache
+def tree_of(source: str) -> ast.Module:
+    """Return the syntax of a module, which several tests look at; it is not changed."""
+    return ast.parse(source)
+
+
 def imported(source: str, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
     """Line and absolute name of each import in the text of `module`; also inside functions."""
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree_of(source)):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, name.name) for name in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -119,7 +125,7 @@ def clocks(source: str) -> list[int]:
     """The lines that ask what time it is."""
     return [
         node.lineno
-        for node in ast.walk(ast.parse(source))
+        for node in ast.walk(tree_of(source))
         if isinstance(node, ast.Attribute)
         and f"{ast.unparse(node.value).rpartition('.')[2]}.{node.attr}" in CLOCKS
     ]
@@ -168,7 +174,7 @@ def modules_of(folder: str) -> Modules:
     found = {}
     for path in sorted((PROJECT / folder).rglob("*.py")):
         parts = path.relative_to(PROJECT).with_suffix("").parts
-        found[".".join(part for part in parts if part != "__init__")] = ast.parse(path.read_text())
+        found[".".join(part for part in parts if part != "__init__")] = tree_of(path.read_text())
     return found
 
 
@@ -227,7 +233,7 @@ def test_a_package_of_many_modules_lists_them() -> None:
     for first in PACKAGE.rglob("__init__.py"):
         modules = {each.stem for each in first.parent.glob("*.py")} - {"__init__"}
         if len(modules) > 25:
-            listed = ast.get_docstring(ast.parse(first.read_text())) or ""
+            listed = ast.get_docstring(tree_of(first.read_text())) or ""
             missing[first.parent.name] = modules - set(re.findall(r"`(\w+)`", listed))
     assert missing == {"cli": set()}
 
@@ -314,7 +320,7 @@ def writing(source: str) -> list[int]:
     """The lines that change what is at a path, or import a function that can under a new name."""
     return sorted(
         node.lineno
-        for node in ast.walk(ast.parse(source))
+        for node in ast.walk(tree_of(source))
         if (isinstance(node, ast.Call) and is_writing(node))
         or (
             isinstance(node, ast.ImportFrom)
@@ -331,7 +337,7 @@ def writing(source: str) -> list[int]:
 def unsafe_pythons(source: str) -> list[int]:
     """Lines that start Python so that it imports modules from the working folder."""
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree_of(source)):
         words = [ast.unparse(each) for each in getattr(node, "elts", ())]
         for place, word in enumerate(words):
             if word == "sys.executable" and words[place + 1 : place + 2] != ["'-P'"]:

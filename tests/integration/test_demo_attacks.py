@@ -25,6 +25,7 @@ from tests.integration.test_demo_run import processes_with, start
 from tests.integration.weak_keystores import WEAKNESSES, make_weak
 from tests.support.children import LONG, PATIENCE
 from tests.support.harness import snapshot, sros
+from tests.support.long_form import ONLY_LONG
 
 pytestmark = pytest.mark.dds
 
@@ -83,8 +84,14 @@ def test_every_attack_ends_as_expected(
     assert all(row["remedy"] for row in result["rows"] if row["open_because"])
 
 
+OFTEN = ("subjects that others contain", "nothing encrypted", "files open to all users")
+
+
 @needs_isolation
-@pytest.mark.parametrize("name", WEAKNESSES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(each, marks=[] if each in OFTEN else ONLY_LONG) for each in WEAKNESSES],
+)
 def test_a_weakness_makes_its_rows_fail_and_no_others(
     backend: Backend, name: str, tmp_path: Path
 ) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.dds.decision.vendors import Vendor
@@ -57,7 +57,6 @@ def test_shipped_policies_are_proven(file: Path) -> None:
         assert differences(enclave, made, DOMAINS, ASKED) == []
 
 
-@settings(max_examples=30)
 @given(policies())
 def test_equal_expressions_give_equal_decisions(policy: Policy) -> None:
     """Equal sets of expressions mean equal decisions of the engine, for random policies."""
@@ -67,7 +66,6 @@ def test_equal_expressions_give_equal_decisions(policy: Policy) -> None:
         assert differences(enclave, made, DOMAINS, ASKED) == []
 
 
-@settings(max_examples=30)
 @given(policies())
 def test_stated_expressions_allow_what_the_policy_allows(policy: Policy) -> None:
     """The DDS expressions of the proof allow exactly the topics that the policy allows."""
@@ -81,7 +79,6 @@ def test_stated_expressions_allow_what_the_policy_allows(policy: Policy) -> None
                     assert stated.allow(verb, topic) == allowed, (verb, topic)
 
 
-@settings(max_examples=30)
 @given(policies())
 def test_the_short_form_of_a_large_document_is_proven(policy: Policy) -> None:
     for enclave in policy.enclaves:
