@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import islice
 
 from sros_tool.automata import NameSet, SearchLimit
@@ -30,7 +31,7 @@ from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import Right
 from sros_tool.policy.stated import StatedProtection
 from sros_tool.proof.access import domains_of, enforced_access, is_enforced
-from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource
+from sros_tool.proof.sources import ALL_DOMAINS, AT, KEYSTORE_ITSELF, AccessSource, Trust
 from sros_tool.proof.worlds import named, valid_topics
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
 from sros_tool.topics import SERVICE_ENDS, dds_names
@@ -564,11 +565,45 @@ def _loosened(old: AccessSource, new: AccessSource, limit: SearchLimit) -> Itera
                 if role == "identity"
                 else "whoever has its key can give any right",
             )
+    yield from _trusted_again(old, new)
+    if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
+        text = "nothing enforces on Zenoh what its files enforced"
+        yield SettingChange(Effect.LOOSER, "files of Zenoh", "present", "missing", text)
     if old.router and new.router and old.router != new.router:
         text = "whoever plays the router reads and changes all that passes"
         yield SettingChange(Effect.LOOSER, "router of Zenoh", old.router, new.router, text)
     if old.protections and new.protections is not None:
         yield from _no_longer_stated(old.protections, new.protections, limit)
+
+
+def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
+    """Yield the certificates that enclaves refuse in ``old``, and not in ``new``."""
+    if old.trusts is None or new.trusts is None:
+        return
+    all_revoked = frozenset(each for trust in old.trusts.values() for each in trust.revoked)
+    again: dict[int, list[str]] = defaultdict(list)
+
+    @lru_cache(maxsize=8)  # most enclaves have the same lists
+    def lost(before: frozenset[tuple[str, int]], after: Trust) -> list[int]:
+        gone = before - after.revoked
+        return sorted(serial for authority, serial in gone if authority in after.authorities)
+
+    for name in sorted(new.trusts):
+        if old.scope is None or new.scope is not None or name in old.scope:
+            before = old.trusts[name].revoked if name in old.trusts else all_revoked
+            for serial in lost(before, new.trusts[name]):
+                again[serial].append(name)
+    for serial in sorted(again)[:_MOST_SERIALS]:
+        names = [each for each in again[serial] if each != KEYSTORE_ITSELF] or [KEYSTORE_ITSELF]
+        who = f"{names[0]} trusts" if len(names) == 1 else f"{len(names)} enclaves trust"
+        text = f"{who} whoever has its key again"
+        yield SettingChange(Effect.LOOSER, f"certificate {serial:x}", "revoked", "trusted", text)
+    if (more := len(again) - _MOST_SERIALS) > 0:
+        text = "enclaves trust whoever has their keys again"
+        yield SettingChange(Effect.LOOSER, f"{more} certificates more", "revoked", "trusted", text)
+
+
+_MOST_SERIALS = 20
 
 
 def _looser_governance(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from functools import lru_cache
 from pathlib import Path
 from shlex import quote
 
@@ -15,17 +18,22 @@ from sros_tool.errors import DocumentError, Note, SrosError
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.layout import (
+    CRL,
+    CRL_FILE,
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
+    IDENTITY,
     IDENTITY_CA_FILE,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
+    ca_certificate,
     enclave_names,
     enclave_path,
     has_zenoh_files,
     is_keystore,
     permissions_ca_for,
 )
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.reader import governance_of
 from sros_tool.keystore.rights import RightsSource, load_rights, load_zenoh_rights
 from sros_tool.names import expand
@@ -34,8 +42,11 @@ from sros_tool.pki.certificates import (
     common_name,
     fingerprints,
     load_certificate,
+    load_certificates,
     subject_text,
 )
+from sros_tool.pki.crl import CRL_MARK, load_crl, refusal_of, signed_by
+from sros_tool.pki.requests import key_digest
 from sros_tool.policy.document import PolicyFiles, read_policy
 from sros_tool.policy.model import Enclave, Policy, Source
 from sros_tool.policy.rights import Right, policy_rights
@@ -58,6 +69,21 @@ UNCERTAIN = {
 """Notes on what a comparison of rights leaves out: then it cannot say that nothing is added."""
 
 
+KEYSTORE_ITSELF = "the keystore"
+"""What has the CA and the revocation list of enclaves that a keystore gets later."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """The identity CAs that an enclave trusts, and the certificates of these that it refuses.
+
+    A CA is the SHA-256 of its public key; ``revoked`` are pairs of a CA and a serial number.
+    """
+
+    authorities: frozenset[str]
+    revoked: frozenset[tuple[str, int]]
+
+
 @dataclass(frozen=True, slots=True)
 class AccessSource:
     """What a file, a folder or a revision gives.
@@ -67,7 +93,8 @@ class AccessSource:
     are in ROS terms, ``zenoh`` those that rules of Zenoh give, or None without any; ``enforcers``
     are these rules, ``router`` is the enclave of the router.  ``scope`` are the enclaves that it is
     for; None for all.  ``governance`` is None if it has none of its own.  ``authorities`` are the
-    CAs that its enclaves trust, pairs of role and fingerprint; None if it does not say.
+    CAs that its enclaves trust, pairs of role and fingerprint, and ``trusts`` whom each of them
+    trusts, and `KEYSTORE_ITSELF`; None if it does not say.
     """
 
     shown: str
@@ -79,6 +106,7 @@ class AccessSource:
     router: str = ""
     governance: Governance | None = None
     authorities: frozenset[tuple[str, str]] | None = None
+    trusts: Mapping[str, Trust] | None = None
     scope: frozenset[str] | None = None
     notes: tuple[Note, ...] = ()
     fleet: Fleet | None = None
@@ -155,11 +183,21 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
     if source.kind == "enclave":
         has_one = (path / GOVERNANCE_FILE).exists()
         governance = _governance(path / GOVERNANCE_FILE) if has_one else None
-        return replace(side, governance=governance, authorities=_authorities([path]))
+        files = path / IDENTITY_CA_FILE, path / CRL_FILE
+        trusts = _trusts(dict.fromkeys(source.scope or (), files), {})
+        return replace(side, governance=governance, authorities=_authorities([path]), trusts=trusts)
     if source.kind != "keystore":
         return side
-    folders = [enclave_path(path, name) for name in enclave_names(path)]
-    side = replace(side, governance=_of_all(path, folders), authorities=_authorities(folders))
+    folders = {name: enclave_path(path, name) for name in enclave_names(path)}
+    trusting = {
+        name: (each / IDENTITY_CA_FILE, each / CRL_FILE) for name, each in folders.items()
+    } | {KEYSTORE_ITSELF: (path / ca_certificate(IDENTITY), path / CRL)}
+    side = replace(
+        side,
+        governance=_of_all(path, folders.values()),
+        authorities=_authorities(folders.values()),
+        trusts=_trusts(trusting, _expiries(path)),
+    )
     if not has_zenoh_files(path):
         return side
     found = load_zenoh_rights(path)
@@ -201,6 +239,65 @@ def _authorities(folders: Iterable[Path]) -> frozenset[tuple[str, str]]:
         if (folder / file).exists()
     }
     return frozenset((role, each) for role, pem in found for each in fingerprints(pem))
+
+
+def _expiries(root: Path) -> dict[int, str]:
+    """Return when certificates expire, by serial number, as the ledger of a keystore has it."""
+    if not (root / CRL).exists():
+        return {}
+    found = {}
+    for each in read_ledger(root, having=("what", "certificate")).entries:
+        with suppress(ValueError):
+            found[int(each.serial, 16)] = each.not_after
+    return found
+
+
+def _trusts(
+    files: Mapping[str, tuple[Path, Path]], expiries: Mapping[int, str]
+) -> dict[str, Trust]:
+    """Return whom enclaves trust by their identity CA and revocation list, if they have a CA.
+
+    Certificates that had expired when a list was signed do not count: lists may leave them out.
+
+    Raises:
+        DocumentError: a list is damaged, is of no CA that the enclave trusts, or is not for all
+            of its certificates, so that it is not certain what it revokes.
+    """
+
+    @lru_cache(maxsize=8)  # most enclaves have the same files
+    def trust(pem: bytes, own: bytes | None) -> Trust:
+        authorities = load_certificates(pem, IDENTITY_CA_FILE)
+        keys = {key_digest(each.public_key()): each for each in authorities}  # type: ignore[arg-type]
+        revoked = set()
+        for data in (own, pem if CRL_MARK in pem else None):
+            if data is None:
+                continue
+            found = load_crl(data, CRL_FILE)
+            key = next((key for key, each in keys.items() if signed_by(found.list, each)), "")
+            if refusal := refusal_of(found.list) or ("" if key else "it is of another CA"):
+                raise DocumentError(f"its revocation list refuses everybody: {refusal}")
+            signed = iso(found.this_update)
+            revoked |= {
+                (key, each.serial)
+                for each in found.revoked
+                if expiries.get(each.serial, signed) >= signed
+            }
+        return Trust(frozenset(keys), frozenset(revoked))
+
+    found = {}
+    for name, (authority, own) in files.items():
+        if authority.exists():
+            pem = read_bytes(authority, "certificate")
+            try:
+                listed = read_bytes(own, "revocation list") if os.path.lexists(own) else None
+                found[name] = trust(pem, listed)
+            except SrosError as error:
+                raise DocumentError(
+                    f"'{authority.parent}' cannot be compared: {error.what}",
+                    "Whom it refuses is not certain.",
+                    error.remedy,
+                ) from error
+    return found
 
 
 def _governance(file: Path) -> Governance:

@@ -38,6 +38,11 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "req.toml").write_text(REQUIREMENTS)
     for words in ("create_keystore ks", "generate_artifacts -k ks -p robot.xml", "zenoh ks"):
         sros(*words.split(), cwd=folder).ok()
+    for name in ("/lost", "/stolen"):
+        sros("create_enclave", "ks", name, cwd=folder).ok()
+        sros("revoke", "ks", name, cwd=folder).ok()
+        if name == "/lost":
+            shutil.copy(folder / "ks/public/identity_ca.crl.pem", folder / "earlier.pem")
     assert required(folder, "ks") == (0, "nothing found\n")
     assert sros("diff_policy", "--no-new-access", "ks", "ks", cwd=folder).status == 0
     return folder
@@ -215,9 +220,57 @@ def test_no_requirement_holds_that_does_not(
     assert "Traceback" not in text
 
 
+def without_the_list(keystore: Path) -> None:
+    (keystore / "enclaves/mux/crl.pem").unlink()
+
+
+def an_earlier_list(keystore: Path) -> None:
+    """A list that the CA signed before: without the enclave that was revoked since."""
+    for each in ("web", "mux", "router"):
+        file = keystore / "enclaves" / each / "crl.pem"
+        file.unlink()
+        shutil.copy(keystore.parent / "earlier.pem", file)
+
+
+def an_earlier_list_for_later_enclaves(keystore: Path) -> None:
+    """Enclaves keep theirs, and those that are created later get the earlier one."""
+    for each in ("web", "mux", "router"):
+        file = keystore / "enclaves" / each / "crl.pem"
+        content = file.read_bytes()
+        file.unlink()
+        file.write_bytes(content)
+    shutil.copy(keystore.parent / "earlier.pem", keystore / "public/identity_ca.crl.pem")
+
+
+def a_list_of_another_ca(keystore: Path) -> None:
+    sros("create_keystore", "other", cwd=keystore.parent)
+    sros("create_enclave", "other", "/x", cwd=keystore.parent)
+    sros("revoke", "other", "/x", cwd=keystore.parent)
+    file = keystore / "enclaves/mux/crl.pem"
+    file.unlink()
+    shutil.copy(keystore.parent / "other/public/identity_ca.crl.pem", file)
+
+
+def a_damaged_list(keystore: Path) -> None:
+    file = keystore / "enclaves/mux/crl.pem"
+    file.unlink()
+    file.write_bytes(b"")
+
+
+def without_the_files_of_zenoh(keystore: Path) -> None:
+    for each in (*keystore.rglob("router.*"), *keystore.rglob("session.*")):
+        each.unlink()
+
+
 @pytest.mark.parametrize(
     ("change", "status", "said"),
     [
+        (without_the_list, 1, "revoked -> trusted: /mux trusts whoever has its key again"),
+        (an_earlier_list, 1, "revoked -> trusted: 3 enclaves trust whoever has its key again"),
+        (an_earlier_list_for_later_enclaves, 1, "trusted: the keystore trusts whoever has its"),
+        (a_list_of_another_ca, 2, "its revocation list refuses everybody: it is of another CA"),
+        (a_damaged_list, 2, "mux' cannot be compared: the revocation list crl.pem cannot be read"),
+        (without_the_files_of_zenoh, 1, "+ less protection: files of Zenoh present -> missing"),
         (a_name_without_an_enclave, 1, "+ /ghost publish topic /cmd_vel; with Zenoh"),
         (another_authority, 1, "+ less protection: identity CA"),
         (another_router, 1, "+ less protection: router of Zenoh /router -> /web"),
