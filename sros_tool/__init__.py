@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         fleet_status,
         generate,
         load_template,
+        new_access,
         open_keystore,
         read_policy,
     )
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
+    from sros_tool.proof.growth import Growth
 
 __version__ = "0.2.0"
 
@@ -56,6 +58,7 @@ __all__ = [
     "DocumentError",
     "Finding",
     "FleetStatus",
+    "Growth",
     "Keystore",
     "KeystoreError",
     "Policy",
@@ -71,6 +74,7 @@ __all__ = [
     "fleet_status",
     "generate",
     "load_template",
+    "new_access",
     "open_keystore",
     "read_policy",
 ]
@@ -79,6 +83,7 @@ _ELSEWHERE = {
     "Creation": "sros_tool.keystore.lifecycle.create",
     "Finding": "sros_tool.checks.kind",
     "FleetStatus": "sros_tool.keystore.fleet_status",
+    "Growth": "sros_tool.proof.growth",
     "Policy": "sros_tool.policy.model",
     "Template": "sros_tool.keystore.template",
     **dict.fromkeys((name for name in __all__ if name.endswith("Error")), "sros_tool.errors"),

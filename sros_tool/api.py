@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
+    from sros_tool.proof.growth import Growth
 
 AnyPath = str | PathLike[str]
 Item = TypeVar("Item")
@@ -480,6 +481,38 @@ def check_requirements(
     system = load_system(Path(path), at=_moment(now), zone=zone, domain=domain, world=vendor)
     found = requirement_findings(read, system)
     return tuple(each for each in found if each.severity >= WARNING)
+
+
+def new_access(base: AnyPath, head: AnyPath, *, fleet: AnyPath | None = None) -> Growth:
+    """Return what ``head`` lets enclaves do that ``base`` does not, decided for all names.
+
+    Args:
+        base: What is there before: a policy, a folder of policies, a keystore, an exported enclave,
+            permissions, a Zenoh configuration, or policies at a revision of git, such as
+            "git:main:policies/robot.xml".
+        head: What is there afterwards: any of these.
+        fleet: The file with the robots that the placeholders of policies stand for.
+
+    Returns:
+        What is ``added`` and ``removed``, whom enclaves can influence now (``reach``), and the
+        protection that is ``lost`` and ``gained``; false if nothing is added and nothing lost.
+
+    Raises:
+        SrosError: A path cannot be read, or it cannot be decided, for instance because of a
+            signature that does not verify; then nothing is known of what is new.
+
+    Example:
+        >>> for gain in sros_tool.new_access("git:main:robot.xml", "robot.xml").added:
+        ...     print(*gain.enclaves, gain.action, gain.name, gain.source)
+        /camera subscribe /cmd_vel robot.xml:12
+    """
+    from sros_tool.fleet.document import read_fleet
+    from sros_tool.proof.growth import compare_access
+    from sros_tool.proof.sources import load_side
+
+    robots = read_fleet(Path(fleet)) if fleet else None
+    before, after = (load_side(Path(each), robots) for each in (base, head))
+    return compare_access(before, after)
 
 
 def _moment(now: datetime | None) -> datetime:

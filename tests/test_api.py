@@ -249,3 +249,18 @@ def test_requirements_are_decided(tmp_path: Path) -> None:
     assert sros_tool.check_requirements(policy, required, vendor="zenoh") == (broken, vacuous)
     with pytest.raises(UsageError, match="unknown vendor"):
         sros_tool.check_requirements(policy, required, vendor="none")
+
+
+def test_new_access_is_what_a_change_adds(tmp_path: Path) -> None:
+    base, head = tmp_path / "base.xml", tmp_path / "head.xml"
+    base.write_text(policy_text({"/a": publish("/x"), "/{robot}/b": publish("/y")}))
+    head.write_text(policy_text({"/a": publish("/x*"), "/{robot}/b": publish("/y")}))
+    fleet = tmp_path / "fleet.toml"
+    fleet.write_text("[robots.r1]\n")
+    found = sros_tool.new_access(base, head, fleet=fleet)
+    (gain,) = found.added
+    assert (gain.enclaves, gain.action, str(gain.source)) == (("/a",), "publish", f"{head}:1")
+    assert gain.name.startswith("/x") and found
+    assert not sros_tool.new_access(head, base, fleet=fleet)
+    with pytest.raises(DocumentError, match="placeholder"):
+        sros_tool.new_access(base, head)

@@ -76,7 +76,7 @@ class NewReach:
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """What HEAD adds to BASE, and what it removes; ``reach`` and ``removed`` follow from these.
+    """What HEAD adds to BASE, and what it removes; true if it adds anything or protects less.
 
     ``reach`` has at most 10,000 pairs; ``reach_unknown`` says why it was not followed, if so.
     ``worlds`` are what was decided.
