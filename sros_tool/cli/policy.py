@@ -17,6 +17,7 @@ from sros_tool.cli.common import (
     check_one_format,
     check_output,
     dry_run_option,
+    fleet_option,
     fleets_of,
     fleets_option,
     force_option,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.merge import Merged
     from sros_tool.policy.minimize import EnclaveUse, MinimizedPolicy, WildcardProposal
-    from sros_tool.policy.model import Group, Policy
+    from sros_tool.policy.model import Enclave, Group, Policy
     from sros_tool.policy.rights import Right, RightsDifference
     from sros_tool.policy.stated import StatedProtection
 
@@ -408,7 +409,8 @@ Example:
     observed, and not allowed
       publish topic /cmd_vel
     permissions.p7s: 4044 bytes, then 4028, of at most 61439
-  wrote 'narrow.xml'""",
+  wrote 'narrow.xml'
+  $ sros minimize_policy robot.xml --observed learned.xml --fleet fleet.toml""",
 )
 @click.argument("policy", type=PATH)
 @click.option(
@@ -419,6 +421,7 @@ Example:
     metavar="OBSERVED...",
     help="Observed rights: policies by generate_policy, or permissions.",
 )
+@fleet_option("The robots that the placeholders of POLICY stand for.")
 @output_option("Write the narrowed policy to FILE.")
 @click.option(
     "--strict",
@@ -431,6 +434,7 @@ Example:
 def minimize_policy(
     policy: Path,
     observed: tuple[Path, ...],
+    fleet_file: Path | None,
     output: Path | None,
     strict: bool,
     force: bool,
@@ -443,22 +447,38 @@ def minimize_policy(
     each known name that it matches: names in the policy, in the observations, and in the rights
     that every node needs. The result is one file: includes are resolved, metadata is kept, and
     comments are lost. A DENY always stays, and an enclave that was never observed does not change.
+
+    With --fleet, what was observed of some robots stays for all robots of the same enclave, and
+    sizes are those of the robot with the longest name.
     """
+    from sros_tool.fleet import minimize as of_fleet
+    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.document import read_policy, write_policy
     from sros_tool.policy.minimize import minimize
 
     if output:
         check_output(output, force=force)
-    given = read_policy(policy)
-    sources = [load_rights(path) for path in observed]
-    seen = frozenset(right for source in sources for right in source.rights)
-    result = minimize(given, seen, () if strict else _node_basics())
+    fleet = read_fleet(fleet_file) if fleet_file else None
+    given = read_policy(policy, placeholders=fleet is not None)
+    sources = [load_rights(path, fleet) for path in observed]
+    used = seen = frozenset(right for source in sources for right in source.rights)
     notes = [note for source in sources for note in source.notes]
+    robots = FleetPolicy(given, fleet) if fleet else None
+    if robots:
+        seen = of_fleet.with_placeholders(robots, used)
+        notes += _robot_notes(of_fleet.unobserved_robots(robots, used))
+    stated = of_fleet.absolute(given)
+    result = minimize(stated, seen, () if strict else _node_basics())
+    if robots:
+        of_fleet.check_narrowed(robots, result, used)
     notes += _scope_notes(given, result, seen)
-    measured = _measure(given, result, seen)
-    document = write_policy(result.policy)
-    if output and read_policy(output, document) != result.policy:
+    measured = _measure(stated, result, seen, fleet)
+    narrowed = of_fleet.written(result.policy)
+    document = write_policy(narrowed)
+    again = read_policy(output, document, placeholders=fleet is not None) if output else narrowed
+    if again != narrowed:
         raise PolicyError(
             "the narrowed policy changes when it is written and read again",
             "Nothing was written.",
@@ -469,11 +489,11 @@ def minimize_policy(
     if as_json:
         value = _minimized_json(policy, result, measured, output if not dry_run else None)
         value |= {"dry_run": dry_run, "changes": changes, "notes": notes_json(notes)}
-        print_json(value)
+        print_json(_as_written(value))
     else:
         for use in result.uses:
             for line in _use_lines(use, measured[use.enclave]):
-                click.echo(line)
+                click.echo(of_fleet.as_written(line))
     print_notes(notes)
     if output and dry_run:
         click.echo(f"would {'replace' if output.exists() else 'write'} {output}", err=as_json)
@@ -488,6 +508,16 @@ def _node_basics() -> Sequence[Group]:
 
     basics = read_policy(policies_dir() / "defaults" / "node_basics.xml")
     return [group for each in basics.enclaves for p in each.all_profiles() for group in p.groups]
+
+
+def _robot_notes(unobserved: dict[str, list[str]]) -> Iterator[Note]:
+    for path, robots in unobserved.items():
+        more = f" and {len(robots) - _SHOWN} more" if len(robots) > _SHOWN else ""
+        text = (
+            f"{path} was never observed for {', '.join(robots[:_SHOWN])}{more}: what only these "
+            "use is removed, too."
+        )
+        yield Note("minimize.robot-never-observed", text)
 
 
 def _scope_notes(given: Policy, result: MinimizedPolicy, seen: frozenset[Right]) -> Iterator[Note]:
@@ -511,17 +541,19 @@ class _Measured:
 
 
 def _measure(
-    given: Policy, result: MinimizedPolicy, seen: frozenset[Right]
+    given: Policy, result: MinimizedPolicy, seen: frozenset[Right], fleet: Fleet | None
 ) -> dict[str, _Measured]:
     from sros_tool.dds.permissions import MAX_SIGNED_BYTES
     from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
     from sros_tool.policy.minimize import propose_wildcards
+    from sros_tool.policy.model import Policy
     from sros_tool.policy.rights import policy_rights
 
     estimator = SizeEstimator()
     measured = {}
     for before, after in zip(given.enclaves, result.policy.enclaves, strict=True):
-        sizes = estimator.signed_bytes(before), estimator.signed_bytes(after)
+        one, other = (_longest(Policy((each,)), fleet) for each in (before, after))
+        sizes = estimator.signed_bytes(one), estimator.signed_bytes(other)
         proposals: tuple[WildcardProposal, ...] = ()
         if sizes[1] > MAX_SIGNED_BYTES - _MARGIN:
             proposals = propose_wildcards(
@@ -533,6 +565,15 @@ def _measure(
             )
         measured[before.path] = _Measured(*sizes, proposals)
     return measured
+
+
+def _longest(policy: Policy, fleet: Fleet | None) -> Enclave:
+    """Return the only enclave of a policy, or the one of the robot with the longest path."""
+    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.fleet.minimize import written
+
+    robots = FleetPolicy(written(policy), fleet) if fleet else None
+    return robots[max(robots, key=len)] if robots else policy.enclaves[0]
 
 
 def _ratio_text(ratio: float | None) -> str:
@@ -577,6 +618,17 @@ def _use_lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
         adds += f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
         yield f"    {proposal.rule.describe()}  in place of {len(proposal.replaces)} names"
         yield f"      would save {proposal.saves} bytes and add {adds}"
+
+
+def _as_written(value: Any) -> Any:
+    """Return a JSON value with names as a policy for a fleet has them."""
+    from sros_tool.fleet.minimize import as_written
+
+    if isinstance(value, dict):
+        return {key: _as_written(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return list(map(_as_written, value))
+    return as_written(value) if isinstance(value, str) else value
 
 
 def _minimized_json(

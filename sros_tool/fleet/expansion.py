@@ -74,6 +74,10 @@ class FleetPolicy(Mapping[str, Enclave]):
     def __len__(self) -> int:
         return len(self._of)
 
+    def stated(self, path: str) -> tuple[Enclave, Robot | None]:
+        """Return the enclave of the policy that a path is of, not filled in, and its robot."""
+        return self._of[path]
+
     def policy(self) -> Policy:
         """Return the policy with all enclaves expanded; raise `PolicyError` if there is none."""
         if not self._of:
