@@ -170,7 +170,7 @@ def _check_order(root: Path, names: Sequence[str], file: Path) -> None:
         for each in names
         if is_keystore(Path(each)) or (not each.startswith("/") and os.path.lexists(each))
     ]
-    if not (paths or file.is_dir() or root.is_file()):
+    if not (paths or is_keystore(file) or root.is_file()):
         return
     wrong, place = (paths[0], "an enclave") if paths else (str(file), "the policy file")
     if not root.is_dir():
