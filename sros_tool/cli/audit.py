@@ -146,7 +146,9 @@ def audit(
         command = f"sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
         click.echo(visible_line(f"{written}; add it: {command}"), err=True)
     elif patch is not None:
-        click.echo("no patch is needed" if found.allowed else _NO_PATCH, err=True)
+        stays = f"; the earlier '{patch}' stays" if existed else ""
+        said = "no patch is needed" if found.allowed else _NO_PATCH
+        click.echo(visible_line(said + stays), err=True)
     return 0 if found.allowed else 1
 
 

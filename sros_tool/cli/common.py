@@ -429,8 +429,11 @@ def check_output(output: Path, *, force: bool) -> None:
     Devices and pipes need no ``force``, because writing does not replace them.
 
     Raises:
-        UsageError: it is a folder, its folder is missing, or the file exists without ``force``.
+        UsageError: it is ``-`` or a folder, its folder is missing, or the file exists without
+            ``force``.
     """
+    if str(output) == "-":
+        raise UsageError("'-' is not the name of a file", "", "Name a file.")
     if not output.absolute().parent.is_dir():
         raise UsageError(
             f"cannot write '{output}'", "Its folder does not exist.", "Create the folder first."

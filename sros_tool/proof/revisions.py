@@ -155,6 +155,13 @@ def find_revision(text: str) -> Revision:
         path = os.path.normpath(path)
     if path.startswith(("../", "/")) or path == "..":
         raise DocumentError(f"'{text}' is outside of the repository")
+    listed = ["ls-tree", "--full-tree", "-z", found, "--", path]
+    if path != "." and not _git(listed, "--literal-pathspecs"):
+        raise DocumentError(
+            f"'{PREFIX}{name}:{path}' does not exist",
+            "",
+            "A path is from the top of the repository, or from here with ./ before it.",
+        )
     return Revision(name, found, "" if path == "." else path)
 
 

@@ -101,8 +101,13 @@ def test_a_patch_is_merged_and_then_nothing_is_denied(program: Program, tmp_path
     assert "wrote 'add.xml'; add it: sros merge_policy robot.xml add.xml --in-place" in ended.err
     sros("merge_policy", "robot.xml", "add.xml", "--in-place", cwd=tmp_path).ok()
     ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "more.xml").ok()
-    assert "no patch is needed" in ended.err
+    assert "no patch is needed\n" in ended.err
     assert not (tmp_path / "more.xml").exists()
+    ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "add.xml", "--force").ok()
+    assert "no patch is needed; the earlier 'add.xml' stays\n" in ended.err
+    ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "-")
+    assert (ended.status, (tmp_path / "-").exists()) == (2, False)
+    assert "'-' is not the name of a file" in ended.err
 
 
 def test_a_dry_run_writes_no_patch(program: Program, tmp_path: Path) -> None:

@@ -422,11 +422,13 @@ def test_the_program(tmp_path: Path) -> None:
     assert sros("renew", root, "--all-expiring", "30d").ok().out == ""
     every = sros("renew", root, "--all-expiring", "200d").ok().out
     assert every == "renewed enclave /a\nrenewed enclave /b\n"
+    again = sros("renew", root, "--all-expiring", "9000d").ok().err
+    assert "what is renewed now expires within 9000d again" in again
     assert "the replaced certificates work until" in sros("renew", root, "/a", "/b").ok().err
     told = sros("renew", root, "/a", "--revoke-old").ok()
     assert "restart the processes of 2 enclaves" in told.err
     assert "the replaced" not in told.err
-    assert sros("crl", root).ok().out.count("superseded") == 4
+    assert sros("crl", root).ok().out.count("superseded") == 5
     assert sros("renew", root).status == 2
     assert sros("renew", root, "--all-expiring", "soon").status == 2
     assert sros("renew", root, "/missing").status == 2

@@ -376,6 +376,13 @@ def test_nothing_that_a_repository_configures_is_run(repository: Path) -> None:
     assert not (repository / "sprung").exists()
 
 
+def test_a_path_of_a_revision_is_from_its_top(repository: Path) -> None:
+    words = ("diff_policy", "--no-new-access", "git:main:robot.xml", "robot.xml")
+    ended = sros(*words, cwd=repository / "policies")
+    assert ended.status == 2
+    assert "'git:main:robot.xml' does not exist. A path is from the top of the" in ended.err
+
+
 def test_a_folder_of_too_many_policies_is_refused(repository: Path) -> None:
     for each in range(300):
         (repository / "policies" / f"more{each}.xml").write_text("<policy version='0.2.0'/>")

@@ -32,13 +32,11 @@ _Value = TypeVar("_Value")
 
 
 def some_steps(steps: Sequence[int]) -> Sequence[int]:
-    """Return the steps at which to stop a process: of many every third, and of 50 every fifth.
+    """Return the steps at which to stop a process: of many some eight, with the last one.
 
-    The last one always is among them; in the long form all are.
+    In the long form all are.
     """
-    if LONG or len(steps) < 20:
-        return steps
-    return steps[:: -3 if len(steps) < 50 else -5][::-1]
+    return steps if LONG else steps[:: -(1 + len(steps) // 10)][::-1]
 
 
 def run(

@@ -178,6 +178,11 @@ class EnclaveWriter:
         signs = (each.on_token for each in (identity, permissions) if each)
         self._key_on_token = keys_on_token or any(signs)
 
+    @property
+    def expiry(self) -> datetime:
+        """When the first of what is written expires, unless its enclave is short-lived."""
+        return min(self._certificate_validity.not_after, self._permissions_validity.not_after)
+
     def write(self, issuance: Issuance) -> Issued:
         """Issue, prove, sign and stage ``issuance``, and record it for the ledger.
 

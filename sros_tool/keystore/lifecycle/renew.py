@@ -54,6 +54,7 @@ from sros_tool.pki.certificates import (
     other_issuer,
 )
 from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key
+from sros_tool.validity import duration_text, iso
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +154,11 @@ def renew(
         replaced = [each for each in done.values() if isinstance(each, Superseded)]
         renewed = tuple(each.name for each in replaced)
         notes = (*writer.notes, *renewer.notes) if replaced else ()
+        left = writer.expiry - now
+        if replaced and expiring and expiring.remaining and left <= expiring.remaining:
+            text = f"what is renewed now expires within {duration_text(expiring.remaining)} again, "
+            text += f"on {iso(writer.expiry)}, so that it is renewed each time: choose a shorter "
+            notes += (Note("renew.due-again", f"{text}time, or a longer validity."),)
         with suppress(SrosError):  # its governance is not what is renewed
             notes += edit_notes(root, governance_of(root))
         if not (new_key or places):
