@@ -23,6 +23,7 @@ from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child
 from tests.support.children import some_steps
 from tests.support.harness import remains, snapshot
+from tests.support.long_form import ONLY_LONG
 
 __all__ = ["server"]
 
@@ -95,6 +96,7 @@ def test_death_at_every_step(
     assert steps > 10
 
 
+@ONLY_LONG
 def test_killed_at_random_moments(
     server: Server, robot: tuple[Path, bytes], tmp_path: Path
 ) -> None:

@@ -23,6 +23,7 @@ from sros_tool.keystore.reader import open_enclave, read_crl
 from tests.integration.kills import Moments, Server, server
 from tests.support.children import some_steps
 from tests.support.harness import check_whole, remains
+from tests.support.long_form import ONLY_LONG
 
 __all__ = ["server"]
 
@@ -192,6 +193,7 @@ def test_death_at_every_step(
 # ── real processes ─────────────────────────────────────────────────────────────────────────
 
 
+@ONLY_LONG
 @pytest.mark.parametrize("verb", ["renew", "revoke"])
 def test_killed_at_random_moments(verb: str, server: Server, life: Path, tmp_path: Path) -> None:
     words: dict[str, tuple[object, ...]] = {

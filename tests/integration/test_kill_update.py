@@ -19,6 +19,7 @@ from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child
 from tests.support.children import some_steps
 from tests.support.harness import check_enclave_whole, check_whole, remains
+from tests.support.long_form import ONLY_LONG
 
 __all__ = ["server"]
 
@@ -112,6 +113,7 @@ def test_death_at_every_step(life: Path, tmp_path: Path, monkeypatch: pytest.Mon
     assert steps > 30
 
 
+@ONLY_LONG
 def test_killed_at_random_moments(server: Server, life: Path, tmp_path: Path) -> None:
     work = tmp_path / "work" / "ks"
     work.parent.mkdir()
