@@ -19,19 +19,22 @@ _CLOCK_OF_CRL = (
     "Set the clock of this host; if it is right, sign the list again: `sros crl {root} --refresh`, "
     "and export it to the robots again."
 )
-_IN_EXPORT = {
-    _CLOCK: "Set the clock of this host; if it is right, sign again in the keystore that has the "
-    "CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
-    _CLOCK_OF_CRL: "Set the clock of this host; if it is right, sign the list again in the "
-    "keystore that has the CA keys: `sros crl {root} --refresh`. Then export the enclave again.",
-}
-"""What to do on a robot, of which not all is to be done in the keystore that has the CA keys."""
 _SIGN = "Sign the permissions again: `sros create_permission {root} {enclave} POLICY`."
 _COMPLETE = "Create the missing file: `sros create_enclave {root} {enclave}`."
 REPLACE = (
     "Replace the file: `rm {path} && sros create_enclave {root} {enclave}` links the keystore's "
     "file, or issues the file again."
 )
+_IN_EXPORT = {
+    _CLOCK: "Set the clock of this host; if it is right, sign again in the keystore that has the "
+    "CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
+    _CLOCK_OF_CRL: "Set the clock of this host; if it is right, sign the list again in the "
+    "keystore that has the CA keys: `sros crl {root} --refresh`. Then export the enclave again.",
+    REPLACE: "Export the enclave again. If `sros check {root}` finds the same in the keystore that "
+    "has the CA keys, first replace the file there: `rm {path} && sros create_enclave {root} "
+    "{enclave}`.",
+}
+"""What to do on a robot, of which not all is to be done in the keystore that has the CA keys."""
 _RESTORE = "Restore {path} from a backup."
 _GOVERNANCE = (
     "Every enclave depends on it: restore {root}/enclaves/governance.p7s from a backup, or read "

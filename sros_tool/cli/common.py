@@ -391,7 +391,7 @@ def print_closed(root: Path, changes: Sequence[Change]) -> None:
         )
 
 
-_MAX_NAMES = 5
+_MAX_NAMES = 20
 """Number of enclaves that a message names."""
 
 
@@ -420,7 +420,7 @@ def print_restart(
 
 def _some(names: Sequence[str]) -> str:
     more = len(names) - _MAX_NAMES
-    return ", ".join(names[:_MAX_NAMES]) + (f" and {more} more, see --json" if more > 0 else "")
+    return ", ".join(names[:_MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def check_output(output: Path, *, force: bool) -> None:
