@@ -132,6 +132,23 @@ def read_list(pem: bytes, name: str) -> x509.CertificateRevocationList:
         return crl
 
 
+def embedded_lists(pem: bytes) -> list[bytes]:
+    """Return the revocation lists among the certificates of a PEM file, a PEM file each.
+
+    OpenSSL reads all of them, and nothing that does not begin a line (pem_lib.c).
+    """
+    return [CRL_MARK + each for each in (b"\n" + pem).split(b"\n" + CRL_MARK)[1:]]
+
+
+def names_issuers(crl: x509.CertificateRevocationList) -> bool:
+    """Return whether an entry says of which CA it and the entries after it are."""
+    return any(
+        extension.oid == CRLEntryExtensionOID.CERTIFICATE_ISSUER
+        for entry in crl
+        for extension in entry.extensions
+    )
+
+
 def lists_as_revoked(crl: x509.CertificateRevocationList, serial: int) -> bool:
     """Return whether a list revokes the certificate with the serial number ``serial``.
 

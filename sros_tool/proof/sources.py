@@ -45,7 +45,7 @@ from sros_tool.pki.certificates import (
     load_certificates,
     subject_text,
 )
-from sros_tool.pki.crl import CRL_MARK, load_crl, refusal_of, signed_by
+from sros_tool.pki.crl import embedded_lists, load_crl, names_issuers, refusal_of, signed_by
 from sros_tool.pki.requests import key_digest
 from sros_tool.policy.document import PolicyFiles, read_policy
 from sros_tool.policy.model import Enclave, Policy, Source
@@ -241,14 +241,18 @@ def _authorities(folders: Iterable[Path]) -> frozenset[tuple[str, str]]:
     return frozenset((role, each) for role, pem in found for each in fingerprints(pem))
 
 
+_NEVER = "9999"
+
+
 def _expiries(root: Path) -> dict[int, str]:
     """Return when certificates expire, by serial number, as the ledger of a keystore has it."""
     if not (root / CRL).exists():
         return {}
-    found = {}
+    found: dict[int, str] = {}
     for each in read_ledger(root, having=("what", "certificate")).entries:
         with suppress(ValueError):
-            found[int(each.serial, 16)] = each.not_after
+            serial = int(each.serial, 16)
+            found[serial] = max(found.get(serial, ""), each.not_after or _NEVER)
     return found
 
 
@@ -260,29 +264,33 @@ def _trusts(
     Certificates that had expired when a list was signed do not count: lists may leave them out.
 
     Raises:
-        DocumentError: a list is damaged, is of no CA that the enclave trusts, or is not for all
-            of its certificates, so that it is not certain what it revokes.
+        DocumentError: a list is damaged, is of no CA that the enclave trusts, is not for all of its
+            certificates, has entries that may revoke nothing, or is one of several of its CA, of
+            which OpenSSL takes one: it is not certain what is revoked.
     """
 
     @lru_cache(maxsize=8)  # most enclaves have the same files
     def trust(pem: bytes, own: bytes | None) -> Trust:
         authorities = load_certificates(pem, IDENTITY_CA_FILE)
-        keys = {key_digest(each.public_key()): each for each in authorities}  # type: ignore[arg-type]
+        keys = [(each, key_digest(each.public_key())) for each in authorities]  # type: ignore[arg-type]
         revoked = set()
-        for data in (own, pem if CRL_MARK in pem else None):
-            if data is None:
-                continue
+        lists: dict[str, bytes] = {}
+        for data in dict.fromkeys(([] if own is None else [own]) + embedded_lists(pem)):
             found = load_crl(data, CRL_FILE)
-            key = next((key for key, each in keys.items() if signed_by(found.list, each)), "")
+            key = next((key for each, key in keys if signed_by(found.list, each)), "")
             if refusal := refusal_of(found.list) or ("" if key else "it is of another CA"):
                 raise DocumentError(f"its revocation list refuses everybody: {refusal}")
+            if len(found.revoked) < len(found.list) or names_issuers(found.list):
+                raise DocumentError("its revocation list has entries that may revoke nothing")
+            if lists.setdefault(key, found.list.signature) != found.list.signature:
+                raise DocumentError("it has several revocation lists of one CA, and one counts")
             signed = iso(found.this_update)
             revoked |= {
                 (key, each.serial)
                 for each in found.revoked
                 if expiries.get(each.serial, signed) >= signed
             }
-        return Trust(frozenset(keys), frozenset(revoked))
+        return Trust(frozenset(key for _, key in keys), frozenset(revoked))
 
     found = {}
     for name, (authority, own) in files.items():

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,9 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from sros_tool.automata import Automaton, SearchLimit
 from sros_tool.errors import DocumentError
 from sros_tool.pki import smime
+from sros_tool.pki.certificates import load_certificate
+from sros_tool.pki.crl import load_crl, sign_crl
+from sros_tool.pki.keys import load_key
 from sros_tool.proof.worlds import Side, Topics, named
 from tests.support.harness import sros
 
@@ -251,6 +255,38 @@ def a_list_of_another_ca(keystore: Path) -> None:
     shutil.copy(keystore.parent / "other/public/identity_ca.crl.pem", file)
 
 
+def lists(keystore: Path, own: bytes | None, embedded: bytes) -> None:
+    """Replace the revocation lists of /mux: its own one, and that among its CAs."""
+    folder = keystore / "enclaves/mux"
+    content = (folder / "identity_ca.cert.pem").read_bytes() + embedded
+    for name, data in (("crl.pem", own), ("identity_ca.cert.pem", content)):
+        (folder / name).unlink()
+        if data is not None:
+            (folder / name).write_bytes(data)
+
+
+def a_list_next_to_the_one_that_counts(keystore: Path) -> None:
+    """OpenSSL takes one list of a CA, and not what any of them revokes."""
+    present = (keystore / "enclaves/mux/crl.pem").read_bytes()
+    lists(keystore, (keystore.parent / "earlier.pem").read_bytes(), present)
+
+
+def a_list_that_does_not_begin_a_line(keystore: Path) -> None:
+    """OpenSSL does not find it."""
+    lists(keystore, None, b"# " + (keystore / "enclaves/mux/crl.pem").read_bytes())
+
+
+def an_entry_that_undoes_another(keystore: Path) -> None:
+    """OpenSSL takes the first entry of a certificate, which is that it is not revoked."""
+    authority = load_certificate((keystore / "public/identity_ca.cert.pem").read_bytes(), "")
+    key = load_key((keystore / "private/identity_ca.key.pem").read_bytes(), "")
+    found = load_crl((keystore / "enclaves/mux/crl.pem").read_bytes(), "")
+    entries = [replace(each, reason="removeFromCRL") for each in found.revoked] + [*found.revoked]
+    begin, end = found.this_update, found.next_update
+    text = sign_crl(authority, key, entries, number=99, this_update=begin, next_update=end)
+    lists(keystore, text, b"")
+
+
 def a_damaged_list(keystore: Path) -> None:
     file = keystore / "enclaves/mux/crl.pem"
     file.unlink()
@@ -269,6 +305,9 @@ def without_the_files_of_zenoh(keystore: Path) -> None:
         (an_earlier_list, 1, "revoked -> trusted: 3 enclaves trust whoever has its key again"),
         (an_earlier_list_for_later_enclaves, 1, "trusted: the keystore trusts whoever has its"),
         (a_list_of_another_ca, 2, "its revocation list refuses everybody: it is of another CA"),
+        (a_list_next_to_the_one_that_counts, 2, "several revocation lists of one CA"),
+        (a_list_that_does_not_begin_a_line, 1, "/mux trusts whoever has its key again"),
+        (an_entry_that_undoes_another, 2, "has entries that may revoke nothing"),
         (a_damaged_list, 2, "mux' cannot be compared: the revocation list crl.pem cannot be read"),
         (without_the_files_of_zenoh, 1, "+ less protection: files of Zenoh present -> missing"),
         (a_name_without_an_enclave, 1, "+ /ghost publish topic /cmd_vel; with Zenoh"),
