@@ -123,7 +123,7 @@ def enforces_nothing(environment: Mapping[str, str], variable: str) -> str:
     try:
         data = read_bytes(Path(text), "Zenoh configuration")
         overrides = override_pairs(environment.get(OVERRIDE, ""))
-        document = parse_configuration(data, text, overrides)
+        document = parse_configuration(data, text, overrides, lines=False)
     except SrosError:
         return ""
     return "" if document.access.enabled else f"access_control is off in '{text}' with {OVERRIDE}"
