@@ -94,7 +94,8 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
         allowed, rest = (policy_rights(Policy((each[path],))) for each in (policy, after))
         before, now = Rules(allowed), Rules(rest)
         wrong = [each for each in rest if each.qualifier is ALLOW and not before.cover(each)]
-        wrong += (e for e in unfolded(seen.get(path, ())) if before.cover(e) and not now.cover(e))
+        used = (e for e in unfolded(seen.get(path, ())) if before.allow(path, e.right, e.name))
+        wrong += (each for each in used if not now.cover(each))
         if wrong:
             raise PolicyError(
                 "the policy cannot be narrowed for all robots at once",

@@ -77,3 +77,11 @@ def test_a_wildcard_that_differs_between_robots_is_not_narrowed(folder: Path) ->
     assert (ended.status, ended.out) == (2, "")
     assert "cannot be narrowed for all robots at once" in ended.err
     assert not (folder / "narrow.xml").exists()
+
+
+def test_what_is_observed_and_denied_is_not_kept(folder: Path) -> None:
+    denied = publish("{namespace}/secret").replace("ALLOW", "DENY")
+    (folder / "robot.xml").write_text(policy_text({"/{robot}/base": publish("/*") + denied}))
+    (folder / "seen.xml").write_text(policy_text({"/r1/base": publish("/hall/r1/secret", "/a")}))
+    ended = sros(*WORDS, "--strict", cwd=folder).ok()
+    assert "publish topic /*  becomes  publish topic /a\n" in ended.out
