@@ -32,7 +32,8 @@ EXTRAS = {
 """The extras of the package, with a module that each of them brings."""
 
 _UNWANTED_NAME = re.compile(
-    r"(^|/)(\.(?!gitignore$)[^/]*|__pycache__|node_modules|[^/]*\.(pyc|so|orig|rej|key|p12|p7s))(/|$)"
+    r"(^|/)(\.(?!(?:gitignore|npmrc|pre-commit-hooks\.yaml)$)[^/]*|__pycache__|node_modules|"
+    r"[^/]*\.(pyc|so|orig|rej|key|p12|p7s))(/|$)"
 )
 _PRIVATE = (b"PRIVATE KEY-----\nM", b"OPENSSH PRIVATE KEY-----\nb3Bl")
 _MAY_HAVE_KEYS = re.compile(r"/tests/")
