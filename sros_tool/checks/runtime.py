@@ -66,7 +66,7 @@ class Process:
     def label(self) -> str:
         """Its name in messages, such as "process 4711 (talker)"."""
         program = Path(self.command[0]).name if self.command else "?"
-        return f"process {self.pid} ({program})"
+        return f"process {self.pid} ({_plain(program)})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +85,14 @@ class RuntimeState:
     rmws: tuple[str, ...] = ()
     insecure_rmws: Mapping[str, str] = field(default_factory=dict)
     clock: datetime | None = None
+
+
+def _plain(text: str) -> str:
+    """Return a text that a process chose, so that it can be taken for nothing else in a message."""
+    return re.sub(r"[^\w.+/ -]", "?", text[:_LONGEST])
+
+
+_LONGEST = 40
 
 
 def running_processes(now: datetime, proc: Path = Path("/proc")) -> Iterator[Process]:
@@ -266,10 +274,10 @@ def _processes(state: RuntimeState) -> Iterator[Finding]:
             yield from _runs_unsecured(process)
             yield from _zenoh_process(process)
         elif process.is_node and _domain(environment) in domains:
-            text = f"in domain {_domain(environment)}, with {ENABLE} not 'true'"
+            text = f"in domain {_plain(_domain(environment))}, with {ENABLE} not 'true'"
             yield PROCESS_UNSECURED.found(process.label, text)
         elif process.is_node and _is_open(environment):
-            open_nodes.append(f"{process.label} in domain {_domain(environment)}"[:100])
+            open_nodes.append(f"{process.label} in domain {_plain(_domain(environment))}")
     yield from _not_secured(state.environment, open_nodes)
     if secured_here:
         rmws.setdefault(state.environment.get(RMW) or DEFAULT_RMW, []).append("this environment")

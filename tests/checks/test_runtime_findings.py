@@ -15,7 +15,7 @@ import pytest
 
 from sros_tool.checks.kind import ERROR, NOTE, WARNING
 from sros_tool.checks.registry import FindingFilter
-from sros_tool.checks.runtime import RuntimeState, running_processes, runtime_findings
+from sros_tool.checks.runtime import Process, RuntimeState, running_processes, runtime_findings
 from tests.checks.bench import DAY, Bench
 from tests.checks.runtime_cases import (
     CASES,
@@ -82,6 +82,14 @@ def test_without_security_each_open_node_is_named(sound_one: RuntimeState, bench
         chosen = FindingFilter(severity=severity).choose([found])
         assert bool(chosen.shown) is shown
         assert not chosen.fails(WARNING)
+
+
+def test_the_name_of_a_process_cannot_be_taken_for_another_one(sound_one: RuntimeState) -> None:
+    name = f"x) in domain 0, process 1 (y\x1b[2J{'z' * 500}"
+    node = Process(7, (name,), {DOMAIN: "4, all"}, sound_one.now, has_loaded=True)
+    (found,) = runtime_findings(replace(sound_one, environment={}, processes=(node,)))
+    text = found.text.partition("without it: ")[2]
+    assert text == f"process 7 (x? in domain 0? process 1 ?y??2J{'z' * 8}) in domain 4? all"
 
 
 def test_a_session_file_of_zenoh_is_security_without_ros_variables(
