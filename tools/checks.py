@@ -37,9 +37,9 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     """Run every check, even after failures; return the worst exit status.
 
     Without ``arguments``, mypy and the tests that start DDS processes run at the same time as the
-    other tests; their output is shown after that of the other tests.  Each of both has one process
-    more than there are cores, because tests often wait.  With ``arguments``, pytest runs once, with
-    these arguments.
+    other tests; their output is shown after that of the other tests.  There is one process more
+    for DDS tests than there are cores: each has a separate network and often waits.  With
+    ``arguments``, pytest runs once, with these arguments.
     """
     started = time.monotonic()
     if read_record().ros_around:
@@ -55,7 +55,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         return _conclude(results, Counter(), started)
     cores = len(os.sched_getaffinity(0))
     parts = {
-        "tests": ["-m", "not dds", "-n", str(cores + 1), "--dist", "worksteal"],
+        "tests": ["-m", "not dds", "-n", str(cores), "--dist", "worksteal"],
         # One file runs in one process; `tests/conftest.py` puts the slowest files first.
         "tests on a real DDS": [
             *("-m", "dds", "-n", str(cores + 1), "--dist", "loadfile", "--no-loadscope-reorder"),
