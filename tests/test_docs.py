@@ -48,9 +48,10 @@ def test_links_lead_somewhere(document: Path) -> None:
             assert anchor in anchors(target.resolve().relative_to(PROJECT)), link
 
 
-def test_the_readme_begins_with_the_two_commands_and_is_short() -> None:
+def test_the_readme_says_what_sros_is_then_the_two_commands_and_is_short() -> None:
     lines = re.sub(r"<!--.*?-->\n", "", read("README.md"), flags=re.DOTALL).splitlines()
-    assert [line.split("#")[0].strip() for line in lines[3:5]] == ["./dev demo", "./dev test"]
+    assert lines[2].startswith("**sros** is ")
+    assert [line.split("#")[0].strip() for line in lines[5:7]] == ["./dev demo", "./dev test"]
     assert len(lines) <= 150
 
 
