@@ -485,7 +485,7 @@ class _Reader:
                 etree.strip_tags(child, etree.ProcessingInstruction)
                 metadata = etree.tostring(child, encoding="unicode", with_tail=False)
             else:
-                profiles.append(self._profile(*self._expect(child, at, "profile")))
+                profiles += _absolute(self._profile(*self._expect(child, at, "profile")))
         if not profiles:
             raise PolicyError(f"{self._where(element, place)}: <profiles> contains no <profile>")
         return Profiles(tuple(profiles), element.get("type", ""), metadata)
@@ -700,6 +700,20 @@ class _Reader:
 
     def _where(self, element: etree._Element, place: IncludedFile) -> str:
         return str(self._source(element, place))
+
+
+def _absolute(profile: Profile) -> tuple[Profile, ...]:
+    """Return the profiles that say the same with namespaces that begin with "/".
+
+    Every ROS name begins with "/", so the first ``*`` of a namespace stands for nothing before a
+    "/", or for a text that begins with one.
+    """
+    below = profile.ns.lstrip("*")
+    if below == profile.ns:
+        return (profile,)
+    wide = replace(profile, ns=f"/*{below}")
+    narrow = [replace(profile, ns=below or "/")] if below[:1] in ("", "/") else []
+    return (*narrow, wide)
 
 
 # ── earlier formats ────────────────────────────────────────────────────────────────────────

@@ -213,3 +213,27 @@ def test_a_requirement_of_protection_is_about_the_governance(folder: Path, tmp_p
     assert "/scan: its messages are not, but topic /scan has to be encrypted" in ended.out
     required.write_text(required.read_text().replace("encrypt", "sign"))
     sros(*asked).ok()
+
+
+def test_a_wildcard_namespace_counts_in_every_world(tmp_path: Path) -> None:
+    """Taken for rights to DDS topics, they were missing on Zenoh, where they were given."""
+    policy, before = tmp_path / "wild.xml", tmp_path / "before.xml"
+    rights = {
+        "/a": '<services request="ALLOW"><service>x</service></services>'
+        '<actions call="ALLOW"><action>d</action></actions>',
+        "/b": '<services reply="ALLOW"><service>/n/x</service></services>',
+    }
+    policy.write_text(policy_text(rights).replace('ns="/"', 'ns="*"', 1))
+    before.write_text(policy_text(rights | {"/a": publish("x")}))
+    required = tmp_path / "required.toml"
+    required.write_text('[[nobody]]\nrequest = ["/n/x"]\n[[nobody]]\ncall = ["/n/d"]\n')
+    for vendor in ((), ("--vendor", "zenoh")):
+        ended = sros("check", policy, *ONLY[2:], "--requirements", required, *vendor)
+        assert ended.status == 1
+        assert "/a: may request /n/x by /*/x, but nobody may request /n/x\n" in ended.out
+        assert "/a: may call action /n/d by /*/d, but nobody may call action /n/d\n" in ended.out
+    ended = sros("diff_policy", "--no-new-access", before, policy)
+    assert ended.status == 1
+    assert "/a" in ended.out
+    assert "/n/x" in sros("explain", policy, "--reach", "/a").out
+    sros("view", policy, "--focus", "/a", "-o", tmp_path / "focus.svg").ok()

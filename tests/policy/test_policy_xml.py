@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import string
 import tempfile
 from pathlib import Path
@@ -14,8 +15,10 @@ from lxml import etree
 from sros_tool.errors import DocumentError, PolicyError
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Profiles, Qualifier
+from sros_tool.policy.patterns import matches
+from sros_tool.policy.rights import policy_rights
 from sros_tool.xml import tag_of
-from tests.support.harness import with_includes
+from tests.support.harness import policy_text, with_includes
 
 names = st.sampled_from(("x", "/x/y", "~/z", "~", "*", "a?", "[!a-c]d", "/a/*/b"))
 
@@ -278,3 +281,19 @@ def test_a_group_that_names_nothing_is_to_be_removed(tmp_path: Path) -> None:
     with pytest.raises(PolicyError, match="<topics> names no topic") as caught:
         read_policy(file)
     assert "Remove the element" in str(caught.value)
+
+
+@pytest.mark.parametrize("ns", ["*", "**", "*/", "*/a", "*a", "*a/b", "*[ab]/c", "/a*"])
+def test_a_namespace_that_begins_with_a_wildcard_means_absolute_names(
+    ns: str, tmp_path: Path
+) -> None:
+    """Every part of sros takes a name without a slash before it for one that is not of ROS."""
+    group = '<services request="ALLOW"><service>x</service></services>'
+    file = tmp_path / "policy.xml"
+    file.write_text(policy_text({"/e": group}).replace('ns="/"', f'ns="{ns}"'))
+    stated = [each.name for each in policy_rights(read_policy(file))]
+    assert all(each.startswith("/") for each in stated)
+    written = f"{ns.removesuffix('/')}/x"
+    for parents in (p for size in range(4) for p in itertools.product("abc", repeat=size)):
+        name = "/".join(("", *parents, "x"))
+        assert any(matches(each, name) for each in stated) == matches(written, name), name
