@@ -150,7 +150,12 @@ class KeystoreCopy:
         """Return an enclave's permissions as XML, with more DDS topics in the first allow rule."""
         permissions = self.permissions(part)
         grant = permissions.grants[0]
-        place = next(place for place, rule in enumerate(grant.rules) if rule.allow)
+        place = next((place for place, rule in enumerate(grant.rules) if rule.allow), None)
+        if place is None:
+            raise DocumentError(
+                f"the permissions of {self.enclave(part)} cannot be widened",
+                "They have no rule that allows anything.",
+            )
         rules = list(grant.rules)
         rules[place] = _with_topics(rules[place], publish, subscribe)
         grants = (replace(grant, rules=tuple(rules)), *permissions.grants[1:])
@@ -442,7 +447,8 @@ def _revoke(copy: KeystoreCopy, part: str) -> None:
     folder = copy.folder(part)
     before = {name: copy.read(part, name) for name in REQUIRED_FILES}
     revoke(copy.root, [copy.enclave(part)], now=copy.now, keyring=copy.keyring)
-    folder.mkdir(mode=0o700, exist_ok=True)
+    # A revocation also removes the folder of a namespace that is empty after it.
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, data in before.items():
         copy.put(part, name, data)
     copy.reissue(part, Window(copy.now - _DAY, copy.now + _DAY), new_key=True)

@@ -236,7 +236,7 @@ def create_keystores(
         root = keystores[choice] = folder / "forged" / name_of(choice)
         try:
             copies[choice] = _forge(choice, root, keystores, scenario, spec, user)
-        except SrosError as error:
+        except (SrosError, OSError) as error:
             missing[choice] = str(error)
     return KeystoreSet(keystores, scenario.cast, missing, user, scenario.router, copies)
 

@@ -322,7 +322,7 @@ class _Runner:
         if _is_decided_by_start(row):
             now = time.monotonic()
             return now, now
-        needed = [processes[party.name] for party in row.parties if not party.intruder]
+        needed = [processes[party.name] for party in row.parties if _is_needed(party, row)]
         if not all(process.running for process in needed):
             return None
         if row.meanwhile is not None:
@@ -382,6 +382,12 @@ def worlds(rows: Sequence[Row]) -> list[list[int]]:
 
 def _in_memory(row: Row) -> bool:
     return any(claim.wire is Wire.MEMORY for claim in row.claims)
+
+
+def _is_needed(party: Party, row: Row) -> bool:
+    """Return whether a row can only go on while a party runs: no claim expects its refusal."""
+    refused = {claim.subject for claim in row.claims if claim.relation is Relation.IS_REFUSED}
+    return not party.intruder and party.name not in refused
 
 
 def _is_refused(party: Party, row: Row) -> bool:

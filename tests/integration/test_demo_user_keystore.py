@@ -193,7 +193,7 @@ control = { listener = "viewer", talker = "camera", expected = "heard" }
 [[row]]
 name = "a viewer does not send images"
 claim = { party = "stranger", expected = "refused" }
-control = { party = "viewer", expected = "started" }
+control = { listener = "viewer", talker = "camera", expected = "heard" }
 
 [[row]]
 name = "what is wrong is told"
