@@ -34,7 +34,7 @@ from sros_tool.cli.observing import (
 )
 from sros_tool.cli.written import file_change
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.errors import UnavailableError, UsageError
+from sros_tool.errors import UnavailableError, UsageError, counted
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
@@ -58,7 +58,8 @@ Example:
   wrote 'missing.xml'; add it: sros merge_policy robot.xml missing.xml ...
   $ sros merge_policy robot.xml missing.xml --in-place
 
-Exit status: 0 if nothing would be denied, 1 if something would be, 2 if that could not be
+Exit status: 0 if nothing would be denied and every node of POLICY or KEYSTORE was seen; 1 if
+something would be denied or, without --partial, was not seen or not judged; 2 if nothing could be
 asked.""",
 )
 @click.argument("source", metavar="[POLICY|KEYSTORE]", type=PATH, required=False)
@@ -74,6 +75,11 @@ asked.""",
     metavar="FILE",
     help="Write the rights to add as a policy, for merge_policy.",
 )
+@click.option(
+    "--partial",
+    is_flag=True,
+    help="Accept that nodes were not seen or not judged: the exit status is that of the rest.",
+)
 @fleet_option("The robots that the placeholders of POLICY stand for.")
 @force_option
 @dry_run_option
@@ -87,6 +93,7 @@ def audit(
     keystore: Path | None,
     vendor: str | None,
     patch: Path | None,
+    partial: bool,
     fleet_file: Path | None,
     force: bool,
     dry_run: bool,
@@ -99,7 +106,8 @@ def audit(
     or else in the enclave whose profiles name it. Observes until the graph stops changing; what a
     node does only later needs --watch. The default is the keystore of $ROS_SECURITY_KEYSTORE.
     """
-    from sros_tool.explain.audit import audit as judge
+    from sros_tool.explain import audit as audits
+    from sros_tool.runtime.variables import ENCLAVE
 
     check_duration(watch, spin_time)
     source = source or keystore_from_environment()
@@ -109,10 +117,15 @@ def audit(
     if patch is not None:
         check_output(patch, force=force)
     enclaves = _enclaves(source, fleet_file, vendor, environment)
+    observer = environment.get(ENCLAVE, "")
+
+    def judge(observation: Observation) -> Audit:
+        return audits.audit(observation, enclaves, observer)
+
     reported: set[str] = set()
 
     def report(observation: Observation) -> None:
-        for line in _lines(judge(observation, enclaves)):
+        for line in _denied(judge(observation)):
             if line not in reported:
                 reported.add(line)
                 click.echo(f"denied: {visible_line(line)}", err=True)
@@ -120,7 +133,9 @@ def audit(
     secured = enclave is not None
     then = "the result is shown"
     snapshot, rmw = observe(environment, watch, spin_time, report, secured=secured, then=then)
-    found = judge(snapshot.observation, enclaves)
+    found = judge(snapshot.everything)
+    kept_changing = snapshot.seconds if not snapshot.settled else 0
+    fine = found.allowed and (partial or (found.complete and not kept_changing))
     if not found.observation.nodes:
         raise UnavailableError(
             "there is nothing to audit: no node was observed",
@@ -130,17 +145,14 @@ def audit(
     written = _write_patch(found, patch, dry_run=dry_run)
     if as_json:
         value = _json(source, enclaves, found, patch if written else None, dry_run=dry_run)
+        value |= {"allowed": fine, "settled": snapshot.settled, "partial": partial}
         changes = file_change(patch, existed=existed) if patch and written else []
         print_json({**value, "changes": changes})
     else:
-        _show(found, enclaves)
+        _show(found, enclaves, kept_changing)
     print_notes((*found.notes, *found.missing.notes))
-    if not snapshot.settled:
-        click.echo(
-            f"the ROS graph kept changing for {snapshot.seconds:.0f} s; use --watch to collect "
-            "nodes that come and go.",
-            err=True,
-        )
+    if found.allowed and not fine:
+        click.echo(_NOT_ALL, err=True)
     if written:
         policy = shlex.quote(str(source)) if enclaves.what == "policy" else "POLICY"
         command = f"sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
@@ -149,9 +161,13 @@ def audit(
         stays = f"; the earlier '{patch}' stays" if existed else ""
         said = "no patch is needed" if found.allowed else _NO_PATCH
         click.echo(visible_line(said + stays), err=True)
-    return 0 if found.allowed else 1
+    return 0 if fine else 1
 
 
+_NOT_ALL = (
+    "the exit status is 1 for what was not seen or not judged: --watch finds nodes that start "
+    "later, and --partial accepts it"
+)
 _NO_PATCH = "no patch was written: no right that could be added would allow it"
 
 
@@ -213,29 +229,34 @@ def _write_patch(found: Audit, patch: Path | None, *, dry_run: bool) -> str:
 # ── output ──────────────────────────────────────────────────────────────────────────────
 
 
-def _lines(found: Audit) -> list[str]:
+def _denied(found: Audit) -> list[str]:
     """Return a line for each enclave that is refused, and for each right that is denied."""
     refused = [f"{name}: every process: {reason}" for name, reason in sorted(found.refused.items())]
     return [*refused, *map(str, found.denied)]
 
 
-def _show(found: Audit, enclaves: AuditedEnclaves) -> None:
-    for line in _lines(found):
+def _show(found: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None:
+    """Print what is denied and unseen; the verdict names everything that it does not cover."""
+    for line in (*_denied(found), *(f"not seen: {each}" for each in found.unseen)):
         click.echo(visible_line(line))
-    seen = f"{_count(len(found.observation.nodes), 'node')} with "
-    seen += f"{_count(found.observation.endpoint_count, 'endpoint')}, on {enclaves.vendor.title}"
-    if found.allowed:
-        click.echo(f"nothing would be denied of {seen}", err=True)
-        return
-    what = [_count(len(found.denied), "right")] if found.denied else []
-    what += [_count(len(found.refused), "whole enclave")] if found.refused else []
-    click.echo(f"{' and '.join(what)} would be denied of {seen}", err=True)
+    what = [counted(len(found.denied), "right")] if found.denied else []
+    what += [counted(len(found.refused), "whole enclave")] if found.refused else []
+    verdict = f"{' and '.join(what) or 'nothing'} would be denied of "
+    verdict += f"{counted(len(found.observation.nodes), 'node')} with "
+    verdict += (
+        f"{counted(found.observation.endpoint_count, 'endpoint')}, on {enclaves.vendor.title}"
+    )
+    if found.unseen:
+        number, of = len(found.expected), len(found.expected) - len(found.unseen)
+        seen = f"{of} of {counted(number, 'node')} of the {enclaves.what}"
+        verdict = f"only {seen} {'was' if of == 1 else 'were'} seen: {verdict}"
+    if found.unjudged:
+        verdict += f"; not judged: {', '.join(found.unjudged)}"
+    if kept_changing:
+        verdict += f"; the ROS graph kept changing for {kept_changing:.0f} s"
+    click.echo(verdict, err=True)
     if any(each.by_rule for each in found.denied):
         click.echo("a DENY denies some of it; no right that is added changes that", err=True)
-
-
-def _count(number: int, thing: str) -> str:
-    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def _json(
@@ -264,6 +285,8 @@ def _json(
         "refused": [
             {"enclave": name, "reason": reason} for name, reason in sorted(found.refused.items())
         ],
+        "unseen": as_plain(found.unseen),
+        "unjudged": list(found.unjudged),
         **to_json(found.observation),
         "patch": str(patch) if patch else None,
         "dry_run": dry_run,

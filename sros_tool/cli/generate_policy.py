@@ -17,6 +17,7 @@ from sros_tool.cli.common import (
     print_notes,
     read_log,
     visible,
+    visible_line,
 )
 from sros_tool.cli.observing import (
     Watching,
@@ -27,7 +28,7 @@ from sros_tool.cli.observing import (
     why_empty,
 )
 from sros_tool.cli.written import file_change
-from sros_tool.errors import SrosError, UsageError
+from sros_tool.errors import SrosError, UsageError, counted
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
@@ -165,7 +166,7 @@ def generate_policy(
     from sros_tool.graph.document import draft, write
     from sros_tool.graph.enclaves import NamedEnclaves
     from sros_tool.graph.enclaves import enclave_per_node as name_enclaves
-    from sros_tool.graph.learn import News, common_parts, learn
+    from sros_tool.graph.learn import News, common_parts, is_tool_name, learn, listed
     from sros_tool.resources import policies_dir
 
     common = common_parts(file.parent, policies_dir())
@@ -203,6 +204,9 @@ def generate_policy(
         print_json(_json(plan, file, learned, found.observation, dry_run))
     else:
         _show(plan, learned, written=not dry_run)
+    if gone := sorted(each for each in snapshot.gone if not is_tool_name(each.rpartition("/")[2])):
+        text = f"left out, because these nodes went while the graph was observed: {listed(gone)}"
+        click.echo(visible_line(f"{text}; --watch keeps them."), err=True)
     if not snapshot.settled:
         click.echo(
             f"the ROS graph kept changing for {snapshot.seconds:.0f} s; use --watch to collect "
@@ -277,11 +281,11 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
         enclaves = {each.enclave for each in learned.profiles}
         click.echo(
             f"{would}{'wrote' if written else 'written'} '{plan.path}': "
-            f"{_count(len(enclaves), 'enclave')}, {_count(len(learned.profiles), 'node')}, "
-            f"{_count(len(plan.added), 'right')}"
+            f"{counted(len(enclaves), 'enclave')}, {counted(len(learned.profiles), 'node')}, "
+            f"{counted(len(plan.added), 'right')}"
         )
     elif plan.added:
-        click.echo(f"{would}added {_count(len(plan.added), 'right')} to '{plan.path}'")
+        click.echo(f"{would}added {counted(len(plan.added), 'right')} to '{plan.path}'")
     else:
         known = "denied" if from_log else "observed"
         click.echo(f"nothing to add: '{plan.path}' already covers everything that was {known}")
@@ -291,10 +295,6 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
     if plan.copies:
         click.echo(f"{would}copied {', '.join(sorted(plan.copies))} next to it")
     print_notes((*merge_notes(plan.contradictions), *learned.notes))
-
-
-def _count(number: int, thing: str) -> str:
-    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 # ── from logs ───────────────────────────────────────────────────────────────────────────

@@ -148,7 +148,11 @@ def observe(
             else:
                 settling = SECURED if secured else Settling()
                 snapshot = settle(graph, settling, time.monotonic)
-            return replace(snapshot, observation=identify(snapshot.observation)), graph.rmw
+            return replace(
+                snapshot,
+                observation=identify(snapshot.observation),
+                everything=identify(snapshot.everything),
+            ), graph.rmw
     except ObserverError as error:
         raise _explained(error, environment) from error
 

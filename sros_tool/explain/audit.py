@@ -7,6 +7,9 @@ process would run in, and the answers are what a secured robot would log.
 The graph of a robot without security shows the enclave / for most processes.  The enclave is then
 the one that a profile of the policy, or the node's own services in the permissions of a keystore,
 names the node for.
+
+What was not observed is not judged: the result names the nodes of the policy or keystore that did
+not appear, and everything in the graph that no enclave could be asked about.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from functools import cached_property
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import Governance
-from sros_tool.errors import Note, PolicyError
+from sros_tool.errors import Note, PolicyError, counted
 from sros_tool.explain.denials import nodes_served
 from sros_tool.explain.evaluator import (
     Evaluator,
@@ -29,7 +32,15 @@ from sros_tool.explain.evaluator import (
 )
 from sros_tool.explain.question import Part, Question
 from sros_tool.graph.enclaves import UNSHOWN, enclave_per_node
-from sros_tool.graph.learn import Learned, RightsFound, fold, is_tool, learn, listed
+from sros_tool.graph.learn import (
+    Learned,
+    RightsFound,
+    fold,
+    is_tool,
+    is_tool_name,
+    learn,
+    listed,
+)
 from sros_tool.graph.observation import (
     PUBLISH,
     SUBSCRIBE,
@@ -64,8 +75,35 @@ class EnclaveNodes:
         return exact or frozenset(
             name
             for name, nodes in self.by_enclave.items()
-            if any(is_expression(each) and matches(each, node) for each in nodes)
+            if any(_is_of(node, each) for each in nodes)
         )
+
+    @property
+    def expected(self) -> frozenset[EnclaveNode]:
+        """The nodes that run when the whole robot does: all but the tools that observe it."""
+        return frozenset(
+            EnclaveNode(enclave, node)
+            for enclave, nodes in self.by_enclave.items()
+            for node in nodes or ("",)
+            if not is_tool_name(node.rpartition("/")[2])
+        )
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class EnclaveNode:
+    """A node that an enclave is for; ``node`` is "" if nothing tells the enclave's nodes."""
+
+    enclave: str
+    node: str
+
+    def __str__(self) -> str:
+        """Return text like ``node /talker of enclave /robot/talker``."""
+        return f"{f'node {self.node}' if self.node else 'every node'} of enclave {self.enclave}"
+
+
+def _is_of(node: str, name: str) -> bool:
+    """Return whether the full name of a node is ``name``, which may have wildcards."""
+    return node == name or (is_expression(name) and matches(name, node))
 
 
 @dataclass(frozen=True)
@@ -156,17 +194,27 @@ class Audit:
 
     ``refused`` maps enclaves in which no process would start, or be let in, to the reason.
     ``observation`` has the nodes that were judged, each with the enclaves it was judged in.
+    ``unseen`` are those of the ``expected`` nodes of the policy or keystore that did not appear,
+    and ``unjudged`` says in words what appeared and was not judged.
     """
 
     denied: tuple[DeniedRight, ...]
     refused: Mapping[str, str]
     observation: Observation
     notes: tuple[Note, ...]
+    expected: frozenset[EnclaveNode]
+    unseen: tuple[EnclaveNode, ...]
+    unjudged: tuple[str, ...]
 
     @property
     def allowed(self) -> bool:
-        """Whether nothing would be denied."""
+        """Whether nothing would be denied of what was judged; `complete` says if that is all."""
         return not (self.denied or self.refused)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every expected node was seen, and everything that was seen was judged."""
+        return not (self.unseen or self.unjudged)
 
     @cached_property
     def missing(self) -> Learned:
@@ -175,16 +223,25 @@ class Audit:
         return replace(learned, source=RightsFound.AUDIT)
 
 
-def audit(observation: Observation, enclaves: AuditedEnclaves) -> Audit:
+def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "") -> Audit:
     """Return what the enclaves would be denied of everything that is observed.
 
     If several enclaves are for the nodes of a process, all of them are judged, with a note.
+    ``observer`` is the enclave of the process that observes, if it has one: that process alone
+    is enough for an enclave that is for no node by name.
     """
-    notes = list(_unjudged(observation))
+    unjudged = _unjudged(observation)
+    notes = [note for note, _ in unjudged]
     processes: dict[str, list[ObservedNode]] = {}
     for node in observation.nodes:
-        if not is_tool(node.name):
+        if not is_tool(node):
             processes.setdefault(node.participant, []).append(node)
+    expected = frozenset(
+        each
+        for each in enclaves.nodes.expected
+        if each.enclave != observer or (each.node and not is_expression(each.node))
+    )
+    seen: set[EnclaveNode] = set()
     denied: list[DeniedRight] = []
     refused: dict[str, str] = {}
     judged: list[ObservedNode] = []
@@ -195,6 +252,12 @@ def audit(observation: Observation, enclaves: AuditedEnclaves) -> Audit:
         if not candidates:
             homeless += found
             continue
+        seen |= {
+            each
+            for each in expected
+            if each.enclave in candidates
+            and (not each.node or any(_is_of(node.fqn, each.node) for node in found))
+        }
         answers = {name: _judge(found, name, enclaves) for name in candidates}
         chosen = sorted(candidates)
         if not together:
@@ -215,7 +278,15 @@ def audit(observation: Observation, enclaves: AuditedEnclaves) -> Audit:
         notes.append(Note("audit.divided-process", f"{_DIVIDED}: {listed(sorted(divided), '; ')}"))
     if unclear:
         notes.append(Note("audit.several-enclaves", f"{_UNCLEAR}: {listed(sorted(unclear), '; ')}"))
-    return Audit(_by_right(denied), refused, make_observation(judged), tuple(notes))
+    return Audit(
+        _by_right(denied),
+        refused,
+        make_observation(judged),
+        tuple(notes),
+        expected,
+        tuple(sorted(expected - seen)),
+        tuple(words for _, words in unjudged if words),
+    )
 
 
 _DIVIDED = (
@@ -230,17 +301,48 @@ _TOOLS = (
     "left out, because these nodes are tools that observe the robot; on the secured robot they need"
     " an enclave as policies/operator.xml has it"
 )
+_SILENT = "not judged, because these nodes were announced and had no endpoint"
 _STRAYS = "not judged, because the writers or readers of these topics belong to no ROS node"
 
 
-def _unjudged(observation: Observation) -> Iterator[Note]:
-    tools = {each.fqn for each in observation.nodes if is_tool(each.name)}
-    tools |= {expand(f"/{n}", ns, n) for _, ns, n in observation.silent if is_tool(n)}
+def _unjudged(observation: Observation) -> list[tuple[Note, str]]:
+    """Return a note on each kind of things that are not judged, with their number in words.
+
+    The words are "" for tools that do nothing but observe.
+    """
+    tools = {each.fqn for each in observation.nodes if is_tool(each)}
+    active = {each.fqn for each in observation.nodes if is_tool(each) and not _only_observes(each)}
+    silent = {(expand("~", ns, name), is_tool_name(name)) for _, ns, name in observation.silent}
+    tools |= {name for name, tool in silent if tool}
+    mute = {name for name, tool in silent if not tool}
     strays = {endpoint.topic for _, endpoint in observation.strays}
-    if tools:
-        yield Note("audit.tool", f"{_TOOLS}: {listed(sorted(tools))}")
-    if strays:
-        yield Note("audit.stray", f"{_STRAYS}: {listed(sorted(strays))}")
+    found = [
+        (
+            _note("tool", _TOOLS, tools),
+            f"{counted(len(active), 'node')} with a tool's name",
+            active,
+        ),
+        (_note("silent", _SILENT, mute), f"{counted(len(mute), 'node')} without endpoint", mute),
+        (_note("stray", _STRAYS, strays), f"{counted(len(strays), 'topic')} of no node", strays),
+    ]
+    return [(note, words if counts else "") for note, words, counts in found if note]
+
+
+def _note(kind: str, text: str, subjects: Iterable[str]) -> Note | None:
+    found = sorted(subjects)
+    return Note(f"audit.{kind}", f"{text}: {listed(found)}") if found else None
+
+
+_OF_EVERY_NODE = ("/rosout", "/parameter_events")
+
+
+def _only_observes(node: ObservedNode) -> bool:
+    """Return whether a node uses nothing but what each node has: its own services, logging."""
+    own = expand("~/", node.ns, node.name)
+    folded = fold(node.endpoints)
+    return not (folded.halves or folded.foreign) and all(
+        each.name in _OF_EVERY_NODE or each.name.startswith(own) for each in folded.rights
+    )
 
 
 def _enclaves_of(

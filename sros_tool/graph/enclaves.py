@@ -46,7 +46,7 @@ def enclave_per_node(observation: Observation) -> NamedEnclaves:
     """
     processes: dict[str, list[ObservedNode]] = {}
     for node in observation.nodes:
-        if node.enclaves == UNSHOWN and not is_tool(node.name):
+        if node.enclaves == UNSHOWN and not is_tool(node):
             processes.setdefault(node.participant, []).append(node)
     names = {participant: _enclave_name(nodes) for participant, nodes in processes.items()}
     nodes = [

@@ -111,13 +111,13 @@ def learn(observation: Observation, common: CommonParts | None = None) -> Learne
     notes = _Notes()
     seen: dict[_Place, set[NodeRight]] = {}
     for node in observation.nodes:
-        if is_tool(node.name):
+        if is_tool(node):
             notes.add("tool", node.fqn)
             continue
         for place, rights in _rights_of(node, notes):
             seen.setdefault(place, set()).update(rights)
     for enclave, ns, name in observation.silent:
-        if is_tool(name):
+        if is_tool_name(name):
             notes.add("tool", f"{ns.rstrip('/')}/{name}")
         elif (enclave, ns, stable_name(name)) not in seen:
             notes.add("silent", f"{ns.rstrip('/')}/{name}")
@@ -255,15 +255,23 @@ _CHANGING = (
     (re.compile(r"(launch_ros_)[0-9]+\Z"), r"\1*"),
     (re.compile(r"(rqt_gui_(?:py|cpp)_node_)[0-9]+\Z"), r"\1*"),
 )
-_TOOLS = re.compile(r"_ros2cli(_.*)?\Z|_sros_observer\Z")
+_TOOLS = re.compile(r"_ros2cli(_.*)?\Z|(?P<observer>_sros_observer)(_.*)?\Z")
+_OF_OBSERVER = frozenset({Endpoint("rt/parameter_events", PUBLISH)})
+"""The endpoints of an observer of sros: a node of its name that has others is none."""
 _ABSOLUTE = frozenset(
     ("/bond", "/clock", "/diagnostics", "/parameter_events", "/rosout", "/tf", "/tf_static")
 )
 """Names that packages use with a leading slash, so that they stay the same in any namespace."""
 
 
-def is_tool(name: str) -> bool:
+def is_tool(node: ObservedNode) -> bool:
     """Return whether a node belongs to a tool that observes the robot."""
+    found = _TOOLS.match(node.name)
+    return found is not None and (not found["observer"] or node.endpoints <= _OF_OBSERVER)
+
+
+def is_tool_name(name: str) -> bool:
+    """Return whether a tool that observes the robot gives its node such a name."""
     return _TOOLS.match(name) is not None
 
 

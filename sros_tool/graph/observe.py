@@ -219,35 +219,48 @@ SECURED = Settling(least=6.0, still=5.0, most=45.0)
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A graph, the seconds it took to observe, and whether the graph had stopped changing."""
+    """A graph, the seconds it took to observe, and whether the graph had stopped changing.
+
+    ``everything`` also has the nodes that were seen and went while the graph was observed.
+    """
 
     observation: Observation
+    everything: Observation
     seconds: float
     settled: bool
+
+    @property
+    def gone(self) -> frozenset[str]:
+        """The full names of the nodes that were seen and are no longer there."""
+        stayed = {(each.participant, each.fqn) for each in self.observation.nodes}
+        return frozenset(
+            each.fqn for each in self.everything.nodes if (each.participant, each.fqn) not in stayed
+        )
 
 
 def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
     """Return the graph once it stops changing, or as it is after ``settling.most``."""
     begin = changed = clock()
-    seen = Observation()
+    seen = everything = Observation()
     while True:
         now = clock()
         if now - begin >= settling.most:
-            return Snapshot(seen, now - begin, False)
+            return Snapshot(seen, everything, now - begin, False)
         if now - begin >= settling.least and now - changed >= settling.still:
-            return Snapshot(seen, now - begin, True)
+            return Snapshot(seen, everything, now - begin, True)
         news = source.next(_TICK)
         if news is not None:
-            seen, changed = news, clock()
+            seen, everything, changed = news, everything.union(news), clock()
 
 
 def look_for(source: GraphSource, seconds: float, clock: Clock) -> Snapshot:
     """Return the graph after exactly ``seconds`` seconds."""
     begin = clock()
-    seen = Observation()
+    seen = everything = Observation()
     while (left := begin + seconds - clock()) > 0:
-        seen = source.next(min(left, _TICK)) or seen
-    return Snapshot(seen, seconds, True)
+        if news := source.next(min(left, _TICK)):
+            seen, everything = news, everything.union(news)
+    return Snapshot(seen, everything, seconds, True)
 
 
 def watch(
@@ -282,7 +295,7 @@ def watch(
             reported = union
     if union is not reported:
         report(union)
-    return Snapshot(union, clock() - begin, True)
+    return Snapshot(union, union, clock() - begin, True)
 
 
 # ── the process and the enclave of each node ────────────────────────────────────────────

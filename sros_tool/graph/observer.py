@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import select
 import sys
 import time
@@ -17,8 +18,8 @@ from typing import Any
 
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 
-NODE_NAME = "_sros_observer"
-"""The name of the node with which sros observes a graph; it is left out of observations."""
+_NODE_NAME = "_sros_observer_" + secrets.token_hex(8)
+"""The name of the node that observes: nobody else can know it before the node is there."""
 
 _PREFIX_BYTES = 12  # of an endpoint's identifier: its participant (RTPS 2.3, 9.3.1)
 _DISCOVERY = "ros_discovery_info"
@@ -44,7 +45,7 @@ def main() -> int:
         stage = "node"
         # With as few endpoints as rclpy allows, so that an observer needs few permissions.
         node = rclpy.create_node(
-            NODE_NAME,
+            _NODE_NAME,
             context=context,
             use_global_arguments=False,
             enable_rosout=False,
@@ -69,44 +70,62 @@ def main() -> int:
 
 def _look(node: Any, report: Any, period: float, ordered: bool) -> None:
     before: object = None
-    while not select.select([sys.stdin], [], [], period)[0]:
-        now = _sight(node)
+    observer = _Observer(node)
+    while True:
+        now = observer.sight()
         if now is not None and now != before:
             listed, endpoints = before = now
             _send(report, {"ordered": ordered, "listed": listed, "endpoints": endpoints})
+        if select.select([sys.stdin], [], [], period)[0]:
+            return
 
 
-def _sight(node: Any) -> tuple[list[Any], list[Any]] | None:
-    """Return nodes and endpoints that belong together; None if nodes came or went all the time."""
-    for _ in range(_ATTEMPTS):
-        listed = _listed(node)
-        endpoints = _endpoints(node)
-        if _listed(node) == listed:
-            return listed, endpoints
-    return None
+class _Observer:
+    """The node that observes, which it leaves out; never another one that takes its name."""
 
+    def __init__(self, node: Any) -> None:
+        self._node = node
+        self._itself: tuple[str, str, str] | None = None
+        self._participant = ""
 
-def _listed(node: Any) -> list[tuple[str, str, str]]:
-    """Return enclave, namespace and name of each node but observers, in the RMW's order."""
-    found = node.get_node_names_and_namespaces_with_enclaves()
-    return [(enclave, ns, name) for name, ns, enclave in found if name != NODE_NAME]
+    def sight(self) -> tuple[list[Any], list[Any]] | None:
+        """Return nodes and endpoints that belong together; None if nodes came or went each time."""
+        for _ in range(_ATTEMPTS):
+            listed = self._listed()
+            endpoints = self._endpoints()
+            if self._listed() == listed:
+                return listed, endpoints
+        return None
 
+    def _listed(self) -> list[tuple[str, str, str]]:
+        """Return enclave, namespace and name of each other node, in the RMW's order."""
+        found = self._node.get_node_names_and_namespaces_with_enclaves()
+        listed = [(enclave, ns, name) for name, ns, enclave in found]
+        itself = self._itself or next((each for each in listed if each[2] == _NODE_NAME), None)
+        if itself in listed:
+            self._itself = itself
+            listed.remove(itself)
+        return listed
 
-def _endpoints(node: Any) -> list[tuple[str, str, str, str, str]]:
-    """Return the sorted endpoints: participant, node namespace and name, topic, direction."""
-    found = set()
-    for topic, _ in node.get_topic_names_and_types(no_demangle=True):
-        if topic == _DISCOVERY:  # every participant has it, and no policy mentions it
-            continue
-        for direction, infos in (
-            (PUBLISH, node.get_publishers_info_by_topic(topic, no_mangle=True)),
-            (SUBSCRIBE, node.get_subscriptions_info_by_topic(topic, no_mangle=True)),
-        ):
-            for info in infos:
-                if info.node_name != NODE_NAME:
+    def _endpoints(self) -> list[tuple[str, str, str, str, str]]:
+        """Return the sorted endpoints: participant, node namespace and name, topic, direction."""
+        found = set()
+        for topic, _ in self._node.get_topic_names_and_types(no_demangle=True):
+            if topic == _DISCOVERY:  # every participant has it, and no policy mentions it
+                continue
+            for direction, infos in (
+                (PUBLISH, self._node.get_publishers_info_by_topic(topic, no_mangle=True)),
+                (SUBSCRIBE, self._node.get_subscriptions_info_by_topic(topic, no_mangle=True)),
+            ):
+                for info in infos:
                     participant = bytes(info.endpoint_gid[:_PREFIX_BYTES]).hex()
                     found.add((participant, info.node_namespace, info.node_name, topic, direction))
-    return sorted(found)
+        # The first participant with this name is this process: the name is not known elsewhere yet.
+        named = {participant for participant, _, name, *_ in found if name == _NODE_NAME}
+        if len(named) == 1 and not self._participant:
+            (self._participant,) = named
+        own = self._participant, _NODE_NAME
+        return sorted(each for each in found if (each[0], each[2]) != own)
 
 
 def _send(report: Any, value: object) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import accumulate
 
+from sros_tool.errors import counted
 from sros_tool.policy.model import ALLOW, Qualifier
 from sros_tool.report.focus import ENCLAVE, FocusFlow
 from sros_tool.report.layout import (
@@ -40,7 +41,6 @@ from sros_tool.report.picture import (
     Tie,
     WireLevel,
     coarsened,
-    counted,
     fold,
 )
 

@@ -26,6 +26,7 @@ from collections.abc import (
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
+from sros_tool.errors import counted
 from sros_tool.fleet.model import Robot
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.compose import edge_order, namespace_of
@@ -40,7 +41,6 @@ from sros_tool.report.picture import (
     Name,
     Picture,
     PicturedEnclave,
-    counted,
 )
 
 _MARKS = "{}…"

@@ -14,6 +14,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
+from sros_tool.errors import counted
 from sros_tool.policy.model import ALLOW, Qualifier
 from sros_tool.report.picture import (
     SENDS,
@@ -25,7 +26,6 @@ from sros_tool.report.picture import (
     Tie,
     WireLevel,
     coarsened,
-    counted,
     fold,
     is_plain,
     lack_text,

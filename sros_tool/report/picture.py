@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from sros_tool.errors import counted
 from sros_tool.names import READING_SERVICES
 from sros_tool.policy.model import ALLOW, RIGHTS, Qualifier
 from sros_tool.policy.rights import RIGHT_ORDER
@@ -379,11 +380,6 @@ class Picture:
         different = [each.sentence() for each in self.different[:_SAID]]
         different += [f"{more} more differ"] if more > 0 else []
         return (*(each.sentence for each in self.focus), *found, *equal, *different)
-
-
-def counted(number: int, thing: str) -> str:
-    """Return a number with its noun, like ``1 topic`` or ``2 topics``."""
-    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 @dataclass(frozen=True, slots=True, order=True)

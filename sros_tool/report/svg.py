@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from textwrap import wrap
 
+from sros_tool.errors import counted
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.layout import (
     KIND_NAMES,
@@ -24,7 +25,6 @@ from sros_tool.report.picture import (
     OverlaySide,
     Picture,
     WireLevel,
-    counted,
     lack_text,
 )
 from sros_tool.xml import escape

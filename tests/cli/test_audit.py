@@ -46,6 +46,60 @@ def test_something_would_be_denied_and_nothing_is_written(program: Program, tmp_
     assert [each.name for each in tmp_path.iterdir()] == ["robot.xml"]
 
 
+TWO = POLICY.replace("</profiles>", '<profile ns="/hall" node="listener"></profile></profiles>')
+
+
+@pytest.mark.parametrize(
+    ("nodes", "words", "status", "out", "verdict"),
+    [
+        (
+            (FINE,), (), 1, "not seen: node /hall/listener of enclave /t\n",
+            "only 1 of 2 nodes of the policy was seen: nothing would be denied of 1 node",
+        ),
+        (
+            (FINE,), ("--partial",), 0, "not seen: node /hall/listener of enclave /t\n",
+            "only 1 of 2 nodes of the policy was seen: nothing would be denied of 1 node",
+        ),
+        (
+            (LOUD,), ("--partial",), 1, DENIED + "not seen: node /hall/listener of enclave /t\n",
+            "only 1 of 2 nodes of the policy was seen: 1 right would be denied of 1 node",
+        ),
+        (
+            (FINE, ("/", "/hall", "listener", "01", ["subscribe rt/chatter"])), (), 1,
+            "/t subscribe topic /chatter (/hall/listener): no rule allows subscribe rt/chatter\n",
+            "1 right would be denied of 2 nodes",
+        ),
+    ],
+)  # fmt: skip
+def test_the_verdict_says_what_was_not_seen(
+    nodes: tuple[tuple[str, str, str, str, list[str]], ...],
+    words: tuple[str, ...],
+    status: int,
+    out: str,
+    verdict: str,
+    program: Program,
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "robot.xml").write_text(TWO)
+    ended = program(graph(*nodes), "robot.xml", *SHORT, *words)
+    assert (ended.status, ended.out) == (status, out), ended.err
+    assert ended.err.startswith(verdict)
+    accepted = status == 0 or "1 right" in verdict
+    assert ("--partial accepts it" in ended.err) is not accepted
+
+
+@pytest.mark.parametrize("name", ["_sros_observer", "OBSERVER"])
+def test_another_node_with_the_name_of_the_observer_is_shown(name: str, program: Program) -> None:
+    """OBSERVER stands for the name that the observer gives itself."""
+    hidden = ("/", "/", name, "02", ["publish rt/parameter_events", "publish rt/cmd_vel"])
+    ended = program(graph(FINE, hidden), "robot.xml", *SHORT)
+    assert ended.status == 1
+    assert "publish topic /cmd_vel (/_sros_observer" in ended.out
+    # Another sros that observes is a tool, and is named.
+    ended = program(graph(FINE, (*hidden[:4], hidden[4][:1])), "robot.xml", *SHORT).ok()
+    assert "note [audit.tool]" in ended.err and "/_sros_observer" in ended.err
+
+
 def test_the_vendor_of_the_robot_decides(program: Program) -> None:
     ended = program(graph(LOUD), "robot.xml", *SHORT, "--vendor", "cyclonedds")
     assert "on Cyclone DDS" in ended.err
@@ -78,6 +132,10 @@ def test_json_has_a_stable_shape(program: Program) -> None:
             }
         ],
         "refused": [],
+        "unseen": [],
+        "unjudged": [],
+        "settled": True,
+        "partial": False,
         "nodes": [
             {
                 "enclaves": ["/t"],

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 
@@ -29,6 +30,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.translate import governance_for
 from tests.graph.graphs import graph, node
+from tests.support.harness import sros
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 ONE_DOMAIN = DomainSet.of((0, 0))
@@ -208,7 +210,54 @@ def test_tools_and_strays_are_said(tmp_path: Path) -> None:
     found = audited(tmp_path, TALKER, seen)
     assert found.allowed
     assert ids(found) == ["audit.tool", "audit.stray"]
+    assert found.unjudged == ("1 node with a tool's name", "1 topic of no node")
     assert [each.fqn for each in found.observation.nodes] == ["/talker"]
+
+
+def test_a_tool_that_only_observes_leaves_nothing_open(tmp_path: Path) -> None:
+    seen = graph(talks(), node("/_ros2cli_daemon", like="c++", enclave="/", participant="p2"))
+    found = audited(tmp_path, TALKER, seen)
+    assert (ids(found), found.complete) == (["audit.tool"], True)
+
+
+def test_a_node_without_an_endpoint_is_not_judged(tmp_path: Path) -> None:
+    seen = make_observation([talks()], silent=[("/", "/", "mute"), ("/", "/", "_ros2cli_9")])
+    found = audited(tmp_path, TALKER, seen)
+    assert ids(found) == ["audit.tool", "audit.silent"]
+    assert found.unjudged == ("1 node without endpoint",)
+    assert found.allowed and not found.complete
+
+
+HALL = {"/t": {"/talker": ["publish chatter"], "/hall/a": []}, "/h": {"/hall/[ab]*": []}}
+
+
+@pytest.mark.parametrize(
+    ("enclaves", "nodes", "unseen"),
+    [
+        (TALKER, [talks()], []),
+        (HALL, [talks()], ["node /hall/[ab]* of enclave /h", "node /hall/a of enclave /t"]),
+        (HALL, [talks(), node("/hall/a", enclave="/t")], ["node /hall/[ab]* of enclave /h"]),
+        (
+            HALL,
+            [talks(), node("/hall/bell", enclave="/", participant="p2")],
+            ["node /hall/a of enclave /t"],
+        ),
+        # In another enclave than its own, a node is another one.
+        (
+            {**TALKER, "/u": {"/x": []}},
+            [talks(enclave="/u")],
+            ["node /talker of enclave /t", "node /x of enclave /u"],
+        ),
+        # What the policy has for the tools that observe a robot need not run.
+        ({**TALKER, "/o": {"/_sros_observer": []}, "/cli": {"/_ros2cli_*": []}}, [talks()], []),
+    ],
+)
+def test_nodes_that_were_not_seen(
+    enclaves: Enclaves, nodes: list[ObservedNode], unseen: list[str], tmp_path: Path
+) -> None:
+    found = audited(tmp_path, enclaves, graph(*nodes))
+    assert list(map(str, found.unseen)) == unseen
+    assert found.complete is not bool(unseen)
 
 
 def test_topics_without_a_ros_name_are_judged_and_never_added(tmp_path: Path) -> None:
@@ -312,6 +361,19 @@ def test_permissions_know_their_nodes_by_the_services_that_these_offer(
     )
     found = audit(seen, of_keystore(keystore))
     assert [line.partition(":")[0] for line in said(found)] == denied
+    assert found.complete
+
+
+def test_a_keystore_tells_which_of_its_nodes_were_not_seen(keystore: Path, tmp_path: Path) -> None:
+    seen = graph(uses("/talker", "p1"))
+    (unseen,) = audit(seen, of_keystore(keystore)).unseen
+    assert str(unseen) == "node /hall/listener of enclave /hall/l"
+    other = tmp_path / "ks"
+    copytree(keystore, other, symlinks=True)
+    sros("create_enclave", other, "/observer").ok()
+    without = audit(seen, of_keystore(other)).unseen
+    assert [str(each) for each in without][1:] == ["node /* of enclave /observer"]
+    assert audit(seen, of_keystore(other), "/observer").unseen == (unseen,)
 
 
 def test_an_enclave_that_dds_refuses_is_reported_as_a_whole(keystore: Path) -> None:

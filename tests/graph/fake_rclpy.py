@@ -48,7 +48,7 @@ def init(**_: Any) -> None:
 def create_node(name: str, **_: Any) -> Node:
     _perhaps_fail("node")
     _perhaps_fail("crash")
-    return Node()
+    return Node(name)
 
 
 def get_rmw_implementation_identifier() -> str:
@@ -56,16 +56,22 @@ def get_rmw_implementation_identifier() -> str:
 
 
 class Node:
+    def __init__(self, name: str) -> None:
+        events = "publish rt/parameter_events"
+        others = [
+            [each.replace("OBSERVER", name) for each in n[:4]] + n[4:] for n in GRAPH["nodes"]
+        ]
+        self._nodes = [["/", "/", name, "0f" * 12, [events]], *others]
+
     def destroy_node(self) -> None:
         print("a DDS may log to standard output", file=sys.stdout)
 
     def get_node_names_and_namespaces_with_enclaves(self) -> list[tuple[str, str, str]]:
-        own = [("_sros_observer", "/", "/")]
-        return own + [(name, ns, enclave) for enclave, ns, name, _, _ in GRAPH["nodes"]]
+        return [(name, ns, enclave) for enclave, ns, name, _, _ in self._nodes]
 
     def get_topic_names_and_types(self, no_demangle: bool) -> list[tuple[str, list[str]]]:
         assert no_demangle
-        said = {each.split(" ", 1)[1] for node in GRAPH["nodes"] for each in node[4]}
+        said = {each.split(" ", 1)[1] for node in self._nodes for each in node[4]}
         return [(topic, ["type"]) for topic in sorted(said | {"ros_discovery_info"})]
 
     def get_publishers_info_by_topic(self, topic: str, no_mangle: bool) -> list[SimpleNamespace]:
@@ -81,6 +87,6 @@ class Node:
                 node_namespace=ns,
                 endpoint_gid=[*bytes.fromhex(participant).ljust(12, b"\0"), 0, 0, 1, 3],
             )
-            for _, ns, name, participant, endpoints in GRAPH["nodes"]
+            for _, ns, name, participant, endpoints in self._nodes
             if f"{way} {topic}" in endpoints
         ]

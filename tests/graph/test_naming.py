@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.graph.learn import is_tool, stable_name, written
+from sros_tool.graph.learn import is_tool, is_tool_name, stable_name, written
 from sros_tool.names import expand
+from tests.graph.graphs import node
 
 
 @pytest.mark.parametrize(
@@ -47,8 +48,16 @@ def test_names_of_one_run(name: str, stable: str) -> None:
 
 
 def test_tools() -> None:
-    assert is_tool("_ros2cli_daemon_0_0123abcd")
-    assert is_tool("_ros2cli_1234")
-    assert is_tool("_sros_observer")
-    assert not is_tool("_hidden")
-    assert not is_tool("ros2cli")
+    assert is_tool_name("_ros2cli_daemon_0_0123abcd")
+    assert is_tool_name("_ros2cli_1234")
+    assert is_tool_name("_sros_observer")
+    assert is_tool_name("_sros_observer_12ab")
+    assert not is_tool_name("_hidden")
+    assert not is_tool_name("ros2cli")
+
+
+def test_no_node_hides_behind_the_name_of_the_observer() -> None:
+    for name in ("_sros_observer", "_sros_observer_12ab"):
+        assert is_tool(node(f"/{name}", "publish /parameter_events"))
+        assert not is_tool(node(f"/{name}", "publish /parameter_events", "publish /cmd_vel"))
+    assert is_tool(node("/_ros2cli_12", "subscribe /chatter"))

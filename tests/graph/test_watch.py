@@ -54,7 +54,12 @@ def test_a_late_change_is_waited_for() -> None:
 
 def test_the_snapshot_is_the_graph_as_it_is_now() -> None:
     script = Script([(0.1, TWO), (0.5, ONE)])
-    assert settle(script, SETTLING, script.clock).observation == ONE
+    snapshot = settle(script, SETTLING, script.clock)
+    assert snapshot.observation == ONE
+    # What went is known all the same.
+    assert snapshot.everything == ONE.union(TWO)
+    assert snapshot.gone == {each.fqn for each in TWO.nodes} - {each.fqn for each in ONE.nodes}
+    assert snapshot.gone
 
 
 def test_a_graph_that_never_rests_ends_at_last() -> None:
