@@ -54,14 +54,14 @@ RightNames = tuple[tuple[str, tuple[str, ...]], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _OfRights(Requirement):
+class OfRights(Requirement):
     """A requirement about ``rights`` to names."""
 
     rights: RightNames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Only(_OfRights):
+class Only(OfRights):
     """No enclave except ``enclaves`` has one of the rights to one of the names."""
 
     KIND = "only"
@@ -70,14 +70,14 @@ class Only(_OfRights):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Nobody(_OfRights):
+class Nobody(OfRights):
     """No enclave has one of the rights to one of the names."""
 
     KIND = "nobody"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Must(_OfRights):
+class Must(OfRights):
     """The enclave has all the rights to all the names."""
 
     KIND = "must"
@@ -86,7 +86,7 @@ class Must(_OfRights):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AtMost(_OfRights):
+class AtMost(OfRights):
     """No single name can be used by more than ``most`` enclaves, with one right."""
 
     KIND = "at_most"
@@ -95,7 +95,7 @@ class AtMost(_OfRights):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Widest(_OfRights):
+class Widest(OfRights):
     """Wildcards give the enclaves the rights to no other names; without names, to none at all.
 
     What an enclave may use because its exact name is stated does not count.

@@ -7,10 +7,12 @@ import random
 from collections import Counter
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from itertools import permutations
 
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.decide import Witness, decide
+from sros_tool.proof.dropped import dropped_requirements
 from sros_tool.proof.requirements import (
     Apart,
     AtMost,
@@ -103,17 +105,26 @@ def cases() -> Iterator[tuple[int, Policy, list[Requirement]]]:
 def test_every_decision_is_that_of_brute_force() -> None:
     seen: Counter[tuple[str, str, bool]] = Counter()
     different: list[str] = []
+    implied = 0
     for number, policy, requirements in cases():
         system = policy_system(policy, at=NOW)
         for world in system.worlds:
             small = finite(world.enclaves, stated(policy), world.confirm)
+            broken = []
             for requirement in requirements:
                 witness = decide(requirement, world).witness
                 different += disagreements(number, requirement, world.title, witness, small)
                 seen[world.title, requirement.KIND, witness is not None] += 1
+                broken += [requirement] if witness else []
+            for old, new in permutations(requirements, 2):
+                if not dropped_requirements([old], [new]):
+                    implied += 1
+                    if old in broken and new not in broken:
+                        different.append(f"{number}, {world.title}: {new} does not imply {old}")
     assert different == []
     assert len({title for title, _, _ in seen}) == 4
     assert min(seen.values()) > COUNT / 500
+    assert implied > COUNT / 100
     print(seen)
 
 

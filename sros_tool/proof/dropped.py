@@ -1,0 +1,204 @@
+"""What a file of requirements demands no longer, compared with the file as it was before.
+
+Whoever changes a policy can change its requirements, too.  A requirement is kept if some
+requirements of the new file demand at least as much, under whatever name and in whatever order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from sros_tool.markdown import bounded, code
+from sros_tool.policy.patterns import covers, overlap
+from sros_tool.policy.protection import Level
+from sros_tool.proof.requirements import (
+    Apart,
+    AtMost,
+    Must,
+    Nobody,
+    OfRights,
+    Only,
+    Protected,
+    Requirement,
+    Widest,
+    demand,
+)
+from sros_tool.values import shows
+
+
+@shows("change", "demand", "name", "why", "file", "line", "now")
+@dataclass(frozen=True, slots=True)
+class DroppedRequirement:
+    """A requirement of the earlier file that the new one does not demand, or not all of it.
+
+    ``requirement`` has its place in the earlier file; ``kept`` are the requirements of the new file
+    that are about some of the same, as far as they can be told.
+    """
+
+    requirement: Requirement
+    kept: tuple[Requirement, ...] = ()
+
+    @property
+    def change(self) -> str:
+        """``dropped`` if the new file demands nothing like it, else ``weakened``."""
+        return "weakened" if self.kept else "dropped"
+
+    @property
+    def demand(self) -> str:
+        """What the requirement demanded."""
+        return demand(self.requirement)
+
+    @property
+    def name(self) -> str:
+        """The own name of the requirement, or ""."""
+        return self.requirement.name
+
+    @property
+    def why(self) -> str:
+        """The reason that the requirement gave, or ""."""
+        return self.requirement.why
+
+    @property
+    def file(self) -> str:
+        """The earlier file."""
+        return self.requirement.source.file
+
+    @property
+    def line(self) -> int:
+        """The line of the requirement in the earlier file."""
+        return self.requirement.source.line
+
+    @property
+    def now(self) -> tuple[str, ...]:
+        """What the new file demands in its place."""
+        return tuple(demand(each) for each in self.kept)
+
+    def __str__(self) -> str:
+        named = f"{self.name}: " if self.name else ""
+        text = f"{self.requirement.source}: {self.change}: {named}{self.demand}"
+        return f"{text}; now: {'; '.join(self.now)}" if self.kept else text
+
+
+def dropped_requirements(
+    before: Iterable[Requirement], after: Iterable[Requirement]
+) -> tuple[DroppedRequirement, ...]:
+    """Return the requirements of ``before`` that ``after`` does not demand in full, in order.
+
+    A requirement that is not returned holds wherever all of ``after`` hold.
+    """
+    now = [(part, whole) for whole in after for part in _parts(whole)]
+    found = []
+    for requirement in before:
+        parts = tuple(_parts(requirement))
+        if all(any(_implies(each, part) for each, _ in now) for part in parts):
+            continue
+        kept = (whole for each, whole in now if any(_is_alike(each, part) for part in parts))
+        found.append(DroppedRequirement(requirement, tuple(dict.fromkeys(kept))))
+    return tuple(found)
+
+
+_MOST_CHARACTERS = 20_000
+
+
+def dropped_markdown(dropped: Sequence[DroppedRequirement]) -> str:
+    """Return a bounded list for a comment on a pull request; "" if nothing was dropped."""
+    if not dropped:
+        return ""
+    head = "### Requirements that are no longer demanded\n\n"
+    items = (f"**{each.change}** {code(str(each))}" for each in dropped)
+    return head + bounded(items, _MOST_CHARACTERS, "which the earlier file has") + "\n"
+
+
+# ── what a requirement demands, part by part ───────────────────────────────────────────────
+
+
+def _parts(requirement: Requirement) -> Iterator[Requirement]:
+    """Yield requirements about one name each that together demand the same."""
+    match requirement:
+        case Widest(rights=rights, enclaves=enclaves):
+            for each in rights:
+                for enclave in enclaves:
+                    yield replace(requirement, rights=(each,), enclaves=(enclave,))
+        case (
+            Only(rights=rights)
+            | Nobody(rights=rights)
+            | Must(rights=rights)
+            | AtMost(rights=rights)
+        ):
+            for right, names in rights:
+                for name in names:
+                    yield replace(requirement, rights=((right, (name,)),))
+        case Protected(names=pairs):
+            for pair in pairs:
+                yield replace(requirement, names=(pair,))
+        case Apart(sources=sources, targets=targets):
+            for source in sources:
+                for target in targets:
+                    yield replace(requirement, sources=(source,), targets=(target,))
+        case _:
+            raise AssertionError(requirement)
+
+
+def _implies(new: Requirement, old: Requirement) -> bool:
+    """Return whether one part holds wherever another part holds; false if that is not certain."""
+    match new, old:
+        case Nobody(), Only() | AtMost() | Nobody():
+            return _right_within(old, new)
+        case Only(), Only():
+            return _right_within(old, new) and _all_within(new.enclaves, old.enclaves)
+        case Must(), Must():
+            return new.enclave == old.enclave and _right_within(old, new)
+        case AtMost(), AtMost():
+            return new.most <= old.most and _right_within(old, new)
+        case Widest(), Widest():
+            ((right, names),), ((old_right, old_names),) = new.rights, old.rights
+            return (
+                right == old_right
+                and _all_within(names, old_names)
+                and _all_within(old.enclaves, new.enclaves)
+            )
+        case Protected(), Protected():
+            ((kind, name),), ((old_kind, old_name),) = new.names, old.names
+            strong = new.level is old.level or new.level is Level.ENCRYPT
+            return kind == old_kind and strong and covers(name, old_name)
+        case Apart(), Apart():
+            return (
+                _all_within(old.sources, new.sources)
+                and _all_within(old.targets, new.targets)
+                and _all_within(new.through, old.through)
+            )
+        case _:
+            return False
+
+
+def _right_within(part: OfRights, wide: OfRights) -> bool:
+    """Return whether the right of a part is among those of another part."""
+    ((right, (name,)),), ((wide_right, (wide_name,)),) = part.rights, wide.rights
+    return right == wide_right and covers(wide_name, name)
+
+
+def _all_within(narrow: Iterable[str], wide: Sequence[str]) -> bool:
+    """Return whether some pattern of ``wide`` covers each pattern of ``narrow``."""
+    return all(any(covers(one, each) for one in wide) for each in narrow)
+
+
+def _is_alike(new: Requirement, old: Requirement) -> bool:
+    """Return whether two parts are about some of the same names, or enclaves, in the same way."""
+    if type(new) is not type(old):
+        return False
+    match new, old:
+        case Widest(), Widest():
+            return new.rights[0][0] == old.rights[0][0] and overlap(*new.enclaves, *old.enclaves)
+        case Must(), Must() if new.enclave != old.enclave:
+            return False
+        case OfRights(), OfRights():
+            ((right, (name,)),), ((old_right, (old_name,)),) = new.rights, old.rights
+            return right == old_right and overlap(name, old_name)
+        case Protected(), Protected():
+            ((kind, name),), ((old_kind, old_name),) = new.names, old.names
+            return kind == old_kind and overlap(name, old_name)
+        case Apart(), Apart():
+            return overlap(*new.sources, *old.sources) and overlap(*new.targets, *old.targets)
+        case _:
+            raise AssertionError(old)

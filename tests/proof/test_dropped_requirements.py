@@ -1,0 +1,118 @@
+"""Which requirements of an earlier file a new one does not demand, and how that is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sros_tool.proof.dropped import dropped_markdown, dropped_requirements
+from sros_tool.proof.requirements import Requirement, parse_requirements, read_requirements
+from sros_tool.resources import policies_dir
+from sros_tool.values import as_plain
+
+
+def read(text: str, file: str = "r.toml") -> tuple[Requirement, ...]:
+    return parse_requirements(text.encode(), file)
+
+
+ONLY = '[[only]]\npublish = ["/a", "/b/*"]\nenclaves = ["/x", "/y"]\n'
+APART = '[[apart]]\nfrom = ["/web/*"]\nto = ["/base"]\nthrough = ["/mux"]\n'
+WIDEST = '[[widest]]\npublish = ["/a*"]\nsubscribe = []\nenclaves = ["/x"]\n'
+AT_MOST = '[[at_most]]\ncall = ["/go"]\nenclaves = 2\n'
+PROTECTED = '[[protected]]\ntopics = ["/a"]\nlevel = "encrypt"\n'
+MUST = '[[must]]\nenclave = "/x"\npublish = ["/a", "/b"]\n'
+
+KEPT = {
+    "the same": (ONLY + MUST + PROTECTED, ONLY + MUST + PROTECTED),
+    "another order and name": (ONLY + MUST, MUST + ONLY + 'name = "n"\n'),
+    "fewer enclaves": (ONLY, ONLY.replace(', "/y"', "")),
+    "nobody": (ONLY + AT_MOST, '[[nobody]]\npublish = ["/*"]\ncall = ["/g*"]\n'),
+    "in two tables": (
+        ONLY,
+        '[[only]]\npublish = ["/a"]\nenclaves = ["/y"]\n'
+        '[[only]]\npublish = ["/b*"]\nenclaves = ["/x"]\n',
+    ),
+    "fewer ways round": (APART, APART[: APART.index("through")]),
+    "wider names": (APART, APART.replace("/web/*", "*")),
+    "fewer wildcards": (WIDEST, WIDEST.replace("/a*", "/ab*").replace('"/x"', '"*"')),
+    "a lower number": (AT_MOST, AT_MOST.replace("2", "1")),
+    "stronger": (PROTECTED.replace("encrypt", "sign"), PROTECTED.replace('"/a"', '"/*"')),
+}
+WEAKENED = {
+    "another enclave": (ONLY, ONLY.replace('"/y"', '"/y", "/z"')),
+    "a name less": (ONLY, ONLY.replace('"/a", ', "")),
+    "a narrower name": (ONLY, ONLY.replace("/b/*", "/b/c")),
+    "a wildcard for enclaves": (ONLY, ONLY.replace('"/y"', '"/*"')),
+    "another way round": (APART, APART.replace('"/mux"', '"/mux", "/x"')),
+    "a target less": (
+        APART.replace('"/base"', '"/base", "/arm"'),
+        APART.replace('"/base"', '"/arm"'),
+    ),
+    "more wildcards": (WIDEST, WIDEST.replace("/a*", "/*")),
+    "a higher number": (AT_MOST, AT_MOST.replace("2", "3")),
+    "weaker": (PROTECTED, PROTECTED.replace("encrypt", "sign")),
+    "less that must work": (MUST, MUST.replace(', "/b"', "")),
+}
+DROPPED = {
+    "another kind": (ONLY, MUST),
+    "other names": (ONLY, ONLY.replace("/a", "/c").replace("/b", "/d")),
+    "another right": (ONLY, ONLY.replace("publish", "subscribe")),
+    "another enclave must": (MUST, MUST.replace("/x", "/z")),
+    "other enclaves have no wildcards": (WIDEST, WIDEST.replace("/x", "/z")),
+    "others are apart": (APART, APART.replace("/base", "/arm")),
+}
+
+
+@pytest.mark.parametrize("case", KEPT)
+def test_what_is_demanded_in_other_words_is_kept(case: str) -> None:
+    before, after = map(read, KEPT[case])
+    assert dropped_requirements(before, after) == ()
+
+
+@pytest.mark.parametrize("case", WEAKENED)
+def test_what_is_demanded_in_part_is_weakened(case: str) -> None:
+    before, after = map(read, WEAKENED[case])
+    (found,) = dropped_requirements(before, after)
+    assert (found.change, found.kept) == ("weakened", after)
+
+
+@pytest.mark.parametrize("case", DROPPED)
+def test_what_is_not_demanded_is_dropped(case: str) -> None:
+    before, after = map(read, DROPPED[case])
+    (found,) = dropped_requirements(before, after)
+    assert (found.change, found.kept) == ("dropped", ())
+
+
+def test_twenty_of_twenty_one_are_named() -> None:
+    every = read_requirements(policies_dir() / "mobile_robot.requirements.toml")
+    assert dropped_requirements(every, every) == ()
+    found = dropped_requirements(every, every[:1])
+    assert [each.requirement for each in found] == list(every[1:])
+    markdown = dropped_markdown(found)
+    assert markdown.count("\n- ") == len(every) - 1
+    assert all(f":{each.line}: " in markdown for each in found)
+
+
+def test_text_json_and_markdown(tmp_path: Path) -> None:
+    before = read(ONLY + 'name = "`drive`"\n' + MUST, "before.toml")
+    weakened, dropped = dropped_requirements(before, read(ONLY.replace('"/y"', '"*"')))
+    assert str(weakened) == (
+        "before.toml:1: weakened: `drive`: only /x, /y may publish /a, /b/*; "
+        "now: only /x, * may publish /a, /b/*"
+    )
+    assert str(dropped) == "before.toml:5: dropped: /x has to be able to publish /a, /b"
+    assert as_plain(weakened) == {
+        "change": "weakened",
+        "demand": "only /x, /y may publish /a, /b/*",
+        "name": "`drive`",
+        "why": "",
+        "file": "before.toml",
+        "line": 1,
+        "now": ["only /x, * may publish /a, /b/*"],
+    }
+    assert dropped_markdown([weakened, dropped]) == (
+        "### Requirements that are no longer demanded\n\n"
+        f"- **weakened** `` {weakened} ``\n- **dropped** `{dropped}`\n"
+    )
+    assert dropped_markdown(()) == ""
