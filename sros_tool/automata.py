@@ -126,6 +126,7 @@ class Automaton:
                 edges.append((at, ANY_LETTER, at))
         return cls(tuple(edges), frozenset((at,)))
 
+    @lru_cache(maxsize=4096)  # noqa: B019 - few automata, and each is compared by its hash
     def between(self, begin: str, end: str) -> Automaton:
         """Return an automaton for the texts that this one accepts between ``begin`` and ``end``."""
         starts = self._reached(frozenset((0,)), begin)
@@ -464,6 +465,10 @@ class NameSet:
         """Return the names that are in at least ``count`` of several sets."""
         return cls._of(_AtLeast(tuple(each._node for each in sets), count))
 
+    def between(self, begin: str, end: str) -> NameSet:
+        """Return the texts that this set has with ``begin`` before and ``end`` behind them."""
+        return NameSet._of(_between(self._node, begin, end))
+
     def around(self) -> Surroundings | None:
         """Return exact names and automata that together have every name of this set, and others.
 
@@ -538,6 +543,27 @@ class NameSet:
     def issubset(self, other: NameSet, limit: SearchLimit | None = None) -> bool:
         """Return whether ``other`` has every name of this set; raises what `example` raises."""
         return (self - other).is_empty(limit)
+
+
+def _between(node: _Node, begin: str, end: str) -> _Node:
+    match node:
+        case _Some():
+            size = len(begin) + len(end)
+            exact = frozenset(
+                each[len(begin) : len(each) - len(end)]
+                for each in node.exact
+                if len(each) >= size and each.startswith(begin) and each.endswith(end)
+            )
+            return _Some(exact, frozenset(each.between(begin, end) for each in node.automata))
+        case _Not():
+            return _Not(_between(node.of, begin, end))
+        case _Every():
+            return _Every(tuple(_between(each, begin, end) for each in node.of))
+        case _First():
+            of = tuple((_between(each, begin, end), kept) for each, kept in node.of)
+            return _First(of, node.last)
+        case _AtLeast():
+            return _AtLeast(tuple(_between(each, begin, end) for each in node.of), node.count)
 
 
 @dataclass(frozen=True, slots=True)

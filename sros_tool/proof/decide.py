@@ -9,12 +9,14 @@ This module reads no files.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import lru_cache
 
 from sros_tool.automata import NameSet, SearchLimit
+from sros_tool.names import is_expression
 from sros_tool.policy.model import RIGHTS
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.flow import TopicHop, shortest_chain
@@ -29,7 +31,7 @@ from sros_tool.proof.requirements import (
     RightNames,
     Widest,
 )
-from sros_tool.proof.worlds import Meeting, Topics, World, shortest
+from sros_tool.proof.worlds import Meeting, Topics, World, shortest, valid_topics
 from sros_tool.topics import dds_names, service_of
 
 
@@ -160,6 +162,14 @@ class _Part:
     begin: str
     end: str
 
+    @property
+    def longer(self) -> int:
+        """By how many bytes the topic is longer than the name."""
+        return len(self.begin) + len(self.end)
+
+    def name_in(self, topic: str) -> str:
+        return topic[len(self.begin) : len(topic) - len(self.end)]
+
     def topics(self, name: str) -> Topics:
         return Topics(self.begin, name, self.end)
 
@@ -249,34 +259,82 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
 
 
 def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a name that too many enclaves may use, with as many of them as it needs."""
+    """Return a name that too many enclaves may use, with as many of them as it needs.
+
+    Whoever may write one topic of an action can do a part of what the right to it is for, and
+    counts as one who has it.
+    """
     most = requirement.most
     best: tuple[Use, ...] = ()
     others: tuple[str, ...] = ()
-    for right, part, topics in _each(requirement.rights):
-        met = world.side(part.writes).meeting(topics, limit)
-        if len(met) <= most:
-            continue
-        topic = _shared_by(world, met, most + 1, topics, limit)
-        if topic:
-            users = [each.enclave for each in met if topic in each.names]
-            uses = tuple(_use(each, right, part, topics, topic) for each in users[: most + 1])
+    for right, names in requirement.rights:
+        for expression in names:
+            holders: dict[str, list[tuple[_Part, Meeting]]] = {}
+            for part in _doing(right):
+                for met in world.side(part.writes).meeting(part.topics(expression), limit):
+                    holders.setdefault(met.enclave, []).append((part, met))
+            if len(holders) <= most:
+                continue
+            name = _shared_by(world, holders.values(), most + 1, expression, limit)
+            if name is None:
+                continue
+            uses = [
+                use
+                for enclave, parts in sorted(holders.items())
+                if (use := next(_uses_of(name, enclave, right, parts), None))
+            ]
             if not best or _better(uses[0]) < _better(best[0]):
-                best, others = uses, tuple(users[most + 1 :])
+                best, others = tuple(uses[: most + 1]), tuple(e.enclave for e in uses[most + 1 :])
     return Witness(best, others) if best else None
 
 
+def _uses_of(
+    name: str, enclave: str, right: str, parts: Iterable[tuple[_Part, Meeting]]
+) -> Iterator[Use]:
+    """Yield the uses of a name by an enclave, one for each part of the right."""
+    for part, met in parts:
+        topic = part.topics(name).expression
+        if topic in met.names:
+            yield Use(enclave, right, name, topic, part.writes)
+
+
 def _shared_by(
-    world: World, met: Sequence[Meeting], count: int, topics: Topics, limit: SearchLimit
+    world: World,
+    holders: Collection[Sequence[tuple[_Part, Meeting]]],
+    count: int,
+    expression: str,
+    limit: SearchLimit,
 ) -> str | None:
-    """Return a topic that at least ``count`` of the enclaves may use, or None."""
-    counts: dict[str, int] = {}
-    for each in met:
-        for topic in each.stated:
-            counts[topic] = counts.get(topic, 0) + 1
-    if not any(each.wild for each in met):
-        return shortest(topic for topic, number in counts.items() if number >= count)
-    return world.example(NameSet.at_least(count, (each.names for each in met)), topics, limit)
+    """Return a name among those of an expression that at least ``count`` holders may use, or None.
+
+    A name that some enclave states is better than one that only wildcards match.
+    """
+    counts: Counter[str] = Counter()
+    longest = world.longest
+    for parts in holders:
+        counts.update(
+            {part.topics(expression).ros_name(t) for part, met in parts for t in met.stated}
+        )
+        longest = min(longest, *(world.longest - part.longer for part, _ in parts))
+    if not any(met.wild for parts in holders for _, met in parts):
+        return shortest(name for name, number in counts.items() if number >= count)
+    shared = NameSet.at_least(
+        count,
+        (
+            NameSet.union(met.names.between(part.begin, part.end) for part, met in parts)
+            for parts in holders
+        ),
+    )
+    if not is_expression(expression):
+        return expression if expression in shared else None
+    every = Topics("", expression, "")
+    known = [each for each in counts if each in shared]
+    return (
+        shortest(each for each in known if each in valid_topics("", ""))
+        or (shared & every.valid()).example(limit, longest=longest)
+        or shortest(known)
+        or (shared & every.every()).example(limit, longest=longest)
+    )
 
 
 def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import NOT_ON_ZENOH, VACUOUS, VIOLATED
-from sros_tool.names import is_expression
+from sros_tool.names import action_part, is_expression
 from sros_tool.policy.model import Source
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.decide import Use, Verdict, Witness, Worlds
@@ -22,6 +22,7 @@ from sros_tool.proof.requirements import (
     demand,
 )
 from sros_tool.proof.system import System
+from sros_tool.topics import service_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,21 +39,22 @@ class Step:
 
     def does(self) -> str:
         """Return text such as ``publish /cmd_vel``, with the wildcard that allows it."""
-        use, stated = self.use, self.place.right if self.place else None
-        right, name = use.right, use.name
-        if stated and stated.kind == "actions":
-            right = stated.right
-            name = f"action {name.partition('/_action/')[0]}"
-        by = f" by {stated.name}" if stated and is_expression(stated.name) else ""
-        return f"{right or ('write' if use.writes else 'read')} {name}{by}"
+        right, kind, name, by = self.drawn()
+        shown = f"action {name}" if kind == "actions" else name
+        return f"{right or ('write' if self.use.writes else 'read')} {shown}" + (by and f" by {by}")
 
     def drawn(self) -> tuple[str, str, str, str]:
-        """Return right, kind and name as a picture has them, and the wildcard that allows it."""
+        """Return right, kind and name as a policy states them, and the wildcard that allows it.
+
+        A part of an action is shown as the right that was given: to the action, or to the part.
+        """
         right, name, stated = self.use.right, self.use.name, self.place and self.place.right
-        action, inside, _ = name.partition("/_action/")
-        if stated and stated.kind == "actions" and inside:
-            right, name = stated.right, action
-        kind = KIND_OF[right] if name.startswith("/") else "dds"
+        whole = KIND_OF.get(right) == "actions"
+        if stated and stated.kind == "actions" and not whole:
+            right, name = stated.right, action_part(name)[0] or name
+        elif stated and stated.kind != "actions" and whole:
+            right, name = stated.right, service_of(self.use.topic)[0] or self.use.topic[2:]
+        kind = KIND_OF[right] if right and name.startswith("/") else "dds"
         by = stated.name if stated and is_expression(stated.name) else ""
         return right, kind, name, by
 
@@ -197,8 +199,7 @@ def _fact(violation: Violation) -> str:
         case Protected():
             return "its messages are not"
         case AtMost():
-            users = _listed([each.use.enclave for each in steps])
-            return f"{users} may {steps[0].does()}{_others(violation)}"
+            return f"{_together(steps)}{_others(violation)}"
         case _:
             return f"may {steps[0].does()}{_others(violation)}"
 
@@ -209,6 +210,13 @@ def _chain(steps: Sequence[Step]) -> str:
     return " ".join(
         (steps[0].use.enclave, *(f"-{said.does()}-> {heard.use.enclave}" for said, heard in hops))
     )
+
+
+def _together(steps: Sequence[Step]) -> str:
+    """Return text such as ``/a and /b may publish /x``, or for each what it may do."""
+    if len({each.does() for each in steps}) > 1:
+        return _listed([each.text() for each in steps])
+    return f"{_listed([each.use.enclave for each in steps])} may {steps[0].does()}"
 
 
 def _others(violation: Violation) -> str:

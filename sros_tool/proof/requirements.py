@@ -87,7 +87,7 @@ class Must(OfRights):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AtMost(OfRights):
-    """No single name can be used by more than ``most`` enclaves, with one right."""
+    """No single name can be used by more than ``most`` enclaves, with one right or a part of it."""
 
     KIND = "at_most"
 

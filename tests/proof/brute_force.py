@@ -5,7 +5,7 @@ Only short names are tried, of few letters.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -92,8 +92,13 @@ def breaches(requirement: Requirement, world: Finite) -> Iterator[tuple[str, ...
                     if any(matches(each, name) for each in patterns) and not able:
                         yield (name,)
         case AtMost(most=most):
-            for name, topic, writes in doings(requirement.rights):
-                if sum(world.may(each, writes, topic) for each in world.writes) > most:
+            holders: dict[tuple[str, str], set[str]] = defaultdict(set)
+            for right, patterns in requirement.rights:
+                for name, topic, writes in doings(((right, patterns),)):
+                    users = (each for each in world.writes if world.may(each, writes, topic))
+                    holders[right, name].update(users)
+            for (_, name), found in holders.items():
+                if len(found) > most:
                     yield (name,)
         case Widest():
             for enclave in world.writes:

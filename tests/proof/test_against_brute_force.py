@@ -37,6 +37,12 @@ NAMES = (
     "/a", "/b", "/a/b", "/ab", "/abc", "/b/a", "/c", "/*", "/a*", "/*b", "/a/*", "/?", "/a?",
     "/[ab]", "/[!a]*", "/a*b", "/*/b", "/?/?", "*b", "/b*a", "/[a-c]b", "/ca", "/a/_action/*",
 )  # fmt: skip
+ACTION_PARTS = (
+    "/a/_action/send_goal",
+    "/a/_action/cancel_goal",
+    "/*/_action/get_*",
+    "/?/_action/*",
+)
 PATTERNS = (*NAMES, "*", "/??", "/[bc]*", "*/a", "/*a*", "/c/*")
 SOURCE = Source("r.toml", 1)
 """Where every requirement here stands."""
@@ -52,7 +58,8 @@ def draw_enclave(draw: random.Random, path: str) -> Enclave:
     for _ in range(draw.randint(1, 4)):
         right = draw.choice(("publish", "subscribe") * 3 + tuple(KIND_OF))
         qualifier = DENY if draw.random() < 0.25 else ALLOW
-        names = tuple(dict.fromkeys(draw.choices(NAMES, k=draw.randint(1, 2))))
+        some = ACTION_PARTS if right in ("request", "reply") and draw.random() < 0.6 else NAMES
+        names = tuple(dict.fromkeys(draw.choices(some, k=draw.randint(1, 2))))
         groups.append(Group(KIND_OF[right], ((right, qualifier),), names))
     return Enclave(path, (Profiles((Profile("/", "node", tuple(groups)),)),))
 
@@ -72,6 +79,8 @@ def draw_requirement(draw: random.Random) -> Requirement:
     if kind is Must:
         return Must(source=SOURCE, rights=rights, enclave=draw.choice(ENCLAVES))
     if kind is AtMost:
+        if draw.random() < 0.5:
+            rights = ((draw.choice(("call", "execute")), some(("/a", "/?", "/*"))),)
         return AtMost(source=SOURCE, rights=rights, most=draw.randint(1, 2))
     if kind is Widest:
         return Widest(source=SOURCE, rights=rights, enclaves=some(enclaves))

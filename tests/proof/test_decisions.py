@@ -1,0 +1,84 @@
+"""Decisions on small policies: what a requirement of each kind means, and with whom it breaks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.policy.document import read_policy
+from sros_tool.proof.findings import Decided, decide_all, violation_text
+from sros_tool.proof.requirements import parse_requirements
+from sros_tool.proof.system import policy_system
+from tests.support.harness import policy_text
+
+NOW = datetime(2027, 1, 1, tzinfo=UTC)
+
+
+def may(right: str, *names: str) -> str:
+    """Return a group of a policy that allows a right."""
+    kind = {"publish": "topic", "subscribe": "topic", "request": "service", "reply": "service"}
+    item = kind.get(right, "action")
+    inside = "".join(f"<{item}>{each}</{item}>" for each in names)
+    return f'<{item}s {right}="ALLOW">{inside}</{item}s>'
+
+
+def decided(rights: Mapping[str, str], required: str) -> Decided:
+    policy = read_policy(Path("robot.xml"), policy_text(dict(rights)).encode())
+    requirements = parse_requirements(required.encode(), "r.toml")
+    return decide_all(requirements, policy_system(policy, at=NOW))
+
+
+GOAL, CANCEL = "/dock/_action/send_goal", "/dock/_action/cancel_goal"
+AT_MOST = '[[at_most]]\n{} = ["{}"]\nenclaves = {}\n'
+HOLDERS = {
+    "a goal and a cancellation": (
+        {"/a": may("request", GOAL), "/b": may("request", CANCEL)},
+        AT_MOST.format("call", "/dock", 1),
+        f"/dock: /a may request {GOAL} and /b may request {CANCEL}, "
+        "but at most 1 enclave may call action /dock",
+    ),
+    "of any action": (
+        {"/a": may("request", GOAL), "/b": may("request", "/*/_action/c*")},
+        AT_MOST.format("call", "/*", 1),
+        f"/dock: /a may request {GOAL} and /b may request {CANCEL} by /*/_action/c*, "
+        "but at most 1 enclave may call action /*",
+    ),
+    "only by wildcards": (
+        {"/a": may("request", "*/_action/s*"), "/b": may("request", "*/_action/c*")},
+        AT_MOST.format("call", "/d*", 1),
+        "/d: /a may request /d/_action/send_goal by /*/_action/s* and /b may request "
+        "/d/_action/cancel_goal by /*/_action/c*, but at most 1 enclave may call action /d*",
+    ),
+    "a result and feedback": (
+        {"/a": may("reply", "/dock/_action/get_result"), "/b": may("publish", "/dock/*")},
+        AT_MOST.format("execute", "/dock", 1),
+        "/dock: /a may reply /dock/_action/get_result and /b may publish "
+        "/dock/_action/feedback by /dock/*, but at most 1 enclave may execute action /dock",
+    ),
+    "the whole action twice": (
+        {"/a": may("call", "/dock"), "/b": may("call", "/d*"), "/c": may("call", "/dock")},
+        AT_MOST.format("call", "/dock", 1),
+        "/dock: /a may call action /dock and /b may call action /dock by /d*, and so may /c, "
+        "but at most 1 enclave may call action /dock",
+    ),
+    "others than the same": (
+        {"/a": may("request", GOAL), "/b": may("request", CANCEL.replace("dock", "go"))},
+        AT_MOST.format("call", "/*", 1),
+        "",
+    ),
+    "one enclave with two parts": (
+        {"/a": may("request", GOAL, CANCEL), "/b": may("publish", "/x")},
+        AT_MOST.format("call", "/*", 1),
+        "",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", HOLDERS)
+def test_whoever_has_a_part_of_an_action_holds_the_right_to_it(case: str) -> None:
+    rights, required, text = HOLDERS[case]
+    found = [violation_text(each) for each in decided(rights, required).violations]
+    assert found == ([text] if text else [])
