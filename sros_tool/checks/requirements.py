@@ -21,6 +21,14 @@ VACUOUS = FindingKind(
     "The requirements file.",
     "Correct the name, or remove it from the requirement.",
 )
+DROPPED = FindingKind(
+    "requirement.dropped",
+    WARNING,
+    "a requirement that is no longer demanded",
+    "The earlier file demanded more: what it forbade can now be allowed without a finding.",
+    "The requirements file, and the one given as --requirements-before.",
+    "Demand it again, or agree that it goes.",
+)
 NOT_ON_ZENOH = FindingKind(
     "requirement.not-on-zenoh",
     NOTE,

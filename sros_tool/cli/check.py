@@ -126,8 +126,17 @@ severity or higher is shown, else 0.""",
 @click.option(
     "--requirements",
     type=PATH,
+    multiple=True,
     metavar="FILE",
     help="Decide whether the requirements in this TOML file hold, for all names.",
+)
+@click.option(
+    "--requirements-before",
+    "earlier",
+    type=PATH,
+    multiple=True,
+    metavar="FILE",
+    help="Report what this earlier file demanded, and --requirements does not.",
 )
 @click.option(
     "--suggest",
@@ -179,7 +188,8 @@ def check(
     strict: bool,
     policies: tuple[Path, ...],
     fleet_file: Path | None,
-    requirements: Path | None,
+    requirements: tuple[Path, ...],
+    earlier: tuple[Path, ...],
     suggest: bool,
     vendor: str | None,
     domain: str | None,
@@ -198,7 +208,8 @@ def check(
     """
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
-    from sros_tool.proof.requirements import read_requirements
+    from sros_tool.proof.dropped import dropped_findings
+    from sros_tool.proof.requirements import read_all_requirements
 
     check_one_format()
     family, paths = _family(targets)
@@ -229,15 +240,19 @@ def check(
     at = _circumstances(domain, moment, policies, fleet_file)
     at = replace(at, distribution=_distribution(distribution))
     if suggest:
-        if form != "text" or requirements:
+        if form != "text" or requirements or earlier:
             raise UsageError("--suggest prints TOML", "", "Give it alone.")
         click.echo(_suggested(_one_path(family, paths, "--suggest"), at, vendor), nl=False)
         return 0
-    read = read_requirements(requirements) if requirements else ()
+    read = read_all_requirements(requirements)
+    if earlier and not requirements:
+        raise UsageError("--requirements-before needs --requirements", "", "Name the new file.")
     one = _one_path(family, paths, "--requirements") if read else None
     with progress("checking"):
         every = _findings(family, paths, at)
         every += _broken(one, read, at, vendor) if one else []
+        if earlier:
+            every += dropped_findings(read_all_requirements(earlier), read, str(requirements[0]))
         found = [_shown(each) for each in every]
     chosen = selection.choose(found)
     if form == "text" and at.fleet:

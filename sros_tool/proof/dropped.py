@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from sros_tool.markdown import bounded, code
+from sros_tool.checks.kind import Finding, RelatedPlace
+from sros_tool.checks.requirements import DROPPED
 from sros_tool.policy.patterns import covers, overlap
 from sros_tool.policy.protection import Level
 from sros_tool.proof.requirements import (
@@ -74,10 +75,11 @@ class DroppedRequirement:
         """What the new file demands in its place."""
         return tuple(demand(each) for each in self.kept)
 
-    def __str__(self) -> str:
-        named = f"{self.name}: " if self.name else ""
-        text = f"{self.requirement.source}: {self.change}: {named}{self.demand}"
-        return f"{text}; now: {'; '.join(self.now)}" if self.kept else text
+    def text(self) -> str:
+        """Return what is left of the requirement, as a clause."""
+        if not self.kept:
+            return "nothing demands it any more"
+        return f"only this is left of it: {'; '.join(self.now)}"
 
 
 def dropped_requirements(
@@ -98,16 +100,19 @@ def dropped_requirements(
     return tuple(found)
 
 
-_MOST_CHARACTERS = 20_000
-
-
-def dropped_markdown(dropped: Sequence[DroppedRequirement]) -> str:
-    """Return a bounded list for a comment on a pull request; "" if nothing was dropped."""
-    if not dropped:
-        return ""
-    head = "### Requirements that are no longer demanded\n\n"
-    items = (f"**{each.change}** {code(str(each))}" for each in dropped)
-    return head + bounded(items, _MOST_CHARACTERS, "which the earlier file has") + "\n"
+def dropped_findings(
+    before: Iterable[Requirement], after: Iterable[Requirement], file: str
+) -> list[Finding]:
+    """Return a finding for each requirement that ``after``, of ``file``, does not demand."""
+    return [
+        DROPPED.found(
+            ": ".join(filter(None, (each.name, each.demand))),
+            each.text(),
+            file,
+            related=(RelatedPlace("required before", each.file, each.line or None),),
+        )
+        for each in dropped_requirements(before, after)
+    ]
 
 
 # ── what a requirement demands, part by part ───────────────────────────────────────────────

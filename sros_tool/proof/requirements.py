@@ -178,6 +178,11 @@ def read_requirements(path: Path) -> tuple[Requirement, ...]:
     return parse_requirements(read_bytes(path, "requirements file", most=1024 * 1024), str(path))
 
 
+def read_all_requirements(paths: Iterable[Path]) -> tuple[Requirement, ...]:
+    """Return the requirements in several files; raises what `read_requirements` raises."""
+    return tuple(each for path in paths for each in read_requirements(path))
+
+
 def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML document; ``file`` names it in errors and sources.
 

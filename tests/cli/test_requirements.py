@@ -47,7 +47,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-CASES = {"requirement.violated", "requirement.vacuous", "requirement.not-on-zenoh"}
+CASES = {
+    "requirement.violated",
+    "requirement.vacuous",
+    "requirement.dropped",
+    "requirement.not-on-zenoh",
+}
 """The kinds of findings that tests here bring about."""
 ONLY = ("check", "robot.xml", "--include", "requirement.*")
 
@@ -99,6 +104,30 @@ def test_what_holds_and_what_cannot_fail(folder: Path, tmp_path: Path) -> None:
     sros(*ONLY, "--requirements", held, "--exclude", "requirement.vacuous", cwd=folder).ok()
 
 
+def test_what_is_no_longer_demanded(folder: Path, tmp_path: Path) -> None:
+    new, more = tmp_path / "new.toml", tmp_path / "more.toml"
+    new.write_text(REQUIRED.split("[[apart]]")[0].replace('"/mux"', '"/mux", "/web"'))
+    asked = (*ONLY, "--requirements", new, "--requirements-before", "required.toml")
+    ended = sros(*asked, cwd=folder)
+    assert ended.status == 1
+    head = f"{new}: warning: a requirement that is no longer demanded [requirement.dropped]"
+    assert ended.out.splitlines().count(head) == 3
+    assert (
+        "    only /mux may publish /cmd_vel: only this is left of it: "
+        "only /mux, /web may publish /cmd_vel\n"
+        "      required.toml:2: required before\n"
+    ) in ended.out
+    assert (
+        "    the web does not drive: /lidar must not influence /wheels: "
+        "nothing demands it any more\n      required.toml:7: required before\n"
+    ) in ended.out
+    more.write_text(REQUIRED)
+    ended = sros(*asked, "--requirements", more, "--exclude", "requirement.violated", cwd=folder)
+    assert ended.ok().out == ""
+    ended = sros(*asked, "--requirements", more, cwd=folder)
+    assert f"{more}:7: required: the web does not drive" in ended.out
+
+
 def test_a_policy_that_zenoh_cannot_carry_out(folder: Path, tmp_path: Path) -> None:
     """Between ``*`` and ``*`` there is no list of the names that a denial leaves."""
     policy = tmp_path / "dds.xml"
@@ -139,6 +168,7 @@ def test_a_suggestion_holds(folder: Path, tmp_path: Path) -> None:
         (("robot.xml", "--requirements", "gone.toml"), "gone.toml"),
         (("robot.xml", "--requirements", "robot.xml"), "not valid TOML"),
         (("required.toml", "--requirements", "required.toml"), "required.toml"),
+        (("robot.xml", "--requirements-before", "required.toml"), "needs --requirements"),
         (("robot.xml", "--suggest", "--json"), "--suggest prints TOML"),
         (("robot.xml", "--suggest", "--requirements", "required.toml"), "--suggest prints TOML"),
     ],
