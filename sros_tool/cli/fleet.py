@@ -312,6 +312,8 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     """Yield what a robot has that it should not have, the worst first."""
     if robot.state == "never":
         yield _number(robot.enclaves, "enclave")
+    if robot.revoked:
+        yield f"{_number(len(robot.revoked), 'enclave')} revoked"
     foreign = Counter(
         each.robot or each.enclave for each in robot.pending if each.state == "another"
     )
@@ -383,6 +385,7 @@ def _status_json(found: FleetStatus, moment: datetime) -> dict[str, Any]:
                 "robot": each.robot,
                 "state": each.state,
                 "enclaves": each.enclaves,
+                "revoked": list(each.revoked),
                 "received": iso(each.received) if each.received else None,
                 "clock": iso(each.clock) if each.clock else None,
                 "stage": each.stage or None,

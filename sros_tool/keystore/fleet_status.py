@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sros_tool.errors import SrosError
-from sros_tool.fleet.enclaves import robot_of
+from sros_tool.fleet.enclaves import enclaves_of, robot_of
 from sros_tool.fleet.model import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
@@ -115,14 +115,16 @@ class RobotStatus:
     """What a robot last confirmed.
 
     ``received`` is when, by the clock at home; ``clock`` is the time of the robot's clock in it.
-    ``stage`` is the stage of a CA rotation that its CA files are of: the one of the CA that is
-    behind.  ``files`` counts the files of its enclaves by kind and state; ``pending`` are those
-    that are not current.
+    ``revoked`` are its enclaves that were revoked and are not in the keystore, whatever the robot
+    confirmed.  ``stage`` is the stage of a CA rotation that its CA files are of: the one of the CA
+    that is behind.  ``files`` counts the files of its enclaves by kind and state; ``pending`` are
+    those that are not current.
     """
 
     robot: str
     state: State
     enclaves: int
+    revoked: tuple[str, ...]
     received: datetime | None
     clock: datetime | None
     stage: str
@@ -350,7 +352,8 @@ class _Known:
         different = [each for robot in compared for each in robot.different if each.confirmed]
         wanted = {each.confirmed for each in different}
         wanted.update(one for each in different for one in each.certificates)
-        for entry in read_ledger(root).entries if wanted else ():
+        ledger = read_ledger(root) if wanted else read_ledger(root, having=("what", "revocation"))
+        for entry in ledger.entries:
             if entry.sha256 in wanted:
                 self._issued.setdefault(entry.sha256, entry)
             if entry.what == "certificate":
@@ -359,6 +362,13 @@ class _Known:
                 self._revoked_serials.add(entry.serial)
                 if entry.reason != SUPERSEDED:
                     self._revoked.add(entry.enclave)
+
+    def revoked(self, robot: Robot) -> tuple[str, ...]:
+        """Return the enclaves of a robot that were revoked and are not in the keystore."""
+        if not self._revoked:
+            return ()
+        names = (name for name in enclaves_of(self._fleet, robot) if name in self._revoked)
+        return tuple(name for name in names if not has_enclave(self._root, name))
 
     def file(self, robot: Robot, each: _Difference) -> ConfirmedFile:
         """Return what a robot has instead of the file at home."""
@@ -423,6 +433,7 @@ def _status(compared: _ComparedRobot, known: _Known, stages: _Stages) -> RobotSt
         compared.robot.name,
         state,
         len(compared.enclaves),
+        known.revoked(compared.robot),
         compared.received,
         compared.clock,
         stages.of(compared),

@@ -185,6 +185,9 @@ def test_a_robot_that_was_revoked(field: Field) -> None:
     field.deliver("r1", "r2")
     (field.root / "confirmed/r3.json").unlink()
     assert field.states() == {"r1": "current", "r2": "current", "r3": "none"}
+    revoked = {name: each["revoked"] for name, each in field.status()["robots"].items()}
+    assert revoked == {"r1": [], "r2": [], "r3": ["/r3/base"]}
+    assert "1 enclave revoked" in field.run("fleet", "status", "ks", "--robot", "r3").out
 
 
 def test_a_revoked_robot_comes_back_by_the_commands_that_errors_name(field: Field) -> None:

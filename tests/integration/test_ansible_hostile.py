@@ -6,12 +6,13 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.support.harness import sros
+from tests.support.harness import policy_text, publish, sros
 
 CHECKOUT = Path(__file__).parents[2]
 PLAYBOOK = shutil.which("ansible-playbook", path=str(Path(sys.executable).parent))
@@ -30,7 +31,7 @@ def hostile(folder: Path, name: str, answers: dict[str, dict[str, Any]]) -> Path
     """Return a program that takes the place of Python on a robot, and answers as it likes."""
     cases = []
     for module, answer in answers.items():
-        (folder / f"{name}-{module}.json").write_text(json.dumps(answer))
+        (folder / f"{name}-{module}.json").write_text(f"{json.dumps(answer)}\n")
         cases.append(f"*AnsiballZ_{module}.py*) cat '{folder}/{name}-{module}.json' ;;")
     program = folder / f"{name}-python"
     program.write_text('#!/bin/sh\ncase "$*" in\n' + "\n".join(cases) + "\nesac\n")
@@ -38,8 +39,21 @@ def hostile(folder: Path, name: str, answers: dict[str, dict[str, Any]]) -> Path
     return program
 
 
-def play(folder: Path, which: str, hosts: dict[str, Any], *words: str, **variables: object) -> str:
-    """Run a play of the collection on hosts of this machine; return what it prints."""
+def play(
+    folder: Path,
+    which: str,
+    hosts: dict[str, Any],
+    *words: str,
+    pinged: Sequence[str] = (),
+    **variables: object,
+) -> str:
+    """Run a play of the collection on hosts of this machine; return what it prints.
+
+    First, a play of somebody else takes facts from the hosts ``pinged``.
+    """
+    (folder / "first.yml").write_text(
+        f"[{{hosts: {list(pinged)}, gather_facts: false, tasks: [{{ansible.builtin.ping: }}]}}]"
+    )
     (folder / "inventory.json").write_text(json.dumps({"all": {"hosts": hosts}}))
     playbook = CHECKOUT / f"ansible_collections/sros/fleet/playbooks/{which}.yml"
     done = subprocess.run(
@@ -47,6 +61,7 @@ def play(folder: Path, which: str, hosts: dict[str, Any], *words: str, **variabl
             str(PLAYBOOK),
             "-i",
             folder / "inventory.json",
+            *([folder / "first.yml"] if pinged else []),
             playbook,
             *words,
             "-e",
@@ -68,7 +83,112 @@ def play(folder: Path, which: str, hosts: dict[str, Any], *words: str, **variabl
     return done.stdout + done.stderr
 
 
-@pytest.mark.parametrize(("which", "module"), [("deliver", "ping"), ("status", "enclaves")])
+STEERING = "\x1b]0;title\x07 \x1b[2K\r \x9b31m \u202e \nPLAY RECAP"
+"""What moves the cursor, changes the title or the direction of text, or begins another line."""
+
+
+def fleet_keystore(folder: Path, robots: int) -> Path:
+    """Make a keystore with a fleet: an enclave /NAME/a for each robot, and /dispatcher."""
+    (folder / "policy.xml").write_text(
+        policy_text({"/{robot}/a": publish("a"), "/dispatcher": publish("b")})
+    )
+    names = "".join(f"[robots.r{each}]\n" for each in range(1, robots + 1))
+    (folder / "fleet.toml").write_text(names)
+    words = ("-p", folder / "policy.xml", "--fleet", folder / "fleet.toml")
+    sros("generate_artifacts", "-k", folder / "keystore", *words).ok()
+    return folder / "keystore"
+
+
+def enclaves(keystore: Path) -> list[str]:
+    return list(json.loads(sros("list_enclaves", keystore, "--json").ok().out)["enclaves"])
+
+
+@pytest.mark.parametrize(
+    ("revoke", "said"),
+    [
+        (["r4"], "the fleet has no robot 'r4'"),
+        ([], "has to be a list of robots"),
+        (["r2"], "no enclave of r2, and none was revoked before"),
+    ],
+)
+def test_nobody_revoked_is_an_error(tmp_path: Path, revoke: object, said: str) -> None:
+    keystore = fleet_keystore(tmp_path, 2)
+    shutil.rmtree(keystore / "enclaves/r2")
+    own = {"sros_keystore": str(keystore), "sros_program": [sys.executable, "-m", "sros_tool"]}
+    hosts: dict[str, Any] = {"r4": {"sros_robot": "r1"}, "r2": {}}
+    text = " ".join(play(tmp_path, "revoke", hosts, **own, sros_revoke=revoke).split())
+    assert said in text and "failed=1" in text, text
+    assert enclaves(keystore) == ["/dispatcher", "/r1/a"]
+
+
+def test_robots_that_lie_in_many_ways(tmp_path: Path) -> None:
+    """Facts do not choose who is revoked, and nothing reaches the terminal or the inventory raw."""
+    keystore = fleet_keystore(tmp_path, 7)
+    trace = tmp_path / "trace"
+    run = ["/bin/sh", "-c", f"echo here >> '{trace}'; echo '{{}}'"]
+    steering = {
+        "msg": STEERING,
+        "warnings": [STEERING, {"__ansible_type": "WarningSummary", "event": {"msg": STEERING}}],
+        "remarks": [STEERING],
+        "deprecations": [{"msg": STEERING, "version": "9"}],
+        "diff": [
+            {"before": STEERING, "after": "x", "before_header": STEERING, "prepared": STEERING}
+        ],
+        "exception": f"Traceback: {STEERING}",
+        "stdout": STEERING,
+        "changed": True,
+        f"_ansible_{STEERING}": STEERING,
+        "ansible_facts": {"sros_program": run, "sros_robot": "r4", "sros_done": STEERING},
+        "ansible_stats": {"data": {STEERING: STEERING}},
+        "add_host": {
+            "host_name": "localhost",
+            "groups": ["r4", "all"],
+            "host_vars": {"sros_program": run, "sros_keystore": "/nowhere"},
+        },
+    }
+    group = {**steering, "add_group": "r4", "parent_groups": ["all"]}
+    del group["add_host"]
+    reached: dict[str, dict[str, Any]] = {"ping": {"ping": "pong"}, "reach": {"reached": True}}
+    lies: dict[str, dict[str, Any]] = {
+        "r1": {module: answer | steering for module, answer in reached.items()},
+        "r2": {"enclaves": {**INSTALLED, **group, "restart": [f"/r2/{STEERING}"]}},
+        "r3": {"enclaves": {"failed": True, **steering}},
+        "r4": {"ping": {"ping": "pong", "ansible_facts": {"sros_robot": "r6"}}},
+        "r5": {"ping": {"ping": "pong", "ansible_facts": {"sros_robot": "r4"}}},
+    }
+    hosts: dict[str, dict[str, Any]] = {}
+    for number in range(1, 8):
+        name = f"r{number}"
+        answers = {**reached, "enclaves": INSTALLED, **lies.get(name, {})}
+        robot = hostile(tmp_path, name, answers)
+        hosts[name] = {
+            "ansible_connection": "local",
+            "ansible_python_interpreter": str(robot),
+        }
+    (tmp_path / "ssh").write_text(f"#!/bin/sh\ncat >&2 <<'.'\n{STEERING}\n.\nexit 255\n")
+    (tmp_path / "ssh").chmod(0o755)
+    hosts["r6"] = {"ansible_connection": "ssh", "ansible_ssh_executable": str(tmp_path / "ssh")}
+    (tmp_path / "r7-python").write_text("#!/bin/sh\nexec sleep 9\n")
+    hosts["r7"]["sros_timeout"] = 1
+    with (tmp_path / "r2-python").open("a") as file:
+        file.write(f"cat <<'.' | tee /dev/stderr\n{STEERING}\n.\n")
+    program = [sys.executable, "-m", "sros_tool"]
+    own: dict[str, Any] = {"sros_keystore": str(keystore), "sros_program": program}
+    words = ("--diff", "-vvv")
+    own |= {"sros_revoke": ["r4"], "sros_confirm": False}
+    text = play(tmp_path, "revoke", hosts, *words, pinged=["r4", "r5"], **own)
+    left = [f"/{name}/a" for name in ("r1", "r2", "r3", "r5", "r6", "r7")]
+    assert enclaves(keystore) == ["/dispatcher", *left], text
+    assert not trace.exists(), text
+    odd = {each for each in text if not each.isprintable() and each != "\n"}
+    assert not odd, (odd, text)
+    assert text.count("\nPLAY RECAP") == 2, text  # of each playbook
+    flat = " ".join(text.split())
+    assert "Revoked: /r4/a." in flat and "processes: /dispatcher." in flat, text
+    assert "The revocation list did not get to r2, r3, r5, r6, r7," in flat, text
+
+
+@pytest.mark.parametrize(("which", "module"), [("status", "enclaves")])
 def test_facts_of_a_robot_choose_no_command_and_no_keys(
     tmp_path: Path, which: str, module: str
 ) -> None:
@@ -81,16 +201,17 @@ def test_facts_of_a_robot_choose_no_command_and_no_keys(
         "sros_program": ["/bin/sh", "-c", f"echo here >> '{trace}'; echo '{{}}'"],
         "sros_robot": "r2",
     }
-    answers: dict[str, dict[str, Any]] = {"ping": {"ping": "pong"}, "enclaves": INSTALLED}
+    answers: dict[str, dict[str, Any]] = {"reach": {"reached": True}, "enclaves": INSTALLED}
     answers[module] = {**answers[module], "ansible_facts": facts}
     robot = {
         "ansible_connection": "local",
         "ansible_python_interpreter": str(hostile(tmp_path, "r1", answers)),
         "sros_patterns": ["/r1/*"],
+        "sros_confirm": False,
         "sros_program": [sys.executable, "-m", "sros_tool"],
     }
     text = play(tmp_path, which, {"r1": robot}, sros_keystore=str(keystore))
-    assert "names of settings (sros_program, sros_robot)" in text, text
+    assert "failed=0" in text, text
     assert not trace.exists()
 
 
@@ -112,7 +233,7 @@ def test_bad_requests_of_robots_get_no_certificate_and_stop_no_other(tmp_path: P
     hosts: dict[str, Any] = {}
     for name, answer in returned.items():
         answers: dict[str, dict[str, Any]] = {
-            "ping": {"ping": "pong"},
+            "reach": {"reached": True},
             "requests": {"changed": True, "made": [f"/{name}/own"], **answer},
             "enclaves": INSTALLED,
         }
@@ -141,7 +262,7 @@ def test_a_limit_that_leaves_out_the_home_is_refused(tmp_path: Path) -> None:
     """Otherwise a play would revoke nothing and say that all is well."""
     robot = {
         "ansible_connection": "local",
-        "ansible_python_interpreter": str(hostile(tmp_path, "r1", {"ping": {"ping": "pong"}})),
+        "ansible_python_interpreter": str(hostile(tmp_path, "r1", {"reach": {"reached": True}})),
     }
     hosts = {"r1": robot, "r5": robot}
     said = play(tmp_path, "revoke", hosts, "--limit", "r1", sros_keystore="/k", sros_revoke=["r5"])

@@ -6,44 +6,51 @@ import base64
 import time
 from typing import Any
 
-from ansible.plugins.action import ActionBase
-
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
-from ansible_collections.sros.fleet.plugins.module_utils.home import (
-    ask,
-    check_facts,
-    decoded,
+from ansible_collections.sros.fleet.plugins.module_utils.home import ask, decoded
+from ansible_collections.sros.fleet.plugins.plugin_utils.answers import (
+    DIFFERENCES,
+    flag,
+    list_of,
+    map_of,
+    name,
+    number,
+    record,
+    text,
 )
+from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import RobotAction
 
 
-class ActionModule(ActionBase):  # type: ignore[misc]
+class ActionModule(RobotAction):
     """Export the enclaves of a robot, and run the module on the robot with them."""
 
-    _supports_check_mode = True
-    _supports_async = False
+    readers = {  # noqa: RUF012 - a ClassVar of the class above
+        **dict.fromkeys(
+            ("changed_enclaves", "removed_enclaves", "restart", "routers"), list_of(name)
+        ),
+        "verification": record(by=name, ok=flag, problems=list_of(text), remarks=list_of(text)),
+        "confirmation": record(
+            format=number,
+            robot=name,
+            time=name,
+            files=map_of(name),
+            certificates=map_of(list_of(name)),
+        ),
+        "clock_difference": number,
+        "diff": DIFFERENCES,
+    }
 
-    def run(self, tmp: str | None = None, task_vars: dict[str, Any] | None = None) -> Any:
-        """Return the result of the module, or of a failed export."""
-        result = super().run(tmp, task_vars)
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of the module, with the export."""
         arguments = {
             key: value
             for key, value in self._task.args.items()
             if key not in ("archive", "home_time")
         }
         if arguments.get("keystore"):
-            try:
-                check_facts(task_vars or {})
-                packed = export(arguments)
-            except RefusedError as error:
-                return {**result, "failed": True, "msg": str(error)}
-            arguments["archive"] = base64.b64encode(packed).decode()
+            arguments["archive"] = base64.b64encode(export(arguments)).decode()
         arguments["home_time"] = time.time()
-        return {
-            **result,
-            **self._execute_module(
-                module_name="sros.fleet.enclaves", module_args=arguments, task_vars=task_vars
-            ),
-        }
+        return arguments
 
 
 def export(arguments: dict[str, Any]) -> bytes:

@@ -7,11 +7,11 @@ from typing import Any
 from ansible.plugins.action import ActionBase
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
-from ansible_collections.sros.fleet.plugins.module_utils.home import check_facts
+from ansible_collections.sros.fleet.plugins.plugin_utils.facts import check_facts
 
 
 class ActionModule(ActionBase):  # type: ignore[misc]
-    """Run the module, unless a robot set one of its variables."""
+    """Run the module, unless facts of a robot take the place of variables."""
 
     _supports_check_mode = True
     _supports_async = False

@@ -9,7 +9,7 @@ from typing import Any
 from ansible.errors import AnsibleFilterError
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
-from ansible_collections.sros.fleet.plugins.module_utils.home import check_facts
+from ansible_collections.sros.fleet.plugins.plugin_utils.facts import check_facts
 
 DOCUMENTATION = r"""
 name: made_requests

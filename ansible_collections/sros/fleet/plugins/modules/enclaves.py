@@ -122,6 +122,11 @@ confirmation:
   description: What the robot has, as SHA-256, for C(sros fleet confirm).
   type: dict
   returned: always
+remarks:
+  description: What is worth knowing, which the action at home shows as warnings.
+  type: list
+  elements: str
+  returned: always
 clock_difference:
   description: Seconds that the clock of the robot is ahead.
   type: int
@@ -180,15 +185,12 @@ def main() -> None:
     remark = clock_remark(
         now, module.params["home_time"], module.params["longest_clock_difference"]
     )
-    if remark:
-        module.warn(remark)
     try:
         result = _run(module, now)
     except (RefusedError, OSError) as error:
         module.fail_json(msg="{}{}".format(error, " " + remark if remark else ""))
-    for each in result.get("verification", {}).get("remarks", []):
-        module.warn(each)
-    module.exit_json(**result)
+    said = result.get("verification", {}).get("remarks", [])
+    module.exit_json(remarks=[*([remark] if remark else []), *said], **result)
 
 
 def _run(module: AnsibleModule, now: float) -> dict:

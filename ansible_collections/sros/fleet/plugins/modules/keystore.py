@@ -69,7 +69,7 @@ from typing import Any
 from ansible.module_utils.basic import AnsibleModule
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
-from ansible_collections.sros.fleet.plugins.module_utils.home import ask, decoded
+from ansible_collections.sros.fleet.plugins.module_utils.home import ask, decoded, harmless
 
 
 def main() -> None:
@@ -96,7 +96,7 @@ def main() -> None:
     if done.returncode not in module.params["ok_statuses"] or not isinstance(answer, dict):
         module.fail_json(msg=decoded(done.stderr or done.stdout), status=done.returncode)
     for each in answer.get("notes", []):
-        module.warn(each["text"])
+        module.warn(harmless(each["text"]))
     changed = bool(answer.get("changes")) and not module.params["reads"]
     module.exit_json(changed=changed, answer=answer, status=done.returncode)
 

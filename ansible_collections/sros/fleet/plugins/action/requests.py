@@ -1,0 +1,17 @@
+"""The part of the module requests that runs at home: take nothing else from the answer."""
+
+from __future__ import annotations
+
+from ansible_collections.sros.fleet.plugins.plugin_utils.answers import (
+    document,
+    list_of,
+    map_of,
+    name,
+)
+from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import RobotAction
+
+
+class ActionModule(RobotAction):
+    """Run the module on the robot."""
+
+    readers = {"made": list_of(name), "requests": map_of(document)}  # noqa: RUF012 - as above

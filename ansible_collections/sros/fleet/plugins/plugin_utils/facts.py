@@ -1,0 +1,55 @@
+"""Facts of robots, which must not take the place of variables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ansible import constants
+
+from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
+from ansible_collections.sros.fleet.plugins.module_utils.home import harmless
+
+_SETTINGS = "sros_"
+"""How the names of all variables of this collection begin."""
+_OF_ANSIBLE = ("ansible_", "discovered_interpreter_")
+_OF_SETUP = frozenset({"gather_subset", "module_setup"})
+"""Names under which the modules of Ansible itself return facts."""
+_MOST_SHOWN = 200
+
+
+def check_facts(variables: Mapping[str, Any]) -> None:
+    """Refuse to do anything for a robot whose facts take the place of variables.
+
+    The plays of this collection take no facts from robots. But those of other plays, or of a cache,
+    take the place of variables of the inventory unless ``inject_facts_as_vars`` is off: so a robot
+    could choose the command that runs at home, or whose keys it gets.
+
+    Args:
+        variables: the variables of a task, with the facts of its robot.
+
+    Raises:
+        RefusedError: the robot has such facts.
+    """
+    if found := _replacing(variables):
+        shown = harmless(", ".join(found), most=_MOST_SHOWN)
+        raise RefusedError(
+            f"This robot has facts that take the place of variables ({shown}): so it could choose"
+            " the commands that run at home, or get the keys of another. Nothing was done for it."
+            " Set inject_facts_as_vars = false in ansible.cfg, or delete the facts if they are"
+            " cached (ansible-playbook --flush-cache). If they are named as settings of sros, look"
+            " at the robot."
+        )
+
+
+def _replacing(variables: Mapping[str, Any]) -> list[str]:
+    """Return the names of facts that are variables, sorted."""
+    facts = [str(each) for each in variables.get("ansible_facts") or {}]
+    if not constants.INJECT_FACTS_AS_VARS:
+        return sorted(each for each in facts if each.startswith(_SETTINGS))
+    # Ansible takes the prefix ansible_ off the names of facts, and not off those of variables.
+    return sorted(
+        each
+        for each in facts
+        if each in variables and each not in _OF_SETUP and not each.startswith(_OF_ANSIBLE)
+    )

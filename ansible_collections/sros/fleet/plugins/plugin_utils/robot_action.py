@@ -1,0 +1,93 @@
+"""Actions whose module runs on a robot, which can answer anything."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from ansible.errors import AnsibleConnectionFailure, AnsibleError
+from ansible.plugins.action import ActionBase
+
+from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
+from ansible_collections.sros.fleet.plugins.module_utils.home import harmless
+from ansible_collections.sros.fleet.plugins.plugin_utils.answers import Reader, read_answer
+from ansible_collections.sros.fleet.plugins.plugin_utils.facts import check_facts
+
+_INTERPRETER = re.compile(r"(ansible_)?discovered_interpreter_\w+")
+_PROGRAM = re.compile(r"/[A-Za-z0-9_./+-]{1,200}")
+
+
+class RobotAction(ActionBase):  # type: ignore[misc]
+    """Run a module on a robot, and return of its answer only what is in ``readers``.
+
+    Ansible itself acts on what a module returns (facts, ``add_host``, ``add_group``), and prints
+    warnings, tracebacks and differences as they are.
+    """
+
+    readers: ClassVar[Mapping[str, Reader]] = {}
+    _supports_check_mode = True
+    _supports_async = False
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of the module.
+
+        Raises:
+            RefusedError: something at home is missing, or refused.
+        """
+        return dict(self._task.args)
+
+    def run(self, tmp: str | None = None, task_vars: dict[str, Any] | None = None) -> Any:
+        """Return the result of the module."""
+        variables = task_vars or {}
+        lost = ""
+        try:
+            result = super().run(tmp, variables)
+            check_facts(variables)
+            returned = self._execute_module(
+                module_name=self._task.action, module_args=self.arguments(), task_vars=variables
+            )
+        except AnsibleConnectionFailure as error:
+            lost = harmless(str(error))
+        except (AnsibleError, RefusedError) as error:
+            return {"failed": True, "msg": harmless(str(error))}
+        if lost:  # raised out of the handler, so that no cause is printed with it
+            raise AnsibleConnectionFailure(lost)
+        return {**result, **_presented(returned, str(variables.get("inventory_hostname", "")))}
+
+    def _low_level_execute_command(self, *words: Any, **options: Any) -> Any:
+        """Return what a command on the robot printed, without what would steer a terminal."""
+        done = super()._low_level_execute_command(*words, **options)
+        for key in ("stdout", "stderr", "stdout_lines", "stderr_lines"):
+            value = done.get(key)
+            if isinstance(value, str):
+                done[key] = harmless(value, most=None, lines=True)
+            elif value:
+                done[key] = [harmless(str(each), most=None) for each in value]
+        return done
+
+    def _parse_returned_data(self, res: Mapping[str, Any], *_profile: Any) -> dict[str, Any]:
+        try:
+            found = read_answer(res.get("stdout", ""), res.get("stderr", ""), self.readers)
+        except RefusedError as error:
+            return {"failed": True, "msg": str(error), "_ansible_parsed": True}
+        return {**found, "_ansible_parsed": True}
+
+
+def _presented(returned: Mapping[str, Any], host: str) -> dict[str, Any]:
+    """Return a result as Ansible takes it: with its remarks as warnings, and who says so."""
+    result = {key: value for key, value in returned.items() if key not in ("warnings", "remarks")}
+    facts = result.pop("ansible_facts", None) or {}
+    known = {
+        key: value
+        for key, value in facts.items()
+        if _INTERPRETER.fullmatch(str(key)) and _PROGRAM.fullmatch(str(value))
+    }
+    if known:
+        result["ansible_facts"] = known
+    if "msg" in result:
+        result["msg"] = f"{host}: {result['msg']}"
+    said = [*returned.get("remarks", ()), *map(harmless, returned.get("warnings", ()))]
+    if said:
+        result["warnings"] = [f"{host}: {each}" for each in said]
+    return result
