@@ -16,10 +16,10 @@ VIOLATED = FindingKind(
 VACUOUS = FindingKind(
     "requirement.vacuous",
     WARNING,
-    "a requirement about names or enclaves that nothing has",
-    "It cannot fail, so it protects nothing: perhaps a name in it is misspelt, or was changed.",
+    "a requirement, or a part of one, that cannot fail",
+    "It protects nothing: perhaps a name is misspelt or was changed, or everybody is excepted.",
     "The requirements file.",
-    "Correct the name, or remove it from the requirement.",
+    "Correct the name or the exceptions, or remove the requirement.",
 )
 DROPPED = FindingKind(
     "requirement.dropped",

@@ -18,6 +18,7 @@ from functools import lru_cache
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.names import is_expression
 from sros_tool.policy.model import RIGHTS
+from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.flow import TopicHop, shortest_chain
 from sros_tool.proof.requirements import (
@@ -76,12 +77,14 @@ class Verdict:
     """The decision on a requirement in one world.
 
     ``witness`` is None if the requirement holds.  ``empty`` are names and enclaves in it that
-    nothing has, for which it cannot fail.
+    nothing has, for which it cannot fail.  ``always`` says why it cannot fail whatever rights the
+    enclaves get, or is "".
     """
 
     requirement: Requirement
     witness: Witness | None
     empty: tuple[str, ...] = ()
+    always: str = ""
 
 
 class Worlds:
@@ -134,7 +137,9 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
             raise AssertionError(requirement)
     if witness:
         _confirm(requirement, witness, world)
-    return Verdict(requirement, witness, tuple(_empty(requirement, world, limit)))
+    empty = tuple(_empty(requirement, world, limit))
+    always = "" if witness or empty else _always(requirement, world)
+    return Verdict(requirement, witness, empty, always)
 
 
 def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
@@ -457,6 +462,30 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
                 parts = [part for right in RIGHTS[kind] for part in _doing(right)]
                 if not _anybody(world, parts, name, limit):
                     yield f"{kind.removesuffix('s')} {name}"
+
+
+def _always(requirement: Requirement, world: World) -> str:
+    """Return why no rights of the enclaves that there are can break a requirement, or "".
+
+    A list of all enclaves by their names is no such reason: it names those that may come.
+    """
+    count = len(world.enclaves)
+    match requirement:
+        case Only(enclaves=enclaves) if any(map(is_expression, enclaves)):
+            if all(_match(enclaves, each) for each in world.enclaves):
+                return f"all {count} enclaves are among them"
+        case AtMost(most=most) if most >= count:
+            return f"there are only {count} enclaves"
+        case Widest(rights=rights):
+            if all(any(covers(each, "/*") for each in names) for _, names in rights):
+                return "wildcards may match every name"
+        case Apart():
+            left = [each for each in world.enclaves if not _match(requirement.through, each)]
+            sources = {each for each in left if _match(requirement.sources, each)}
+            targets = {each for each in left if _match(requirement.targets, each)}
+            if not any(sources - {each} for each in targets):
+                return "no two enclaves are left that it keeps apart"
+    return ""
 
 
 def _named(right: str, name: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from sros_tool.automata import SearchLimit
@@ -80,7 +80,7 @@ class Violation:
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """All decisions: what does not hold, and requirements with what nothing has."""
+    """All decisions: what does not hold, and why requirements, or parts of them, cannot fail."""
 
     violations: tuple[Violation, ...]
     vacuous: tuple[tuple[Requirement, tuple[str, ...]], ...]
@@ -110,16 +110,19 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             known = {each for world in system.worlds for each in world.enclaves}
             missing = next((each for each in witness.enclaves if each and each not in known), "")
             violations.append(Violation(requirement, witness, steps, titles, missing))
-        empty = _common(each for _, each in verdicts)
-        if empty:
-            vacuous.append((requirement, empty))
+        if reasons := tuple(_never_fails([each for _, each in verdicts])):
+            vacuous.append((requirement, reasons))
     return Decided(tuple(violations), tuple(vacuous))
 
 
-def _common(verdicts: Iterable[Verdict]) -> tuple[str, ...]:
-    """Return what is empty in all worlds, in the order of the first one."""
-    first, *others = (each.empty for each in verdicts)
-    return tuple(each for each in first if all(each in other for other in others))
+def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
+    """Yield why a requirement, or a part of it, cannot fail in any world."""
+    first, *others = verdicts
+    empty = [each for each in first.empty if all(each in other.empty for other in others)]
+    if empty:
+        yield f"nothing has {_listed(empty)}"
+    if all(each.always for each in verdicts):
+        yield first.always
 
 
 # ── as findings ────────────────────────────────────────────────────────────────────────────
@@ -135,7 +138,7 @@ def requirement_findings(requirements: Sequence[Requirement], system: System) ->
     """
     decided = decide_all(requirements, system)
     found = [_violated(each) for each in decided.violations]
-    found += [_vacuous(requirement, empty) for requirement, empty in decided.vacuous]
+    found += [_vacuous(requirement, why) for requirement, why in decided.vacuous]
     if system.left_out:
         error = system.left_out
         text = f"{error.what}: {error.why}" if error.why else error.what
@@ -231,11 +234,7 @@ def _listed(names: Sequence[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _vacuous(requirement: Requirement, empty: Sequence[str]) -> Finding:
+def _vacuous(requirement: Requirement, why: Sequence[str]) -> Finding:
     own = requirement.source
-    return VACUOUS.found(
-        own.file,
-        f"nothing has {_listed(empty)}: {demand(requirement)}",
-        own.file,
-        own.line,
-    )
+    text = f"{'; '.join(why)}: {demand(requirement)}"
+    return VACUOUS.found(own.file, text, own.file, own.line)

@@ -53,7 +53,7 @@ def suggest(rights: Iterable[Right], worlds: Sequence[World]) -> tuple[Requireme
     all_worlds = Worlds(worlds)
     for each in islice(_candidates(_Stated(rights), worlds), _MOST):
         verdicts = all_worlds.decide(each, limit)
-        if not any(verdict.witness or verdict.empty for _, verdict in verdicts):
+        if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
             last = _joined(found[-1], each) if found else None
             found[-1:] = [last] if last else [*found[-1:], each]
     return tuple(found)

@@ -10,7 +10,8 @@ import pytest
 
 from sros_tool.policy.document import read_policy
 from sros_tool.proof.findings import Decided, decide_all, violation_text
-from sros_tool.proof.requirements import parse_requirements
+from sros_tool.proof.requirements import Only, Protected, parse_requirements
+from sros_tool.proof.suggest import suggest
 from sros_tool.proof.system import policy_system
 from tests.support.harness import policy_text
 
@@ -82,3 +83,48 @@ def test_whoever_has_a_part_of_an_action_holds_the_right_to_it(case: str) -> Non
     rights, required, text = HOLDERS[case]
     found = [violation_text(each) for each in decided(rights, required).violations]
     assert found == ([text] if text else [])
+
+
+ROBOT = {
+    "/r/a": may("publish", "/x", "/y*"),
+    "/r/b": may("subscribe", "/x"),
+    "/r/c": may("publish", "/z") + may("subscribe", "/*"),
+}
+CANNOT_FAIL = {
+    '[[only]]\npublish = ["/x"]\nenclaves = ["*"]': "all 3 enclaves are among them",
+    '[[only]]\npublish = ["/x"]\nenclaves = ["/r/?"]': "all 3 enclaves are among them",
+    '[[at_most]]\npublish = ["/x"]\nenclaves = 100': "there are only 3 enclaves",
+    '[[at_most]]\npublish = ["/x"]\nenclaves = 3': "there are only 3 enclaves",
+    '[[widest]]\nenclaves = ["*"]\npublish = ["*"]': "wildcards may match every name",
+    '[[widest]]\nenclaves = ["*"]\npublish = ["/*"]\nsubscribe = ["/*"]':
+        "wildcards may match every name",
+    '[[apart]]\nfrom = ["/r/a"]\nto = ["/r/c"]\nthrough = ["*"]':
+        "no two enclaves are left that it keeps apart",
+    '[[apart]]\nfrom = ["/r/a"]\nto = ["/r/a"]': "no two enclaves are left that it keeps apart",
+    '[[apart]]\nfrom = ["/r/a"]\nto = ["*"]\nthrough = ["/r/[bc]"]':
+        "no two enclaves are left that it keeps apart",
+}  # fmt: skip
+CAN_FAIL = (
+    '[[only]]\npublish = ["/x"]\nenclaves = ["/r/a", "/r/b", "/r/c"]',
+    '[[only]]\npublish = ["/x"]\nenclaves = ["/r/[ab]"]',
+    '[[at_most]]\npublish = ["/x"]\nenclaves = 2',
+    '[[widest]]\nenclaves = ["/r/b"]\npublish = ["/x"]\nsubscribe = ["/*"]',
+    '[[apart]]\nfrom = ["/r/c"]\nto = ["/r/b"]\nthrough = ["/r/a"]',
+)
+
+
+@pytest.mark.parametrize("required", [*CANNOT_FAIL, *CAN_FAIL])
+def test_what_cannot_fail_is_said(required: str) -> None:
+    found = decided(ROBOT, required)
+    assert found.violations == ()
+    why = CANNOT_FAIL.get(required)
+    assert [each for _, reasons in found.vacuous for each in reasons] == ([why] if why else [])
+
+
+def test_what_is_proposed_can_fail() -> None:
+    two = {"/a": may("publish", "/x", "/*"), "/b": may("subscribe", "/x")}
+    policy = read_policy(Path("robot.xml"), policy_text(two).encode())
+    system = policy_system(policy, at=NOW)
+    proposed = suggest(system.rights, system.worlds)
+    assert {type(each) for each in proposed} >= {Only, Protected}
+    assert decide_all(proposed, system).vacuous == ()
