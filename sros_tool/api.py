@@ -496,6 +496,8 @@ def new_access(base: AnyPath, head: AnyPath, *, fleet: AnyPath | None = None) ->
     Returns:
         What is ``added`` and ``removed``, whom enclaves can influence now (``reach``), and the
         protection that is ``lost`` and ``gained``; false if nothing is added and nothing lost.
+        ``assumed`` and ``left_out`` say on which terms: a policy counts as signed with access
+        control of everything, and as ``base`` also with the protection that is meant by default.
 
     Raises:
         SrosError: A path cannot be read, or it cannot be decided, for instance because of a

@@ -291,7 +291,7 @@ def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
     elif dry_run:
         print_plan(result.root, result.changes)
     else:
-        same = {each.enclave for each in result.replaced if not (each.lost or each.gained)}
+        same = {each.enclave for each in result.replaced if not (each.loses() or each.gains())}
         again = [name for name in result.changed if name in same]
         for names, text in (
             (result.created, "created enclave {}"),
@@ -341,13 +341,11 @@ def _creation_json(result: Creation, dry_run: bool) -> dict[str, Any]:
 
 def _show_rights(replaced: Sequence[ReplacedRights], dry_run: bool, *, err: bool = False) -> None:
     """Print what enclaves lose and gain, on stdout or with ``err`` on stderr."""
-    from sros_tool.keystore.lifecycle.replaced import rights_text
-
     together: dict[tuple[str, str], list[str]] = {}
     for each in replaced:
-        for verb, rights in (("lose", each.lost), ("gain", each.gained)):
-            if rights:
-                together.setdefault((verb, rights_text(rights)), []).append(each.enclave)
+        for verb, text in (("lose", each.loses()), ("gain", each.gains())):
+            if text:
+                together.setdefault((verb, text), []).append(each.enclave)
     for (verb, text), names in together.items():
         word = f"would {verb}" if dry_run else verb if len(names) > 1 else f"{verb}s"
         click.echo(visible(f"{_shown_names(names)} {word}: {text}"), err=err)

@@ -92,7 +92,7 @@ def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
         text += f", which {other} denies by {gain.denied.name}{at}"
     if gain.worlds != growth.worlds:
         text += f"; with {', '.join(gain.worlds)}"
-    if gain.domains != (0,):
+    if gain.domains != (0,) or len(growth.domains) > 1:
         text += f"; in domain {', '.join(map(str, gain.domains))}"
     return text
 
@@ -119,9 +119,18 @@ def _some(names: Sequence[str]) -> str:
 
 def _summary(growth: Growth) -> str:
     worlds = ", ".join(growth.worlds)
+    basis = "".join(
+        f"; {title}: {', '.join(clauses)}"
+        for title, clauses in (
+            ("not compared", growth.not_compared),
+            ("assumed", growth.assumed),
+            ("left out", growth.left_out),
+        )
+        if clauses
+    )
     gone = f"; {_count(len(growth.removed), 'right')} gone" if growth.removed else ""
     if not growth:
-        return f"nobody gets more access, and nothing is protected less ({worlds}){gone}"
+        return f"nobody gets more access, and nothing is protected less ({worlds}){gone}{basis}"
     parts = []
     if growth.added:
         parts.append(f"{_count(len(growth.added), 'right')} new")
@@ -133,7 +142,7 @@ def _summary(growth: Growth) -> str:
         parts.append((text if pairs == 1 else f"{pairs} pairs of enclaves can influence") + " now")
     if growth.added and growth.reach_unknown:
         parts.append(f"whom that lets enclaves influence is not known: {growth.reach_unknown}")
-    return "; ".join(parts) + gone
+    return "; ".join(parts) + gone + basis
 
 
 def _count(number: int, what: str) -> str:
@@ -166,6 +175,10 @@ def _growth_json(base: AccessSource, head: AccessSource, growth: Growth) -> dict
             for side, source in (("base", base), ("head", head))
         },
         "worlds": list(growth.worlds),
+        "domains": list(growth.domains),
+        "assumed": list(growth.assumed),
+        "left_out": list(growth.left_out),
+        "not_compared": list(growth.not_compared),
         "added": [_gain_json(each) for each in growth.added],
         "reach": [
             {

@@ -210,8 +210,10 @@ def diff_policy(
 
     With --no-new-access, A and B can also be folders of policies, and policies at a revision of
     git, as git:REVISION:PATH. The exit status is 0 only if B gives no enclave any access that A
-    does not give, with no vendor and for no name, and protects nothing less; it is 2 if that
-    cannot be decided. Dates are not compared.
+    does not give, with no vendor, in no domain and for no name, and protects nothing less; it is
+    2 if that cannot be decided. A policy counts as signed with access control of everything: as
+    A, a keystore that protects less gives more; as B, it lowers no protection. The last line says
+    what is assumed and what is left out, such as dates.
     """
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.rights import compare

@@ -223,20 +223,25 @@ class UnreadPath:
         )
 
 
-def search_enclaves(root: Path) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
+def search_enclaves(
+    root: Path, *, hidden: bool = False
+) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
     """Return the sorted names of the enclaves, and the folders that may hold others.
 
     An enclave is a folder that has a certificate or a key.  A link to a folder elsewhere is not
-    followed.
+    followed.  With ``hidden``, enclaves in folders whose names begin with a dot are among them,
+    which sros never writes, and DDS loads.
     """
     top = os.fspath(root / ENCLAVES)
-    return _search(top, top)
+    return _search(top, top, hidden=hidden)
 
 
-def _search(top: str, start: str) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
+def _search(
+    top: str, start: str, *, hidden: bool = False
+) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
     """Return what `search_enclaves` does, of the folder ``start`` in the folder of enclaves."""
     unread: list[UnreadPath] = []
-    found = _names_in(top, _walk(start, unread))
+    found = _names_in(top, _walk(start, unread, hidden=hidden))
     return found, tuple(unread)
 
 
@@ -255,8 +260,11 @@ def _names_in(top: str, folders: Iterable[_Walked]) -> tuple[str, ...]:
     )
 
 
-def _walk(top: str, unread: list[UnreadPath]) -> Iterator[_Walked]:
-    """Yield each folder that can hold an enclave, with its files; add the others to ``unread``."""
+def _walk(top: str, unread: list[UnreadPath], *, hidden: bool = False) -> Iterator[_Walked]:
+    """Yield each folder that can hold an enclave, with its files; add the others to ``unread``.
+
+    ``hidden`` ones have a name that begins with a dot.
+    """
     pending = [top]
     while pending:
         folder = pending.pop()
@@ -275,11 +283,11 @@ def _walk(top: str, unread: list[UnreadPath]) -> Iterator[_Walked]:
                 of_file = name.endswith(_FILE_TYPES)
                 if (of_file and name not in _OF_IDENTITY) or not _is_folder(each):
                     files.append(name)
-                elif not of_file and name[0] != "." and not _is_inside(each.path, top):
+                elif not of_file and (hidden or name[0] != ".") and not _is_inside(each.path, top):
                     unread.append(UnreadPath(each.path, _FOLDER_ELSEWHERE))
             elif not each.is_dir(follow_symlinks=False):
                 files.append(name)
-            elif name[0] != ".":
+            elif hidden or name[0] != ".":
                 pending.append(each.path)
         yield folder, files
 
@@ -294,13 +302,15 @@ def _is_inside(path: str, top: str) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(top))
 
 
-def enclave_names(root: Path) -> tuple[str, ...]:
+def enclave_names(root: Path, *, hidden: bool = False) -> tuple[str, ...]:
     """Return the sorted names of the enclaves: every folder that has a certificate or a key.
+
+    With ``hidden``, as `search_enclaves`.
 
     Raises:
         KeystoreError: an enclave may be missing, because a folder cannot be read.
     """
-    names, unread = search_enclaves(root)
+    names, unread = search_enclaves(root, hidden=hidden)
     if unread:
         raise _unreadable(root, unread, "Enclaves in it would be missing from the result.")
     return names
@@ -319,11 +329,14 @@ def enclaves_below(root: Path, name: str) -> tuple[str, ...]:
     return tuple(each for each in names if each != name)
 
 
-def has_zenoh_files(root: Path) -> bool:
-    """Return whether any enclave that this user can read has a configuration of Zenoh."""
+def has_zenoh_files(root: Path, *, hidden: bool = False) -> bool:
+    """Return whether any enclave that this user can read has a configuration of Zenoh.
+
+    With ``hidden``, as `search_enclaves`.
+    """
     return any(
         is_enclave(Path(folder)) and Path(folder, file).is_file()
-        for folder, files in _walk(os.fspath(root / ENCLAVES), [])
+        for folder, files in _walk(os.fspath(root / ENCLAVES), [], hidden=hidden)
         for file in ZENOH_SIGNED.keys() & files
     )
 

@@ -42,7 +42,7 @@ from sros_tool.translate_zenoh import StatedRight
 from sros_tool.translate_zenoh_back import rights_in_rules
 from sros_tool.xml import parse, read_bytes
 from sros_tool.zenoh.configuration import Mode
-from sros_tool.zenoh.document import parse_configuration
+from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
 from sros_tool.zenoh.enforcement import Enforcement
 
 _COMMON_NAME = re.compile(r"(?:^|[,/])\s*CN\s*=\s*(/[^,]*?)\s*(?:,|$)")
@@ -59,6 +59,7 @@ class RightsSource:
     what a policy says about the protection of names; None for anything else.  ``documents`` are the
     permissions of enclaves, as far as there are any, and ``enforcers`` the access control of each
     Zenoh process that checks others; ``router`` is the enclave of a keystore's router, or "".
+    ``configurations`` are the files of Zenoh that were read, also those of clients.
     ``policy`` is what a policy file holds.
     """
 
@@ -73,21 +74,23 @@ class RightsSource:
     documents: Mapping[str, Permissions] = field(default_factory=dict)
     enforcers: tuple[Enforcement, ...] = ()
     router: str = ""
+    configurations: Mapping[Path, ConfigurationDocument] = field(default_factory=dict)
     policy: Policy | None = None
 
 
-def load_rights(path: Path, fleet: Fleet | None = None) -> RightsSource:
+def load_rights(path: Path, fleet: Fleet | None = None, *, hidden: bool = False) -> RightsSource:
     """Return the rights that ``path`` gives; a policy's are those for ``fleet``, if there is one.
 
     ``path`` is a policy file, ``permissions.p7s`` or ``permissions.xml``, an enclave folder, a
-    keystore, or a configuration of Zenoh such as ``router.json5``.
+    keystore, or a configuration of Zenoh such as ``router.json5``.  With ``hidden``, enclaves of a
+    keystore in folders whose names begin with a dot are among them.
 
     Raises:
         DocumentError: ``path`` is anything else, or malformed.
     """
     if path.is_dir():
         if is_keystore(path):
-            return _keystore_rights(path)
+            return _keystore_rights(path, hidden=hidden)
         if (path / PERMISSIONS_FILE).exists():
             return _document_rights(path, "enclave", path / PERMISSIONS_FILE)
         refuse_earlier(path)
@@ -97,7 +100,7 @@ def load_rights(path: Path, fleet: Fleet | None = None) -> RightsSource:
         )
     data = read_bytes(path, "file")
     if is_zenoh(data):
-        return _zenoh_rights(path, data)
+        return _zenoh_rights(path, parse_configuration(data, str(path), lines=False))
     signed = b"multipart/signed" in data[:1000].lower()
     # read_policy says how a policy of an earlier format, with <profiles> at the top, is converted.
     if not signed and parse(data, f"'{path}'").tag in ("policy", "profiles"):
@@ -111,16 +114,17 @@ def load_rights(path: Path, fleet: Fleet | None = None) -> RightsSource:
     return _document_rights(path, "permissions", path)
 
 
-def load_zenoh_rights(root: Path) -> RightsSource:
+def load_zenoh_rights(root: Path, *, hidden: bool = False) -> RightsSource:
     """Return the rights that the Zenoh configurations of a keystore give its enclaves together.
 
-    Those are of the router, and of peers, which are connected without it.
+    Those are of the router, and of peers, which are connected without it.  ``hidden`` is that of
+    `load_rights`.
 
     Raises:
         KeystoreError: there is no configuration of a router, or there are several.
         DocumentError: Zenoh would not accept a configuration.
     """
-    files = {name: enclave_path(root, name) for name in enclave_names(root)}
+    files = {name: enclave_path(root, name) for name in enclave_names(root, hidden=hidden)}
     routers = [name for name, folder in files.items() if (folder / ROUTER_FILE).is_file()]
     if not routers:
         raise KeystoreError(
@@ -135,15 +139,20 @@ def load_zenoh_rights(root: Path) -> RightsSource:
             "Remove those that no process uses, or write all files again: "
             f"`sros zenoh {quote(str(root))}`.",
         )
-    found = [load_rights(files[name] / ROUTER_FILE) for name in routers]
+    found = []
+    configurations: dict[Path, ConfigurationDocument] = {}
     for name, folder in files.items():
-        file = folder / SESSION_FILE
-        if name not in routers and file.is_file():
+        for file in (folder / ROUTER_FILE, folder / SESSION_FILE):
+            if not file.is_file():
+                continue
             data = read_bytes(file, "Zenoh configuration")
             document = parse_configuration(data, str(file), lines=False)
-            if document.mode is not Mode.PEER:
-                continue  # clients are filtered by the router
-            found.append(_zenoh_rights(file, data))
+            configurations[file] = document
+            # Clients are filtered by the router.
+            if file.name == ROUTER_FILE or (
+                name not in routers and document.mode is not Mode.CLIENT
+            ):
+                found.append(_zenoh_rights(file, document))
     return RightsSource(
         root,
         "zenoh",
@@ -153,6 +162,7 @@ def load_zenoh_rights(root: Path) -> RightsSource:
         tuple(dict.fromkeys(note for one in found for note in one.notes)),
         enforcers=tuple(each for one in found for each in one.enforcers),
         router=routers[0],
+        configurations=configurations,
     )
 
 
@@ -161,8 +171,7 @@ def is_zenoh(data: bytes) -> bool:
     return data.lstrip()[:1] in (b"{", b"/") and b"access_control" in data
 
 
-def _zenoh_rights(path: Path, data: bytes) -> RightsSource:
-    document = parse_configuration(data, str(path), lines=False)
+def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
     access = document.access
     found = rights_in_rules(access)
     notes = []
@@ -194,6 +203,7 @@ def _zenoh_rights(path: Path, data: bytes) -> RightsSource:
         True,
         tuple(notes),
         enforcers=(access,),
+        configurations={path: document},
     )
 
 
@@ -211,10 +221,10 @@ def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:
     )
 
 
-def _keystore_rights(root: Path) -> RightsSource:
+def _keystore_rights(root: Path, *, hidden: bool) -> RightsSource:
     reader = _Reader()
     rights: set[Right] = set()
-    for name in enclave_names(root):
+    for name in enclave_names(root, hidden=hidden):
         file = enclave_path(root, name) / PERMISSIONS_FILE
         try:
             found, scope = reader.permissions(file, name)

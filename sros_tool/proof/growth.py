@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import islice
 
 from sros_tool.automata import NameSet, SearchLimit
@@ -20,22 +19,20 @@ from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import matches, names_of
 from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError
-from sros_tool.keystore.comparison import Effect, SettingChange, attribute_changes
-from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
+from sros_tool.keystore.comparison import Effect, SettingChange
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Source
-from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import Right
-from sros_tool.policy.stated import StatedProtection
 from sros_tool.proof.access import domains_of, enforced_access, is_enforced
-from sros_tool.proof.sources import ALL_DOMAINS, AT, KEYSTORE_ITSELF, AccessSource, Trust
-from sros_tool.proof.worlds import named, valid_topics
+from sros_tool.proof.assumptions import assumptions, completed, domains_of_robots, left_out
+from sros_tool.proof.protection import contradiction, less_protection
+from sros_tool.proof.sources import AT, AccessSource
+from sros_tool.proof.worlds import ROS_TOPICS
+from sros_tool.proof.zenoh_settings import unknown_settings
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
-from sros_tool.topics import SERVICE_ENDS, dds_names
-from sros_tool.translate import governance_for
+from sros_tool.topics import dds_names
 
 _VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 _ZENOH = "Zenoh"
@@ -91,6 +88,14 @@ class Growth:
     gained: tuple[SettingChange, ...]
     """The protection that is more, as the change that would undo it."""
     worlds: tuple[str, ...]
+    domains: tuple[int, ...]
+    """The ROS domains that were decided: of those that have the same rules on both sides one."""
+    assumed: tuple[str, ...]
+    """What is taken for granted of sides that do not say everything, as clauses."""
+    left_out: tuple[str, ...]
+    """What is not compared on purpose."""
+    not_compared: tuple[str, ...]
+    """What could not be compared; without any gain or loss, that is an error."""
 
     def __bool__(self) -> bool:
         return bool(self.added or self.lost)
@@ -99,32 +104,55 @@ class Growth:
 def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     """Return what ``head`` gives that ``base`` does not, and the reverse.
 
+    A policy counts as signed with access control of everything.  As BASE, it means encryption of
+    all that it demands no other protection of, and a keystore that protects less has lost it; as
+    HEAD, it lowers no protection that a keystore has.  It is for the domains of the other side, and
+    enclaves of robots of a fleet for that of their robot.
+
     Raises:
-        DocumentError: it cannot be decided: for too many wildcards, or permissions that a vendor
-            does not accept.
+        DocumentError: it cannot be decided: for too many wildcards, permissions that a vendor does
+            not accept, contradicting protection, or settings of Zenoh that are not known; for the
+            last two only if nothing else is new.
     """
     limit = SearchLimit()
     scope = None
     if base.scope is None or head.scope is None:
         scope = head.scope if base.scope is None else base.scope
-    worlds = _worlds(base, head)
-    added = tuple(_gains(base, head, worlds, scope, limit))
-    removed = tuple(_gains(head, base, worlds, scope, limit))
-    sides = (_edges(base), _edges(head)) if added and scope is None else ({}, {})
+    before, after = completed(base, head), completed(head, base)
+    worlds = _worlds(before, after)
+    added = tuple(_gains(before, after, worlds, scope, limit))
+    lost = tuple(dict.fromkeys(less_protection(base, head, limit)))
+    unclear = tuple(_not_compared(base, head))
+    if unclear and not added and not lost:
+        raise DocumentError(
+            f"'{head.shown}' cannot be compared: {unclear[0]}",
+            "Apart from that, nothing is new.",
+        )
+    sides = (_edges(before), _edges(after)) if added and scope is None else ({}, {})
     unknown = "only some enclaves are compared" if scope is not None else ""
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
+    more = dict.fromkeys(less_protection(head, base, limit))
     return Growth(
         added,
-        removed,
+        tuple(_gains(after, before, worlds, scope, limit)),
         tuple(islice(_new_reach(*sides), _MOST_REACH)),
         unknown,
-        tuple(dict.fromkeys(_loosened(base, head, limit))),
-        tuple(
-            replace(e, effect=Effect.TIGHTER) for e in dict.fromkeys(_loosened(head, base, limit))
-        ),
+        lost,
+        tuple(replace(each, effect=Effect.TIGHTER) for each in more),
         tuple(each.title for each in worlds),
+        tuple(sorted({domain for each in worlds for domain in each.domains})),
+        assumptions(base, head),
+        left_out(base, head),
+        unclear,
     )
+
+
+def _not_compared(base: AccessSource, head: AccessSource) -> Iterator[str]:
+    """Yield what of HEAD cannot be compared."""
+    if found := contradiction(head):
+        yield f"the protection of HEAD: {found}"
+    yield from unknown_settings(base.zenoh_files, head.zenoh_files)
 
 
 # ── worlds ─────────────────────────────────────────────────────────────────────────────────
@@ -142,6 +170,10 @@ class _Access:
 _NO_ACCESS = _Access(dict.fromkeys(_VERBS, NameSet()), lambda verb, topic: False, joins=False)
 
 
+_AccessOf = Callable[[AccessSource, str, int], _Access]
+"""The access of an enclave of a side in a domain."""
+
+
 @dataclass(frozen=True, slots=True)
 class _World:
     """A vendor, or Zenoh, with the domains that are compared there."""
@@ -149,36 +181,29 @@ class _World:
     title: str
     style: Style
     domains: tuple[int, ...]
-    access: Callable[[AccessSource, str, int], _Access]
+    access: _AccessOf
     longest: int | None = None
 
 
 def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
     found = []
     if "zenoh" not in (base.kind, head.kind):
-        governances = _governances(base, head)
-        domains = _domains(base, head, governances.values())
+        domains = _domains(base, head)
         for vendor in MEASURED:
-            by_side = _of_vendor(vendor, governances)
+            by_side = _of_vendor(vendor)
             longest = vendor.traits.longest_topic_name
             found.append(_World(vendor.title, vendor.traits.style, domains, by_side, longest))
     if base.zenoh is not None or head.zenoh is not None:
-        domains = domains_of((*base.enforcers, *head.enforcers)) or (0,)
+        of_robots = [domains_of_robots(base, head), domains_of_robots(head, base)]
+        own = {domain for each in of_robots for domain in each.values()}
+        domains = tuple(sorted({*domains_of((*base.enforcers, *head.enforcers)), *own})) or (0,)
         found.append(_World(_ZENOH, Style.FNMATCH, domains, _on_zenoh(base, head)))
     return found
 
 
-def _governances(base: AccessSource, head: AccessSource) -> dict[int, Governance]:
-    """Return the governance of each side, by its id: that of the other one if it has none."""
-    strict = governance_for(load_template(DEFAULT_TEMPLATE).protection, ALL_DOMAINS)
-    of = base.governance or head.governance or strict
-    return {id(base): of, id(head): head.governance or of}
-
-
-def _domains(
-    base: AccessSource, head: AccessSource, governances: Iterable[Governance]
-) -> tuple[int, ...]:
+def _domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
     """Return one domain of each kind: between two of them, all have the same rules as the first."""
+    governances = (each.governance for each in (base, head) if each.governance)
     listed = {rule.domains for each in governances for rule in each.domain_access_rules}
     granted = {
         rule.domains
@@ -190,15 +215,13 @@ def _domains(
     return DomainSet.one_of_each_kind(listed, granted)
 
 
-def _of_vendor(
-    vendor: Vendor, governances: Mapping[int, Governance]
-) -> Callable[[AccessSource, str, int], _Access]:
+def _of_vendor(vendor: Vendor) -> _AccessOf:
     def access(side: AccessSource, enclave: str, domain: int) -> _Access:
         permissions = side.permissions.get(enclave)
-        if permissions is None:
+        if permissions is None or side.governance is None:
             return _NO_ACCESS
         subject = permissions.grants[0].subject if permissions.grants else ""
-        found = Access(vendor, governances[id(side)], permissions, subject, domain=domain, at=AT)
+        found = Access(vendor, side.governance, permissions, subject, domain=domain, at=AT)
         if found.join().reason in ("no-grant", "malformed") or found.join().outcome == "crashes":
             raise DocumentError(
                 f"the permissions of {enclave} in '{side.shown}' cannot be compared",
@@ -214,13 +237,16 @@ def _of_vendor(
     return access
 
 
-def _on_zenoh(*sides: AccessSource) -> Callable[[AccessSource, str, int], _Access]:
+def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
     """Return the access that rules of Zenoh give, or for a side without them its rights."""
+    sides = (base, head)
     stated = _of_rights({id(each): each.rights for each in sides if each.zenoh is None})
+    robots = {id(one): domains_of_robots(one, other) for one, other in (sides, sides[::-1])}
 
     def access(side: AccessSource, enclave: str, domain: int) -> _Access:
         if side.zenoh is None:
-            return stated(side, enclave, domain)
+            elsewhere = robots[id(side)].get(enclave, domain) != domain
+            return _NO_ACCESS if elsewhere else stated(side, enclave, domain)
         if enclave == side.router:
             return _NO_ACCESS
         found = enforced_access(side.enforcers, enclave, domain)
@@ -229,7 +255,7 @@ def _on_zenoh(*sides: AccessSource) -> Callable[[AccessSource, str, int], _Acces
             writes = verb is AccessVerb.PUBLISH
             return is_enforced(side.enforcers, enclave, domain, topic, writes=writes)
 
-        writes, reads = (each & _ROS_TOPICS for each in (found.writes, found.reads))
+        writes, reads = (each & ROS_TOPICS for each in (found.writes, found.reads))
         topics = {AccessVerb.PUBLISH: writes, AccessVerb.SUBSCRIBE: reads}
         joins = any(enclave in each.names() for each in side.enforcers)
         return _Access(topics, decide, joins=joins)
@@ -239,7 +265,7 @@ def _on_zenoh(*sides: AccessSource) -> Callable[[AccessSource, str, int], _Acces
 
 def _of_rights(
     rights: Mapping[int, Collection[Right]],
-) -> Callable[[AccessSource, str, int], _Access]:
+) -> _AccessOf:
     """Return the access that rights in ROS terms give, by the id of a side."""
     by_enclave = {side: _by_enclave(some) for side, some in rights.items()}
 
@@ -266,7 +292,7 @@ def _of_rights(
 
         def topics(verb: AccessVerb) -> NameSet:
             given = names_of(Style.FNMATCH, allowed[verb]) - names_of(Style.FNMATCH, denied[verb])
-            return given & _ROS_TOPICS
+            return given & ROS_TOPICS
 
         return _Access({verb: topics(verb) for verb in _VERBS}, decide, joins=bool(own))
 
@@ -339,7 +365,7 @@ def _each_gain(
                 found = False
                 for verb in _VERBS:
                     more = after.topics[verb] - before.topics[verb]
-                    if enclave not in old.permissions:
+                    if not before.joins:
                         more -= NameSet((ROS_DISCOVERY_TOPIC,))  # every participant has it
                     for gain in stated.gains(enclave, verb, more, world, domain, limit):
                         if not after.decide(verb, gain.topic) or before.decide(verb, gain.topic):
@@ -356,7 +382,7 @@ def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> 
     """Return whether an enclave certainly has the same access on both sides."""
     if world.title == _ZENOH:
         return None not in (old.zenoh, new.zenoh) and old.enforcers == new.enforcers
-    if old.governance and new.governance and old.governance != new.governance:
+    if old.governance != new.governance:
         return False
     one, other = old.permissions.get(enclave), new.permissions.get(enclave)
     if one is None or other is None:
@@ -467,15 +493,9 @@ def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit)
     if not is_expression(expression):
         return expression if expression in names else None
     found = names.example(limit, longest=world.longest)
-    if found is None or found in _ROS_TOPICS:
+    if found is None or found in ROS_TOPICS:
         return found
-    return (names & _ROS_TOPICS).example(limit, longest=world.longest) or found
-
-
-_ROS_TOPICS = NameSet.union(
-    valid_topics(begin, end) for begin, end in (("rt", ""), *SERVICE_ENDS.items())
-)
-"""The topics of all valid ROS names."""
+    return (names & ROS_TOPICS).example(limit, longest=world.longest) or found
 
 
 # ── reach ──────────────────────────────────────────────────────────────────────────────────
@@ -545,151 +565,3 @@ def _network(side: AccessSource) -> Network:
         unguarded=unguarded(side.governance) if side.governance else (),
         everybody=sorted(side.permissions),
     )
-
-
-# ── protection ─────────────────────────────────────────────────────────────────────────────
-
-
-def _loosened(old: AccessSource, new: AccessSource, limit: SearchLimit) -> Iterator[SettingChange]:
-    """Yield what is protected less in ``new`` than in ``old``."""
-    if old.governance and new.governance:
-        yield from _looser_governance(old.governance, new.governance, limit)
-    if old.authorities is not None and new.authorities is not None:
-        for role, each in sorted(new.authorities - old.authorities):
-            yield SettingChange(
-                Effect.LOOSER,
-                f"{role} CA {each[:16]}...",
-                "unknown",
-                "trusted",
-                "whoever has its key can become any enclave"
-                if role == "identity"
-                else "whoever has its key can give any right",
-            )
-    yield from _trusted_again(old, new)
-    if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
-        text = "nothing enforces on Zenoh what its files enforced"
-        yield SettingChange(Effect.LOOSER, "files of Zenoh", "present", "missing", text)
-    if old.router and new.router and old.router != new.router:
-        text = "whoever plays the router reads and changes all that passes"
-        yield SettingChange(Effect.LOOSER, "router of Zenoh", old.router, new.router, text)
-    if old.protections and new.protections is not None:
-        yield from _no_longer_stated(old.protections, new.protections, limit)
-
-
-def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
-    """Yield the certificates that enclaves refuse in ``old``, and not in ``new``."""
-    if old.trusts is None or new.trusts is None:
-        return
-    all_revoked = frozenset(each for trust in old.trusts.values() for each in trust.revoked)
-    again: dict[int, list[str]] = defaultdict(list)
-
-    @lru_cache(maxsize=8)  # most enclaves have the same lists
-    def lost(before: frozenset[tuple[str, int]], after: Trust) -> list[int]:
-        gone = before - after.revoked
-        return sorted(serial for authority, serial in gone if authority in after.authorities)
-
-    for name in sorted(new.trusts):
-        if old.scope is None or new.scope is not None or name in old.scope:
-            before = old.trusts[name].revoked if name in old.trusts else all_revoked
-            for serial in lost(before, new.trusts[name]):
-                again[serial].append(name)
-    for serial in sorted(again)[:_MOST_SERIALS]:
-        names = [each for each in again[serial] if each != KEYSTORE_ITSELF] or [KEYSTORE_ITSELF]
-        who = f"{names[0]} trusts" if len(names) == 1 else f"{len(names)} enclaves trust"
-        text = f"{who} whoever has its key again"
-        yield SettingChange(Effect.LOOSER, f"certificate {serial:x}", "revoked", "trusted", text)
-    if (more := len(again) - _MOST_SERIALS) > 0:
-        text = "enclaves trust whoever has their keys again"
-        yield SettingChange(Effect.LOOSER, f"{more} certificates more", "revoked", "trusted", text)
-
-
-_MOST_SERIALS = 20
-
-
-def _looser_governance(
-    old: Governance, new: Governance, limit: SearchLimit
-) -> Iterator[SettingChange]:
-    pairs = dict.fromkeys(
-        (one, other)
-        for one in old.domain_access_rules
-        for other in new.domain_access_rules
-        if any(each in other.domains.closed() for each in one.domains.closed())
-    )
-    for one, other in pairs:
-        for each in attribute_changes(one, other, "protection", ""):
-            if each.effect is Effect.LOOSER:
-                yield each
-        for style in Style:
-            yield from _looser_topics(one, other, style, limit)
-
-
-def _looser_topics(
-    old: DomainRule, new: DomainRule, style: Style, limit: SearchLimit
-) -> Iterator[SettingChange]:
-    for before, had in _by_protection(old, style):
-        for after, has in _by_protection(new, style):
-            changes = [
-                each
-                for each in attribute_changes(before, after, "protection", "{}")
-                if each.effect is Effect.LOOSER
-            ]
-            both = had & has
-            if not changes:
-                continue
-            topic = both.example(limit)
-            if topic is None:
-                continue
-            if topic not in _ROS_TOPICS:
-                topic = (both & _ROS_TOPICS).example(limit) or topic
-            for each in changes:
-                yield replace(each, meaning=each.meaning.replace("{}", f"DDS topic {topic}"))
-
-
-def _by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, NameSet]]:
-    """Return each protection of topics, as a rule without its expression, and all its topics."""
-    rules = [
-        (names_of(style, (each.topic_expression,)), replace(each, topic_expression="*"))
-        for each in rule.topic_access_rules
-    ]
-    return [
-        (kind, NameSet.first((names, each == kind) for names, each in rules))
-        for kind in dict.fromkeys(each for _, each in rules)
-    ]
-
-
-def _no_longer_stated(
-    old: Iterable[StatedProtection], new: Iterable[StatedProtection], limit: SearchLimit
-) -> Iterator[SettingChange]:
-    """Yield the names whose protection one policy demands, and the other one less or not."""
-    later = tuple(new)
-    for each in old:
-        enough = [
-            other.name
-            for other in later
-            if other.kind == each.kind and (other.level, each.level) != (Level.SIGN, Level.ENCRYPT)
-        ]
-        names = _named((each.name,)) - _named(enough)
-        found = names.example(limit)
-        if found is not None:
-            valid = names & _ABSOLUTE
-            name = found if found in _ABSOLUTE else valid.example(limit) or found
-            less = "sign" if name in _named(_signed(later, each.kind)) else "nothing"
-            yield SettingChange(
-                Effect.LOOSER,
-                f"protect {each}",
-                each.word,
-                less,
-                f"the policy no longer demands it of {each.kind.removesuffix('s')} {name}",
-            )
-
-
-def _signed(stated: Iterable[StatedProtection], kind: str) -> list[str]:
-    return [each.name for each in stated if each.kind == kind]
-
-
-def _named(names: Iterable[str]) -> NameSet:
-    return NameSet.union(map(named, names))
-
-
-_ABSOLUTE = valid_topics("", "")
-"""All absolute ROS names."""

@@ -26,6 +26,7 @@ from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
+    ZENOH_SIGNED,
     ca_certificate,
     enclave_names,
     enclave_path,
@@ -34,8 +35,10 @@ from sros_tool.keystore.layout import (
     permissions_ca_for,
 )
 from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.reader import governance_of
+from sros_tool.keystore.reader import OpenedKeystore, governance_of, load_settings
 from sros_tool.keystore.rights import RightsSource, load_rights, load_zenoh_rights
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.zenoh.opened import is_signed
 from sros_tool.names import expand
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
@@ -52,9 +55,11 @@ from sros_tool.policy.model import Enclave, Policy, Source
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.proof.revisions import PREFIX, Revision, find_revision
+from sros_tool.proof.zenoh_settings import LONE, SIGNED, SignedConfiguration
 from sros_tool.translate import permissions_for
 from sros_tool.validity import iso, window
 from sros_tool.xml import parse, read_bytes
+from sros_tool.zenoh.document import ConfigurationDocument
 from sros_tool.zenoh.enforcement import Enforcement
 
 UNCERTAIN = {
@@ -94,7 +99,9 @@ class AccessSource:
     are these rules, ``router`` is the enclave of the router.  ``scope`` are the enclaves that it is
     for; None for all.  ``governance`` is None if it has none of its own.  ``authorities`` are the
     CAs that its enclaves trust, pairs of role and fingerprint, and ``trusts`` whom each of them
-    trusts, and `KEYSTORE_ITSELF`; None if it does not say.
+    trusts, and `KEYSTORE_ITSELF`; None if it does not say.  ``later`` are the settings for enclaves
+    that are created later, None without any.  ``zenoh_files`` are the configurations of Zenoh, by
+    enclave and file name.
     """
 
     shown: str
@@ -107,6 +114,8 @@ class AccessSource:
     governance: Governance | None = None
     authorities: frozenset[tuple[str, str]] | None = None
     trusts: Mapping[str, Trust] | None = None
+    later: Template | None = None
+    zenoh_files: Mapping[str, SignedConfiguration] = field(default_factory=dict)
     scope: frozenset[str] | None = None
     notes: tuple[Note, ...] = ()
     fleet: Fleet | None = None
@@ -148,7 +157,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
         files = [each for each in sorted(path.glob("*.xml")) if _is_policy(each)]
         if files:
             return _of_policies(str(path), [_read(each, fleet) for each in files])
-    source = load_rights(path, fleet)
+    source = load_rights(path, fleet, hidden=True)
     for note in source.notes:
         if not source.sound or note.id in UNCERTAIN:
             raise DocumentError(
@@ -179,7 +188,9 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
                 "Sign one grant for each enclave.",
             )
     if source.kind == "zenoh":
-        return replace(side, zenoh=source.rights, enforcers=source.enforcers)
+        (document,) = source.configurations.values()
+        lone = {LONE: _zenoh_file(path, document)}
+        return replace(side, zenoh=source.rights, enforcers=source.enforcers, zenoh_files=lone)
     if source.kind == "enclave":
         has_one = (path / GOVERNANCE_FILE).exists()
         governance = _governance(path / GOVERNANCE_FILE) if has_one else None
@@ -188,7 +199,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         return replace(side, governance=governance, authorities=_authorities([path]), trusts=trusts)
     if source.kind != "keystore":
         return side
-    folders = {name: enclave_path(path, name) for name in enclave_names(path)}
+    folders = {name: enclave_path(path, name) for name in enclave_names(path, hidden=True)}
     trusting = {
         name: (each / IDENTITY_CA_FILE, each / CRL_FILE) for name, each in folders.items()
     } | {KEYSTORE_ITSELF: (path / ca_certificate(IDENTITY), path / CRL)}
@@ -197,14 +208,39 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         governance=_of_all(path, folders.values()),
         authorities=_authorities(folders.values()),
         trusts=_trusts(trusting, _expiries(path)),
+        later=load_settings(path) if OpenedKeystore(path).is_home else None,
     )
-    if not has_zenoh_files(path):
+    if not has_zenoh_files(path, hidden=True):
         return side
-    found = load_zenoh_rights(path)
+    found = load_zenoh_rights(path, hidden=True)
     for note in found.notes:
         if note.id in UNCERTAIN:
             raise DocumentError(f"'{path}' cannot be compared: {note.text.rstrip('.')}")
-    return replace(side, zenoh=found.rights, enforcers=found.enforcers, router=found.router)
+    names = {folder: name for name, folder in folders.items()}
+    configurations = {
+        f"{names[file.parent]} {file.name}": _zenoh_file(file, document)
+        for file, document in found.configurations.items()
+    }
+    return replace(
+        side,
+        zenoh=found.rights,
+        enforcers=found.enforcers,
+        router=found.router,
+        zenoh_files=configurations,
+    )
+
+
+def _zenoh_file(path: Path, document: ConfigurationDocument) -> SignedConfiguration:
+    """Return a configuration of Zenoh with the state of the signature next to it."""
+    signed = ZENOH_SIGNED.get(path.name)
+    authority = permissions_ca_for(path)
+    if signed is None or not os.path.lexists(path.with_name(signed)):
+        return SignedConfiguration(document, "missing")
+    if authority is None:
+        return SignedConfiguration(document, "not verified")
+    certificate = load_certificate(read_bytes(authority, "certificate"), f"'{authority}'")
+    data = read_bytes(path, "Zenoh configuration")
+    return SignedConfiguration(document, SIGNED if is_signed(path, data, certificate) else "broken")
 
 
 def _of_all(root: Path, folders: Iterable[Path]) -> Governance:
@@ -379,7 +415,9 @@ def _of_policies(shown: str, policies: list[_Read]) -> AccessSource:
     }
     rights = frozenset(each for policy, _ in policies for each in policy_rights(policy))
     stated = stated_protections(enclaves.values())
-    fleet = policies[0][1] if len(policies) == 1 else None
+    fleets = [fleet for _, fleet in policies if fleet]
+    patterns = dict.fromkeys(each for fleet in fleets for each in fleet.enclaves)
+    fleet = fleets[0].with_enclaves(tuple(patterns)) if fleets else None
     return AccessSource(
         shown, "policy", rights, permissions, fleet=fleet, protections=stated, enclaves=enclaves
     )

@@ -19,6 +19,7 @@ from sros_tool.dds.decision.matching import names_of
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.names import is_expression
 from sros_tool.policy.protection import Level
+from sros_tool.topics import SERVICE_ENDS
 
 LONGEST = 255
 """Longest name of a topic in bytes: the limit of DDS in ROS 2 (rmw, validate_full_topic_name.h)."""
@@ -85,6 +86,12 @@ def valid_topics(begin: str, end: str) -> NameSet:
     edges += [(at + 2, more, at + 2), (at + 2, slash, at + 1)]
     edges += [(at + 2 + i, Letters.of(letter), at + 3 + i) for i, letter in enumerate(end)]
     return NameSet(automata=(Automaton(tuple(edges), frozenset((at + 2 + len(end),))),))
+
+
+ROS_TOPICS = NameSet.union(
+    valid_topics(begin, end) for begin, end in (("rt", ""), *SERVICE_ENDS.items())
+)
+"""The topics of all valid ROS names."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ Source: commons/zenoh-config of zenoh 1.9; compared with the wheel 1.10.2.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -111,6 +112,7 @@ class ConfigurationDocument:
     ``protocols`` are the only ones for endpoints, None for all.  ``namespace`` stands before every
     key of the process.  ``lines`` are the lines of settings, by their paths with "/" between the
     parts; ``unknown`` the paths of settings that no version of Zenoh up to 1.10 accepts.
+    ``settings`` are all settings that the file states, but for access control, as JSON.
     """
 
     name: str
@@ -128,6 +130,7 @@ class ConfigurationDocument:
     namespace: str | None = None
     access: Enforcement = field(default_factory=Enforcement)
     unknown: tuple[str, ...] = ()
+    settings: Mapping[str, str] = field(default_factory=dict, repr=False)
     lines: Mapping[str, int] = field(default_factory=dict, compare=False, repr=False)
 
     def open_link(self) -> str:
@@ -331,6 +334,7 @@ def _configuration(root: _Section, name: str) -> ConfigurationDocument:
         root.text("namespace"),
         _enforcement(root.section("access_control")),
         tuple(unknown),
+        dict(_settings(root.value, "")),
         dict(_lines(root.value, "")),
     )
 
@@ -464,6 +468,15 @@ def _repeated(ids: Iterable[str]) -> Iterator[str]:
         if each in seen:
             yield each
         seen.add(each)
+
+
+def _settings(value: Json5Object, path: str) -> Iterator[tuple[str, str]]:
+    for name, inner in value.items():
+        if isinstance(inner, Json5Object) and inner:
+            if path or name != "access_control":
+                yield from _settings(inner, f"{path}{name}/")
+        else:
+            yield path + name, json.dumps(inner, sort_keys=True)
 
 
 def _lines(value: Json5Object, path: str) -> Iterator[tuple[str, int]]:

@@ -40,7 +40,13 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sound")
     (folder / "robot.xml").write_text(POLICY)
     (folder / "req.toml").write_text(REQUIREMENTS)
-    for words in ("create_keystore ks", "generate_artifacts -k ks -p robot.xml", "zenoh ks"):
+    strict = "--set permissions.default=node_basics --set certificates.unique_subject=true"
+    for words in (
+        "create_keystore ks",
+        f"update_keystore ks {strict}",
+        "generate_artifacts -k ks -p robot.xml",
+        "zenoh ks",
+    ):
         sros(*words.split(), cwd=folder).ok()
     for name in ("/lost", "/stolen"):
         sros("create_enclave", "ks", name, cwd=folder).ok()
@@ -298,9 +304,139 @@ def without_the_files_of_zenoh(keystore: Path) -> None:
         each.unlink()
 
 
+def rules_that_nobody_signed(keystore: Path) -> None:
+    """They state the same as before."""
+    rules(keystore, lambda document: None)
+
+
+def without_the_signature(keystore: Path) -> None:
+    (keystore / ROUTER).with_suffix(".p7s").unlink()
+
+
+def setting(path: str, value: object) -> Callable[[Path], None]:
+    """Return the change of a setting in the file of Zenoh's router."""
+
+    def change(keystore: Path) -> None:
+        def set_in(document: dict) -> None:  # type: ignore[type-arg]
+            *parents, last = path.split("/")
+            for each in parents:
+                document = document.setdefault(each, {})
+            document[last] = value
+
+        rules(keystore, set_in)
+
+    change.__name__ = path.replace("/", "-")
+    return change
+
+
+def rules_that_a_session_does_not_enforce(keystore: Path) -> None:
+    file = keystore / "enclaves/web/session.json5"
+    text = file.read_text().replace('"enabled": true,\n  "default', '"enabled": false,\n  "default')
+    file.write_text(text)
+
+
+def a_session_that_routes(keystore: Path) -> None:
+    """What it lets others do is compared as well as what the router does."""
+    file = keystore / "enclaves/web/session.json5"
+    text = (keystore / ROUTER).read_text().replace("0/cmd_vel/", "0/cmd_$*/")
+    file.write_text(text)
+
+
+def in_a_dot_folder(keystore: Path) -> None:
+    """DDS loads an enclave from any folder."""
+    shutil.copytree(keystore / "enclaves/web", keystore / "enclaves/.h", symlinks=True)
+    for each in (keystore / "enclaves/.h").glob("*.json5"):
+        each.unlink()
+
+    def hidden(document: bytes) -> bytes:
+        return drives(document).replace(b"/web", b"/.h")
+
+    signed(keystore, "enclaves/.h/permissions.p7s", hidden)
+
+
+def settings(old: str, new: str) -> Callable[[Path], None]:
+    """Return an edit of the settings, which later enclaves follow."""
+
+    def change(keystore: Path) -> None:
+        text = (keystore / "sros.toml").read_text()
+        assert old in text
+        (keystore / "sros.toml").write_text(text.replace(old, new, 1))
+
+    change.__name__ = f"set-{new.partition(' ')[0]}"
+    return change
+
+
+def without_settings(keystore: Path) -> None:
+    """Then those of the template for ros2/sros2 hold."""
+    (keystore / "sros.toml").unlink()
+
+
+LESS = "+ less protection: "
+OPEN_SETTINGS = [
+    ("transport/link/tls/enable_mtls", False, "it asks for no certificate"),
+    ("transport/link/tls/close_link_on_expiration", False, LESS),
+    ("transport/link/tls/verify_name_on_connect", False, ""),
+    ("transport/link/tls/root_ca_certificate", "/tmp/ca.pem", "a certificate of that CA is let in"),
+    ("transport/link/protocols", ["tls", "quic"], "without -> with quic"),
+    ("transport/shared_memory/enabled", True, LESS),
+    ("scouting/multicast/enabled", True, LESS),
+    ("adminspace/enabled", True, "adminspace/permissions/read of /router router.json5 false -> "),
+    ("adminspace", {"enabled": True, "permissions": {"write": True}}, "others may change its"),
+    ("plugins/rest/http_port", 8000, "plugins/rest/http_port of /router router.json5 missing ->"),
+    ("plugins_loading/enabled", True, "it loads plugins"),
+    ("transport/auth/usrpwd/password", "hush", "transport/auth/usrpwd/password of /router"),
+    ("listen/endpoints", ["tls/0.0.0.0:1"], "without -> with tls/0.0.0.0:1: it listens there"),
+    ("connect/endpoints", ["tls/evil:7447"], "it connects to what is there"),
+    (
+        "downsampling",
+        [],
+        "the setting downsampling of /router router.json5, of which sros does not",
+    ),
+    ("scouting/gossip/target/peer", ["peer"], "the setting scouting/gossip/target/peer of"),
+    ("queries_default_timeout", 1, ""),
+    ("metadata", {"name": "x"}, ""),
+]
+"""Settings of the router with what is said of them; nothing for those that give nobody anything."""
+
+
+@pytest.mark.parametrize(("path", "value", "said"), OPEN_SETTINGS)
+def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, said: str) -> None:
+    keystore = sound / f"set-{path.replace('/', '-')}"
+    shutil.copytree(sound / "ks", keystore, symlinks=True)
+    setting(path, value)(keystore)
+    authority = load_certificate((keystore / "public/permissions_ca.cert.pem").read_bytes(), "")
+    key = load_key((keystore / "private/permissions_ca.key.pem").read_bytes(), "")
+    message = smime.sign((keystore / ROUTER).read_bytes(), authority, key)
+    (keystore / ROUTER).with_suffix(".p7s").write_bytes(message)
+    words = ("diff_policy", "--no-new-access", "ks", keystore.name)
+    ended = sros(*words, cwd=sound)
+    assert said in ended.out + ended.err
+    assert "hush" not in ended.out + ended.err
+    refused = "of which sros does not" in ended.err or "cannot be compared" in ended.err
+    assert ended.status == (2 if refused else int(bool(said))), ended
+
+
 @pytest.mark.parametrize(
     ("change", "status", "said"),
     [
+        (rules_that_nobody_signed, 1, "signature of /router router.json5 holds -> broken: anybody"),
+        (without_the_signature, 1, "signature of /router router.json5 holds -> missing: anybody"),
+        (rules_that_a_session_does_not_enforce, 1, "access_control/enabled of /web session.json5"),
+        (a_session_that_routes, 1, "+ /mux publish topic /cmd_*: such as /cmd_"),
+        (in_a_dot_folder, 1, "+ /.h publish topic /cmd_vel"),
+        (
+            settings('default = "node_basics"', 'default = "everything"'),
+            1,
+            "later enclaves: permissions.default node_basics -> everything: an enclave without a",
+        ),
+        (
+            settings('rtps = "SIGN"', 'rtps = "NONE"'),
+            1,
+            "later enclaves: protection.rtps SIGN -> NONE: whole messages: no longer",
+        ),
+        (settings("unique_subject = true", "unique_subject = false"), 1, "fit every later"),
+        (settings('validity = "1d"', 'validity = "2d"'), 0, "left out: dates, "),
+        (without_settings, 1, "later enclaves: permissions.default node_basics -> everything"),
         (without_the_list, 1, "revoked -> trusted: /mux trusts whoever has its key again"),
         (an_earlier_list, 1, "revoked -> trusted: 3 enclaves trust whoever has its key again"),
         (an_earlier_list_for_later_enclaves, 1, "trusted: the keystore trusts whoever has its"),

@@ -255,6 +255,75 @@ def test_a_governance_that_opens_a_topic(made: Path) -> None:
     assert "- more protection: protection.data NONE -> ENCRYPT" in back.out
 
 
+LOOSER = {
+    "topics": ("--rule", "topic /wheels data=NONE metadata=NONE"),
+    "writing": ("--rule", "topic /wheels write_access_control=false"),
+    "rtps": ("--set", "protection.rtps=NONE"),
+    "discovery": ("--set", "protection.discovery=NONE"),
+    "liveliness": ("--set", "protection.liveliness=SIGN"),
+    "join": ("--set", "protection.join_access_control=false"),
+    "unauthenticated": (
+        "--set", "protection.rtps=NONE",
+        "--set", "protection.allow_unauthenticated_participants=true",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", LOOSER)
+def test_a_policy_alone_means_a_strict_governance(made: Path, kind: str) -> None:
+    keystore = made / f"looser-{kind}"
+    shutil.copytree(made / "ks", keystore)
+    change = ("update_keystore", keystore.name, *LOOSER[kind], "--allow-looser")
+    sros(*change, cwd=made).ok()
+    words = ("diff_policy", "--no-new-access")
+    ended = sros(*words, "robot.xml", keystore.name, cwd=made)
+    assert ended.status == 1, ended
+    assert "+ less protection: protection." in ended.out
+    back = sros(*words, keystore.name, "robot.xml", cwd=made)
+    assert back.status == 0, back
+    assert "- more protection: protection." in back.out
+    assert "; assumed: HEAD is signed with access control of everything" in back.err
+    strict = sros(*words, "robot.xml", "ks", cwd=made)
+    assert strict.status == 0
+    assert "nothing is protected less" in strict.err
+    assert "; assumed: BASE means access control of everything" in strict.err
+
+
+def test_what_a_policy_demands_of_a_name_is_asked_of_a_keystore(made: Path) -> None:
+    """A policy that demands a signature of a name alone is content with it, and only there."""
+    protected = '<topics publish="ALLOW"><topic>/image<?sros protect="{}"?></topic></topics>'
+    for level in ("sign", "encrypt"):
+        write(made, f"{level}.xml", "/log_*", "vel", protected.format(level))
+    words = ("diff_policy", "--no-new-access")
+    shutil.copytree(made / "ks", made / "camera")
+    sros("generate_artifacts", "-k", "camera", "-p", "sign.xml", cwd=made).ok()
+    signs = ("--rule", "topic /image data=NONE metadata=SIGN", "--allow-looser")
+    sros("update_keystore", "camera", *signs, cwd=made).ok()
+    assert sros(*words, "sign.xml", "camera", cwd=made).status == 0
+    assert sros(*words, "camera", "sign.xml", cwd=made).status == 0
+    ended = sros(*words, "encrypt.xml", "camera", cwd=made)
+    assert ended.status == 1
+    assert "DDS topic rt/image: no longer encrypted" in ended.out
+
+
+def test_protection_that_contradicts_itself_is_not_compared(tmp_path: Path) -> None:
+    """Two lines of HEAD that demand different protection of a name demand nothing certain."""
+    line = '<topics publish="ALLOW"><topic>/image{}<?sros protect="{}"?></topic></topics>'
+    write(tmp_path, "base.xml", "/x", "vel", line.format("*", "encrypt"))
+    both = line.format("*", "encrypt") + line.format("_left", "sign")
+    write(tmp_path, "head.xml", "/x", "vel", both)
+    words = ("diff_policy", "--no-new-access")
+    ended = sros(*words, "base.xml", "head.xml", cwd=tmp_path)
+    assert ended.status == 2, ended
+    assert 'head.xml:14: topic /image_left has protect="sign"' in ended.err
+    assert "nobody gets more access" not in ended.err
+    write(tmp_path, "more.xml", "/y", "vel", both)
+    ended = sros(*words, "base.xml", "more.xml", cwd=tmp_path)
+    assert ended.status == 1
+    assert "not compared: the protection of HEAD" in ended.err
+    assert sros(*words, "head.xml", "base.xml", cwd=tmp_path).status == 0
+
+
 def test_a_signature_that_does_not_verify_is_not_compared(made: Path) -> None:
     broken = made / "broken"
     broken.mkdir()
@@ -407,3 +476,72 @@ def test_a_git_that_fails_without_a_word_is_no_missing_file(
     ended = sros("diff_policy", "--no-new-access", *sides, cwd=repository)
     assert ended.status == 2
     assert "git cannot read it: it ended with status 9" in ended.err
+
+
+# ── fleets ─────────────────────────────────────────────────────────────────────────────────
+
+
+FLEET_POLICY = """<policy version="0.2.0"><enclaves>
+<enclave path="/{robot}/base"><profiles><profile ns="{namespace}" node="base">
+<topics publish="ALLOW"><topic>status</topic></topics></profile></profiles></enclave>
+<enclave path="/desk"><profiles><profile ns="/" node="desk">
+<topics subscribe="ALLOW"><topic>/r1/status</topic></topics></profile></profiles></enclave>
+</enclaves></policy>"""
+ROBOTS = '[robots.r1]\nnamespace = "/r1"\n{}\n[robots.r2]\nnamespace = "/r2"\n'
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy, fleets whose robot r1 is in another domain, and a keystore with domains 0 and 7."""
+    folder = tmp_path_factory.mktemp("fleet")
+    (folder / "fleet.xml").write_text(FLEET_POLICY)
+    for name, line in (("any", ""), ("seven", "domain = 7"), ("eight", "domain = 8")):
+        (folder / f"{name}.toml").write_text(ROBOTS.format(line))
+    sros("create_keystore", "ks", cwd=folder, env={"ROS_DOMAIN_ID": None}).ok()
+    sros("update_keystore", "ks", "--domain", "0,7", "--allow-looser", cwd=folder).ok()
+    made = ("generate_artifacts", "-k", "ks", "-p", "fleet.xml", "--fleet", "seven.toml")
+    sros(*made, cwd=folder).ok()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("base", "head", "status", "said"),
+    [
+        ("seven", "eight", 1, "+ /r1/base publish topic /r1/status  (fleet.xml:3); in domain 8\n"),
+        ("seven", "any", 1, "+ /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n"),
+        ("any", "seven", 0, "- /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n"),
+        ("seven", "seven", 0, ""),
+        ("ks", "seven", 0, ""),
+        ("seven", "ks", 0, ""),
+        ("ks", "any", 1, "+ /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n"),
+        ("ks", "eight", 1, "+ /desk subscribe topic /r1/status  (fleet.xml:5); in domain 8\n"),
+        ("any", "ks", 0, "- /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n"),
+    ],
+)
+def test_the_domains_of_robots_are_compared(
+    fleet: Path, base: str, head: str, status: int, said: str
+) -> None:
+    sides = ["ks" if each == "ks" else "fleet.xml" for each in (base, head)]
+    files = [f"{each}.toml" for each in (base, head) if each != "ks"]
+    words = [word for each in files for word in ("--fleet", each)]
+    ended = sros("diff_policy", "--no-new-access", *sides, *words, cwd=fleet)
+    assert ended.status == status, ended
+    assert (said in ended.out) if said else not ended.out
+
+
+def test_a_fleet_in_another_domain_is_said_when_it_is_signed(fleet: Path) -> None:
+    """What was signed for the domain of before works on, and that is said."""
+    root = fleet / "moved"
+    shutil.copytree(fleet / "ks", root)
+    words = ("generate_artifacts", "-k", "moved", "-p", "fleet.xml", "--fleet", "any.toml")
+    ended = sros(*words, cwd=fleet).ok()
+    assert "replaced the permissions of enclave /r1/base" in ended.out
+    assert "same rights" not in ended.out
+    assert "/r1/base gains: domain 0" in ended.err
+    words = ("generate_artifacts", "-k", "moved", "-p", "fleet.xml", "--fleet", "seven.toml")
+    ended = sros(*words, cwd=fleet).ok()
+    assert "same rights" not in ended.out
+    assert "/r1/base loses: domain 0" in ended.err
+    assert "/r1/base: what it lost works until" in ended.err
+    rights = json.loads(sros(*words[:-1], "any.toml", "--dry-run", "--json", cwd=fleet).out)
+    assert [each["gained_domains"] for each in rights["rights"]] == ["0"]

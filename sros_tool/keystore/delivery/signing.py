@@ -56,7 +56,6 @@ from sros_tool.keystore.lifecycle.replaced import (
     earlier_permissions,
     lasting_text,
     replaced_rights,
-    rights_text,
 )
 from sros_tool.keystore.reader import (
     check_domain,
@@ -467,7 +466,7 @@ def _lost_rights(
     text = lasting_text(root, replaced)
     if not text:
         return []
-    lost = f"{replaced.enclave} loses: {rights_text(replaced.lost)}."
+    lost = f"{replaced.enclave} loses: {replaced.loses()}."
     again = "Then answer its request again with `sros sign_request --renew`."
     return [Note("request.rights-lost", f"{lost} {text} {again}")]
 

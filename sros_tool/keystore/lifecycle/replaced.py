@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
 
 from cryptography import x509
 
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import CERTIFICATE_FILE, PERMISSIONS_FILE, enclave_path
@@ -40,17 +41,28 @@ class ReplacedRights:
 
     ``lost`` and ``gained`` are rights and denials as their statement would read: a new denial is
     lost as ``ALLOW`` is.  ``works_until`` is when the replaced permissions expire for whoever kept
-    them with the certificate of that time, or None if they no longer work.
+    them with the certificate of that time, or None if they no longer work.  ``lost_domains`` and
+    ``gained_domains`` are ROS domains, as ``0,7``, or "" for none.
     """
 
     enclave: str
     lost: tuple[Right, ...]
     gained: tuple[Right, ...]
     works_until: datetime | None
+    lost_domains: str = ""
+    gained_domains: str = ""
 
     def revoked(self) -> ReplacedRights:
         """Return the same rights, for a certificate that was revoked."""
-        return ReplacedRights(self.enclave, self.lost, self.gained, None)
+        return replace(self, works_until=None)
+
+    def loses(self) -> str:
+        """Return the rights and domains that are lost, as text; "" for none."""
+        return _both_text(self.lost, self.lost_domains)
+
+    def gains(self) -> str:
+        """Return the rights and domains that are gained, as text; "" for none."""
+        return _both_text(self.gained, self.gained_domains)
 
 
 def earlier_permissions(
@@ -84,7 +96,17 @@ def replaced_rights(
     end = validity_of(earlier.certificate).not_after
     with suppress(SrosError):  # an expiry before the beginning
         end = min(end, earlier.grant.validity.not_after)
-    return ReplacedRights(name, tuple(lost), tuple(gained), end if end >= now else None)
+    before, after = earlier.grant.domains().closed(), grant.domains().closed()
+    return ReplacedRights(
+        name,
+        tuple(lost),
+        tuple(gained),
+        end if end >= now else None,
+        *(
+            str(DomainSet.of(*((each, each) for each in one if each not in other)))
+            for one, other in ((before, after), (after, before))
+        ),
+    )
 
 
 _RIGHTS_SHOWN = 6
@@ -103,9 +125,14 @@ def rights_text(rights: Sequence[Right]) -> str:
     return f"{shown} and {more} more" if more > 0 else shown
 
 
+def _both_text(rights: Sequence[Right], domains: str) -> str:
+    texts = (rights_text(rights), f"domain {domains}" if domains else "")
+    return ", ".join(filter(None, texts))
+
+
 def lasting_text(root: Path, replaced: ReplacedRights) -> str:
     """Return what still works of the lost rights and what ends it, as sentences; "" if nothing."""
-    if not (replaced.lost and replaced.works_until):
+    if not (replaced.loses() and replaced.works_until):
         return ""
     command = f"`sros renew {quote(str(root))} {quote(replaced.enclave)} --revoke-old`"
     return (

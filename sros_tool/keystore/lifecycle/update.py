@@ -187,11 +187,12 @@ class KeystoreUpdate:
 
     def looser(self) -> tuple[str, ...]:
         """Return a clause for each thing that becomes possible."""
-        gained = [f"{each.enclave} gains {rights_text(each.gained)}" for each in self.rights]
-        return (
-            *(str(each) for each in self.settings if each.effect is Effect.LOOSER),
-            *(text for text, each in zip(gained, self.rights, strict=True) if each.gained),
-        )
+        gained = [
+            f"{each.enclave} gains {rights_text(each.gained)}"
+            for each in self.rights
+            if each.gained
+        ]
+        return (*(str(each) for each in self.settings if each.effect is Effect.LOOSER), *gained)
 
 
 # ── what is, and what shall be ─────────────────────────────────────────────────────────────

@@ -1,0 +1,172 @@
+"""What a comparison of two sides takes for granted, and what it leaves out on purpose.
+
+A policy says neither which governance it is signed with, nor, but for robots of a fleet, for which
+domains.  Permissions do not say the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
+from sros_tool.dds.governance import DomainRule, Governance
+from sros_tool.dds.permissions import Permissions
+from sros_tool.fleet.enclaves import robot_of
+from sros_tool.proof.protection import strict_protection
+from sros_tool.proof.sources import AccessSource
+from sros_tool.translate import governance_for
+
+_ALL = DomainSet.of((0, MAX_DOMAIN))
+
+
+def completed(side: AccessSource, other: AccessSource) -> AccessSource:
+    """Return a side of which domains and access control are certain, to compare it with another.
+
+    Enclaves of robots are for the domain of their robot.  Without a governance of its own, a side
+    has access control of everything, in the domains of the other side and in its own ones.
+    """
+    domains = domains_of_robots(side, other)
+    permissions = side.permissions
+    if domains:
+        permissions = {
+            name: _for_domain(each, domains[name]) if name in domains else each
+            for name, each in permissions.items()
+        }
+    if side.governance:
+        return replace(side, permissions=permissions)
+    own = DomainSet.of(*((each, each) for each in domains.values()))
+    if side.kind != "policy":
+        own = _granted(side)
+    governance = _controlling(other.governance, own)
+    if governance is None:
+        known = DomainSet((*own.ranges, *_granted(other).ranges)).closed()
+        open_ended = {"policy"} >= {side.kind, other.kind}
+        governance = governance_for(strict_protection(), _ALL if open_ended else known)
+    return replace(side, permissions=permissions, governance=governance)
+
+
+def domains_of_robots(side: AccessSource, other: AccessSource) -> dict[str, int]:
+    """Map the enclaves of a policy that are of a robot with a domain of its own to that domain."""
+    robots = side.fleet or other.fleet
+    if side.kind != "policy" or robots is None:
+        return {}
+    found = ((name, robot_of(robots, name)) for name in side.permissions)
+    return {
+        name: robot.domain
+        for name, robot in found
+        if robot is not None and robot.domain is not None
+    }
+
+
+def _for_domain(permissions: Permissions, domain: int) -> Permissions:
+    only = DomainSet.of((domain, domain))
+    return Permissions(
+        tuple(
+            replace(grant, rules=tuple(replace(rule, domains=only) for rule in grant.rules))
+            for grant in permissions.grants
+        )
+    )
+
+
+def _granted(side: AccessSource) -> DomainSet:
+    """Return the domains for which permissions have rules; none for a policy, which is for any."""
+    if side.kind == "policy":
+        return DomainSet(())
+    return DomainSet(
+        tuple(
+            part
+            for each in side.permissions.values()
+            for grant in each.grants
+            for rule in grant.rules
+            for part in rule.domains.ranges
+        )
+    ).closed()
+
+
+def _controlling(governance: Governance | None, more: DomainSet) -> Governance | None:
+    """Return a governance with access control of everything, also in further domains."""
+    if governance is None:
+        return None
+    strict = governance_for(strict_protection(), more).domain_access_rules[0]
+
+    def controlling(rule: DomainRule) -> DomainRule:
+        topics = tuple(
+            replace(each, enable_read_access_control=True, enable_write_access_control=True)
+            for each in rule.topic_access_rules
+        )
+        if not any(each.topic_expression == "*" for each in topics):
+            topics += strict.topic_access_rules
+        return replace(
+            rule,
+            allow_unauthenticated_participants=False,
+            enable_join_access_control=True,
+            topic_access_rules=topics,
+        )
+
+    rules = tuple(map(controlling, governance.domain_access_rules))
+    missing = [each for each in more if each not in governance.domains().closed()]
+    if missing:
+        rules += (replace(strict, domains=DomainSet.of(*((each, each) for each in missing))),)
+    return Governance(rules)
+
+
+# ── in words ───────────────────────────────────────────────────────────────────────────────
+
+
+def assumptions(base: AccessSource, head: AccessSource) -> tuple[str, ...]:
+    """Return what is assumed of sides that do not say everything, as clauses."""
+    return tuple(_assumed(base, head))
+
+
+def _assumed(base: AccessSource, head: AccessSource) -> Iterator[str]:
+    if "zenoh" not in (base.kind, head.kind):
+        if base.governance is None and head.governance is None:
+            yield "both are signed with the same governance, which controls all access"
+        elif base.governance is None:
+            yield (
+                "BASE means access control of everything, and encryption of what it demands no "
+                "other protection of"
+            )
+        elif head.governance is None:
+            yield (
+                "HEAD is signed with access control of everything, and protects no less than BASE"
+            )
+    for name, side, other in (("BASE", base, "HEAD"), ("HEAD", head, "BASE")):
+        against = head if side is base else base
+        if side.kind != "policy" or against.kind == "policy":
+            continue
+        if domains_of_robots(side, against).keys() < side.permissions.keys():
+            whose = "its enclaves without a robot" if side.fleet else "it"
+            yield f"{name} does not say the domains, and {whose} is for those of {other}"
+        if against.zenoh is not None:
+            yield f"{name} means the settings of Zenoh that sros writes"
+
+
+def left_out(base: AccessSource, head: AccessSource) -> tuple[str, ...]:
+    """Return what is not compared on purpose, in words."""
+    return tuple(_left_out(base, head))
+
+
+def _left_out(base: AccessSource, head: AccessSource) -> Iterator[str]:
+    yield "dates"
+    sides = (("BASE", base), ("HEAD", head))
+    if "zenoh" in (base.kind, head.kind):
+        if {base.kind, head.kind} != {"zenoh"}:
+            yield "what DDS permits"
+    else:
+        yield "partitions other than the default one"
+    if {base.kind, head.kind} & {"keystore", "enclave"}:
+        yield "who holds which key"
+    for name, side in sides:
+        other = head if side is base else base
+        if side.trusts is not None and other.trusts is None:
+            yield f"the CAs and revocation lists of {name}"
+        if side.later is not None and other.later is None:
+            yield f"what {name} gives to enclaves that are created later"
+        if side.zenoh_files and not other.zenoh_files:
+            yield f"where the Zenoh processes of {name} listen and connect"
+        if side.scope is not None and other.scope is None:
+            yield f"enclaves that {name} does not have"
+    if base.protections is not None and head.governance is None and head.kind != "policy":
+        yield "the protection of messages, of which HEAD says nothing"

@@ -1,0 +1,286 @@
+"""What one side of a comparison protects less than the other one: messages, trust, statements.
+
+A side without a governance of its own, such as a policy, means a strict one: a keystore with a
+looser one protects less.  A policy never lowers what a keystore protects.
+
+This module reads no files.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+from sros_tool.automata import NameSet, SearchLimit
+from sros_tool.dds.decision.matching import names_of
+from sros_tool.dds.decision.vendors import Style
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
+from sros_tool.keystore.comparison import (
+    Effect,
+    SettingChange,
+    attribute_changes,
+    compare_settings,
+)
+from sros_tool.keystore.protection import contradictions
+from sros_tool.keystore.template import load_template
+from sros_tool.policy.protection import DomainProtection, Level
+from sros_tool.policy.stated import StatedProtection
+from sros_tool.proof.sources import AT, KEYSTORE_ITSELF, AccessSource, Trust
+from sros_tool.proof.worlds import ROS_TOPICS, named, valid_topics
+from sros_tool.proof.zenoh_settings import looser_settings
+from sros_tool.translate import governance_for, protected_topics
+
+
+@lru_cache(maxsize=1)
+def strict_protection() -> DomainProtection:
+    """Return the protection that is meant where nothing is said: that of the template production.
+
+    Whole messages need only be signed, as in the template development: what is in them is encrypted
+    without it.
+    """
+    return replace(load_template("production").protection, rtps=Level.SIGN)
+
+
+def _demanded_governance(stated: Sequence[StatedProtection], domains: DomainSet) -> Governance:
+    """Return the least governance that a policy means: strict, except where it demands a level.
+
+    Of a name for which it demands both levels, the higher one counts.
+    """
+    (rule,) = governance_for(strict_protection(), domains).domain_access_rules
+    (every,) = rule.topic_access_rules
+    kinds = {Level.SIGN: ProtectionKind.NONE, Level.ENCRYPT: ProtectionKind.ENCRYPT}
+    topics = {
+        (each.level, topic): replace(
+            every,
+            topic_expression=topic,
+            metadata_protection_kind=ProtectionKind.NONE,
+            data_protection_kind=kinds[each.level],
+        )
+        for level in (Level.ENCRYPT, Level.SIGN)
+        for each in stated
+        if each.level is level
+        for topic in protected_topics(each.kind, each.name)
+    }
+    return Governance((replace(rule, topic_access_rules=(*topics.values(), every)),))
+
+
+def _of_payloads(governance: Governance) -> Governance:
+    """Return a governance with the protection of payloads that they have by all layers together."""
+
+    def strongest(domain: DomainRule, topic: TopicRule) -> TopicRule:
+        kinds = (
+            topic.data_protection_kind,
+            topic.metadata_protection_kind,
+            domain.rtps_protection_kind,
+        )
+        names = [each.value.partition("_")[0] for each in kinds]
+        found = max(names, key=("NONE", "SIGN", "ENCRYPT").index)
+        return replace(topic, data_protection_kind=ProtectionKind(found))
+
+    return Governance(
+        tuple(
+            replace(
+                rule,
+                topic_access_rules=tuple(strongest(rule, each) for each in rule.topic_access_rules),
+            )
+            for rule in governance.domain_access_rules
+        )
+    )
+
+
+def contradiction(side: AccessSource) -> str:
+    """Return the first two statements of policies that demand different protection of a name."""
+    for one, other in contradictions(side.protections or ()):
+        places = (side.shown_source(each.source) for each in (other, one))
+        return (
+            f'{next(places)}: {other} has protect="{other.word}", and {one} has '
+            f'protect="{one.word}" at {next(places)}'
+        )
+    return ""
+
+
+def less_protection(
+    old: AccessSource, new: AccessSource, limit: SearchLimit
+) -> Iterator[SettingChange]:
+    """Yield what is protected less in ``new`` than in ``old``."""
+    if "zenoh" in (old.kind, new.kind):
+        pass  # only what Zenoh permits is compared
+    elif old.governance and new.governance:
+        yield from _looser_governance(old.governance, new.governance, limit)
+    elif new.governance:
+        least = _demanded_governance(old.protections or (), new.governance.domains().closed())
+        yield from _looser_governance(least, _of_payloads(new.governance), limit)
+    if old.authorities is not None and new.authorities is not None:
+        for role, each in sorted(new.authorities - old.authorities):
+            yield SettingChange(
+                Effect.LOOSER,
+                f"{role} CA {each[:16]}...",
+                "unknown",
+                "trusted",
+                "whoever has its key can become any enclave"
+                if role == "identity"
+                else "whoever has its key can give any right",
+            )
+    yield from _trusted_again(old, new)
+    if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
+        text = "nothing enforces on Zenoh what its files enforced"
+        yield SettingChange(Effect.LOOSER, "files of Zenoh", "present", "missing", text)
+    if old.router and new.router and old.router != new.router:
+        text = "whoever plays the router reads and changes all that passes"
+        yield SettingChange(Effect.LOOSER, "router of Zenoh", old.router, new.router, text)
+    if new.zenoh_files:
+        yield from looser_settings(old.zenoh_files, new.zenoh_files)
+    if old.protections and new.protections is not None:
+        yield from _no_longer_stated(old.protections, new.protections, limit)
+    yield from _looser_later(old, new, limit)
+
+
+def _looser_later(
+    old: AccessSource, new: AccessSource, limit: SearchLimit
+) -> Iterator[SettingChange]:
+    """Yield what the settings of a keystore, and its fleet, give to later enclaves only in new."""
+    if old.later is None or new.later is None:
+        return
+    domains = DomainSet.of((0, 0))
+    before, after = (governance_for(each.protection, domains) for each in (old.later, new.later))
+    changes = [
+        *compare_settings(old.later, new.later, AT),
+        *_looser_governance(before, after, limit),
+    ]
+    for each in changes:
+        if each.effect is Effect.LOOSER and not each.key.endswith("validity"):
+            yield replace(each, key=f"later enclaves: {each.key}")
+    if old.fleet and new.fleet:
+        for name, robot in new.fleet.robots.items():
+            known = old.fleet.robots.get(name)
+            if known and known.domain is not None and known.domain != robot.domain:
+                domain = "all of the keystore" if robot.domain is None else str(robot.domain)
+                yield SettingChange(
+                    Effect.LOOSER,
+                    f"later enclaves: domain of robot {name}",
+                    str(known.domain),
+                    domain,
+                    "what is signed for it later is valid there",
+                )
+
+
+def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
+    """Yield the certificates that enclaves refuse in ``old``, and not in ``new``."""
+    if old.trusts is None or new.trusts is None:
+        return
+    all_revoked = frozenset(each for trust in old.trusts.values() for each in trust.revoked)
+    again: dict[int, list[str]] = defaultdict(list)
+
+    @lru_cache(maxsize=8)  # most enclaves have the same lists
+    def lost(before: frozenset[tuple[str, int]], after: Trust) -> list[int]:
+        gone = before - after.revoked
+        return sorted(serial for authority, serial in gone if authority in after.authorities)
+
+    for name in sorted(new.trusts):
+        if old.scope is None or new.scope is not None or name in old.scope:
+            before = old.trusts[name].revoked if name in old.trusts else all_revoked
+            for serial in lost(before, new.trusts[name]):
+                again[serial].append(name)
+    for serial in sorted(again)[:_MOST_SERIALS]:
+        names = [each for each in again[serial] if each != KEYSTORE_ITSELF] or [KEYSTORE_ITSELF]
+        who = f"{names[0]} trusts" if len(names) == 1 else f"{len(names)} enclaves trust"
+        text = f"{who} whoever has its key again"
+        yield SettingChange(Effect.LOOSER, f"certificate {serial:x}", "revoked", "trusted", text)
+    if (more := len(again) - _MOST_SERIALS) > 0:
+        text = "enclaves trust whoever has their keys again"
+        yield SettingChange(Effect.LOOSER, f"{more} certificates more", "revoked", "trusted", text)
+
+
+_MOST_SERIALS = 20
+
+
+def _looser_governance(
+    old: Governance, new: Governance, limit: SearchLimit
+) -> Iterator[SettingChange]:
+    pairs = dict.fromkeys(
+        (one, other)
+        for one in old.domain_access_rules
+        for other in new.domain_access_rules
+        if any(each in other.domains.closed() for each in one.domains.closed())
+    )
+    for one, other in pairs:
+        for each in attribute_changes(one, other, "protection", ""):
+            if each.effect is Effect.LOOSER:
+                yield each
+        for style in Style:
+            yield from _looser_topics(one, other, style, limit)
+
+
+def _looser_topics(
+    old: DomainRule, new: DomainRule, style: Style, limit: SearchLimit
+) -> Iterator[SettingChange]:
+    for before, had in _by_protection(old, style):
+        for after, has in _by_protection(new, style):
+            changes = [
+                each
+                for each in attribute_changes(before, after, "protection", "{}")
+                if each.effect is Effect.LOOSER
+            ]
+            both = had & has
+            if not changes:
+                continue
+            topic = both.example(limit)
+            if topic is None:
+                continue
+            if topic not in ROS_TOPICS:
+                topic = (both & ROS_TOPICS).example(limit) or topic
+            for each in changes:
+                yield replace(each, meaning=each.meaning.replace("{}", f"DDS topic {topic}"))
+
+
+def _by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, NameSet]]:
+    """Return each protection of topics, as a rule without its expression, and all its topics."""
+    rules = [
+        (names_of(style, (each.topic_expression,)), replace(each, topic_expression="*"))
+        for each in rule.topic_access_rules
+    ]
+    return [
+        (kind, NameSet.first((names, each == kind) for names, each in rules))
+        for kind in dict.fromkeys(each for _, each in rules)
+    ]
+
+
+def _no_longer_stated(
+    old: Iterable[StatedProtection], new: Iterable[StatedProtection], limit: SearchLimit
+) -> Iterator[SettingChange]:
+    """Yield the names whose protection one policy demands, and the other one less or not."""
+    later = tuple(new)
+    for each in old:
+        enough = [
+            other.name
+            for other in later
+            if other.kind == each.kind and (other.level, each.level) != (Level.SIGN, Level.ENCRYPT)
+        ]
+        names = _named((each.name,)) - _named(enough)
+        found = names.example(limit)
+        if found is not None:
+            valid = names & _ABSOLUTE
+            name = found if found in _ABSOLUTE else valid.example(limit) or found
+            less = "sign" if name in _named(_signed(later, each.kind)) else "nothing"
+            yield SettingChange(
+                Effect.LOOSER,
+                f"protect {each}",
+                each.word,
+                less,
+                f"the policy no longer demands it of {each.kind.removesuffix('s')} {name}",
+            )
+
+
+def _signed(stated: Iterable[StatedProtection], kind: str) -> list[str]:
+    return [each.name for each in stated if each.kind == kind]
+
+
+def _named(names: Iterable[str]) -> NameSet:
+    return NameSet.union(map(named, names))
+
+
+_ABSOLUTE = valid_topics("", "")
+"""All absolute ROS names."""

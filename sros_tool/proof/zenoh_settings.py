@@ -1,0 +1,203 @@
+"""What the settings of Zenoh processes open on one side of a comparison, next to their rules.
+
+A setting of which it is not known what it gives is never passed over: it is not compared, and then
+nobody can say that nothing is new.  Source of the settings: DEFAULT_CONFIG.json5 of zenoh 1.9.
+
+This module reads no files.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+from sros_tool.keystore.comparison import Effect, SettingChange
+from sros_tool.zenoh.configuration import Mode, render_configuration
+from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
+
+
+@dataclass(frozen=True, slots=True)
+class SignedConfiguration:
+    """A configuration of Zenoh, and whether its signature "holds", is "missing" or "broken"."""
+
+    document: ConfigurationDocument
+    signature: str
+
+
+SIGNED = "holds"
+
+_Files = Mapping[str, SignedConfiguration]
+"""Files by their enclave and name, such as "/web session.json5", or a single one by `LONE`."""
+LONE = "the file"
+
+_OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...] = (
+    (
+        "transport/link/tls/enable_mtls",
+        lambda each: each.tls.mutual,
+        False,
+        "whoever connects needs no certificate",
+    ),
+    (
+        "transport/link/tls/verify_name_on_connect",
+        lambda each: each.tls.verifies_name,
+        False,
+        "another host with a certificate of the CA is taken for the one it connects to",
+    ),
+    (
+        "transport/link/tls/close_link_on_expiration",
+        lambda each: each.tls.closes_on_expiration,
+        False,
+        "a connection stays when the certificate of the other side expires",
+    ),
+    (
+        "transport/shared_memory/enabled",
+        lambda each: each.shared_memory,
+        True,
+        "processes of the host exchange data unencrypted",
+    ),
+    (
+        "scouting/multicast/enabled",
+        lambda each: each.multicast,
+        True,
+        "it looks for others, and answers them, unencrypted",
+    ),
+    ("scouting/gossip/enabled", lambda each: each.gossip, True, "it tells of others to others"),
+    (
+        "adminspace/permissions/read",
+        lambda each: each.adminspace and each.adminspace_readable,
+        True,
+        "others may read its state and its settings",
+    ),
+    (
+        "adminspace/permissions/write",
+        lambda each: each.adminspace and each.adminspace_writable,
+        True,
+        "others may change its settings while it runs",
+    ),
+    (
+        "access_control/enabled",
+        lambda each: each.access.enabled,
+        False,
+        "it lets everything pass",
+    ),
+    (
+        "access_control/default_permission",
+        lambda each: each.access.allows_by_default,
+        True,
+        "it lets pass what no rule denies",
+    ),
+)
+"""Settings that are on or off, with their open value, and what that means as a clause."""
+
+_COMPARED = re.compile(
+    r"mode|namespace|(?:listen|connect)/endpoints(?:/\w+)?|transport/link/protocols"
+    r"|adminspace/enabled|adminspace/permissions/(?:read|write)"
+    r"|transport/link/tls/(?:enable_mtls|verify_name_on_connect|close_link_on_expiration)"
+    r"|transport/shared_memory/enabled|scouting/(?:multicast|gossip)/enabled"
+)
+"""Settings that `_OPEN`, the endpoints or the rules themselves stand for."""
+_HARMLESS = re.compile(
+    r"metadata(?:/.*)?|timestamping/.*|queries_default_timeout|open/.*|stats/.*"
+    r"|transport/unicast/.*|transport/link/[tr]x/.*|transport/link/tls/so_(?:snd|rcv)buf"
+    r"|(?:listen|connect)/(?:timeout_ms|exit_on_failure|retry)(?:/.*)?|scouting/(?:timeout|delay)"
+)
+"""Settings that give nobody anything: times, sizes, and words."""
+_GIVING = (
+    (re.compile(r"plugins(?:/.*)?"), "a plugin answers others by its own rules"),
+    (re.compile(r"plugins_loading(?:/.*)?"), "it loads plugins, which answer others"),
+    (
+        re.compile(r"transport/auth(?:/.*)?"),
+        "whoever has what it now asks for, a password or key, is let in",
+    ),
+    (
+        re.compile(r"transport/link/tls/root_ca_certificate(?:_base64)?"),
+        "whoever has a certificate of that CA is let in",
+    ),
+)
+"""Settings of which any other value gives access, and what they mean as a clause."""
+
+
+def looser_settings(old: _Files, new: _Files) -> Iterator[SettingChange]:
+    """Yield what the settings in ``new`` open that those in ``old`` do not.
+
+    A file that ``old`` has not is compared with what sros writes; where it connects and listens,
+    with all other files of ``old``.
+    """
+    files: dict[tuple[str, str, str, str], list[str]] = defaultdict(list)
+    for place, file in sorted(new.items()):
+        for key, before, after, meaning in _changes(old, place, file):
+            files[key, before, after, meaning].append(place)
+    for (key, before, after, meaning), places in files.items():
+        of = places[0] if len(places) == 1 else f"{len(places)} files of Zenoh"
+        yield SettingChange(Effect.LOOSER, f"{key} of {of}", before, after, meaning)
+
+
+def unknown_settings(old: _Files, new: _Files) -> Iterator[str]:
+    """Yield the settings that differ and of which it is not known what they give, as clauses."""
+    files: dict[str, list[str]] = defaultdict(list)
+    for place, file in sorted(new.items()):
+        before = old[place].document if place in old else _usual(file.document.mode)
+        one, other = before.settings, file.document.settings
+        for path in sorted({*one, *other, *file.document.unknown}):
+            known = any(each.fullmatch(path) for each in (_COMPARED, _HARMLESS))
+            gives = any(each.fullmatch(path) for each, _ in _GIVING)
+            if one.get(path) != other.get(path) and not known and not gives:
+                files[path].append(place)
+    for path, places in files.items():
+        of = places[0] if len(places) == 1 else f"{len(places)} files of Zenoh"
+        yield f"the setting {path[:80]} of {of}, of which sros does not know what it gives"
+
+
+def _changes(
+    old: _Files, place: str, file: SignedConfiguration
+) -> Iterator[tuple[str, str, str, str]]:
+    """Yield key, both values and the meaning of what a file opens."""
+    known = old.get(place)
+    before, after = known.document if known else _usual(file.document.mode), file.document
+    if file.signature != SIGNED and (known is None or known.signature == SIGNED):
+        meaning = "anybody who can write the file states the rights and settings"
+        yield "signature", SIGNED, file.signature, meaning
+    for path, value, open_value, meaning in _OPEN:
+        if value(after) is open_value is not value(before):
+            one, other = (str(value(each)).lower() for each in (before, after))
+            yield path, one, other, meaning
+    for key, what in (("listen", "it listens there"), ("connect", "it connects to what is there")):
+        own = [before] if known else [each.document for each in old.values()]
+        there = {each.text for one in own for each in getattr(one, key)}
+        for endpoint in getattr(after, key):
+            if old and endpoint.text not in there:
+                address = f"{endpoint.protocol}/{endpoint.address}"[:80]
+                yield f"{key}/endpoints", "without", f"with {address}", what
+    if protocols := _more_protocols(before.protocols, after.protocols):
+        meaning = "it takes connections of these protocols"
+        yield "transport/link/protocols", "without", f"with {protocols}", meaning
+    for path in sorted({*before.settings, *after.settings}):
+        values = before.settings.get(path), after.settings.get(path)
+        for expression, meaning in _GIVING:
+            plugin = "/".join(path.split("/")[:2])
+            gone = plugin.startswith("plugins") and not any(
+                each == plugin or each.startswith(f"{plugin}/") for each in after.settings
+            )
+            if values[0] != values[1] and not gone and expression.fullmatch(path):
+                # The values may be secrets.
+                words = ("missing" if each is None else "stated" for each in values)
+                one, other = words
+                yield path[:80], one, "stated in another way" if one == other else other, meaning
+
+
+def _more_protocols(before: tuple[str, ...] | None, after: tuple[str, ...] | None) -> str:
+    """Return the protocols that are allowed after, and not before; "" for none."""
+    if before is None:
+        return ""
+    if after is None:
+        return "all"
+    return ", ".join(each[:20] for each in after if each not in before)
+
+
+@lru_cache(maxsize=len(Mode))
+def _usual(mode: Mode) -> ConfigurationDocument:
+    """Return the configuration that sros writes for a mode, without endpoints and rules."""
+    return parse_configuration(render_configuration(mode, (), (), ()), "as sros writes it")
