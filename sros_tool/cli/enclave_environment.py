@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from sros_tool.cli.common import now
 from sros_tool.errors import KeystoreError, Note, UsageError
+from sros_tool.owners import other_writers
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -115,6 +116,11 @@ def loadable_environment(
             _check_pin(state.token, name)
     elif not accept_key and not (target and state.key_on_robot):
         _check_key_closed(folder / KEY_FILE, root, name)
+    if not target:
+        if not accept_key:
+            _check_folders_closed(root, folder, name)
+        if not zenoh:
+            _check_dates_here(name, folder, domain, rmw)
     variables = secured_environment(target or root, name, domain)
     if zenoh:
         place = enclave_path(target or root, name)
@@ -144,6 +150,46 @@ def _check_key_closed(key: Path, root: Path, name: str) -> None:
             f"Run `chmod 600 {quote(str(key))}`. If others had access, give the enclave another "
             f"key: `sros renew {quote(str(root))} {name} --new-key --revoke-old`. To run it "
             "nevertheless, add --accept-readable-key.",
+        )
+
+
+def _check_folders_closed(root: Path, folder: Path, name: str) -> None:
+    """Raise `KeystoreError` if others can put files of their own into the enclave's folders."""
+    trusted = frozenset({0, os.geteuid(), root.stat().st_uid})
+    for each in (folder, *folder.parents):
+        if why := other_writers(each.stat(), trusted):
+            raise KeystoreError(
+                f"others can replace the files of enclave {name}",
+                f"'{each}': {why}. Whoever does decides whom the process trusts.",
+                f"Run `chmod go-w {quote(str(each))}`, then `sros verify {quote(str(root))}`. To "
+                "run it nevertheless, add --accept-readable-key.",
+            )
+        if each == root:
+            return
+
+
+def _check_dates_here(name: str, folder: Path, domain: int, rmw: str | None) -> None:
+    """Raise `KeystoreError` if DDS takes permissions that are valid for expired in this time zone.
+
+    Fast DDS reads their dates, which are in UTC, as local time.
+    """
+    from sros_tool.cli.common import local_zone
+    from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
+    from sros_tool.explain.question import ask
+    from sros_tool.runtime.rmw import chosen_rmw, vendor_here, vendor_of
+
+    zone, moment = local_zone(os.environ), now()
+    if not zone.utcoffset(moment.replace(tzinfo=None)):
+        return
+    vendor = vendor_of(chosen_rmw(rmw, os.environ)) or vendor_here(os.environ)[0]
+    enclave = load_enclave(name, folder, at=moment)
+    answer = Evaluator(vendor, enclave, JoinContext(domain, moment, zone)).answer(ask("join"))
+    if not answer.allowed and answer.decision.reason in ("expired", "not-yet-valid"):
+        raise KeystoreError(
+            f"a process cannot run in enclave {name} in this time zone",
+            f"{answer.decision.text.removesuffix('.')}.",
+            "Set the time zone of the process to UTC (`TZ=UTC`), or sign permissions that are "
+            "valid for longer.",
         )
 
 

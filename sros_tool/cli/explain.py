@@ -1400,7 +1400,8 @@ def _show_log(
     log: str, root: Path | None, rest: tuple[str, ...], options: _ContextOptions, as_json: bool
 ) -> int:
     """Print explanations of a DDS log, or of standard input for "-"; return 1 for any, else 0."""
-    from sros_tool.explain.log import explain_log
+    from sros_tool.explain.log import SearchedKeystore, explain_log
+    from sros_tool.keystore.layout import is_keystore
 
     if len(rest) > 1:
         raise UsageError("--log takes at most a keystore and an enclave")
@@ -1428,7 +1429,11 @@ def _show_log(
 
     text = read_log(log)
     findings = explain_log(
-        text, find, lambda enclave: options.context(enclave.joined_domains), str(root or "")
+        text,
+        find,
+        lambda enclave: options.context(enclave.joined_domains),
+        str(root or ""),
+        SearchedKeystore(root) if root and is_keystore(root) else None,
     )
     if as_json:
         notes = as_plain(_LOG_NOTES if findings else ())

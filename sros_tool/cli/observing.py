@@ -7,7 +7,7 @@ import re
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -158,26 +158,15 @@ def observe(
 
 
 def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
-    """Map `identity_of` each certificate's subject in the observer's keystore to its enclave.
-
-    An enclave whose certificate cannot be read is left out.
-    """
-    from sros_tool.graph.observe import identity_of
-    from sros_tool.keystore.layout import enclave_names, enclave_path, is_keystore
-    from sros_tool.pki.certificates import load_certificate
+    """Return the enclaves by the identities of their participants, if the observer is secured."""
+    from sros_tool.keystore.known_keys import enclaves_by_identity
+    from sros_tool.keystore.layout import is_keystore
     from sros_tool.runtime.variables import ENABLE, KEYSTORE
-    from sros_tool.xml import read_bytes
 
     root = Path(environment.get(KEYSTORE, ""))
     if environment.get(ENABLE) != "true" or not is_keystore(root):
         return {}
-    found = {}
-    for name in enclave_names(root):
-        with suppress(SrosError):
-            data = read_bytes(enclave_path(root, name) / "cert.pem", "certificate")
-            subject = load_certificate(data, name).subject
-            found[identity_of(subject.public_bytes())] = name
-    return found
+    return enclaves_by_identity(root)
 
 
 def _watch(

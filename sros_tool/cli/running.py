@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -63,8 +64,8 @@ RMW = click.option(
 ACCEPT_KEY = click.option(
     "--accept-readable-key",
     is_flag=True,
-    help="Accept a private key, or the PIN of its token, that other users can read, as on a file "
-    "system without modes.",
+    help="Accept a private key, or the PIN of its token, that other users can read, and folders in "
+    "which they can write, as on a file system without modes.",
 )
 
 
@@ -299,7 +300,7 @@ def run(
     With --policy, COMMAND gives its node a name: `--ros-args -r __node:=NAME -r __ns:=NAMESPACE`,
     as launch files do.
     """
-    from sros_tool.runtime.environment import enclave_argument, with_enclave
+    from sros_tool.runtime.environment import enclave_argument, named_enclave, with_enclave
 
     root, rest = split_root(words)
     if policy and rest and ctx.meta[COMMAND]:
@@ -312,6 +313,13 @@ def run(
     if not command:
         raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
     name = _enclave_of_node(policy, command) if policy else rest[0] if rest else ""
+    if (other := named_enclave(command)) and other != name:
+        raise UsageError(
+            f"the command names the enclave {other}, and sros would run it in {name}",
+            "ROS_SECURITY_ENCLAVE_OVERRIDE, which sros sets, counts more than --enclave.",
+            f"Leave `--enclave {shlex.quote(other)}` out, or name the same enclave: `sros run "
+            f"{shlex.quote(str(root))} {shlex.quote(other)} -- COMMAND`.",
+        )
     found = loadable_environment(root, name, domain, rmw, accept_key=accept_readable_key)
     program = shutil.which(command[0])
     if program is None:

@@ -10,6 +10,9 @@ import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
 from shlex import quote
 
 from sros_tool.dds.decision.answers import AccessVerb
@@ -22,11 +25,18 @@ from sros_tool.explain.question import Part, Question, ask
 from sros_tool.explain.remedy import remedy
 from sros_tool.faults import Fault
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
+from sros_tool.keystore.known_keys import enclaves_by_identity
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+from sros_tool.keystore.rights import load_rights
 from sros_tool.names import ACTION_SEPARATOR
+from sros_tool.pki.certificates import IDENTITY_DIGITS
+from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import covers
 from sros_tool.runtime.vendor_log import (
     CONTINUED,
     DOMAIN_OF_LINE,
+    NO_ENCLAVE,
+    RUNS_OPEN,
     SECURITY_DIRECTORY,
     UNKNOWN,
     LogText,
@@ -80,6 +90,49 @@ class LogFinding:
     zenoh: bool = False
 
 
+class SearchedKeystore:
+    """A keystore in which the enclaves of peers and of nodes are looked for, each thing once."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    def peer(self, guid: str) -> str:
+        """Return the enclave of the participant with a GUID, as a vendor writes it, or ""."""
+        identity = guid.replace(".", "")
+        if ":" in guid:
+            identity = "".join(word.zfill(8) for word in guid.split(":"))
+        return self._by_identity.get(identity[:IDENTITY_DIGITS], "")
+
+    def enclaves_for(self, node: str) -> tuple[str, ...]:
+        """Return the enclaves whose permissions are for the node with this full name alone."""
+        return self._by_node.get(node, ())
+
+    @cached_property
+    def rotates(self) -> bool:
+        """Whether the CAs are being replaced, and the new ones have issued everything."""
+        try:
+            return read_rotation(self._root).stage is RotationStage.REISSUE
+        except SrosError:
+            return False
+
+    @cached_property
+    def _by_identity(self) -> Mapping[str, str]:
+        return enclaves_by_identity(self._root)
+
+    @cached_property
+    def _by_node(self) -> Mapping[str, tuple[str, ...]]:
+        found: dict[str, set[str]] = {}
+        try:
+            rights = load_rights(self._root).rights
+        except SrosError:  # its documents do not tell
+            return {}
+        for right in rights:
+            if right.qualifier is ALLOW:
+                for node in nodes_served([(right.right, right.name)]):
+                    found.setdefault(node, set()).add(right.enclave)
+        return {node: tuple(sorted(enclaves)) for node, enclaves in found.items()}
+
+
 FindEnclave = Callable[[str], LoadedEnclave | None]
 """A function from an enclave's name ("": the one that the user named) to the enclave, or None."""
 
@@ -89,20 +142,22 @@ def explain_log(
     find: FindEnclave,
     context: Callable[[LoadedEnclave], JoinContext],
     root: str = "",
+    keystore: SearchedKeystore | None = None,
 ) -> tuple[LogFinding, ...]:
     """Return the faults that a log reports, each once, in the order of the log.
 
-    ``context`` gives domain and time for an enclave, ``root`` names its keystore in commands.
+    ``context`` gives domain and time for an enclave, ``root`` names its keystore in commands;
+    ``keystore`` is that keystore, to look for the enclaves of peers and of nodes in it.
     """
     plain = plain_text(text)
-    examiner = _Examiner(find, context, root)
+    examiner = _Examiner(find, context, root, keystore)
     lines = log_lines(plain)
     denied = read_denials(plain)
     naming = _lines_naming(lines, {each.topic for each in denied})
     denials = [(each, naming[each.process, each.topic]) for each in denied]
     reported = {each.process for each in denied}
     hits = _strongest(_hits(_joined(lines)), reported)
-    found = [examiner.message(group) for group in _grouped(hits)]
+    found = [examiner.message(group) for group in _grouped(hits) if examiner.matters(group[0])]
     found += [examiner.denial(each, named) for each, named in denials]
     found += _dropped(lines, root)
     return tuple(sorted(found, key=lambda each: each.line))
@@ -162,6 +217,8 @@ def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
         process, rest = labelled_line(line)
         if named := SECURITY_DIRECTORY.search(line):
             enclaves[process] = named["enclave"] or "/"
+            if enclaves[process] == "/":
+                yield _Hit(number, " ".join(rest.split()), process, "/", RUNS_OPEN, {})
             continue
         if following and (whole := _broken(process, line, rest, following[0][1])):
             following.popleft()
@@ -310,12 +367,21 @@ class _Examiner:
     """An examiner that searches enclaves for the causes of messages."""
 
     def __init__(
-        self, find: FindEnclave, context: Callable[[LoadedEnclave], JoinContext], root: str
+        self,
+        find: FindEnclave,
+        context: Callable[[LoadedEnclave], JoinContext],
+        root: str,
+        keystore: SearchedKeystore | None,
     ) -> None:
         self._find = find
         self._context = context
         self._root = root
+        self._keystore = keystore
         self._evaluators: dict[tuple[Vendor, str], Evaluator] = {}
+
+    def matters(self, hit: _Hit) -> bool:
+        """Return whether a message is one, and not the name of an enclave that exists."""
+        return hit.meaning is not RUNS_OPEN or self._find("/") is None
 
     def message(self, hits: list[_Hit]) -> LogFinding:
         """Return the finding for one group of equal messages."""
@@ -323,6 +389,9 @@ class _Examiner:
         meaning = first.meaning
         vendor = style_of(first.text) if meaning is UNKNOWN else meaning.vendor
         named = self._find(first.enclave)
+        if meaning.id == "files-missing" and first.enclave == "/" and named is None:
+            first = replace(first, meaning=NO_ENCLAVE)
+            meaning = NO_ENCLAVE
         remedy_of = self._with_names(meaning.remedy, named, first)
         plain = LogFinding(
             meaning.id,
@@ -336,6 +405,8 @@ class _Examiner:
             remedy_of,
             zenoh=meaning.id.startswith(ZENOH_IDS),
         )
+        if meaning.id.startswith("peer-"):
+            return self._peer(plain, hits)
         examined = meaning.faults or meaning.id == "service"
         enclave = named if examined else None
         if enclave is None:
@@ -358,13 +429,46 @@ class _Examiner:
 
     def _with_names(self, text: str, enclave: LoadedEnclave | None, hit: _Hit) -> str:
         """Return a remedy with the keystore and the enclave that the user named, and the fields."""
-        names = {"KEYSTORE": self._root, "ENCLAVE": enclave.name if enclave else ""}
+        own = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) or not enclave else enclave.name
+        names = {"KEYSTORE": self._root, "ENCLAVE": own}
         for word, name in names.items():
             if name:
                 plain = quote(name).replace("{", "{{").replace("}", "}}")
                 # Not the KEYSTORE in ROS_SECURITY_KEYSTORE.
                 text = plain.join(re.split(rf"\b{word}\b", text))
         return text.format(**hit.quoted)
+
+    def _peer(self, finding: LogFinding, hits: Sequence[_Hit]) -> LogFinding:
+        """Return a finding about peers with what their enclaves tell, where the log names them."""
+        shown = dict.fromkeys(hit.fields["peer"] for hit in hits if hit.fields.get("peer"))
+        names = (
+            [self._keystore.peer(each) for each in islice(shown, _MOST_PEERS)]
+            if self._keystore
+            else []
+        )
+        peers = {name: self._find(name) for name in names if name}
+        found: list[str] = []
+        remedies: list[str] = []
+        rotating = self._keystore.rotates if self._keystore else False
+        for name, peer in peers.items():
+            if peer is None:
+                continue
+            answer = self._answer(peer, finding.vendor or Vendor.FAST, ask("join"))
+            causes = list(self._causes(peer, answer, ()))
+            found += [f"the peer is enclave {name}: {cause}" for cause, _ in causes]
+            remedies += [f"{each} Then restart its processes." for _, each in causes if each]
+            if not causes:
+                found.append(f"the peer is enclave {name}, whose present files have no fault")
+                if not (rotating and finding.id in _OF_ROTATION):
+                    remedies.append(_OLDER_FILES.format(peer=name))
+        if peers and rotating and finding.id in _OF_ROTATION:
+            of = f" of enclave {finding.enclave}" if finding.enclave else ""
+            found.append("the CAs of this keystore are being replaced, and stage 2 is done")
+            remedies = [_NOT_RESTARTED[finding.vendor or Vendor.FAST].format(of=of)]
+        text = " ".join(dict.fromkeys(remedies)) or finding.remedy
+        only = next(iter(peers)) if len(peers) == 1 else ""
+        text = re.sub(r"\bPEER\b", lambda _: quote(only), text) if only else text
+        return replace(finding, found=tuple(found), checked=bool(found), remedy=text)
 
     def denial(self, denial: Denial, named: list[tuple[int, str]]) -> LogFinding:
         """Return the finding for a denied topic; ``named`` are the lines that name it."""
@@ -396,13 +500,34 @@ class _Examiner:
             found = ["the present permissions allow it"]
             remedy = "Restart the process: it loaded earlier permissions."
         else:
-            other, better = _other_node(denial, answer)
+            other, better = self._other_node(denial, answer)
             found = [answer.decision.text, *other]
             remedy = better or finding.remedy
         remedy = remedy.replace("ENCLAVE", enclave.name)
         return replace(
             finding, enclave=enclave.name, found=tuple(found), checked=True, remedy=remedy
         )
+
+    def _other_node(self, denial: Denial, answer: Answer) -> tuple[list[str], str]:
+        """Return causes and a remedy if the permissions are for a node with another name."""
+        node, nodes = serving_node(denial), _served(answer)
+        if node and not any(covers(each, node) for each in nodes):
+            homes = self._keystore.enclaves_for(node) if self._keystore else ()
+            this = f"the permissions are for {_listed(nodes)}, and " if nodes else ""
+            if homes:
+                return [f"{this}this is the node {node}, for which there is {_or(homes)}"], (
+                    f"Start it in the enclave that is for it: `sros run {quote(self._root)} "
+                    f"{quote(homes[0])} -- COMMAND`."
+                )
+            if nodes:
+                return [f"{this}this is the node {node}"], _renamed(nodes[0], node)
+        if not nodes and (node or denial.topic in _TOPICS_OF_EVERY_NODE):
+            return [f"the permissions lack {_EVERY_NODE}"], (
+                'Add <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> to the '
+                "node's profile, or run `sros generate_policy POLICY --enclave ENCLAVE --from-log "
+                "LOG`."
+            )
+        return [], ""
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show what a policy lacks for a topic, here called ``name``."""
@@ -463,6 +588,18 @@ class _Examiner:
         )
 
 
+_MOST_PEERS = 5
+"""The number of peers that are looked at for a message: the log chooses how many it names."""
+_OF_ROTATION = ("peer-signature", "peer-permissions-ca")
+_NOT_RESTARTED = {
+    Vendor.FAST: "Restart this process{of}: it was not restarted since stage 1, and so does not "
+    "know the new CA.",
+    Vendor.CYCLONE: "Restart this process{of} and the peer: one of them was not restarted since "
+    "stage 2, and Cyclone DDS trusts one CA at a time.",
+}
+_OLDER_FILES = (
+    "Restart the processes of {peer}, and then this process: one of them loaded files of before."
+)
 _ABOUT_DOMAINS = ("domain", "domain-of-permissions")
 _EVERY_NODE = "the rights that every node needs: parameter services, /rosout, /parameter_events"
 _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")
@@ -481,22 +618,17 @@ def _served(answer: Answer) -> tuple[str, ...]:
     return nodes_served((each.right, each.name) for each in rights)
 
 
-def _other_node(denial: Denial, answer: Answer) -> tuple[list[str], str]:
-    """Return causes and a remedy if the permissions are for a node with another name."""
-    node, nodes = serving_node(denial), _served(answer)
-    if node and nodes and not any(covers(each, node) for each in nodes):
-        ns, _, name = nodes[0].rpartition("/")
-        return [f"the permissions are for {_listed(nodes)}, and this is the node {node}"], (
-            f"Start it under that name (`--ros-args -r __node:={quote(name)} "
-            f"-r __ns:={quote(ns or '/')}`); or, "
-            f"if {node} is right, give it a profile in the policy of ENCLAVE, with common/node.xml."
-        )
-    if not nodes and (node or denial.topic in _TOPICS_OF_EVERY_NODE):
-        return [f"the permissions lack {_EVERY_NODE}"], (
-            'Add <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> to the '
-            "node's profile, or run `sros generate_policy POLICY --enclave ENCLAVE --from-log LOG`."
-        )
-    return [], ""
+def _renamed(right: str, wrong: str) -> str:
+    ns, _, name = right.rpartition("/")
+    return (
+        f"Start it under that name (`--ros-args -r __node:={quote(name)} "
+        f"-r __ns:={quote(ns or '/')}`); or, "
+        f"if {wrong} is right, give it a profile in the policy of ENCLAVE, with common/node.xml."
+    )
+
+
+def _or(enclaves: Sequence[str]) -> str:
+    return f"the enclave{'s' * (len(enclaves) > 1)} {' and '.join(enclaves)}"
 
 
 def _listed(nodes: Sequence[str]) -> str:

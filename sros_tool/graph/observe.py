@@ -28,12 +28,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from hashlib import sha256
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 from sros_tool.errors import UnavailableError
 from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
+from sros_tool.pki.certificates import IDENTITY_DIGITS
 
 _LOG = logging.getLogger(__name__)
 _PERIOD_SECONDS = 0.1
@@ -404,20 +404,9 @@ def _by_order(
 # ── enclaves by certificates ────────────────────────────────────────────────────────────
 
 
-_DIGITS = 12
-_FIRST_BIT = 1 << (4 * _DIGITS - 1)
 _SECURED = tuple("89abcdef")
 """The first hex digits that identifiers of secured participants have: the first bit is set."""
 _DEFAULT_ENCLAVE = ("/",)
-
-
-def identity_of(subject: bytes) -> str:
-    """Return the first 6 bytes (hex) of a secured participant's GUID, from its subject name (DER).
-
-    Source: DDS-Security 1.1, 9.3.3.
-    """
-    digest = int(sha256(subject).hexdigest()[:_DIGITS], 16)
-    return f"{_FIRST_BIT | digest >> 1:x}"
 
 
 def identified(observation: Observation, enclaves: Mapping[str, str]) -> Observation:
@@ -428,7 +417,7 @@ def identified(observation: Observation, enclaves: Mapping[str, str]) -> Observa
     """
     nodes = []
     for node in observation.nodes:
-        enclave = enclaves.get(node.participant[:_DIGITS])
+        enclave = enclaves.get(node.participant[:IDENTITY_DIGITS])
         if enclave is not None:
             node = replace(node, enclaves=(enclave,))
         elif node.participant.startswith(_SECURED) and node.enclaves == _DEFAULT_ENCLAVE:

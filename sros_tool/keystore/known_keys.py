@@ -27,7 +27,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.keystore.reader import read_certificate, read_lists
 from sros_tool.parallel import map_slices
-from sros_tool.pki.certificates import common_name_of, subject_text
+from sros_tool.pki.certificates import common_name_of, identity_of, subject_text
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
 from sros_tool.pki.requests import key_digest, load_request
@@ -175,3 +175,20 @@ def _digests(root: Path, name: str) -> Iterator[str]:
             yield key_digest(load_request(read_bytes(path, "request"), f"'{path}'").public_key)
     except PkiError:
         return  # a damaged file, which no DDS loads; `sros check` reports it
+
+
+# ── participants of DDS ─────────────────────────────────────────────────────────────────
+
+
+def enclaves_by_identity(root: Path) -> dict[str, str]:
+    """Map `identity_of` each certificate's subject in a keystore to its enclave.
+
+    A secured participant shows this identity in its GUID.  An enclave whose certificate cannot be
+    read is left out.
+    """
+    found = {}
+    for name in enclave_names(root):
+        with suppress(SrosError):
+            certificate = read_certificate(enclave_path(root, name) / CERTIFICATE_FILE)
+            found[identity_of(certificate.subject.public_bytes())] = name
+    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import secrets
 from functools import lru_cache
+from hashlib import sha256
 from typing import TypeVar
 
 from cryptography import x509
@@ -352,3 +353,18 @@ def common_name_of(name: x509.Name) -> str:
 def fingerprints(pem: bytes) -> frozenset[str]:
     """Return the fingerprints of the certificates in a CA file: several during a rotation."""
     return frozenset(map(digest, load_certificates(pem, "the certificate of a CA")))
+
+
+# ── participants of DDS ─────────────────────────────────────────────────────────────────
+
+IDENTITY_DIGITS = 12
+_FIRST_BIT = 1 << (4 * IDENTITY_DIGITS - 1)
+
+
+def identity_of(subject: bytes) -> str:
+    """Return the first 6 bytes (hex) of a secured participant's GUID, from its subject name (DER).
+
+    Source: DDS-Security 1.1, 9.3.3.
+    """
+    digest = int(sha256(subject).hexdigest()[:IDENTITY_DIGITS], 16)
+    return f"{_FIRST_BIT | digest >> 1:x}"

@@ -176,9 +176,14 @@ def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
 
 def enclave_argument(command: Sequence[str]) -> str:
     """Return the enclave of ``--ros-args --enclave`` in a command, or "/", the default of rcl."""
+    return named_enclave(command) or "/"
+
+
+def named_enclave(command: Sequence[str]) -> str:
+    """Return the enclave that ``--ros-args --enclave`` names in a command, or ""."""
     words = list(command[command.index(_ROS_ARGS) :]) if _ROS_ARGS in command else []
     named = [value for word, value in pairwise(words) if _ENCLAVE_OPTION.match(word)]
-    return named[-1] if named else "/"
+    return named[-1] if named else ""
 
 
 _REMAP_OPTIONS = ("-r", "--remap")

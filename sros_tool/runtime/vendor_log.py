@@ -123,6 +123,19 @@ _SET_DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env KEYSTORE ENCLAVE --domain ID` prints "
     "the variables."
 )
+_PEER = r"(?P<peer>[0-9a-f]{2}(?:\.[0-9a-f]{2}){11})\|\S*"
+"""A remote participant in a line of Fast DDS; its GUID begins with a digest of its subject name."""
+_PEER_OF_CYCLONE = r"remote participant (?P<peer>[0-9a-f]{1,8}(?::[0-9a-f]{1,8}){2}):\S+"
+_REFUSED_PEER = rf"(?:permissions for {_PEER} \()?"
+_RENEW_PEER = (
+    "`sros inspect KEYSTORE` shows how long each enclave is valid, and `sros renew KEYSTORE PEER` "
+    "renews that of the peer; then restart the peer."
+)
+_OTHER_SIGNER = (
+    "its permissions are not signed by a permissions CA that this process has loaded. This process "
+    "was not restarted since stage 1 of a rotation (`sros rotate_ca`), or the peer not since stage "
+    "2; or both have enclaves of two keystores, or a file was changed"
+)
 _PEERS = "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of each."
 _FAST, _CYCLONE = Vendor.FAST, Vendor.CYCLONE
 _DENIED_ENDPOINT = (
@@ -202,6 +215,23 @@ LOG_TEXTS: tuple[LogText, ...] = (
         r"|from unauthenticated participant|downgrade participant \S+ to non-secure",
         "a PEER was refused: it runs without DDS Security, or is not authenticated yet",
         "Start the peer in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`.",
+    ),
+    _text(
+        "peer-permissions", _CYCLONE, rf"{_PEER_OF_CYCLONE} permissions from plugin: "
+        r"Permissions validity period (?:expired|has not started)",
+        "a PEER was refused: by the clock of this host its permissions have expired or are not "
+        "valid yet", _RENEW_PEER,
+    ),
+    _text(
+        "peer-signature", _CYCLONE,
+        rf"{_PEER_OF_CYCLONE} permissions from plugin: .*(?:PKCS7|SMIME)",
+        f"a PEER was refused: {_OTHER_SIGNER}",
+        "Restart all processes together after stage 2 of `sros rotate_ca`. If it goes on: "
+        f"{_PEERS}",
+    ),
+    _text(
+        "peer-refused", _CYCLONE, rf"{_PEER_OF_CYCLONE} permissions from plugin: (?P<why>\w.+)",
+        "a PEER was refused, not this process: its permissions are not accepted ({why})", _PEERS,
     ),
     # ── Cyclone DDS, starting ──────────────────────────────────────────────────────────────
     _text(
@@ -327,7 +357,8 @@ LOG_TEXTS: tuple[LogText, ...] = (
     ),
     # ── Fast DDS, meeting peers ────────────────────────────────────────────────────────────
     _text(
-        "peer-permissions-ca", _FAST, r"Remote participant PermissionsCA differs from local",
+        "peer-permissions-ca", _FAST,
+        rf"{_REFUSED_PEER}Remote participant PermissionsCA differs from local",
         "a PEER was refused: its permissions CA is not that of this process. Both have enclaves of "
         "different keystores, or one of them was started before the CA was replaced and the other "
         "after it",
@@ -339,17 +370,17 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "another type of key", "Run one version of Fast DDS on all hosts of the robot.",
     ),
     _text(
-        "peer-permissions", _FAST, r"Remote participant doesn't found in its permissions file",
+        "peer-permissions", _FAST,
+        rf"{_REFUSED_PEER}Remote participant doesn't found in its permissions file",
         "a PEER was refused: by the clock and the time zone of this host its permissions have "
         "expired or are not valid yet, or they have no grant for its certificate",
-        "Compare clocks and time zones of both hosts: Fast DDS reads dates in local time; "
-        "`sros inspect KEYSTORE` shows how long each enclave is valid, and `sros renew KEYSTORE "
-        "ENCLAVE` renews the peer's.",
+        "Compare clocks and time zones of both hosts: Fast DDS reads dates in local time. "
+        f"{_RENEW_PEER}",
     ),
     _text(
-        "peer-signature", _FAST, r"Cannot read as PKCS7 the permissions file",
-        "a PEER was refused: its permissions are not signed by the permissions CA of this process, "
-        "although its CA has the same name: enclaves of two keystores, or a changed file", _PEERS,
+        "peer-signature", _FAST, rf"{_REFUSED_PEER}Cannot read as PKCS7 the permissions file",
+        f"a PEER was refused: {_OTHER_SIGNER}",
+        f"Restart this process, and then the peer. If it goes on: {_PEERS}",
     ),
     _text(
         "peer-malformed", _FAST,
@@ -471,6 +502,12 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "Leave partitions out of permissions; sros never writes them.",
         refuses=Refused.TOPIC,
     ),
+    _text(
+        "endpoint-gone", _FAST, r"Cannot find (?:local|remote) (?:reader|writer|participant)\b",
+        "a message could not be protected, because its writer, its reader or the peer is not known "
+        "yet or has just gone: seen when a process starts or ends",
+        "Do nothing if it stops. If it goes on, restart the process and its peers.", weak=1,
+    ),
     # ── messages that follow others ────────────────────────────────────────────────────────
     _text(
         "plugin-unset", _FAST, r"Authentication plugin not configured. Security will be disabled",
@@ -591,6 +628,28 @@ UNKNOWN = LogText(
     "`sros explain KEYSTORE ENCLAVE join` check all that DDS checks.",
 )
 """The meaning of a line that looks like a DDS Security message but is not in `LOG_TEXTS`."""
+
+_NAMED = (
+    "start the process with `sros run KEYSTORE ENCLAVE -- COMMAND`, or name its enclave in "
+    "ROS_SECURITY_ENCLAVE_OVERRIDE or `--ros-args --enclave`. Do not create an enclave /: every "
+    "process that names none would run in it."
+)
+NO_ENCLAVE = _text(
+    "no-enclave", _ROS, "",
+    "no enclave is named for this process, so it looked for the files of the enclave /, and the "
+    "keystore has none",
+    f"Name one: {_NAMED}",
+    refuses=Refused.PARTICIPANT,
+)  # fmt: skip
+"""The meaning of `files-missing` in a process that named no enclave."""
+RUNS_OPEN = _text(
+    "runs-open", _ROS, "",
+    "no enclave is named for this process: unless the keystore has an enclave /, it RUNS UNSECURED "
+    "where ROS_SECURITY_STRATEGY is not exactly Enforce, without any further message; with Enforce "
+    "it does not start",
+    f"If it runs, stop it. Then {_NAMED}", weak=4,
+)  # fmt: skip
+"""The meaning of the line in which rcl names the enclave /, where no error follows."""
 
 _STYLES = (
     (Vendor.CYCLONE, re.compile(r"\A\d+\.\d+ \[\d*\]\s+\S+: ")),

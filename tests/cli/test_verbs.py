@@ -627,6 +627,49 @@ def test_no_process_starts_with_a_key_that_others_can_read(mode: int, keystore: 
     sros(*shlex.split(replace)[1:]).ok()
 
 
+@pytest.mark.parametrize("place", ["", "enclaves", "enclaves/a"])
+def test_no_process_starts_with_files_that_others_can_replace(place: str, keystore: Path) -> None:
+    folder = keystore / place
+    before = stat.S_IMODE(folder.stat().st_mode)
+    folder.chmod(before | 0o022)
+    marker = keystore.parent / "ran"
+    command = (keystore, "/a", "--", "touch", marker)
+    refused = sros("run", *command)
+    assert (refused.status, marker.exists()) == (2, False)
+    assert f"'{folder}': its mode is {before | 0o022:04o}, so everybody can write" in refused.err
+    assert sros("env", keystore, "/a").out == render_refusal("sh")
+    run([*PROGRAM, "run", "--accept-readable-key", *command])
+    marker.unlink()
+    run(["sh", "-c", re.findall("`(chmod .+?)`", refused.err)[0]])
+    run([*PROGRAM, "run", *command])
+    assert marker.exists()
+
+
+def test_the_command_names_no_other_enclave(keystore: Path) -> None:
+    marker = keystore.parent / "ran"
+    command = ("--", "touch", marker, "--ros-args")
+    for option in ("--enclave", "-e"):
+        refused = sros("run", keystore, "/a", *command, option, "/other")
+        assert (refused.status, marker.exists()) == (2, False)
+        assert "the command names the enclave /other, and sros would run it in /a" in refused.err
+
+
+def test_permissions_that_fast_dds_takes_for_expired_here_start_nothing(tmp_path: Path) -> None:
+    """Fast DDS reads dates in local time: in Tokyo, the last nine hours have passed."""
+    words = ("--permissions-validity", "5h", "--template", "development")
+    sros("create_keystore", tmp_path / "ks", *words).ok()
+    sros("create_enclave", tmp_path / "ks", "/a").ok()
+    fast, cyclone = ({"RMW_IMPLEMENTATION": f"rmw_{n}_cpp"} for n in ("fastrtps", "cyclonedds"))
+    for zone in ("Asia/Tokyo", "Australia/Sydney"):
+        refused = sros("env", tmp_path / "ks", "/a", env={**fast, "TZ": zone})
+        assert (refused.status, refused.out) == (2, render_refusal("sh"))
+        assert "cannot run in enclave /a in this time zone" in refused.err
+        assert "`TZ=UTC`" in refused.err
+        sros("env", tmp_path / "ks", "/a", env={**cyclone, "TZ": zone}).ok()
+    for zone in ("UTC", "America/Los_Angeles"):
+        sros("env", tmp_path / "ks", "/a", env={**fast, "TZ": zone}).ok()
+
+
 def test_env_of_a_path_that_a_form_cannot_hold(tmp_path: Path) -> None:
     root = tmp_path / "a\nb"
     sros("create_keystore", root).ok()

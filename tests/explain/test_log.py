@@ -18,8 +18,9 @@ from sros_tool.explain import evaluator
 from sros_tool.explain.evaluator import LoadedEnclave, load_enclave
 from sros_tool.explain.log import LogFinding, explain_log
 from sros_tool.keystore.ledger import Ledger
+from sros_tool.pki.certificates import identity_of, load_certificate
 from sros_tool.resources import policies_dir
-from tests.explain.broken import BREAKAGES, ENCLAVE, Enclave, make_keystore
+from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
 from tests.support.harness import policy_text, publish, sros
 
@@ -251,6 +252,13 @@ def test_cyclone_says_nothing_of_a_whole_enclave(keystore: Path, tmp_path: Path)
         ("rclpy.no_enclave.log", ["enclave-missing"]),
         ("rclpy.permissive.log", ["runs-unsecured"]),
         ("rclpy.unset_keystore.log", ["keystore-unset"]),
+        ("rclpy.no_enclave_named.log", ["no-enclave"]),
+        ("rclpy.permissive_no_enclave_named.log", ["runs-open"]),
+        ("fastdds_2.14.5.node_of_another_enclave.log", ["topic-denied"]),
+        ("fastdds_2.14.5.peer_after_stage_2.log", ["peer-signature"]),
+        ("fastdds_2.14.5.peer_expired.log", ["peer-permissions"]),
+        ("cyclone_0.10.2.peer_after_stage_2.log", ["peer-signature"]),
+        ("cyclone_0.10.2.peer_expired.log", ["peer-permissions"]),
         ("cyclone_0.10.2.peer_another_ca_2.log", ["peer-refused"]),
         ("cyclone_0.10.2.peer_key_mismatch_1.log", ["peer-handshake"]),
         ("fastdds_2.9.1.working.log", ["topic-denied", "topic-denied"]),
@@ -318,7 +326,7 @@ def test_single_lines(line: str, name: str) -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        "2026-01-01 12:00:00.000 [SECURITY Error] Cannot find local writer 01.0f|0.0.1.c1",
+        "2026-01-01 12:00:00.000 [SECURITY Error] Cannot find the local writer 01.0f|0.0.1.c1",
         "2026-01-01 12:00:00.000 [RTPS_SECURITY Error] Bad thing -> Function set",
         "[1795309573.65] [INFORMATIONAL] 01.0f|0.0.1.c1 0 SecurityManager::init : Bad thing",
         "[1795309573.65] [EMERGENCY] 01.0f|0.0.1.c1 0 PKIDH::begin_handshake_request : Bad thing",
@@ -397,6 +405,16 @@ def test_what_is_not_understood_is_shown(line: str, tmp_path: Path) -> None:
         ),
         ("[SECURITY_CRYPTO Error] Invalid CryptoToken -> Function set_tokens", "crypto"),
         (f"{FAST_LINE}Malformed CryptoTokenSequence", "crypto"),
+        (
+            f"{FAST_LINE}Cannot find local reader 01.0f.78|0.0.1c.7 -> Function "
+            "encode_reader_submessage",
+            "endpoint-gone",
+        ),
+        (
+            f"{CYCLONE_LINE}Could not get remote participant 1:2:3:1c1 permissions from plugin: "
+            "Subject name is invalid(code: 146)",
+            "peer-refused",
+        ),
         (f"{FAST_LINE}Error in fastcdr trying to deserialize SecureDataHeader", "crypto"),
         (
             "[SECURITY_CRYPTO Warning] Unable to decode the payload. EVP_DecryptFinal function "
@@ -620,6 +638,105 @@ def test_a_missing_common_part_is_told(keystore: Path, tmp_path: Path) -> None:
     found = sros("explain", keystore, ENCLAVE, "--log", log).out
     assert "the permissions lack the rights that every node needs" in found
     assert 'href="common/node.xml"' in found
+
+
+# ── enclaves that a log names by a node, by a GUID, or not at all ──────────────────────────
+
+
+def test_the_enclave_of_a_node_that_runs_in_another_one_is_named(keystore: Path) -> None:
+    log = LOGS / f"{FAST_14}.node_of_another_enclave.log"
+    found = sros("explain", keystore, "--log", log).out
+    assert f"this is the node /listener, for which there is the enclave {OTHER}" in found
+    assert f"`sros run {keystore} {OTHER} -- COMMAND`" in found
+    assert "__node:=" not in found and "profile" not in found
+    # Without that enclave, the name is what is wrong.
+    shutil.rmtree(keystore / "enclaves" / OTHER.lstrip("/"))
+    assert (
+        "`--ros-args -r __node:=talker -r __ns:=/`" in sros("explain", keystore, "--log", log).out
+    )
+
+
+@pytest.mark.parametrize("name", ["no_enclave_named", "permissive_no_enclave_named"])
+def test_no_enclave_for_everybody_is_advised(name: str, keystore: Path, tmp_path: Path) -> None:
+    log = LOGS / f"rclpy.{name}.log"
+    for words in ((), (keystore,), (keystore, ENCLAVE)):
+        ended = sros("explain", *words, "--log", log)
+        assert ended.status == 1
+        assert "no enclave is named for this process" in ended.out
+        assert "sros create_enclave" not in ended.out
+        assert f"`sros run {words[0] if words else 'KEYSTORE'} ENCLAVE -- COMMAND`" in ended.out
+        assert ("RUNS UNSECURED" in ended.out) is name.startswith("permissive")
+    sros("create_enclave", keystore, "/").ok()  # what it names is there, then
+    ended = sros("explain", keystore, "--log", log)
+    assert "no enclave is named" not in ended.out
+    assert ended.status == (0 if name.startswith("permissive") else 1)
+
+
+def test_an_error_says_more_than_that_no_enclave_is_named() -> None:
+    line = "[INFO] [1.0] [rcl]: Found security directory: /ks/enclaves\n"
+    for error, name in (("RCLError: invalid allocator", "endpoint"), (f"{FAST_LINE}X", "not-")):
+        names = [each.id for each in explained(line + error)]
+        assert any(each.startswith(name) for each in names)
+        assert ("runs-open" in names) is (name == "not-")
+
+
+def log_about(peer: Path, name: str, folder: Path) -> Path:
+    """A log in which the GUID of the peer is that of an enclave."""
+    subject = load_certificate((peer / "cert.pem").read_bytes(), "cert").subject
+    digits = identity_of(subject.public_bytes())
+    text = (LOGS / name).read_text()
+    bytes_ = ".".join(digits[each : each + 2] for each in range(0, 12, 2))
+    text = re.sub(r"[0-9a-f]{2}(?:\.[0-9a-f]{2}){5}(?=\.[0-9a-f.]+\|0\.0\.1\.c1)", bytes_, text)
+    text = re.sub(
+        r"[0-9a-f]{8}:[0-9a-f]{4}(?=[0-9a-f]{4}:[0-9a-f]+:1c1)", f"{digits[:8]}:{digits[8:]}", text
+    )
+    assert text != (LOGS / name).read_text()
+    (folder / "peer.log").write_text(text)
+    return folder / "peer.log"
+
+
+@pytest.mark.parametrize("vendor", [FAST_14, CYCLONE])
+def test_the_peer_whose_permissions_expired_is_named(
+    vendor: str, keystore: Path, tmp_path: Path
+) -> None:
+    peer = Enclave(keystore, OTHER)
+    log = log_about(peer.folder, f"{vendor}.peer_expired.log", tmp_path)
+    fine = sros("explain", keystore, ENCLAVE, "--log", log).out
+    assert f"the peer is enclave {OTHER}, whose present files have no fault" in fine
+    BREAKAGES["permissions expired"](peer)
+    found = sros("explain", keystore, ENCLAVE, "--log", log).out
+    assert f"the peer is enclave {OTHER}: " in found and "expired at" in found
+    commands = re.findall("`(sros .+?)`", found)
+    assert commands and all(f"{keystore} {OTHER}" in each for each in commands[:1]), found
+    assert f"{keystore} {ENCLAVE}" not in found
+    unnamed = sros("explain", "--log", log).out
+    assert "`sros renew KEYSTORE PEER`" in unnamed
+
+
+@pytest.mark.parametrize(
+    ("vendor", "remedy"),
+    [
+        (FAST_14, "Restart this process of enclave /talker_listener/talker: it was not restarted"),
+        (CYCLONE, "Restart this process and the peer: one of them was not restarted since stage 2"),
+    ],
+)
+def test_a_process_that_was_not_restarted_in_a_rotation_is_named(
+    vendor: str, remedy: str, keystore: Path, tmp_path: Path
+) -> None:
+    for _ in range(2):
+        sros("rotate_ca", keystore, "--permissions", "--next").ok()
+    log = log_about(Enclave(keystore, OTHER).folder, f"{vendor}.peer_after_stage_2.log", tmp_path)
+    found = sros("explain", keystore, "--log", log).out
+    assert "the CAs of this keystore are being replaced, and stage 2 is done" in found
+    assert f"  remedy    {remedy}" in found
+    # After the rotation, or about a peer that this keystore does not know, it is not certain.
+    stranger = sros("explain", keystore, "--log", LOGS / f"{vendor}.peer_after_stage_2.log").out
+    assert "was not restarted since stage 1 of a rotation" in stranger
+    assert "  found " not in stranger
+    sros("rotate_ca", keystore, "--next").ok()
+    after = sros("explain", keystore, "--log", log).out
+    assert f"the peer is enclave {OTHER}, whose present files have no fault" in after
+    assert f"Restart the processes of {OTHER}, and then this process" in after
 
 
 # ── denials ────────────────────────────────────────────────────────────────────────────────

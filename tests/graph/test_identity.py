@@ -5,8 +5,8 @@ from __future__ import annotations
 from cryptography import x509
 
 from sros_tool.graph.learn import learn
-from sros_tool.graph.observe import identified, identity_of
-from sros_tool.pki.certificates import common_name
+from sros_tool.graph.observe import identified
+from sros_tool.pki.certificates import common_name, identity_of
 from tests.graph.graphs import graph, node
 
 # As Fast DDS 2.14.5 gave them to participants of these enclaves.
