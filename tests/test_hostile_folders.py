@@ -13,10 +13,11 @@ import shlex
 import shutil
 import stat
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -42,7 +43,7 @@ from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import lock as locking
 from sros_tool.keystore.transaction.stage import staged_name
 from sros_tool.xml import read_bytes
-from tests.conftest import POLICY
+from tests.conftest import MEMORY, POLICY
 from tests.support.children import run
 from tests.support.harness import snapshot, sros
 
@@ -224,7 +225,8 @@ def test_a_stage_that_others_can_open_is_refused(keystore: Path) -> None:
 
 
 @as_root
-def test_what_root_makes_belongs_to_the_owner_of_the_keystore(keystore: Path) -> None:
+def test_what_root_makes_belongs_to_the_owner_of_the_keystore(reachable: Path) -> None:
+    keystore = reachable
     give(keystore, OWNER)
     create_enclaves(keystore, ["/by_root/inner"], now=NOW)
     renew(keystore, ["/a"], now=NOW, new_key=True)
@@ -235,8 +237,6 @@ def test_what_root_makes_belongs_to_the_owner_of_the_keystore(keystore: Path) ->
             if stat.S_ISLNK(state.st_mode):
                 continue  # who owns a link may do nothing with it that others may not
             assert (state.st_uid, state.st_gid) == (OWNER, OWNER), name
-    keystore.parent.chmod(0o755)
-    make_reachable(keystore.parent)
     assert not in_process_of(OWNER, lambda: create_enclaves(keystore, ["/own"], now=NOW))
     assert (keystore / "enclaves/own/key.pem").stat().st_uid == OWNER
 
@@ -293,20 +293,21 @@ def test_root_completes_what_the_owner_was_killed_in(keystore: Path) -> None:
     assert not (keystore / STAGE).exists()
 
 
-def make_reachable(folder: Path) -> None:
-    """Let every user reach a folder; for good, since tests at the same time share its parents."""
-    for each in (folder, *folder.parents):
-        mode = stat.S_IMODE(each.stat().st_mode)
-        if not mode & 0o001:
-            each.chmod(mode | 0o011)
+@pytest.fixture
+def reachable(made_keystore: Path) -> Iterator[Path]:
+    """A keystore that every user can reach: pytest closes its own folders whenever it starts."""
+    with TemporaryDirectory(dir=MEMORY if os.access(MEMORY, os.W_OK) else None) as folder:
+        Path(folder).chmod(0o755)
+        yield Path(shutil.copytree(made_keystore, Path(folder, "ks"), symlinks=True))
 
 
 # ── the lock ───────────────────────────────────────────────────────────────────────────────
 
 
 @as_root
-def test_nobody_else_can_block_the_writers(keystore: Path) -> None:
+def test_nobody_else_can_block_the_writers(reachable: Path) -> None:
     """The reader of a keystore locks all that he can open, and its owner writes on."""
+    keystore = reachable
     keystore.chmod(0o755)
     ready, go = os.pipe()
     done, end = os.pipe()
@@ -321,7 +322,6 @@ def test_nobody_else_can_block_the_writers(keystore: Path) -> None:
         os.close(end)
         os.read(done, 1)
 
-    make_reachable(keystore.parent)
     child = os.fork()
     if child == 0:
         with suppress(BaseException):
