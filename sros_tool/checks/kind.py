@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -98,6 +98,20 @@ class RelatedPlace:
 
 
 @dataclass(frozen=True, slots=True)
+class Cause:
+    """The common cause of several findings of one severity, and the remedy that ends all of them.
+
+    ``title`` is a clause, ``text`` and ``remedy`` are sentences.  ``number`` counts the findings:
+    where only some of them are selected, they are shown one by one.
+    """
+
+    title: str
+    text: str
+    remedy: str
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
 class Finding:
     """A problem found at one place.
 
@@ -105,7 +119,7 @@ class Finding:
     counts from 1.  ``text`` says what was found; ``own_remedy`` replaces the remedy of the kind
     unless it is empty.  ``accepted`` names the template or setting that accepts the finding, which
     then counts as a note.  ``related`` are other places that it is
-    about, in the order to read them.
+    about, in the order to read them.  ``cause`` is set if others have the same cause.
     """
 
     kind: FindingKind
@@ -116,6 +130,7 @@ class Finding:
     own_remedy: str = ""
     accepted: str = ""
     related: tuple[RelatedPlace, ...] = ()
+    cause: Cause | None = None
 
     @property
     def id(self) -> str:
@@ -155,6 +170,22 @@ class Finding:
                 {"text": each.text, "file": each.file, "line": each.line} for each in self.related
             ],
         }
+
+
+def by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
+    """Yield findings in their order, those of one cause together if none of them is missing."""
+    groups: dict[Cause, list[Finding]] = {}
+    for each in findings:
+        if each.cause:
+            groups.setdefault(each.cause, []).append(each)
+    done: set[Cause] = set()
+    for each in findings:
+        cause = each.cause
+        if not cause or len(groups[cause]) != cause.number:
+            yield (each,)
+        elif cause not in done:
+            done.add(cause)
+            yield tuple(groups[cause])
 
 
 def by_id(*kinds: FindingKind) -> Mapping[str, FindingKind]:

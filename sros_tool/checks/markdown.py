@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
-from sros_tool.checks.kind import Finding
+from sros_tool.checks.kind import Finding, by_cause
 from sros_tool.checks.registry import ChosenFindings
 from sros_tool.markdown import bounded, code, plain
 
@@ -15,12 +15,23 @@ _SIGNS = {"error": "🔴", "warning": "🟠", "note": "🔵"}
 def findings_markdown(chosen: ChosenFindings, summary: str) -> str:
     """Return the findings under a heading; ``summary`` counts them in words."""
     rest = "which `sros check` shows"
-    listed = bounded(map(_item, chosen.shown), _MOST, rest)
+    listed = bounded(map(_item, by_cause(chosen.shown)), _MOST, rest)
     return "\n\n".join(part for part in (f"### Findings: {plain(summary)}", listed) if part) + "\n"
 
 
-def _item(finding: Finding) -> str:
-    return "<br>".join(_lines(finding))
+def _item(findings: Sequence[Finding]) -> str:
+    return "<br>".join(_lines(findings[0]) if len(findings) == 1 else _cause_lines(findings))
+
+
+def _cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
+    """Yield the lines of findings of one cause."""
+    first = findings[0]
+    assert first.cause, "findings that are shown together have a cause"
+    word = first.severity.word
+    ids = code(", ".join(dict.fromkeys(each.id for each in findings)))
+    yield f"{_SIGNS[word]} **{word}** {code(first.place)} {plain(first.cause.title)} ({ids})"
+    yield code(first.cause.text)
+    yield code(first.cause.remedy)
 
 
 def _lines(finding: Finding) -> Iterator[str]:

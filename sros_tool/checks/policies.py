@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import os
 import re
-from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from itertools import islice
 from pathlib import Path
+from shlex import quote
 
 from lxml import etree
 
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Cause, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
@@ -35,7 +36,7 @@ from sros_tool.names import (
     is_expression,
 )
 from sros_tool.pki.certificates import common_name, subject_text
-from sros_tool.policy.document import IncludedFile, Includer, read_policy
+from sros_tool.policy.document import COMMON, IncludedFile, Includer, read_policy
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Policy, Profile, Source
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
 from sros_tool.policy.rights import WHOLE, Right, Rules, parts, policy_rights
@@ -277,9 +278,13 @@ def _breadth(each: _Statement) -> Iterator[Finding]:
         yield each.found(SETS_PARAMETERS, f"{text} matches every node")
 
 
+_INCLUDE = (
+    '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="common/node.xml" '
+    'xpointer="xpointer(/profile/*)"/>'
+)
 _INCLUDE_HINT = (
-    '<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> allows '
-    "what every node needs; `sros policies --copy` writes that file."
+    f"{_INCLUDE} allows what every node needs; `sros policies --copy common` writes that file, "
+    "in the folder of the policy."
 )
 
 NO_TYPE_DESCRIPTION = FindingKind(
@@ -346,6 +351,13 @@ _BASICS = (
     (NO_PARAMETER_EVENTS, "publish", ("/parameter_events",)),
     (NO_PARAMETER_SERVICES, "reply", tuple(f"~/{name}" for name in PARAMETER_SERVICES)),
 )
+_STARTING = {
+    NO_ROSOUT: "publish /rosout",
+    NO_PARAMETER_EVENTS: "publish /parameter_events",
+    NO_PARAMETER_SERVICES: "offer its parameter services",
+    NO_TYPE_DESCRIPTION: "offer ~/get_type_description",
+}
+"""What a node does when it starts, for each kind of finding that denies it."""
 _LISTENER = "transform_listener_impl_"
 """Name prefix of the nodes of tf2_ros listeners, which have no parameters and no events."""
 _OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
@@ -358,17 +370,80 @@ def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
     ros2cli, without log, parameters and type descriptions (ROS 2 design, "Topic and Service
     Names").
     """
-    for enclave in checked.policy.enclaves:
-        for profile in enclave.all_profiles():
-            if profile.node and profile.ns.startswith("/") and not profile.node.startswith("_"):
-                yield from _basics(checked, enclave, profile)
-    for each in checked.statements:
-        if each.written in _GLOBAL and each.profile.ns != "/" and each.right.kind == "topics":
-            text = f"{each.written} becomes {each.name} in namespace {each.profile.ns}"
-            yield each.found(RELATIVE_GLOBAL, text, f"Write /{each.written}.")
+    lacking = [
+        each
+        for enclave in checked.policy.enclaves
+        for profile in enclave.all_profiles()
+        if profile.node and profile.ns.startswith("/") and not profile.node.startswith("_")
+        for each in _basics(checked, enclave, profile)
+    ]
+    by_file: dict[str, list[_Lacking]] = defaultdict(list)
+    for each in lacking:
+        if each.has_include:
+            by_file[each.finding.file].append(each)
+    causes = {file: _no_common_part(found) for file, found in by_file.items() if len(found) > 1}
+    for one in lacking:
+        yield replace(one.finding, cause=causes.get(one.finding.file) if one.has_include else None)
+    for said in checked.statements:
+        if said.written in _GLOBAL and said.profile.ns != "/" and said.right.kind == "topics":
+            text = f"{said.written} becomes {said.name} in namespace {said.profile.ns}"
+            yield said.found(RELATIVE_GLOBAL, text, f"Write /{said.written}.")
 
 
-def _basics(checked: _CheckedPolicy, enclave: Enclave, profile: Profile) -> Iterator[Finding]:
+@dataclass(frozen=True, slots=True)
+class _Lacking:
+    """A finding about a node that lacks a right that every node needs."""
+
+    finding: Finding
+    node: str
+    listener: bool
+
+    @property
+    def has_include(self) -> bool:
+        """Whether including the common part is the remedy."""
+        return not self.listener and self.finding.severity is ERROR
+
+
+def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
+    """Return the cause of findings in one file: the common part is not included."""
+    file = Path(lacking[0].finding.file)
+    nodes = list(dict.fromkeys(each.node for each in lacking))
+    lines = list(dict.fromkeys(each.finding.line or 0 for each in lacking))
+    counted = Counter(each.finding.kind for each in lacking)
+    plural = len(nodes) > 1
+    what = [
+        verb if counted[kind] == len(nodes) else f"{verb} ({_nodes(counted[kind])})"
+        for kind, verb in _STARTING.items()
+        if counted[kind]
+    ]
+    copied = (file.parent / COMMON / "node.xml").exists()
+    target = quote(str(file.parent / COMMON))
+    first = "Put" if copied else f"Run `sros policies --copy {target}`, and put"
+    place = "the <profile> of every node" if plural else "its <profile>"
+    at = f"line{'s' * (len(lines) > 1)} {_some([str(each) for each in lines])}"
+    return Cause(
+        f"{_nodes(len(nodes))} lack the common part" if plural else "a node lacks the common part",
+        f"{_some(nodes)} may not {'; '.join(what)}. A node does all this when it starts, and "
+        "exits if it is denied.",
+        f"{first} this line into {place} ({at}): {_INCLUDE}",
+        len(lacking),
+    )
+
+
+def _nodes(count: int) -> str:
+    return "1 node" if count == 1 else f"{count} nodes"
+
+
+def _some(words: Sequence[str]) -> str:
+    """Return the first words, and the number of the others."""
+    more = len(words) - _NODES_SHOWN
+    return ", ".join(words[:_NODES_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+_NODES_SHOWN = 6
+
+
+def _basics(checked: _CheckedPolicy, enclave: Enclave, profile: Profile) -> Iterator[_Lacking]:
     node = expand("~", profile.ns, profile.node)
     listener = profile.node.startswith(_LISTENER)
     lacks_others = False
@@ -385,7 +460,8 @@ def _basics(checked: _CheckedPolicy, enclave: Enclave, profile: Profile) -> Iter
             kind = NO_PARAMETERS
         lacks_others = True
         text = f"node {node} may not {right} {', '.join(missing)}"
-        yield kind.found(enclave.path, text, profile.source.file, profile.source.line)
+        source = profile.source
+        yield _Lacking(kind.found(enclave.path, text, source.file, source.line), node, listener)
 
 
 DOCUMENT_SIZE = FindingKind(
@@ -699,8 +775,8 @@ _INCLUDES = tuple(f"{{http://www.w3.org/{year}/XInclude}}include" for year in (2
 _MANY = 1000
 
 
-def _policy_findings(policy: Policy, distribution: str) -> Iterator[Finding]:
-    """Yield all findings in a readable policy."""
+def findings_in(policy: Policy, distribution: str = "") -> Iterator[Finding]:
+    """Yield all findings in a policy that was read, except those about its includes."""
     checked = _CheckedPolicy(policy, distribution)
     for check in _CHECKS:
         yield from check(checked)
@@ -720,7 +796,7 @@ def policy_file_findings(
     except SrosError as error:
         yield from _unreadable(path, error)
         return
-    yield from _policy_findings(policy, distribution)
+    yield from findings_in(policy, distribution)
     yield from _includes(path)
 
 

@@ -21,7 +21,6 @@ from sros_tool.cli.common import (
     PATH,
     check_one_format,
     check_output,
-    coloured,
     domain_of,
     fleet_option,
     force_option,
@@ -36,6 +35,7 @@ from sros_tool.cli.common import (
     visible,
     visible_line,
 )
+from sros_tool.cli.findings import echo_findings
 from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
@@ -256,7 +256,7 @@ def check(
         found = [_shown(each) for each in every]
     chosen = selection.choose(found)
     if form == "text" and at.fleet:
-        _print_text(chosen, _by_robot(chosen.shown, _with_enclaves(at.fleet, paths)))
+        _print_text(chosen, _with_enclaves(at.fleet, paths))
     else:
         _SHOW[form](chosen, selection)
     return 1 if fail_on != "never" and chosen.fails(Severity[fail_on.upper()]) else 0
@@ -522,12 +522,19 @@ _MOST_ROBOTS = 10
 
 
 def _print_all(chosen: ChosenFindings, _selection: FindingFilter) -> None:
-    _print_text(chosen, ((each, "") for each in chosen.shown))
+    _print_text(chosen)
 
 
-def _print_text(chosen: ChosenFindings, shown: Iterable[tuple[Finding, str]]) -> None:
-    for each, others in shown:
-        echo_finding(each)
+def _print_text(chosen: ChosenFindings, fleet: Fleet | None = None) -> None:
+    from sros_tool.checks.kind import by_cause
+
+    groups = list(by_cause(chosen.shown))
+    for group in groups:
+        if len(group) > 1:
+            echo_findings(group)
+    single = [group[0] for group in groups if len(group) == 1]
+    for each, others in _by_robot(single, fleet) if fleet else ((each, "") for each in single):
+        echo_findings([each])
         if others:
             click.echo(visible_line(f"    {others}"))
     for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
@@ -535,22 +542,6 @@ def _print_text(chosen: ChosenFindings, shown: Iterable[tuple[Finding, str]]) ->
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
         click.echo(f"accepted by the {choice}: {kinds_text}")
     click.echo(_summary(chosen), err=True)
-
-
-def _finding_lines(finding: Finding) -> list[str]:
-    """Return a finding as lines: place and title, reason, remedy, and related places."""
-    head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
-    subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
-    by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
-    related = [f"      {each}: {each.text}" for each in finding.related]
-    return [head, f"    {subject}{finding.text}{by}", *related, f"    {finding.remedy}"]
-
-
-def echo_finding(finding: Finding) -> None:
-    """Print a finding as text, its severity in colour on a terminal."""
-    word = f": {finding.severity.word}: "
-    head, *rest = (visible_line(line) for line in _finding_lines(finding))
-    click.echo("\n".join((head.replace(word, f": {coloured(word[2:-2])}: ", 1), *rest)))
 
 
 def _summary(chosen: ChosenFindings) -> str:
@@ -572,9 +563,22 @@ def _counts(chosen: ChosenFindings) -> dict[str, int]:
 
 
 def _print_json(chosen: ChosenFindings, _selection: FindingFilter) -> None:
+    from sros_tool.checks.kind import by_cause
+
+    place = {id(each): index for index, each in enumerate(chosen.shown)}
     print_json(
         {
             "findings": [each.as_json() for each in chosen.shown],
+            "causes": [
+                {
+                    "title": group[0].cause.title,
+                    "text": group[0].cause.text,
+                    "remedy": group[0].cause.remedy,
+                    "findings": [place[id(each)] for each in group],
+                }
+                for group in by_cause(chosen.shown)
+                if len(group) > 1 and group[0].cause
+            ],
             "accepted": [each.as_json() for each in chosen.accepted],
             "counts": {
                 **_counts(chosen),
@@ -679,7 +683,7 @@ def doctor(report: Path | None, force: bool, as_json: bool) -> None:
         for each in findings:
             if each.severity >= WARNING:
                 click.echo()
-                echo_finding(each)
+                echo_findings([each])
     if report:
         lines = _report_sections(diagnosis, provider, findings)
         text = support_report(os.environ, lines, secrets=taken_secrets())

@@ -278,8 +278,8 @@ def verify(
     status is 0 if there are no findings.
     """
     from sros_tool.checks.keystores.arrival import verify_arrival
-    from sros_tool.cli.check import echo_finding
     from sros_tool.cli.common import local_zone
+    from sros_tool.cli.findings import echo_findings
     from sros_tool.keystore.selection import select_enclaves
     from sros_tool.validity import iso
 
@@ -312,7 +312,7 @@ def verify(
         place = f", key on the token {each.token.token}" if each.token else ""
         click.echo(f"{each.name}  {state}{place}")
     for finding in arrival.findings:
-        echo_finding(finding)
+        echo_findings([finding])
     return 1 if arrival.findings else 0
 
 

@@ -37,6 +37,7 @@ from sros_tool.cli.common import (
     split_root,
     visible,
 )
+from sros_tool.cli.findings import print_signed
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import authority_json, changes_json, enclave_json, notes_json
 from sros_tool.errors import Note, UsageError
@@ -145,17 +146,18 @@ def create_permission(
     *given, last = rest
     file = PATH.convert(last, None, None)
     _check_order(root, given, file)
+    policy = policy_for(file, fleet_file)
     result = create(
         root,
         chosen_enclaves(root, given, patterns, robots, every=every),
-        policy_for(file, fleet_file),
+        policy,
         now=now(),
         domain=ros_domain(),
         revoke_old=revoke_old,
         keyring=keyring(),
         dry_run=dry_run,
     )
-    _show(result, dry_run, as_json)
+    _show(result, dry_run, as_json, [policy])
 
 
 _ORDER = "Write them in this order: `sros create_permission ROOT NAME... POLICY_FILE`."
@@ -278,16 +280,24 @@ def generate_artifacts(
         click.echo(f"'{root}' is not a valid keystore, creating new keystore", err=True)
         if not as_json:
             _print_new_keystore(root, template, result.domains)
-    _show(result, dry_run, as_json)
+    _show(result, dry_run, as_json, policies)
     if result.new_keystore:
         _print_open_rights(root, template)
 
 
-def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
+def _show(
+    result: Creation,
+    dry_run: bool,
+    as_json: bool,
+    policies: Sequence[Policy | FleetPolicy] = (),
+) -> None:
+    from sros_tool.checks.signed import as_note, signed_findings
     from sros_tool.keystore.lifecycle.replaced import lasting_text
 
+    signed = {*result.created, *result.changed, *result.kept}
+    found = signed_findings(policies, signed, os.environ.get("ROS_DISTRO", ""))
     if as_json:
-        print_json(_creation_json(result, dry_run))
+        print_json(_creation_json(result, dry_run, [as_note(each) for each in found]))
     elif dry_run:
         print_plan(result.root, result.changes)
     else:
@@ -316,9 +326,11 @@ def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
     print_restart(result.restart, result.zenoh)
     print_remarks(result.remarks)
     print_notes(result.notes)
+    if not as_json:
+        print_signed(found, [each.file for each in policies])
 
 
-def _creation_json(result: Creation, dry_run: bool) -> dict[str, Any]:
+def _creation_json(result: Creation, dry_run: bool, found: Sequence[Note] = ()) -> dict[str, Any]:
     from sros_tool.values import as_plain
 
     names = ("created", "changed", "completed", "kept")
@@ -335,7 +347,7 @@ def _creation_json(result: Creation, dry_run: bool) -> dict[str, Any]:
         "restart": list(result.restart),
         "restart_zenoh": list(result.zenoh.restart),
         "changes": changes_json(result.root, result.changes),
-        "notes": notes_json((*result.notes, *result.remarks)),
+        "notes": notes_json((*result.notes, *result.remarks, *found)),
     }
 
 
@@ -406,6 +418,7 @@ def _robots_of(root: Path, names: Sequence[str]) -> dict[str, dict[str, str]]:
 
 if TYPE_CHECKING:
     from sros_tool.dds.domains import DomainSet
+    from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.template import NamedValues, Template
     from sros_tool.policy.model import Policy
 

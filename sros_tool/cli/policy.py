@@ -677,6 +677,8 @@ Example:
   ...
   $ sros policies --copy my_policies
   copied the policies to 'my_policies'
+  $ sros policies --copy common
+  copied the common parts of policies to 'common'
   $ sros policies --convert eloquent.xml -o robot.policy.xml
   converted 2 nodes of 'eloquent.xml' to enclaves: /listener, /talker
   wrote 'robot.policy.xml'""",
@@ -685,8 +687,11 @@ Example:
     "--copy",
     "target",
     type=PATH,
-    metavar="DIR",
-    help="Copy them to the new folder DIR, as a start for your own.",
+    metavar="[DIR]",
+    is_flag=False,
+    flag_value="policies",
+    help="Copy them to the folder DIR (policies), as a start for your own; to a DIR named common, "
+    "only the common parts.",
 )
 @click.option(
     "--convert",
@@ -716,15 +721,16 @@ def policies(
 ) -> int:
     """List the policies that ship with sros and their enclaves, or copy the policies.
 
+    --copy adds to an existing folder the files that it lacks, and replaces nothing: where a file
+    differs, nothing is copied.
+
     --convert gives a policy of version 0.1.0 (ROS 2 Crystal to Eloquent) the present format, with
     the same rights: each node becomes an enclave with the node's name. Nodes of a later ROS 2 need
     more, which --with-node-rights adds. The result is one file: includes are resolved, and comments
     are lost. The exit status is 1 if a part was left out.
     """
-    from sros_tool.files import write_new_folder
     from sros_tool.policy.document import read_policy
     from sros_tool.resources import policies_dir
-    from sros_tool.xml import read_bytes
 
     if earlier is not None:
         if target is not None:
@@ -736,20 +742,7 @@ def policies(
         raise UsageError("--with-node-rights, --output and --force are for --convert only")
     source = policies_dir()
     if target is not None:
-        if os.path.lexists(target):
-            raise UsageError(f"'{target}' already exists", "", "Name a new folder.")
-        if dry_run and not as_json:
-            click.echo(f"would copy the policies to '{target}'")
-            return 0
-        found_files = (each for each in sorted(source.rglob("*")) if each.is_file())
-        files = {str(each.relative_to(source)): read_bytes(each, "file") for each in found_files}
-        if not dry_run:
-            write_new_folder(target, files)
-        if as_json:
-            changes = [{"action": "create", "path": str(target / each)} for each in files]
-            print_json({"folder": str(target), "dry_run": dry_run, "changes": changes, "notes": []})
-        else:
-            click.echo(f"copied the policies to '{target}'")
+        _copy(source, target, as_json=as_json, dry_run=dry_run)
         return 0
     found = {path: read_policy(path) for path in sorted(source.glob("*.xml"))}
     if as_json:
@@ -767,6 +760,48 @@ def policies(
         click.echo(f"{path.name:{width}}  {', '.join(each.path for each in policy.enclaves)}")
     click.echo(f"they are in '{source}'", err=True)
     return 0
+
+
+def _copy(source: Path, target: Path, *, as_json: bool, dry_run: bool) -> None:
+    """Copy the shipped policies, or the common parts to a folder ``common``, to a folder."""
+    from sros_tool.files import new_files, write_new_folder
+    from sros_tool.keystore.layout import is_keystore
+    from sros_tool.policy.document import COMMON
+    from sros_tool.xml import read_bytes
+
+    what = "policies"
+    if target.absolute().name == COMMON:
+        source, what = source / COMMON, "common parts of policies"
+    shipped = (each for each in sorted(source.rglob("*")) if each.is_file())
+    files = {str(each.relative_to(source)): read_bytes(each, "file") for each in shipped}
+    exists = os.path.lexists(target)
+    if exists and not target.is_dir():
+        raise UsageError(f"'{target}' is no folder", "", "Name a new folder, or an existing one.")
+    if is_keystore(target):
+        raise UsageError(f"'{target}' already exists, as a keystore", "", "Name another folder.")
+    present = [each for each in files if os.path.lexists(target / each)]
+    for each in present:
+        path = target / each
+        if not path.is_file() or read_bytes(path, "file") != files[each]:
+            raise UsageError(
+                f"'{path}' differs from the file that ships with sros",
+                "What exists is not replaced, and nothing was copied.",
+                "Name another folder, or move the file away.",
+            )
+    missing = {each: data for each, data in files.items() if each not in present}
+    if missing and not dry_run:
+        if exists:
+            with new_files(target, missing):
+                pass
+        else:
+            write_new_folder(target, missing)
+    if as_json:
+        changes = [{"action": "create", "path": str(target / each)} for each in missing]
+        print_json({"folder": str(target), "dry_run": dry_run, "changes": changes, "notes": []})
+    elif not missing:
+        click.echo(f"nothing to copy: '{target}' has the {what}")
+    else:
+        click.echo(f"{'would copy' if dry_run else 'copied'} the {what} to '{target}'")
 
 
 def _convert(

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sros_tool.cli.check import echo_finding
 from sros_tool.cli.common import check_output, print_json, print_notes, save, visible, visible_line
+from sros_tool.cli.findings import echo_findings
 from sros_tool.cli.written import file_change, notes_json
 from sros_tool.errors import Note, PolicyError
 
@@ -71,7 +71,7 @@ def show_from(file: Path, output: Path | None, *, force: bool, dry_run: bool, as
         for line in _lines(document, rights):
             click.echo(visible(line))
         for each in shown:
-            echo_finding(each)
+            echo_findings([each])
         if output and dry_run:
             click.echo(visible(f"would {changes[0]['action']} {output}"))
     print_notes(notes)

@@ -84,6 +84,18 @@ class FleetPolicy(Mapping[str, Enclave]):
             raise PolicyError(f"'{self._policy.file}': the policy has no enclave for this fleet")
         return replace(self._policy, enclaves=tuple(self.values()))
 
+    def for_one_robot(self) -> Policy:
+        """Return the policy with each enclave once, as it is for the first of its robots."""
+        first: dict[int, str] = {}
+        for path, (enclave, _) in self._of.items():
+            first.setdefault(id(enclave), path)
+        return replace(self._policy, enclaves=tuple(self[path] for path in first.values()))
+
+    @property
+    def file(self) -> str:
+        """The path of the policy file."""
+        return self._policy.file
+
     def _paths(self, enclave: Enclave) -> Iterator[tuple[str, Robot | None]]:
         if not has_placeholder(enclave.path):
             yield enclave.path, None

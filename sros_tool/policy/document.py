@@ -275,17 +275,17 @@ class Includer:
         return list(found)
 
 
+COMMON = "common"
+"""Name of the folder of the parts that policies include."""
+
+
 def _missing_remedy(file: Path) -> str:
     """Return how to get an included file that ships with sros, or "" for any other file."""
-    common = "common"
-    tail = file.parts[file.parts.index(common) :] if common in file.parts else ()
+    tail = file.parts[file.parts.index(COMMON) :] if COMMON in file.parts else ()
     if not tail or not policies_dir().joinpath(*tail).is_file():
         return ""
-    place = Path(*file.parts[: len(file.parts) - len(tail)])
-    return (
-        "It ships with sros. Put it there: `sros policies --copy shipped && cp -r shipped/common "
-        f"{quote(str(place))}`."
-    )
+    place = Path(*file.parts[: len(file.parts) - len(tail) + 1])
+    return f"It ships with sros. Put it there: `sros policies --copy {quote(str(place))}`."
 
 
 _ITEMS = frozenset(kind.removesuffix("s") for kind in RIGHTS)

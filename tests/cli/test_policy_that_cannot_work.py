@@ -1,0 +1,171 @@
+"""A policy whose nodes cannot start is said in one paragraph, also when it is signed."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from sros_tool.resources import policies_dir
+from tests.support.harness import sros
+
+NODES = ("arm", "base", "camera", "drive", "grip", "head")
+
+
+def write_policy(path: Path, nodes: tuple[str, ...] = NODES, more: str = "") -> Path:
+    enclaves = "\n".join(
+        f'<enclave path="/{node}"><profiles>\n<profile ns="/" node="{node}">\n'
+        f'<topics publish="ALLOW"><topic>{node}/state</topic></topics>\n{more}\n'
+        "</profile></profiles></enclave>"
+        for node in nodes
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f'<policy version="0.2.0"><enclaves>\n{enclaves}\n</enclaves></policy>\n')
+    return path
+
+
+# ── the copy of the common part ────────────────────────────────────────────────────────────
+
+
+def test_the_policies_are_copied_to_a_new_or_an_existing_folder(tmp_path: Path) -> None:
+    sros("policies", "--copy", cwd=tmp_path).ok()
+    assert (tmp_path / "policies/common/node.xml").is_file()
+    here = tmp_path / "here"
+    here.mkdir()
+    (here / "robot.xml").write_text("mine")
+    assert "copied" in sros("policies", "--copy", ".", cwd=here).ok().out
+    assert (here / "common/node/types.xml").is_file()
+    assert (here / "robot.xml").read_text() == "mine"
+    assert "nothing to copy" in sros("policies", "--copy", ".", cwd=here).ok().out
+
+
+def test_a_folder_named_common_gets_the_common_parts_alone(tmp_path: Path) -> None:
+    sros("policies", "--copy", "common", cwd=tmp_path).ok()
+    assert (tmp_path / "common/node.xml").is_file()
+    assert not (tmp_path / "common/common").exists()
+    assert not (tmp_path / "common/talker_listener.xml").exists()
+    (tmp_path / "common/node.xml").unlink()
+    (tmp_path / "common/own.xml").write_text("mine")
+    planned = sros("policies", "--copy", "common", "--dry-run", "--json", cwd=tmp_path).ok()
+    assert [each["path"] for each in json.loads(planned.out)["changes"]] == ["common/node.xml"]
+    sros("policies", "--copy", "common", cwd=tmp_path).ok()
+    assert (tmp_path / "common/node.xml").is_file()
+    assert (tmp_path / "common/own.xml").read_text() == "mine"
+
+
+def test_nothing_is_copied_over_a_file_that_differs(tmp_path: Path) -> None:
+    (tmp_path / "common").mkdir()
+    (tmp_path / "common/node.xml").write_text("mine")
+    ended = sros("policies", "--copy", "common", cwd=tmp_path)
+    assert ended.status == 2
+    assert "'common/node.xml' differs" in ended.err
+    assert [each.name for each in (tmp_path / "common").iterdir()] == ["node.xml"]
+    (tmp_path / "file").write_text("")
+    assert "is no folder" in sros("policies", "--copy", "file", cwd=tmp_path).err
+
+
+# ── one paragraph ──────────────────────────────────────────────────────────────────────────
+
+
+def mended(policy: Path, said: str) -> None:
+    """Do what the paragraph says: its command, and its line in every profile."""
+    (include,) = set(re.findall(r"<xi:include [^>]*/>", " ".join(said.split())))
+    for command in re.findall("`(sros .+?)`", " ".join(said.split())):
+        sros(*shlex.split(command)[1:], cwd=policy.parent).ok()
+    text = policy.read_text()
+    policy.write_text(re.sub(r"(<profile ns.*?>)", lambda start: start[1] + include, text))
+
+
+def test_nodes_without_the_common_part_are_one_paragraph_with_one_mend(tmp_path: Path) -> None:
+    policy = write_policy(tmp_path / "robot.xml")
+    ended = sros("check", "robot.xml", cwd=tmp_path)
+    assert ended.status == 1
+    lines = ended.out.splitlines()
+    assert len(lines) <= 12, ended.out
+    assert "6 nodes lack the common part" in lines[0]
+    assert "24 errors" in ended.err
+    kinds = ("no-rosout", "no-parameter-events", "no-parameter-services", "no-type-description")
+    assert all(f"policy.{kind}" in ended.out for kind in kinds)
+    document = json.loads(sros("check", "robot.xml", "--json", cwd=tmp_path).out)
+    (cause,) = document["causes"]
+    assert len(document["findings"]) == 24
+    assert sorted(cause["findings"]) == list(range(24))
+    markdown = sros("check", "robot.xml", "--format", "markdown", cwd=tmp_path).out
+    assert markdown.count("**error**") == 1
+    mended(policy, ended.out)
+    assert sros("check", "--strict", "robot.xml", cwd=tmp_path).ok().out == ""
+
+
+def test_a_cause_of_which_a_finding_is_left_out_is_not_one_paragraph(tmp_path: Path) -> None:
+    write_policy(tmp_path / "robot.xml", ("arm",))
+    whole = sros("check", "robot.xml", cwd=tmp_path)
+    assert "a node lacks the common part" in whole.out
+    part = sros("check", "robot.xml", "--exclude", "policy.no-rosout", cwd=tmp_path)
+    assert "common part [" not in part.out
+    assert len(part.out.splitlines()) == 9
+
+
+def test_nodes_that_lack_less_are_counted(tmp_path: Path) -> None:
+    log = '<topics publish="ALLOW"><topic>/rosout</topic></topics>'
+    policy = write_policy(tmp_path / "robot.xml", ("arm", "base"))
+    policy.write_text(policy.read_text().replace("<topics", f"{log}<topics", 1))
+    said = " ".join(sros("check", "robot.xml", cwd=tmp_path).out.split())
+    assert "publish /rosout (1 nodes)" not in said
+    assert "publish /rosout (1 node)" in said
+    mended(policy, said)
+    sros("check", "robot.xml", cwd=tmp_path).ok()
+
+
+# ── when it is signed ──────────────────────────────────────────────────────────────────────
+
+
+def signing(policy: str) -> list[list[str]]:
+    return [
+        ["generate_artifacts", "-k", "ks", "-p", policy],
+        ["create_permission", "ks", "/arm", "/base", policy],
+    ]
+
+
+@pytest.mark.parametrize("dry_run", [False, True])
+def test_a_policy_that_cannot_work_is_said_when_it_is_signed(tmp_path: Path, dry_run: bool) -> None:
+    write_policy(tmp_path / "robot.xml", ("arm", "base"))
+    sros("generate_artifacts", "-k", "ks", "-e", "/arm", "/base", cwd=tmp_path).ok()
+    planned = ["--dry-run"] if dry_run else []
+    for words in signing("robot.xml"):
+        ended = sros(*words, *planned, cwd=tmp_path).ok()
+        assert ended.err.count("2 nodes lack the common part") == 1
+        assert "lack" not in ended.out
+        document = json.loads(sros(*words, "--json", *planned, cwd=tmp_path).ok().out)
+        notes = [each["text"] for each in document["notes"] if each["id"].startswith("policy.")]
+        assert len(notes) == 1 and "2 nodes lack the common part" in notes[0]
+    mended(tmp_path / "robot.xml", ended.err)
+    for words in signing("robot.xml"):
+        assert "lack" not in sros(*words, *planned, cwd=tmp_path).ok().err
+
+
+def test_only_what_is_signed_is_said(tmp_path: Path) -> None:
+    write_policy(tmp_path / "robot.xml", ("arm", "base"))
+    sros("generate_artifacts", "-k", "ks", "-e", "/arm", cwd=tmp_path).ok()
+    ended = sros("create_permission", "ks", "/arm", "robot.xml", cwd=tmp_path).ok()
+    assert "a node lacks the common part" in ended.err
+    assert "/arm may not" in ended.err and "/base" not in ended.err
+
+
+def test_a_policy_for_a_fleet_is_said_once_when_it_is_signed(tmp_path: Path) -> None:
+    policy = write_policy(tmp_path / "robot.xml", ("arm",))
+    policy.write_text(policy.read_text().replace('path="/', 'path="/{robot}/'))
+    (tmp_path / "fleet.toml").write_text("[robots]\n" + "".join(f"r{n} = {{}}\n" for n in range(9)))
+    words = ("generate_artifacts", "-k", "ks", "-p", "robot.xml", "--fleet", "fleet.toml")
+    ended = sros(*words, cwd=tmp_path).ok()
+    assert "a node lacks the common part" in ended.err
+
+
+def test_more_than_a_few_kinds_of_findings_are_counted(tmp_path: Path) -> None:
+    more = '<topics publish="ALLOW"><topic>/*</topic></topics>'
+    wrong = '<services request="ALLOW"><service>/tf</service><service>/a*</service></services>'
+    write_policy(tmp_path / "robot.xml", ("arm", "base"), more + wrong)
+    ended = sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", cwd=tmp_path).ok()
+    assert "warnings: see `sros check robot.xml`" in ended.err
