@@ -188,6 +188,15 @@ def by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
             yield tuple(groups[cause])
 
 
+def some_names(names: Sequence[str]) -> str:
+    """Return the first names, and the number of the others."""
+    more = len(names) - _NAMES_SHOWN
+    return ", ".join(names[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+_NAMES_SHOWN = 6
+
+
 def by_id(*kinds: FindingKind) -> Mapping[str, FindingKind]:
     """Map each kind's id to the kind; raise for a duplicate id."""
     table = {kind.id: kind for kind in kinds}

@@ -15,7 +15,17 @@ from shlex import quote
 
 from lxml import etree
 
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Cause, Finding, FindingKind
+from sros_tool.checks.kind import (
+    ERROR,
+    NOTE,
+    WARNING,
+    Cause,
+    Finding,
+    FindingKind,
+    RelatedPlace,
+    some_names,
+)
+from sros_tool.checks.near_names import NearNames
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
@@ -181,6 +191,15 @@ NO_COUNTERPART = FindingKind(
     "sros: the policy as a whole.",
     "Compare the names on both sides, after remapping.",
 )
+MISSPELT = FindingKind(
+    "policy.name-misspelt",
+    WARNING,
+    "a name that is nearly, but not, a name of the other side",
+    "Neither of the two names has a counterpart, so the nodes do not communicate: one is perhaps "
+    "a typing error, or of another kind, such as a service where an action is called.",
+    "sros: the policy as a whole.",
+    "Write the same name, of the same kind, on both sides, as the nodes have it after remapping.",
+)
 
 CONTRADICTING_PROTECTION = FindingKind(
     "policy.protection-contradicts",
@@ -198,6 +217,7 @@ _DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
 _GLOBAL_TOPICS = ("/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics")
 _ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
 _OTHER_SIDE = {"subscribe": "publish", "request": "reply", "call": "execute"}
+_ASKING_SIDE = {offering: asking for asking, offering in _OTHER_SIDE.items()}
 
 
 def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
@@ -221,16 +241,60 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
     for each in checked.statements:
         if each.allows:
             names[each.right.right].add(each.name)
-    sides = {right: Names(sorted(names[right])) for right in _OTHER_SIDE.values()}
+    sides = {right: Names(sorted(found)) for right, found in names.items()}
+
+    def is_alone(each: _Statement, other: str) -> bool:
+        name = each.name
+        if not each.allows or is_expression(name) or name in _GLOBAL_TOPICS:
+            return False
+        # The other side may name the whole action.
+        return not sides[other].meets(name) and not action_part(name)[1]
+
+    alone = [
+        each
+        for each in checked.statements
+        if (other := _ASKING_SIDE.get(each.right.right)) and is_alone(each, other)
+    ]
+    offered: dict[str, list[_Statement]] = defaultdict(list)
+    for each in alone:
+        if not _is_of_a_node(each.name):
+            offered[each.name].append(each)
+    near = NearNames(offered)
     for each in checked.statements:
         other = _OTHER_SIDE.get(each.right.right)
-        name = each.name
-        if not other or not each.allows or is_expression(name) or name in _GLOBAL_TOPICS:
+        if not other or not is_alone(each, other):
             continue
-        if not sides[other].meets(name):
-            if action_part(name)[1]:
-                continue  # the other side may name the whole action
-            yield each.found(NO_COUNTERPART, f"no enclave may {other} {name}")
+        same = [each.name] if each.name in offered else []
+        meant = [
+            one
+            for name in (*same, *near.near(each.name))
+            for one in offered[name]
+            if one.profile is not each.profile  # a node has, say, a topic and a service of one name
+        ]
+        if meant:
+            yield _misspelt(each, other, meant)
+        else:
+            yield each.found(NO_COUNTERPART, f"no enclave may {other} {each.name}")
+
+
+def _is_of_a_node(name: str) -> bool:
+    """Return whether every node offers a service of this name: not everything has a client."""
+    return name.rpartition("/")[2] in NODE_SERVICES
+
+
+def _misspelt(each: _Statement, other: str, meant: Sequence[_Statement]) -> Finding:
+    """Return the finding that ``each`` perhaps means what one of ``meant`` offers."""
+    shown = " or ".join(f"{one.name} ({one.right.right})" for one in meant[:_NAMES_SHOWN])
+    text = f"no enclave may {other} {each.name}; perhaps you mean {shown}, which nobody uses"
+    places = tuple(
+        RelatedPlace(f"{one.right.enclave} may {one.right.describe()}", *_place(one.source))
+        for one in meant[:_NAMES_SHOWN]
+    )
+    return replace(each.found(MISSPELT, text), related=places)
+
+
+def _place(source: Source) -> tuple[str, int | None]:
+    return source.file, source.line or None
 
 
 def _check_protection(checked: _CheckedPolicy) -> Iterator[Finding]:
@@ -420,10 +484,10 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
     target = quote(str(file.parent / COMMON))
     first = "Put" if copied else f"Run `sros policies --copy {target}`, and put"
     place = "the <profile> of every node" if plural else "its <profile>"
-    at = f"line{'s' * (len(lines) > 1)} {_some([str(each) for each in lines])}"
+    at = f"line{'s' * (len(lines) > 1)} {some_names([str(each) for each in lines])}"
     return Cause(
         f"{_nodes(len(nodes))} lack the common part" if plural else "a node lacks the common part",
-        f"{_some(nodes)} may not {'; '.join(what)}. A node does all this when it starts, and "
+        f"{some_names(nodes)} may not {'; '.join(what)}. A node does all this when it starts, and "
         "exits if it is denied.",
         f"{first} this line into {place} ({at}): {_INCLUDE}",
         len(lacking),
@@ -432,15 +496,6 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
 
 def _nodes(count: int) -> str:
     return "1 node" if count == 1 else f"{count} nodes"
-
-
-def _some(words: Sequence[str]) -> str:
-    """Return the first words, and the number of the others."""
-    more = len(words) - _NODES_SHOWN
-    return ", ".join(words[:_NODES_SHOWN]) + (f" and {more} more" if more > 0 else "")
-
-
-_NODES_SHOWN = 6
 
 
 def _basics(checked: _CheckedPolicy, enclave: Enclave, profile: Profile) -> Iterator[_Lacking]:

@@ -103,5 +103,6 @@ def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:
         zone=at.zone,
         domain=at.domain,
         policies=at.policies,
+        distribution=at.distribution,
         only=None if only is None else (only,),
     )

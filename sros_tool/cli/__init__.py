@@ -9,7 +9,7 @@
 - robots that run: `generate_policy` and `audit` (with `observing`)
 - answers: `explain` (with `explain_zenoh`), `check`
 
-All share `common`, `findings` (as text) and `progress`.  `ros2` has the same verbs as ``ros2 security``.
+All share `common`, `findings` and `progress`.  `ros2` has the same verbs as ``ros2 security``.
 """
 
 from __future__ import annotations

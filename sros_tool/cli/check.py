@@ -374,7 +374,12 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
             finding
             for root in roots
             for finding in keystore_findings(
-                root, now=at.now, zone=at.zone, domain=at.domain, policies=at.policies
+                root,
+                now=at.now,
+                zone=at.zone,
+                domain=at.domain,
+                policies=at.policies,
+                distribution=at.distribution,
             )
         ]
     if paths:

@@ -102,6 +102,7 @@ CASES |= {
     "keystore.ca-key-on-robot": lambda b: (b.export() / "ca.key.pem").write_bytes(
         key_pem(new_key())
     ),
+    "keystore.home-or-robot": lambda b: shutil.copytree(b.path("private"), b.export() / "private"),
 }
 
 
@@ -259,6 +260,7 @@ CASES |= {
     "keystore.allow-everything": lambda b: b.permissions(
         ("<topic>ros_discovery_info</topic>", "<topic>*</topic>")
     ),
+    "enclave.node-cannot-start": lambda b: b.permissions(("rt/parameter_events", "rt/events")),
     "enclave.xml-differs": lambda b: b.permissions(("rosout", "rosoot"), xml=False),
     "enclave.crl-missing": lambda b: b.revoke(linked=False),
 }

@@ -46,6 +46,7 @@ TYPES = "~/get_type_description"
 LOG = topics("publish", "/rosout")
 EVENTS = topics("publish", "/parameter_events")
 BASICS = f"{LOG}{EVENTS}{services('reply', TYPES, *PARAMETERS)}"
+OTHER = '</profile><profile ns="/" node="m">' + BASICS
 GOAL = "dock/_action/send_goal"
 MANY = tuple(f"{'very_' * 8}long_{index}" for index in range(1200))
 
@@ -86,9 +87,12 @@ CASES = [
     Case("policy.sets-clock", topics("publish", "/clock"), topics("subscribe", "/clock")),
     Case("policy.no-counterpart", topics("subscribe", "a"),
          f"{topics('subscribe', 'a')}{topics('publish', 'a')}"),
+    Case("policy.name-misspelt",
+         services("request", "gripper/set") + OTHER + services("reply", "griper/set"),
+         services("request", "gripper/set") + OTHER + services("reply", "gripper/set")),
     Case("policy.several-profiles",
          '</profile></profiles><profiles><profile ns="/" node="m">' + BASICS,
-         '</profile><profile ns="/" node="m">' + BASICS, line=None),
+         OTHER, line=None),
     Case("portable.document-size", topics("publish", *MANY), topics("publish", *MANY[:100]),
          line=None),
     Case("portable.long-name", topics("publish", f"/{'n' * 249}"),

@@ -9,15 +9,14 @@ from pathlib import Path
 import pytest
 
 from tests.checks.bench import SECRET, Bench
+from tests.checks.policy_cases import BASICS
 from tests.support.harness import sros
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 
-BASICS = """<topics publish="ALLOW"><topic>/rosout</topic><topic>/parameter_events</topic></topics>
-<topics publish="ALLOW"><topic>status</topic></topics>"""
 POLICY = "".join(
-    f'<enclave path="/{name}"><profiles><profile ns="/" node="{name}">{BASICS}</profile></profiles>'
-    "</enclave>"
+    f'<enclave path="/{name}"><profiles><profile ns="/" node="{name}">{BASICS}'
+    '<topics publish="ALLOW"><topic>status</topic></topics></profile></profiles></enclave>'
     for name in ("base", "arm")
 )
 

@@ -26,7 +26,8 @@ NOW = datetime.now(UTC)
 
 
 def ids(root: Path, now: datetime = NOW) -> list[str]:
-    chosen = FindingFilter().choose(keystore_findings(root, now=now))
+    selection = FindingFilter(exclude=("enclave.node-cannot-start",))
+    chosen = selection.choose(keystore_findings(root, now=now))
     return [each.id for each in chosen.shown]
 
 
@@ -40,10 +41,11 @@ def test_only_an_open_enclave_is_found_in_what_sros_makes(template: str, tmp_pat
     assert ended.status == (template != "production"), ended
     assert ("keystore.allow-everything" in ended.out) == (template != "production")
     sros("create_permission", root, "/a", policy).ok()
-    ended = sros("check", "keystore", root).ok()
+    no_node = ("--exclude", "enclave.node-cannot-start")  # the policy is for one topic
+    ended = sros("check", "keystore", root, *no_node).ok()
     named = "keystore.one-authority" in ended.out
     assert named == (template == "sros2")
-    assert sros("check", root, "--strict").status == (template != "production")
+    assert sros("check", root, "--strict", *no_node).status == (template != "production")
 
 
 def test_a_template_accepts_nothing_that_was_opened_later(tmp_path: Path) -> None:

@@ -169,3 +169,51 @@ def test_more_than_a_few_kinds_of_findings_are_counted(tmp_path: Path) -> None:
     write_policy(tmp_path / "robot.xml", ("arm", "base"), more + wrong)
     ended = sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", cwd=tmp_path).ok()
     assert "warnings: see `sros check robot.xml`" in ended.err
+
+
+# ── in a keystore ──────────────────────────────────────────────────────────────────────────
+
+
+def test_a_keystore_is_checked_with_its_policy_and_without(tmp_path: Path) -> None:
+    policy = write_policy(tmp_path / "robot.xml")
+    sros("create_keystore", "ks", "--template", "production", cwd=tmp_path).ok()
+    sign = ("generate_artifacts", "-k", "ks", "-p", "robot.xml")
+    sros(*sign, cwd=tmp_path).ok()
+    for strict in ((), ("--strict",)):
+        alone = sros("check", "ks", *strict, cwd=tmp_path)
+        assert alone.status == 1
+        assert "6 enclaves in which no ordinary node" in alone.out
+        assert "`sros generate_artifacts -k ks -p POLICY_FILE`" in alone.out
+        assert len(alone.out.splitlines()) <= 10
+        both = sros("check", "ks", "--policy", "robot.xml", *strict, cwd=tmp_path)
+        assert both.status == 1
+        assert "6 nodes lack the common part" in both.out
+        assert "ordinary node" not in both.out
+        assert len(both.out.splitlines()) <= 10
+    one = sros("check", "ks/enclaves/arm", "--policy", "robot.xml", cwd=tmp_path)
+    assert "a node lacks the common part" in one.out
+    mended(policy, both.out)
+    sros(*sign, cwd=tmp_path).ok()
+    sros("check", "ks", cwd=tmp_path).ok()
+    sros("check", "ks", "--policy", "robot.xml", "--strict", cwd=tmp_path).ok()
+
+
+def test_a_keystore_of_an_earlier_distribution_has_no_type_descriptions(tmp_path: Path) -> None:
+    parts = ("logging", "parameters", "time")
+    include = '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="common/node/{}.xml" '
+    more = "".join(include.format(part) + 'xpointer="xpointer(/profile/*)"/>' for part in parts)
+    sros("policies", "--copy", "common", cwd=tmp_path).ok()
+    write_policy(tmp_path / "robot.xml", ("arm",), more)
+    sros("create_keystore", "ks", "--template", "production", cwd=tmp_path).ok()
+    sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", cwd=tmp_path).ok()
+    sros("check", "ks", "--distro", "humble", cwd=tmp_path).ok()
+    assert "no node may offer ~/get_type_description" in sros("check", "ks", cwd=tmp_path).out
+
+
+def test_nothing_is_said_of_enclaves_of_the_shipped_policies(tmp_path: Path) -> None:
+    files = sorted(policies_dir().glob("*.xml"))
+    sros("create_keystore", tmp_path / "ks", "--template", "production").ok()
+    signed = sros("generate_artifacts", "-k", tmp_path / "ks", "-p", *files).ok()
+    found = json.loads(sros("check", tmp_path / "ks", "--json").out)["findings"]
+    assert not {each["id"] for each in found} & {"enclave.node-cannot-start"}
+    assert "[policy.no" not in signed.err

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.arrival import verify_arrival
+from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.keystore.delivery.archive import unpack
@@ -250,16 +251,50 @@ def test_another_domain(arrived: Path) -> None:
 def test_a_copy_of_the_whole_keystore_has_ca_keys(fleet: Path) -> None:
     arrival = verify_arrival(fleet, now=NOW)
     findings = arrival.findings
-    keys = [each for each in findings if each.id == "keystore.ca-key-on-robot"]
-    assert {str(Path(each.file).relative_to(fleet)) for each in keys} == {
-        "private/identity_ca.key.pem",
-        "private/permissions_ca.key.pem",
-    }
+    keys = [each for each in findings if each.id == "keystore.home-or-robot"]
+    (said,) = keys
+    assert "private/identity_ca.key.pem, private/permissions_ca.key.pem" in said.text
+    assert said.remedy.startswith("Where the keystore is kept, keep the keys")
     # The enclave whose key is on its robot is no finding at home.
     assert [each.name for each in arrival.enclaves if each.key_elsewhere] == [BORN]
     assert not [each for each in findings if each not in keys]
     # The enclave's links lead to other folders of the same keystore.
     assert not verify_arrival(fleet / "enclaves/base", now=NOW).findings
+
+
+def test_keys_of_revoked_enclaves_are_kept_at_home(fleet: Path) -> None:
+    """One finding in words for both places, and nothing for who checks it as what it is."""
+    revoke(fleet, ["/base"], now=NOW)
+    (said,) = verify_arrival(fleet, now=NOW).findings
+    assert "revoked/" in said.text
+    assert "elete" not in said.remedy
+    kinds = {each.id for each in keystore_findings(fleet, now=NOW)}
+    assert not kinds & {"keystore.home-or-robot", "keystore.ca-key-on-robot"}
+
+
+@pytest.mark.parametrize("looks", ["public", "private", "sros.toml", "whole"])
+def test_an_export_that_looks_like_home_is_found_with_its_ca_key(
+    fleet: Path, tmp_path: Path, looks: str
+) -> None:
+    robot = tmp_path / "robot"
+    distribute(fleet, ["/base", "/armada"], robot, now=NOW)
+    for name in ("public", "private", "sros.toml", "ledger.jsonl", "ledger.p7s"):
+        if looks in (name, "whole") or name == "private":
+            source = fleet / name
+            copy = shutil.copytree if source.is_dir() else shutil.copy
+            copy(source, robot / name)
+    verified = {each.id for each in verify_arrival(robot, now=NOW).findings}
+    checked = {each.id: each.remedy for each in keystore_findings(robot, now=NOW)}
+    assert "keystore.home-or-robot" in verified & set(checked)
+    assert "keep the keys" in checked["keystore.home-or-robot"]
+
+
+def test_no_remedy_for_a_ca_key_may_lose_it(fleet: Path, tmp_path: Path) -> None:
+    distribute(fleet, ["/base"], tmp_path / "robot", now=NOW)
+    shutil.copy(fleet / "private/identity_ca.key.pem", tmp_path / "robot/enclaves/base")
+    (said,) = verify_arrival(tmp_path / "robot", now=NOW).findings
+    assert said.id == "keystore.ca-key-on-robot"
+    assert said.remedy.startswith("Make sure that the keystore")
 
 
 def test_a_revoked_enclave_on_the_robot_is_a_finding(fleet: Path, tmp_path: Path) -> None:

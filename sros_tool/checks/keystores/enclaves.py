@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
@@ -11,7 +13,16 @@ from cryptography import x509
 
 from sros_tool.checks.keystores.authorities import WEAK, key_findings, shared_ca_findings
 from sros_tool.checks.keystores.opened import CheckedEnclave
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, by_id
+from sros_tool.checks.kind import (
+    ERROR,
+    NOTE,
+    WARNING,
+    Cause,
+    Finding,
+    FindingKind,
+    by_id,
+    some_names,
+)
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
@@ -21,13 +32,16 @@ from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
     KEY_URI_FILE,
     PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
     REQUEST,
     ZENOH_FILES,
     waits_for_answer,
 )
 from sros_tool.keystore.reader import weaknesses
+from sros_tool.names import NODE_SERVICES, ROS_DISCOVERY_TOPIC, has_type_descriptions
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.pki.token_uri import TokenUri
+from sros_tool.policy.patterns import covers, overlap
 from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 from sros_tool.xml import read_bytes
@@ -193,6 +207,17 @@ PIN_FILE = FindingKind(
     "Write the PIN alone into the file, with mode 0600, for the user that runs the node.",
 )
 
+NO_NODE = FindingKind(
+    "enclave.node-cannot-start",
+    ERROR,
+    "permissions with which no ordinary node of ROS 2 can start",
+    "A node of rclpy or rclcpp creates these endpoints when it starts, and exits if one of them is "
+    "denied. The permissions say nothing of nodes that were created without them.",
+    "ROS 2 Jazzy, rcl 9, rclcpp 28 and rclpy 7; ~/get_type_description since Iron (REP-2016).",
+    "Include common/node.xml in the profiles of its nodes (`sros check POLICY_FILE` says how), and "
+    "sign the policy with `sros generate_artifacts -k ROOT -p POLICY_FILE`.",
+)
+
 _SOON = timedelta(days=30)
 _LONG = timedelta(days=2 * 366)
 
@@ -311,6 +336,68 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
         accepted = keystore.accepts(lambda s: _is_as_long(s.permissions_validity, length))
         text = f"they are valid from {iso(window.not_before)} to {iso(window.not_after)}"
         yield LONG_PERMISSIONS.found(enclave.name, text, file, accepted=accepted)
+
+
+def check_starting(enclave: CheckedEnclave) -> Iterator[Finding]:
+    """Yield a finding if the signed permissions let no ordinary node start.
+
+    An enclave with a part of what every node needs, and nothing else, is for a tool such as the
+    observer of `sros generate_policy`, which has no log and no services.
+    """
+    grant = grant_of(enclave)
+    if grant is None or grant.default_allow or not grant.rules:
+        return
+    written = frozenset(
+        topic
+        for rule in grant.rules
+        if rule.allow
+        for criteria in rule.publish
+        for topic in criteria.topics
+    )
+    wanted = [name for name in _STARTING if not any(covers(each, f"rt{name}") for each in written)]
+    described = has_type_descriptions(enclave.keystore.distribution)
+    if described and not any(overlap(each, _TYPES) for each in written):
+        wanted.append("~/get_type_description")
+    if wanted and (_STARTING[0] in wanted or any(map(_is_own, written))):
+        text = f"no node may {' or '.join(map(_starting, wanted))}"
+        yield NO_NODE.found(enclave.name, text, enclave.file(PERMISSIONS_FILE))
+
+
+def _starting(name: str) -> str:
+    return f"{'offer' if name.startswith('~') else 'publish'} {name}"
+
+
+def _is_own(topic: str) -> bool:
+    """Return whether a topic is one of the robot, not one that every node has."""
+    name = topic.rpartition("/")[2].removesuffix("Reply")
+    common = topic in (ROS_DISCOVERY_TOPIC, *(f"rt{each}" for each in _STARTING))
+    return not common and name not in NODE_SERVICES
+
+
+_STARTING = ("/parameter_events", "/rosout")
+_TYPES = "rr/*/get_type_descriptionReply"
+
+
+def with_causes(findings: Sequence[Finding]) -> list[Finding]:
+    """Return the findings; those of several enclaves in which no node can start have one cause."""
+    same: dict[str, list[Finding]] = defaultdict(list)
+    for each in findings:
+        if each.kind is NO_NODE:
+            same[each.text].append(each)
+    causes = {
+        text: Cause(
+            f"{len(group)} enclaves in which no ordinary node of ROS 2 can start",
+            f"In {some_names([each.subject for each in group])}, {text}. {NO_NODE.why}",
+            group[0].remedy,
+            len(group),
+        )
+        for text, group in same.items()
+        if len(group) > 1
+    }
+    return [
+        replace(each, cause=causes.get(each.text)) if each.kind is NO_NODE else each
+        for each in findings
+    ]
 
 
 def _is_as_long(chosen: Span, length: timedelta) -> bool:

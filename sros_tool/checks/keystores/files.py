@@ -11,13 +11,14 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.errors import KeystoreError
 from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
     CONFIRMED,
     ENCLAVES,
     FLEET,
+    IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_URI_FILE,
     LEDGER,
@@ -36,6 +37,7 @@ from sros_tool.keystore.layout import (
     ZENOH_FILES,
     UnreadPath,
     enclave_folder,
+    enclave_path,
 )
 from sros_tool.keystore.transaction.stage import check_interrupted
 from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
@@ -153,7 +155,19 @@ CA_KEY_ON_ROBOT = FindingKind(
     "a CA key in an export for a robot",
     "An attacker on the robot can create any enclave, with any rights.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "Delete the key there; if others had access, replace the CA (`sros rotate_ca`).",
+    "Make sure that the keystore that the export is from has the key, and remove it here. If "
+    "others had access, replace the CA in that keystore (`sros rotate_ca`).",
+)
+HOME_OR_ROBOT = FindingKind(
+    "keystore.home-or-robot",
+    ERROR,
+    "a keystore with the keys of CAs or of revoked enclaves, where an export may be meant",
+    "Where the keystore is kept, the keys belong. On a robot, an attacker who gets a CA key can "
+    "create any enclave, with any rights; and what is there cannot tell the two apart.",
+    "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
+    "Where the keystore is kept, keep the keys: `sros check ROOT` checks it, and `sros verify` is "
+    "for robots. On a robot, put an export in its place (`sros distribute_key ROOT NAME TARGET` "
+    "where the keystore is kept); if others had access, replace the CA there (`sros rotate_ca`).",
 )
 UNREADABLE = FindingKind(
     "keystore.file-unreadable",
@@ -202,26 +216,46 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     if state.st_uid not in (0, os.geteuid()):
         yield FOREIGN_OWNER.found(root, f"it belongs to {user_name(state.st_uid)}", root)
     trusted = frozenset({0, os.geteuid(), state.st_uid})
+    kept: list[str] = []
     for folder, why in replaceable_on_the_way(keystore.root, trusted):
         yield REPLACEABLE.found(str(folder), why, str(folder))
     yield from _writers(root, state, trusted)
     links = _Links(root)
     if names is None:
-        yield from _below(root, keystore, links, trusted)
+        yield from _below(root, keystore, links, trusted, kept)
+        if kept and not (keystore.is_home and _has_links(keystore)):
+            yield HOME_OR_ROBOT.found(root, f"it has {some_names(kept)}", root)
         return
     passed: set[Path] = set()
     for name in names:
         folder = Path(enclave_folder(name))
         passed |= {folder, *folder.parents} - {Path()}
-        yield from _below(os.path.join(root, folder), keystore, links, trusted)
+        yield from _below(os.path.join(root, folder), keystore, links, trusted, kept)
     for folder in sorted(passed):
         path = os.path.join(root, folder)
         yield from _writers(path, Path(path).stat(), trusted)
 
 
+def _has_links(keystore: CheckedKeystore) -> bool:
+    """Return whether some enclave has a link to the identity CA, as where the keystore is kept.
+
+    All enclaves of an export have copies, whatever else somebody put into it to look like home.
+    """
+    files = [enclave_path(keystore.root, name) / IDENTITY_CA_FILE for name in keystore.names]
+    return not any(map(os.path.lexists, files)) or any(map(os.path.islink, files))
+
+
 def _below(
-    start: str, keystore: CheckedKeystore, links: _Links, trusted: frozenset[int]
+    start: str,
+    keystore: CheckedKeystore,
+    links: _Links,
+    trusted: frozenset[int],
+    kept: list[str],
 ) -> Iterator[Finding]:
+    """Yield findings about what is in the folder ``start``.
+
+    Keys that belong where a keystore is kept are added to ``kept``.
+    """
     root = os.fspath(keystore.root)
     keys = {os.path.join(root, ENCLAVES, name[1:], KEY_FILE) for name in keystore.names}
     keys |= {os.path.join(root, ENCLAVES, KEY_FILE)}
@@ -255,6 +289,9 @@ def _below(
                     with suppress(OSError):  # `check_enclave` reports an unreadable one
                         if _holds_key(path, info):
                             yield from _other(path, root, info, home)
+            elif keystore.looks_like_home and _is_kept(path, root, info):
+                kept.append(os.path.relpath(path, root))
+                yield from key_mode_findings(path, info.st_mode)
             else:
                 yield from _other(path, root, info, home)
     for error in unread:
@@ -350,6 +387,16 @@ def _holds_key(path: str, info: os.stat_result) -> bool:
     return small and holds_private_key(Path(path).read_bytes())
 
 
+def _is_kept(path: str, root: str, info: os.stat_result) -> bool:
+    """Return whether a file is a private key in a folder for those of CAs and revoked enclaves."""
+    if os.path.relpath(path, root).partition(os.sep)[0] not in (PRIVATE, REVOKED, RETIRED):
+        return False
+    try:
+        return _holds_key(path, info)
+    except OSError:
+        return False  # reported as one that cannot be read
+
+
 def _other(path: str, root: str, info: os.stat_result, home: bool) -> Iterator[Finding]:
     """Yield findings about a file that is not one of an enclave, such as a misplaced key."""
     inside = os.path.relpath(Path(path).parent, root)
@@ -361,8 +408,6 @@ def _other(path: str, root: str, info: os.stat_result, home: bool) -> Iterator[F
         return
     if holds_key:
         yield from key_mode_findings(path, info.st_mode)
-        if place in (PRIVATE, REVOKED, RETIRED) and home:
-            return
         if place == PRIVATE or not home:
             text = "it contains a private key that belongs to no enclave"
             yield CA_KEY_ON_ROBOT.found(path, text, path)

@@ -18,7 +18,13 @@ from sros_tool.checks.keystores.documents import (
     check_vendors,
     governance_findings,
 )
-from sros_tool.checks.keystores.enclaves import EVERYTHING, LONG_PERMISSIONS, check_enclave
+from sros_tool.checks.keystores.enclaves import (
+    EVERYTHING,
+    LONG_PERMISSIONS,
+    check_enclave,
+    check_starting,
+    with_causes,
+)
 from sros_tool.checks.keystores.files import check_files
 from sros_tool.checks.keystores.issued import (
     EnclaveSummary,
@@ -30,6 +36,7 @@ from sros_tool.checks.keystores.issued import (
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
 from sros_tool.checks.keystores.zenoh_files import check_network, check_own_zenoh
 from sros_tool.checks.kind import Finding
+from sros_tool.checks.policies import findings_in
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_P7S, enclave_path
@@ -53,6 +60,7 @@ def keystore_findings(
     policies: tuple[Policy, ...] = (),
     only: Sequence[str] | None = None,
     on_robot: bool = False,
+    distribution: str = "",
 ) -> list[Finding]:
     """Return all findings in a keystore, or in some of its enclaves.
 
@@ -64,11 +72,19 @@ def keystore_findings(
         policies: policies with which its permissions are compared.
         only: the enclaves to check; None for all of them and the keystore itself.
         on_robot: whether it is on a robot, where no CA key may be.
+        distribution: the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
 
     Raises:
         KeystoreError: ``root`` is no keystore.
     """
-    keystore = read_keystore(root, now=now, zone=zone, policies=policies, on_robot=on_robot)
+    keystore = read_keystore(
+        root,
+        now=now,
+        zone=zone,
+        policies=policies,
+        on_robot=on_robot,
+        distribution=distribution,
+    )
     names = keystore.names if only is None else tuple(only)
     wanted = wanted_rights(keystore)
     first = next(
@@ -82,6 +98,8 @@ def keystore_findings(
             state = open_enclave(enclave_path(root, name), now=now, domain=domain)
             enclave = CheckedEnclave(keystore, name, state)
             found += _enclave_findings(enclave, wanted, only_differing=name != first)
+            if not on_robot and name not in wanted:  # a policy knows more exactly of its nodes
+                found += check_starting(enclave)
             if each := summary_of(enclave):
                 issued.append(each)
             tick()
@@ -98,9 +116,12 @@ def keystore_findings(
     else:
         found = [*check_files(keystore, names), *found]
     found += check_network(keystore, only)
+    for policy in policies:
+        chosen = tuple(each for each in policy.enclaves if only is None or each.path in only)
+        found += findings_in(replace(policy, enclaves=chosen), distribution)
     real_root = os.path.realpath(root)
     located = (_at_real_file(each, root, real_root) for each in found)
-    return joined([_with_names(each, root) for each in located])
+    return with_causes(joined([_with_names(each, root) for each in located]))
 
 
 def _enclave_findings(

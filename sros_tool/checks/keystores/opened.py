@@ -59,10 +59,12 @@ class CheckedKeystore:
 
     ``settings`` are None if ros2/sros2 made it.  ``authorities`` maps a role to the certificates of
     its CA file, the issuing one first.  ``governance`` is the signed document that its enclaves
-    share, or b"".  ``is_home`` is false on a robot, where no CA key may be.  ``policies`` are
+    share, or b"".  ``is_home`` is false on a robot, where no CA key may be;
+    ``looks_like_home`` is true there, too, of what has the folders of a keystore.  ``policies`` are
     compared with its permissions; ``zone`` is the time zone of the host on which its enclaves run.
     ``edits`` are what somebody edited by hand; ``fleet`` are its robots, and ``fleet_edited`` says
-    how the file of them was, as a clause.
+    how the file of them was, as a clause.  ``distribution`` is the ROS 2 distribution of the nodes;
+    "" is the latest.
     """
 
     root: Path
@@ -77,9 +79,11 @@ class CheckedKeystore:
     policies: tuple[Policy, ...] = ()
     zone: tzinfo = UTC
     is_home: bool = True
+    looks_like_home: bool = True
     edits: HandEdits = HandEdits()  # noqa: RUF009 - frozen
     fleet: Fleet | None = None
     fleet_edited: str = ""
+    distribution: str = ""
 
     def accepts(self, chosen: Callable[[Template], bool]) -> str:
         """Return text naming the template or keystore that accepts a weakness; "" if none does.
@@ -131,6 +135,7 @@ def read_keystore(
     zone: tzinfo = UTC,
     policies: tuple[Policy, ...] = (),
     on_robot: bool = False,
+    distribution: str = "",
 ) -> CheckedKeystore:
     """Return the readable parts of a keystore, and the list of unreadable ones.
 
@@ -140,6 +145,7 @@ def read_keystore(
         zone: the time zone of the host on which its enclaves run.
         policies: policies with which its permissions are compared.
         on_robot: whether it is on a robot, even if it contains CA keys.
+        distribution: the ROS 2 distribution of its nodes; "" is the latest.
 
     Raises:
         KeystoreError: ``root`` is no keystore.
@@ -187,7 +193,9 @@ def read_keystore(
         policies,
         zone,
         keystore.is_home and not on_robot,
+        keystore.is_home,
         edits,
         part(FLEET, lambda: load_fleet(root), None),
         part(FLEET, lambda: edited_fleet(root, ledger), ""),
+        distribution,
     )
