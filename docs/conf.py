@@ -30,6 +30,7 @@ myst_heading_anchors = 4
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", ".*")]  # types in signatures, of which most are not on the site
 default_role = "code"  # `name` in docstrings
+smartquotes = False  # they would change the dashes of options and the quotes of attributes
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 suppress_warnings = ["misc.highlighting_failure"]  # elided XML and JSON in examples

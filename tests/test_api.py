@@ -144,8 +144,11 @@ def test_a_fleet_has_one_policy_and_one_status(tmp_path: Path) -> None:
 def test_a_choice_of_a_template_is_found_only_when_asked_for(tmp_path: Path) -> None:
     made = sros_tool.create_keystore(tmp_path / "ks", template="sros2", domains="0,7")
     assert sros_tool.check(made) == ()
-    found = sros_tool.check(made, strict=True)
+    found = sros_tool.check(made, strict=True, severity="warning")
     assert "keystore.one-authority" in [each.id for each in found]
+    assert {each.severity for each in found} == {"warning"}
+    assert all("note" < each.severity < "error" for each in found)
+    assert sros_tool.check(made, strict=True, severity=found[0].severity.value) == found
 
 
 def test_a_dry_run_changes_nothing(keystore: sros_tool.Keystore) -> None:

@@ -4,28 +4,53 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import StrEnum
 from typing import Any
 
 from sros_tool.dds.decision.vendors import Vendor
 
 
-class Severity(IntEnum):
-    """Severity of a finding; `--severity` and `--fail-on` take the names in lower case."""
+class Severity(StrEnum):
+    """Severity of a finding, as the word that options and reports write.
 
-    NOTE = 1
+    Severities, and their words, compare by weight: ``Severity.ERROR > "warning"``.
+    """
+
+    NOTE = "note"
     """Worth knowing; it may be intended."""
-    WARNING = 2
+    WARNING = "warning"
     """Works today, but is a weakness or will break."""
-    ERROR = 3
+    ERROR = "error"
     """Does not work, or is not protected although it should be."""
 
     @property
     def word(self) -> str:
-        """The name in lower case, as options and reports write it."""
-        return self.name.lower()
+        """The plain word."""
+        return self.value
+
+    @property
+    def weight(self) -> int:
+        """The position among the severities, of which a note has the lowest."""
+        return _WEIGHTS[self]
+
+    def __lt__(self, other: str) -> bool:
+        """Return whether this is less severe; raise `ValueError` for any other word."""
+        return self.weight < Severity(other).weight
+
+    def __le__(self, other: str) -> bool:
+        """Return whether this is at most as severe."""
+        return self.weight <= Severity(other).weight
+
+    def __gt__(self, other: str) -> bool:
+        """Return whether this is more severe."""
+        return self.weight > Severity(other).weight
+
+    def __ge__(self, other: str) -> bool:
+        """Return whether this is at least as severe."""
+        return self.weight >= Severity(other).weight
 
 
+_WEIGHTS = {each: weight for weight, each in enumerate(Severity)}
 NOTE, WARNING, ERROR = Severity.NOTE, Severity.WARNING, Severity.ERROR
 
 

@@ -90,7 +90,7 @@ class FindingFilter:
         if self.strict:
             wanted = [replace(each, accepted="") for each in wanted]
         shown = [each for each in wanted if self._shows(each)]
-        shown.sort(key=lambda each: (-each.severity, each.file, each.line or 0))
+        shown.sort(key=lambda each: (-each.severity.weight, each.file, each.line or 0))
         hidden = [each for each in wanted if not self._shows(each)]
         accepted = [each for each in hidden if each.accepted and each.kind.severity > NOTE]
         return ChosenFindings(tuple(shown), tuple(accepted), len(hidden) - len(accepted))

@@ -39,7 +39,7 @@ def show_from(file: Path, output: Path | None, *, force: bool, dry_run: bool, as
     document = parse_configuration(read_bytes(file, "Zenoh configuration"), str(file))
     rights = rights_behind(document)
     findings = sorted(
-        document_findings(document), key=lambda each: (-each.severity, each.line or 0)
+        document_findings(document), key=lambda each: (-each.severity.weight, each.line or 0)
     )
     shown = [each for each in findings if each.severity >= WARNING]
     notes: tuple[Note, ...] = ()

@@ -113,6 +113,22 @@ def test_groups_stand_for_their_kinds() -> None:
     assert all(kind.severity is Severity.ERROR for kind in kinds)
 
 
+@pytest.mark.parametrize("one", ["note", "warning", "error"])
+@pytest.mark.parametrize("other", ["note", "warning", "error"])
+def test_a_severity_is_its_word_and_compares_by_weight(one: str, other: str) -> None:
+    severity, weights = Severity(one), {"note": 1, "warning": 2, "error": 3}
+    assert (severity == other) is (one == other)
+    assert (severity >= other, severity > other, severity <= other, severity < other) == (
+        weights[one] >= weights[other],
+        weights[one] > weights[other],
+        weights[one] <= weights[other],
+        weights[one] < weights[other],
+    )
+    assert f"{severity}" == one == json.loads(json.dumps(severity))
+    with pytest.raises(ValueError, match="loud"):
+        assert severity < "loud"
+
+
 # ── the command line ───────────────────────────────────────────────────────────────────────
 
 
