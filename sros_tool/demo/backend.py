@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import ProtectionKind
-from sros_tool.demo.casting import naming_arguments
+from sros_tool.demo.node_names import naming_arguments
 from sros_tool.demo.scenarios.model import Condition, Role
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import EVERYTHING, Template
@@ -246,6 +246,7 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
         Condition.SHARED_SUBJECTS: not template.unique_subject,
         Condition.OPEN_DEFAULT: template.default_permissions == EVERYTHING,
         Condition.IN_CLEAR: not any(kind in _ENCRYPTING for kind in kinds),
+        Condition.UNSIGNED: bare,
         Condition.UNAUTHENTICATED: unauthenticated and bare and uncontrolled,
         Condition.UNAUTHENTICATED_SEE: unauthenticated and not rule.enable_discovery_protection,
         Condition.UNCONTROLLED: uncontrolled,

@@ -1,51 +1,103 @@
-"""Casting: choose enclaves of a keystore for the parts of a scenario, and their node names.
+"""Casting: choose enclaves of a user's keystore for the parts of a scenario.
 
-Both depend on the signed permissions.  A ROS node offers standard services under its name
-(parameters, types), and an enclave made from a policy allows these only for the nodes in that
-policy: a node with another name fails at start.  So a node gets a name that its enclave allows.
+The choice depends on the files of all enclaves.  An enclave that may only do what a part needs
+shows best whether more is denied, so it is preferred; and the enclave that may do most without
+having been given a topic by its name gets a part of its own, so that one enclave with wide
+permissions among many narrow ones does not go unseen.  Enclaves with faulty or revoked files play
+no part, and get a row of their own.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from datetime import datetime
 from itertools import permutations
 from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Grant, Rule, parse_permissions
-from sros_tool.demo.scenarios.model import Role, Scenario
-from sros_tool.demo.scenarios.policies import SERVICE
+from sros_tool.dds.governance import Governance
+from sros_tool.dds.permissions import Grant
+from sros_tool.demo.grants import (
+    allows,
+    application_topics,
+    expressions_of,
+    is_denied,
+    is_wild,
+    may,
+)
+from sros_tool.demo.scenarios.attacks.keystores import (
+    WIDEST,
+    WIDEST_CLIENT,
+    WIDEST_PUBLISHER,
+    WIDEST_SERVER,
+    WIDEST_SUBSCRIBER,
+    joining,
+    revoked_joining,
+)
+from sros_tool.demo.scenarios.model import (
+    OWN,
+    STATUS_OF,
+    Party,
+    Role,
+    Row,
+    RowStatus,
+    Scenario,
+)
+from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, DENIED_TOPIC, SERVICE
 from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.faults import Fault
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.layout import (
+    CRL,
+    CRL_FILE,
     ENCLAVES,
+    IDENTITY,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
+    PERMISSIONS,
+    PERMISSIONS_CA_FILE,
     PRIVATE,
     ROLES,
     ca_key,
     enclave_path,
-    list_enclaves,
 )
-from sros_tool.keystore.reader import governance_of, load_settings
+from sros_tool.keystore.reader import (
+    OpenedEnclave,
+    OpenedKeystore,
+    governance_of,
+    load_settings,
+    open_keystore,
+)
 from sros_tool.keystore.template import Template
-from sros_tool.names import ACTION_SEPARATOR, NODE_SERVICES
-from sros_tool.pki import smime
-from sros_tool.policy.patterns import matches
+from sros_tool.names import ACTION_SEPARATOR
+from sros_tool.pki.certificates import digest, fingerprints
 from sros_tool.topics import dds_names, service_of
+from sros_tool.xml import read_bytes
 
-_TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events", "rt/clock", "ros_discovery_info")
-_NODE_MARK = ("rr", f"/{NODE_SERVICES[0]}Reply")
-_WILD = set("*?[")
+_RIGHTS = {
+    Role.TALKER: "publish",
+    Role.LISTENER: "subscribe",
+    Role.SERVER: "reply",
+    Role.CLIENT: "request",
+}
+_MOST_FAULTY = 8
+"""The largest number of enclaves with faulty or revoked files that get a row."""
 
 
 @dataclass(frozen=True)
 class CastMember:
-    """An enclave of the user's keystore with its part, and the names of its ROS nodes on rclpy."""
+    """An enclave of the user's keystore with its part, and the names of its ROS nodes on rclpy.
+
+    ``why`` is why this enclave was chosen, or "".
+    """
 
     part: str
     enclave: str
     nodes: tuple[str, ...] = ()
+    why: str = ""
 
 
 @dataclass(frozen=True)
@@ -53,7 +105,10 @@ class UserKeystore:
     """A user's keystore to attack, with its template, domains, and cast.
 
     ``topic`` is the attacked ROS topic, ``service`` the attacked ROS service ("": none).
-    ``guessed`` says that the cast was chosen by the rights of the enclaves, not by their names.
+    ``grants`` has the grant of each enclave of the cast, ``why`` the reason for the choice of some
+    parts.  ``rows`` are for the widest enclaves, and for those whose faulty or revoked files allow
+    them no part.  ``enclaves`` is the number of all enclaves, of which ``elsewhere`` have their key
+    elsewhere; ``not_tried`` says what would have to be tried for a proof, and cannot be.
     """
 
     root: Path
@@ -62,11 +117,18 @@ class UserKeystore:
     cast: Mapping[str, str]
     topic: str
     service: str
-    guessed: bool
+    grants: Mapping[str, Grant]
+    why: Mapping[str, str]
+    rows: tuple[Row, ...]
+    enclaves: int
+    elsewhere: int
+    not_tried: tuple[str, ...]
 
     def copy(self, target: Path) -> None:
-        """Copy the keystore with modes and links, but only the cast's enclaves and no CA keys."""
-        folders = {f"{ENCLAVES}{name}" for name in self.cast.values()}
+        """Copy the keystore with modes and links, but only the enclaves of rows and no CA keys."""
+        of_rows = {party.identity.enclave for row in self.rows for party in row.parties}
+        names = {*self.cast.values(), *(each for each in of_rows if each.startswith("/"))}
+        folders = {f"{ENCLAVES}{name}" for name in names}
         shutil.copytree(self.root, target, symlinks=True, ignore=_all_but(self.root, folders))
 
     def keyring(self) -> Keyring:
@@ -75,52 +137,235 @@ class UserKeystore:
         places = {role: f"file:{path}" for role, path in inside.items() if path.exists()}
         return Keyring(places=places)
 
+    def topic_of(self, party: Party, topic: str) -> str:
+        """Return the topic or service of a party; ``topic`` is the attacked ROS topic."""
+        name = party.topic or topic
+        return (self.service or SERVICE) if name == SERVICE else name
 
-def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeystore:
+    def rightful(self, row: Row) -> str:
+        """Return the enclave of a row whose attacker is the very enclave that it competes with."""
+        own = [each for each in row.parties if each.identity.keystore is OWN]
+        for attacker in (each for each in own if each.intruder):
+            enclave = self.cast.get(attacker.identity.enclave, "")
+            for other in own:
+                same = (other.role, self.cast.get(other.identity.enclave)) == (
+                    attacker.role,
+                    enclave,
+                )
+                if same and not other.intruder and enclave:
+                    return enclave
+        return ""
+
+    def opened(self, row: Row, topic: str) -> Row:
+        """Return a row that expects the attack to succeed if the attacker's permissions allow it.
+
+        ``topic`` is the attacked ROS topic.  Nobody else takes part then: the success proves
+        itself, and a second server would answer in the attacker's place.
+        """
+        attacker = next((each for each in row.parties if each.intruder), None)
+        if row.expected is not RowStatus.REFUSED or attacker is None:
+            return row
+        enclave = self.cast.get(attacker.identity.enclave, "")
+        if attacker.identity.keystore is not OWN or enclave not in self.grants:
+            return row
+        if self.rightful(row):
+            return row
+        right, name = _RIGHTS[attacker.role], self.topic_of(attacker, topic)
+        expressions = expressions_of(self.grants[enclave], right, name)
+        if not all(expressions):
+            return row
+        wild = next((f" by {each}" for each in expressions if is_wild(each)), "")
+        claim = row.claims[0]
+        success = STATUS_OF[claim.relation, True]
+        return replace(
+            row,
+            expected=success,
+            mechanism="its signed permissions allow it",
+            parties=tuple(
+                each for each in row.parties if each.name in (claim.subject, claim.talker)
+            ),
+            claims=(claim.expecting(success),),
+            controls=(),
+            open_because=f"the permissions of {enclave} allow it to {right} {name}{wild}",
+            remedy="give it a policy without this right, or accept the row",
+        )
+
+
+def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime) -> UserKeystore:
     """Read a keystore and cast its enclaves for the ROS topic ``topic`` ("": any).
 
     Raises:
         KeystoreError: ``root`` is not a keystore, or no two enclaves may talk to each other.
     """
-    names = list_enclaves(root)
+    keystore = open_keystore(root)
     domains = governance_of(root).domains()
-    rights = {name: grants for name in names if (grants := enclave_grant(root, name))}
+    read = _read_enclaves(keystore, now, next(iter(domains)))
     template = load_settings(root)
     # A keystore created from this template gets new CA keys, not the user's.
     template = replace(template, identity_key="", permissions_key="")
     wanted = f"rt{topic}" if topic else ""
-    guessed = not set(scenario.cast.values()) <= set(names)
-    if not guessed:
+    rights = read.rights
+    if set(scenario.cast.values()) <= set(rights):
         cast = dict(scenario.cast)
         chosen = wanted or _first_topic(rights, cast)
     else:
-        cast, chosen = _best_cast(rights, wanted)
+        cast, chosen = _best_cast(rights, wanted, read.without_list)
     if not chosen:
         raise KeystoreError(
             f"no two enclaves of keystore '{root}' may talk on {topic or 'a topic'}",
             "An attack needs an enclave that may publish a topic (named without wildcards), and"
-            " another enclave that may subscribe to it.",
+            " another enclave that may subscribe to it." + read.faults_text(),
             "Name the topic with --topic, or attack a keystore that `sros demo --keep` made.",
         )
     service = _service(rights, cast) if "server" in cast else ""
-    topic = chosen.removeprefix("rt")
-    return UserKeystore(root, template, domains, cast, topic, service, guessed)
+    attacked = chosen.removeprefix("rt")
+    widest = dict(_widest(rights, cast, attacked, service))
+    cast |= {part: enclave for part, (enclave, _) in widest.items()}
+    return UserKeystore(
+        root,
+        template,
+        domains,
+        cast,
+        attacked,
+        service,
+        {name: rights[name] for name in cast.values()},
+        {part: why for part, (_, why) in widest.items()},
+        (*(row for part, row in WIDEST.items() if part in widest), *read.rows()),
+        len(keystore.names),
+        len(read.elsewhere),
+        tuple(read.not_tried(cast)),
+    )
 
 
-def _best_cast(rights: Mapping[str, Grant], wanted: str) -> tuple[dict[str, str], str]:
+@dataclass(frozen=True)
+class _Enclaves:
+    """The enclaves of a keystore, by what their files allow the demo to do with them.
+
+    ``rights`` are the grants of sound enclaves.  ``faulty`` has the first fault of each enclave
+    that the others do not accept, ``revoked`` whether its own list names a revoked enclave.
+    ``elsewhere`` are those whose key is not in the keystore.  ``without_list`` lack the newest
+    revocation list of their keystore; ``other_governance`` have another governance than the rest.
+    """
+
+    rights: Mapping[str, Grant]
+    faulty: Mapping[str, str]
+    revoked: Mapping[str, bool]
+    elsewhere: tuple[str, ...]
+    without_list: frozenset[str]
+    other_governance: tuple[str, ...]
+
+    def rows(self) -> Iterator[Row]:
+        """Yield a row for each enclave with faulty or revoked files, up to `_MOST_FAULTY`."""
+        rows = [revoked_joining(name, own) for name, own in self.revoked.items()]
+        rows += [joining(name, why) for name, why in self.faulty.items()]
+        yield from rows[:_MOST_FAULTY]
+
+    def not_tried(self, cast: Mapping[str, str]) -> Iterator[str]:
+        """Yield what would have to be tried in a cast, and cannot be."""
+        more = len(self.revoked) + len(self.faulty) - _MOST_FAULTY
+        if more > 0:
+            yield f"{more} more enclaves with faulty or revoked files"
+        if self.without_list and cast["listener"] not in self.without_list:
+            yield f"{_listed(self.without_list)} without the newest revocation list"
+        if self.other_governance:
+            yield f"{_listed(self.other_governance)} with a governance of its own"
+
+    def faults_text(self) -> str:
+        """Return a sentence on the first enclave that is left out for its files, or ""."""
+        for name, why in self.faulty.items():
+            return f" {name} is left out: {why}."
+        return ""
+
+
+def _listed(names: frozenset[str] | tuple[str, ...]) -> str:
+    first, *others = sorted(names)
+    return f"{first} and {len(others)} more" if others else first
+
+
+def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enclaves:
+    """Read the files of all enclaves; ``domain`` is the domain in which they meet."""
+    rights: dict[str, Grant] = {}
+    faulty: dict[str, str] = {}
+    revoked: dict[str, bool] = {}
+    elsewhere: list[str] = []
+    without_list: list[str] = []
+    governances: dict[str, Governance | None] = {}
+    serials = _revoked_serials(keystore)
+    newest = _content(keystore.root / CRL)
+    for name in keystore.names:
+        state = keystore.enclave(name, now=now, domain=domain)
+        faults = [each for each in state.problems if each.fault is not Fault.REVOKED]
+        own = len(faults) < len(state.problems)
+        if KEY_FILE not in state.files and (state.key_on_robot or state.token):
+            elsewhere.append(name)
+        elif own or (state.certificate and state.certificate.serial_number in serials):
+            revoked[name] = own
+        elif reason := str(faults[0]) if faults else _strange_authority(keystore, state):
+            faulty[name] = reason
+        elif grant := state.grant:
+            rules = tuple(rule for rule in grant.rules if domain in rule.domains.closed())
+            rights[name] = replace(grant, rules=rules)
+            governances[name] = state.governance
+            if newest or serials:
+                found = _content(enclave_path(keystore.root, name) / CRL_FILE)
+                without_list += [name] if not found or found != (newest or found) else []
+    usual = Counter(governances.values()).most_common(1)
+    return _Enclaves(
+        rights,
+        faulty,
+        revoked,
+        tuple(elsewhere),
+        frozenset(without_list),
+        tuple(name for name, found in governances.items() if found != usual[0][0]),
+    )
+
+
+def _revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
+    """Return the serial numbers that the ledger or the revocation list names as revoked."""
+    entries = (each for each in keystore.ledger.entries if each.what == "revocation")
+    listed = keystore.revocation_list.revoked if keystore.revocation_list else ()
+    return frozenset({*(int(each.serial, 16) for each in entries), *(e.serial for e in listed)})
+
+
+def _content(path: Path) -> bytes:
+    """Return the content of a file; nothing if it is not there, or cannot be read."""
+    try:
+        return read_bytes(path, "revocation list") if path.exists() else b""
+    except SrosError:
+        return b""
+
+
+def _strange_authority(keystore: OpenedKeystore, state: OpenedEnclave) -> str:
+    """Return which CA file of an enclave has no CA of the keystore, or ""."""
+    for file, role in ((IDENTITY_CA_FILE, IDENTITY), (PERMISSIONS_CA_FILE, PERMISSIONS)):
+        known = {digest(each) for each in keystore.authority(role)}
+        if fingerprints(state.files[file]).isdisjoint(known):
+            return f"{file}: it has no certificate of the keystore's {role} CA"
+    return ""
+
+
+def _best_cast(
+    rights: Mapping[str, Grant], wanted: str, without_list: frozenset[str]
+) -> tuple[dict[str, str], str]:
     """Return the most useful cast (talker, listener, guest) and its DDS topic.
 
-    An enclave that may only publish, or only subscribe, is more useful than one that may do both.
+    An enclave that may only publish, or only subscribe, is more useful than one that may do both;
+    most useful as listener is one ``without_list``, which may not know who was revoked.
     """
     best: tuple[int, dict[str, str], str] = (-1, {}, "")
-    for topic in [wanted] if wanted else sorted(each for each in _topics(rights) if "rt/" in each):
+    serving = _serving(rights)
+    named = sorted(each for each in _topics(rights) if "rt/" in each)
+    for topic in [wanted] if wanted else [*named, f"rt{DEFAULT_TOPIC}"]:
         talkers = {name for name in rights if allows(rights[name], "publish", topic)}
         listeners = {name for name in rights if allows(rights[name], "subscribe", topic)}
         pair = next(
             (
                 (talker, listener)
-                for talker in _single_purpose_first(rights, talkers, listeners)
-                for listener in _single_purpose_first(rights, listeners, talkers)
+                for talker in _best_first(rights, "publish", talkers, listeners, topic)
+                for listener in sorted(
+                    _best_first(rights, "subscribe", listeners, talkers, topic),
+                    key=lambda name: name not in without_list,
+                )
                 if talker != listener
             ),
             None,
@@ -129,7 +374,9 @@ def _best_cast(rights: Mapping[str, Grant], wanted: str) -> tuple[dict[str, str]
             continue
         cast = dict(zip(("talker", "listener"), pair, strict=True))
         guests = [name for name in rights if name not in pair]
-        guests.sort(key=lambda name: (name in talkers) + (name in listeners))
+        guests.sort(
+            key=lambda name: ((name in talkers) + (name in listeners), name in serving.values())
+        )
         if guests:
             cast["guest"] = guests[0]
         nested = [(g, a) for g, a in permutations(rights, 2) if _within(g, a)]
@@ -138,39 +385,56 @@ def _best_cast(rights: Mapping[str, Grant], wanted: str) -> tuple[dict[str, str]
             cast["guest"], cast["admin"] = lent
         both = talkers & listeners
         score = len(cast) + (cast.get("guest") not in talkers) - len(both & set(pair))
+        score += 10 * (cast["listener"] in without_list)
         if score > best[0]:
             best = (score, cast, topic)
     _, cast, topic = best
-    if cast:
-        cast |= _serving(rights)
-    return cast, topic
+    return (cast | serving if cast else cast), topic
 
 
-def _single_purpose_first(
-    rights: Mapping[str, Grant], chosen: set[str], others: set[str]
+def _best_first(
+    rights: Mapping[str, Grant], right: str, chosen: set[str], others: set[str], topic: str
 ) -> list[str]:
-    """Return ``chosen`` in the order of ``rights``, with those also in ``others`` at the end."""
-    return sorted((name for name in rights if name in chosen), key=lambda name: name in others)
+    """Return ``chosen``, first those not in ``others``, and of them those that name the topic.
+
+    Last are those that a rule denies the other direction: Cyclone DDS 0.10 denies them both.
+    """
+    return sorted(
+        (name for name in rights if name in chosen),
+        key=lambda name: (
+            is_denied(rights[name], topic),
+            name in others,
+            not may(rights[name], right, topic.removeprefix("rt"), named=True),
+        ),
+    )
 
 
 def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
-    """Return server and client of one service, if any; prefer a client that may not serve."""
+    """Return server and client of one service, if any.
+
+    A client that may not serve is preferred, and one that names the service.
+    """
     found: dict[str, str] = {}
+    best = -1
     for server, client in permutations(rights, 2):
-        for topic in _application_topics(rights[server], "publish"):
+        for topic in application_topics(rights[server], "publish"):
             service, begin = service_of(topic)
-            if begin == "rr" and ACTION_SEPARATOR not in service:
-                request = dds_names("request", service).publish[0]
-                if "parameter" not in topic and allows(rights[client], "publish", request):
-                    found = {"server": server, "client": client}
-                    if not allows(rights[client], "publish", topic):
-                        return found
+            if begin != "rr" or ACTION_SEPARATOR in service or "parameter" in topic:
+                continue
+            if not allows(rights[client], "publish", dds_names("request", service).publish[0]):
+                continue
+            score = 2 * (not allows(rights[client], "publish", topic))
+            score += may(rights[client], "request", service, named=True)
+            if score > best:
+                best, found = score, {"server": server, "client": client}
+            if best == 3:
+                return found
     return found
 
 
 def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     """Return the service that the server of a cast offers and its client calls."""
-    for topic in _application_topics(rights[cast["server"]], "publish"):
+    for topic in application_topics(rights[cast["server"]], "publish"):
         name, begin = service_of(topic)
         requests = dds_names("request", name).publish[0]
         if begin == "rr" and allows(rights[cast["client"]], "publish", requests):
@@ -178,10 +442,55 @@ def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     return SERVICE
 
 
+def _widest(
+    rights: Mapping[str, Grant], cast: Mapping[str, str], topic: str, service: str
+) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield the part, the enclave and the reason for each enclave with the widest permissions.
+
+    An enclave that names the topic or service was given it, and counts only if it may also use what
+    nobody named.  No part is for an enclave that another row tries with the same attack.
+    """
+    for part, right, name, others in (
+        (WIDEST_PUBLISHER, "publish", topic, ("talker", "listener", "guest")),
+        (WIDEST_SUBSCRIBER, "subscribe", topic, ("talker", "listener", "guest")),
+        (WIDEST_CLIENT, "request", service, ("server", "client", "guest")),
+        (WIDEST_SERVER, "reply", service, ("server", "client")),
+    ):
+        if not name:
+            continue
+        unnamed = [
+            enclave
+            for enclave, grant in rights.items()
+            if not may(grant, right, name, named=True) or may(grant, right, DENIED_TOPIC)
+        ]
+        tried = {cast[each] for each in others if each in cast}
+        width = {each: _width(rights[each], right, name) for each in unnamed}
+        free = [each for each in unnamed if each not in tried]
+        if not free:
+            continue
+        found = max(free, key=width.__getitem__)
+        if any(width[found][:2]):
+            why = f"may {right} {name if width[found][0] else 'what nobody named'} by a wildcard"
+        else:
+            why = f"has the most rights of those that may not {right} {name}"
+        yield part, (found, why)
+
+
+def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
+    """Return whether a grant allows a right on a name, and on one that nobody named, and its size.
+
+    Tuples compare as the grants do: the greatest is the widest.
+    """
+    size = sum(
+        len(each.topics) for rule in grant.rules for each in (*rule.publish, *rule.subscribe)
+    )
+    return may(grant, right, name), may(grant, right, DENIED_TOPIC), size
+
+
 def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     own = [
         topic
-        for topic in _application_topics(rights[cast["talker"]], "publish")
+        for topic in application_topics(rights[cast["talker"]], "publish")
         if topic[:3] == "rt/"
     ]
     return next((t for t in own if allows(rights[cast["listener"]], "subscribe", t)), "")
@@ -193,7 +502,7 @@ def _within(short: str, long: str) -> bool:
 
 
 def _topics(rights: Mapping[str, Grant]) -> set[str]:
-    return {topic for grant in rights.values() for topic in _application_topics(grant, "publish")}
+    return {topic for grant in rights.values() for topic in application_topics(grant, "publish")}
 
 
 def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[str]]:
@@ -211,124 +520,3 @@ def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[st
         }
 
     return left_out
-
-
-def enclave_grant(root: Path, enclave: str) -> Grant | None:
-    """Return the first grant of an enclave, or None if its permissions cannot be read."""
-    try:
-        signed = (enclave_path(root, enclave) / "permissions.p7s").read_bytes()
-        grants = parse_permissions(smime.parse(signed).document).grants
-    except (SrosError, OSError):
-        return None
-    return grants[0] if grants else None
-
-
-def allows(grant: Grant, verb: str, topic: str) -> bool:
-    """Return whether a grant allows ``verb`` (publish or subscribe) on a DDS topic.
-
-    The first rule that names the topic decides, as with the vendors.  A topic that no rule
-    names is denied.
-    """
-    for rule in grant.rules:
-        if any(matches(expression, topic) for expression in _expressions(rule, verb)):
-            return rule.allow
-    return False
-
-
-def _application_topics(grant: Grant, verb: str) -> Iterator[str]:
-    """Yield the application's DDS topics that a grant allows by a name without wildcards.
-
-    Topics of every node, hidden topics and topics of actions are left out.
-    """
-    for topic in _allowed(grant, verb):
-        private = topic.startswith("rt/_") or ACTION_SEPARATOR in topic
-        if topic not in _TOPICS_OF_EVERY_NODE and not private:
-            yield topic
-
-
-def is_node_allowed(grant: Grant, node: str) -> bool:
-    """Return whether a grant allows all standard services of the node ``node`` (absolute)."""
-    names = (dds_names("reply", f"{node}/{service}") for service in NODE_SERVICES)
-    return all(
-        all(allows(grant, "publish", topic) for topic in each.publish)
-        and all(allows(grant, "subscribe", topic) for topic in each.subscribe)
-        for each in names
-    )
-
-
-def nodes_named(grant: Grant) -> Iterator[str]:
-    """Yield the absolute names of the nodes whose standard services a grant names and allows."""
-    kind, service = _NODE_MARK
-    for topic in _allowed(grant, "publish"):
-        if topic.startswith(kind) and topic.endswith(service):
-            node = topic.removeprefix(kind).removesuffix(service)
-            if is_node_allowed(grant, node):
-                yield node
-
-
-def _allowed(grant: Grant, verb: str) -> Iterator[str]:
-    for rule in grant.rules:
-        for topic in _expressions(rule, verb) if rule.allow else ():
-            if not set(topic) & _WILD:
-                yield topic
-
-
-def _expressions(rule: Rule, verb: str) -> Iterator[str]:
-    for criteria in rule.publish if verb == "publish" else rule.subscribe:
-        yield from criteria.topics
-
-
-DEFAULT_NODE_NAMES: Mapping[Role, tuple[str, ...]] = {
-    Role.TALKER: ("talker",),
-    Role.LISTENER: ("listener",),
-    Role.OBSERVER: ("observer",),
-    Role.SERVER: ("server",),
-    Role.CLIENT: ("client",),
-    Role.ACTION_SERVER: ("action_server",),
-    Role.ACTION_CLIENT: ("action_client",),
-    Role.COMPOSED: ("talker", "listener", "server"),
-}
-"""The default names of the nodes of each role, in the namespace /."""
-
-
-def node_names(role: Role, grant: Grant | None) -> tuple[str, ...]:
-    """Return the absolute names of a role's nodes under a grant (None: without security).
-
-    A node keeps its default name if the grant allows it.  Otherwise it gets the most similar node
-    name in the grant; if there is no such name, it keeps its default name.
-    """
-    wanted = [f"/{name}" for name in DEFAULT_NODE_NAMES[role]]
-    if grant is None:
-        return tuple(wanted)
-    kept = {name for name in wanted if is_node_allowed(grant, name)}
-    named = [*dict.fromkeys(nodes_named(grant))]
-    free = [name for name in named if name not in kept]
-    return tuple(_names(wanted, kept, free, named))
-
-
-def _names(
-    wanted: Sequence[str], kept: set[str], free: list[str], named: Sequence[str]
-) -> Iterator[str]:
-    for name in wanted:
-        if name in kept or not named:
-            yield name
-            continue
-        # With more nodes than names, two nodes share a name: DDS allows that in a process.
-        alike = [each for each in free if name[1:] in each.lower()]
-        chosen = (alike or free or named)[0]
-        if chosen in free:
-            free.remove(chosen)
-        yield chosen
-
-
-def naming_arguments(role: Role, names: Sequence[str]) -> list[str]:
-    """Return the ``--ros-args`` that give the nodes of a role these absolute names."""
-    rules: list[str] = []
-    for default, name in zip(DEFAULT_NODE_NAMES[role], names, strict=True):
-        namespace, _, node = name.rpartition("/")
-        if node != default:
-            rules += ["-r", f"{default}:__node:={node}"]
-        if namespace:
-            # rcl looks up the namespace under the new name of the node.
-            rules += ["-r", f"{node}:__ns:={namespace}"]
-    return ["--ros-args", *rules, "--"] if rules else []

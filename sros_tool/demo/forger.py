@@ -48,6 +48,7 @@ from sros_tool.keystore.layout import (
     REQUIRED_FILES,
     enclave_path,
 )
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.reader import load_settings
@@ -96,7 +97,7 @@ class KeystoreCopy:
             KeystoreError: no enclave plays the part.
         """
         if part not in self.cast:
-            raise KeystoreError(
+            raise UncastError(
                 f"the keystore has no enclave that can be the {part}",
                 "None has the permissions that this part of the attack needs.",
             )
@@ -179,6 +180,10 @@ class KeystoreCopy:
         self.put(part, CERTIFICATE_FILE, pem(issuer.issue(subject, key.public_key(), validity)))
         if new_key:
             self.put(part, KEY_FILE, key_pem(key))
+
+
+class UncastError(KeystoreError):
+    """A forgery that the keystore has no enclave for."""
 
 
 Forge = Callable[[KeystoreCopy], None]
@@ -446,13 +451,33 @@ def _revoke(copy: KeystoreCopy, part: str) -> None:
     """Revoke an enclave, then give it a new key and certificate for the same subject."""
     folder = copy.folder(part)
     before = {name: copy.read(part, name) for name in REQUIRED_FILES}
+    lists = _outdated_lists(copy)
     revoke(copy.root, [copy.enclave(part)], now=copy.now, keyring=copy.keyring)
     # A revocation also removes the folder of a namespace that is empty after it.
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for path, data in lists.items():
+        path.unlink(missing_ok=True)
+        if data:
+            path.write_bytes(data)
     for name, data in before.items():
         copy.put(part, name, data)
     copy.reissue(part, Window(copy.now - _DAY, copy.now + _DAY), new_key=True)
     copy.put(part, CRL_FILE, (copy.root / CRL).read_bytes())
+
+
+def _outdated_lists(copy: KeystoreCopy) -> dict[Path, bytes]:
+    """Return the revocation lists (empty: none) of enclaves that lack their keystore's list.
+
+    Who did not get the last list will not get the next one, either.
+    """
+    newest = copy.root / CRL
+    revoked = any(each.what == "revocation" for each in read_ledger(copy.root).entries)
+    if not revoked and not newest.exists():
+        return {}
+    paths = [copy.folder(part) / CRL_FILE for part in copy.cast]
+    lists = {path: path.read_bytes() if path.exists() else b"" for path in paths}
+    current = newest.read_bytes() if newest.exists() else None
+    return {path: data for path, data in lists.items() if not data or data != (current or data)}
 
 
 def talker_revoked(copy: KeystoreCopy) -> None:

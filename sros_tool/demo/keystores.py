@@ -14,21 +14,21 @@ from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
-from sros_tool.demo.casting import CastMember, UserKeystore, allows, enclave_grant, node_names
-from sros_tool.demo.forger import Forge, KeystoreCopy, Undefended, name_of
+from sros_tool.demo.casting import CastMember, UserKeystore
+from sros_tool.demo.forger import Forge, KeystoreCopy, UncastError, Undefended, name_of
+from sros_tool.demo.grants import enclave_grant
+from sros_tool.demo.node_names import node_names
 from sros_tool.demo.scenarios.model import (
     FOREIGN,
     OWN,
     Identity,
     KeystoreChoice,
     Party,
-    Role,
     Row,
-    RowStatus,
     Scenario,
     SoundKeystore,
 )
-from sros_tool.demo.scenarios.policies import DENIED_TOPIC, SERVICE
+from sros_tool.demo.scenarios.policies import DENIED_TOPIC
 from sros_tool.demo.zenoh_files import start_network, zenoh_variables
 from sros_tool.errors import SrosError
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
@@ -37,16 +37,8 @@ from sros_tool.keystore.template import Template
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.stacks import ProbeEnclave
 from sros_tool.runtime.variables import DOMAIN
-from sros_tool.topics import dds_names
 from sros_tool.validity import Window
 from sros_tool.zenoh.configuration import Mode
-
-_RIGHTS = {
-    Role.TALKER: "publish",
-    Role.LISTENER: "subscribe",
-    Role.SERVER: "reply",
-    Role.CLIENT: "request",
-}
 
 
 @dataclass(frozen=True)
@@ -67,7 +59,7 @@ class KeystoreSpec:
 class KeystoreSet:
     """The keystores of a scenario, unforged and forged, and the enclave of each part.
 
-    ``missing`` has the reason for each keystore that could not be made.  The scenario's own
+    ``missing`` has the error for each keystore that could not be made.  The scenario's own
     keystore is a copy of the ``user`` keystore, if given: that copy and its forgeries have the
     cast of ``user``, the other keystores have ``cast``.  With a ``router``, the name of an
     enclave, the processes run on Zenoh.  ``copies`` has the forged keystores.
@@ -75,17 +67,15 @@ class KeystoreSet:
 
     keystores: Mapping[KeystoreChoice, Path]
     cast: Mapping[str, str] = field(default_factory=dict)
-    missing: Mapping[KeystoreChoice, str] = field(default_factory=dict)
+    missing: Mapping[KeystoreChoice, Exception] = field(default_factory=dict)
     user: UserKeystore | None = None
     router: str = ""
     copies: Mapping[KeystoreChoice, KeystoreCopy] = field(default_factory=dict)
 
     def topic(self, party: Party, topic: str) -> str:
         """Return the ROS topic, service or action of a party; ``topic`` is the demo's topic."""
-        name = party.topic or topic
         user = self._user_of(party.identity)
-        if name == SERVICE and user is not None:
-            name = user.service or SERVICE
+        name = user.topic_of(party, topic) if user else party.topic or topic
         return f"{name}_in_the_open" if party.other_topic else name
 
     def enclave(self, identity: Identity) -> str:
@@ -145,8 +135,9 @@ class KeystoreSet:
                 part = party.identity.enclave
                 if party.identity.keystore is OWN and part in cast:
                     nodes.setdefault(part, set()).update(self.node_names(party) if on_ros else ())
+        why = self.user.why if self.user else {}
         return tuple(
-            CastMember(part, cast[part], tuple(sorted(nodes[part])))
+            CastMember(part, cast[part], tuple(sorted(nodes[part])), why.get(part, ""))
             for part in cast
             if part in nodes
         )
@@ -156,8 +147,8 @@ class KeystoreSet:
         environment = self.environment(Identity(OWN, "talker"), domain)
         return ProbeEnclave(environment, topic, DENIED_TOPIC)
 
-    def problem(self, row: Row, topic: str) -> str:
-        """Return why a row cannot run on the ROS topic ``topic``, or ""."""
+    def inapplicable(self, row: Row) -> str:
+        """Return why a row has nothing to try in this keystore (nobody plays a part), or ""."""
         for party in row.parties:
             identity = party.identity
             part = identity.enclave
@@ -167,31 +158,19 @@ class KeystoreSet:
                 and part not in self._cast(identity)
             ):
                 return f"the keystore has no enclave that can be the {part}"
-            if identity.keystore is not None and identity.keystore in self.missing:
-                return self.missing[identity.keystore]
-        if self.user is not None and self.user.guessed and row.expected is RowStatus.REFUSED:
-            for party in row.parties:
-                if party.intruder and party.identity.keystore is OWN:
-                    return self._why_not_denied(party, topic)
+            if isinstance(error := self._missing(party), UncastError):
+                return str(error)
+        if self.user is not None and (enclave := self.user.rightful(row)):
+            return f"the keystore has no other enclave than {enclave}, which may rightfully do it"
         return ""
 
-    def _why_not_denied(self, party: Party, topic: str) -> str:
-        """Return why a row cannot show a denial (the party has the right), or ""."""
-        right = _RIGHTS[party.role]
-        name = self.topic(party, topic)
-        grant = self._grant(party.identity)
-        topics = dds_names(right, name)
-        if grant is None or not all(
-            allows(grant, verb, each)
-            for verb in ("publish", "subscribe")
-            for each in getattr(topics, verb)
-        ):
-            return ""
-        enclave, part = self.enclave(party.identity), party.identity.enclave
-        return (
-            f"the best enclave for the {part} is {enclave}, but its permissions allow it to {right}"
-            f" {name}: it would not be refused"
-        )
+    def problem(self, row: Row) -> str:
+        """Return why a row cannot run, because a keystore could not be made, or ""."""
+        return next((str(e) for party in row.parties if (e := self._missing(party))), "")
+
+    def _missing(self, party: Party) -> Exception | None:
+        choice = party.identity.keystore
+        return None if choice is None else self.missing.get(choice)
 
     def _grant(self, identity: Identity) -> Grant | None:
         if identity.keystore is None:
@@ -230,14 +209,14 @@ def create_keystores(
         create_scenario_keystore(keystores[OWN], scenario, spec)
     else:
         user.copy(keystores[OWN])
-    missing: dict[KeystoreChoice, str] = {}
+    missing: dict[KeystoreChoice, Exception] = {}
     copies: dict[KeystoreChoice, KeystoreCopy] = {}
     for choice in _forgeries_of(scenario):
         root = keystores[choice] = folder / "forged" / name_of(choice)
         try:
             copies[choice] = _forge(choice, root, keystores, scenario, spec, user)
         except (SrosError, OSError) as error:
-            missing[choice] = str(error)
+            missing[choice] = error
     return KeystoreSet(keystores, scenario.cast, missing, user, scenario.router, copies)
 
 

@@ -32,7 +32,7 @@ from sros_tool.demo.casting import UserKeystore, open_user_keystore
 from sros_tool.demo.cost import Effort, measure_cost
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.network import Progress, run_isolated
-from sros_tool.demo.result import DemoResult, ScenarioResult
+from sros_tool.demo.result import DemoResult, KeystoreSummary, ScenarioResult
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.isolation import ISOLATION
 from sros_tool.demo.scenarios.model import Row, Scenario, joined
@@ -91,7 +91,6 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
         UnavailableError: no DDS enforces security here.
         SrosError: a keystore could not be made.
     """
-    _check_accepted(options)
     zenoh = zenoh_backend() if options.backend == ZENOH else None
     if zenoh and options.keystore is not None:
         raise UsageError(
@@ -99,7 +98,10 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             "The demo on Zenoh attacks keystores of its own.",
             "Leave out one of them.",
         )
-    user = _user_keystore(options)
+    user = _user_keystore(options, now)
+    if user:
+        options = replace(options, scenarios=(_with_rows_of(user, options.scenarios[0]),))
+    _check_accepted(options)
     template = options.template or (user.template if user else load_template(_DEFAULT_TEMPLATE))
     topic = options.topic
     topic = check_topic((user.topic if user else DEFAULT_TOPIC) if topic is None else topic)
@@ -124,7 +126,9 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             if user:
                 strong = load_template(_DEFAULT_TEMPLATE)
                 rows = tuple(
-                    _gated(row, _expected(same, backend, strong, topic), options)
+                    _gated(
+                        user.opened(row, topic), _expected(same, backend, strong, topic), options
+                    )
                     for row, same in zip(rows, scenario.rows, strict=True)
                 )
             scenario = replace(scenario, rows=rows)
@@ -155,10 +159,17 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 results += _parted(scenarios, row_results)
                 continue
             cast = keystores.members(scenario.rows, on_ros=backend.name == RCLPY) if user else ()
-            results.append(
-                ScenarioResult(scenario.name, scenario.title, tuple(row_results), cost, cast)
+            summary = (
+                KeystoreSummary(user.enclaves, user.elsewhere, user.not_tried) if user else None
             )
-        result = DemoResult(backend, topic, isolation, template.name, tuple(results))
+            results.append(
+                ScenarioResult(
+                    scenario.name, scenario.title, tuple(row_results), cost, cast, summary
+                )
+            )
+        left_out = sum(len(each.rows) for each in options.scenarios)
+        left_out -= sum(len(each.rows) for each in results)
+        result = DemoResult(backend, topic, isolation, template.name, tuple(results), left_out)
         if options.keep is not None:
             text = json.dumps(versioned(result.as_json()), indent=2) + "\n"
             (folder / "result.json").write_text(text, encoding="utf-8")
@@ -216,7 +227,7 @@ def _find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend
         return choose_backend(wish, keystores.probe(topic, _DEFAULT_DOMAIN))
 
 
-def _user_keystore(options: DemoOptions) -> UserKeystore | None:
+def _user_keystore(options: DemoOptions, now: datetime) -> UserKeystore | None:
     """Return the user's keystore, if one is given.
 
     Raises:
@@ -232,7 +243,12 @@ def _user_keystore(options: DemoOptions) -> UserKeystore | None:
                 "Use --keystore with --scenario attacks alone.",
             )
     topic = "" if options.topic is None else check_topic(options.topic)
-    return open_user_keystore(options.keystore, topic, options.scenarios[0])
+    return open_user_keystore(options.keystore, topic, options.scenarios[0], now)
+
+
+def _with_rows_of(user: UserKeystore, scenario: Scenario) -> Scenario:
+    """Return the scenario with the rows that only this keystore of the user needs."""
+    return replace(scenario, rows=(*scenario.rows, *user.rows))
 
 
 def _with_chosen_rows(options: DemoOptions) -> tuple[Scenario, ...]:

@@ -52,6 +52,7 @@ from sros_tool.demo.wire import (
     forged_text,
     mapped_segments,
     shared_memory,
+    with_changed_byte,
     with_replaced_text,
 )
 from sros_tool.runtime.events import Event, EventKind, EventReader
@@ -167,6 +168,7 @@ class _Runner:
         """Run rows that share their processes; return their results by their places."""
         rows, domain = [self._plan.rows[index] for index in group], self._plan.domains[group[0]]
         skipped = {row.name: why for row in rows if (why := self._why_skipped(row))}
+        inapplicable = {row.name for row in rows if self._plan.keystores.inapplicable(row)}
         tried = [row for row in rows if row.name not in skipped]
         played = RowRecord(rows[0], domain)
         if tried:
@@ -178,7 +180,12 @@ class _Runner:
                         break
         results = {}
         for index, row in zip(group, rows, strict=True):
-            record = replace(played, row=row, skipped=skipped.get(row.name, played.skipped))
+            record = replace(
+                played,
+                row=row,
+                skipped=skipped.get(row.name, played.skipped),
+                applies=row.name not in inapplicable,
+            )
             result = results[index] = judge_row(record)
             self._finished += 1
             self._progress(
@@ -187,10 +194,12 @@ class _Runner:
         return results
 
     def _why_skipped(self, row: Row) -> str:
+        if why := self._plan.keystores.inapplicable(row):
+            return why
         handshake = any(claim.wire in (Wire.TOPIC, Wire.CERTIFICATE) for claim in row.claims)
         if (handshake or row.replay or row.impersonate) and not self._plan.own_networks:
             return "the row needs a separate network namespace"
-        return self._plan.keystores.problem(row, self._plan.topic)
+        return self._plan.keystores.problem(row)
 
     async def _play(self, index: int, row: Row, patience: _Patience) -> RowRecord:
         plan, domain = self._plan, self._plan.domains[index]
@@ -416,6 +425,8 @@ _AFTER_REPLAY = 2.0
 _LONGEST_PAUSE = 0.5
 _REPLAY_ROUNDS = 2
 _FORGED_PACKETS = 5
+_LAST_PACKETS = 20
+"""Of these last packets of a talker, some have messages."""
 _AFTER_FORGERY = 1.0
 
 
@@ -435,15 +446,24 @@ async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
 
 
 async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
-    """Suspend a talker, then send changed copies of its last readable packet."""
+    """Suspend a talker, then send changed copies of its last packets.
+
+    The last readable one gets another text; if none is readable, the last large ones get changed
+    bytes, as an attacker without keys can change them.
+    """
     talker.hold()
     await asyncio.sleep(_GRACE)
     text, forged = talker.text, forged_text(talker.text)
     packets = [each.packet for each in reversed(tap.packets(talker.ports()))]
     last = next((each for each in packets if with_replaced_text(each, text, forged, 1)), b"")
+    steps = range(1, _FORGED_PACKETS + 1)
+    if last:
+        changed = [with_replaced_text(last, text, forged, step) for step in steps]
+    else:
+        large = sorted(packets[:_LAST_PACKETS], key=len, reverse=True)[:_FORGED_PACKETS]
+        changed = [with_changed_byte(packet, step) for packet in large for step in steps]
+    sent = [packet for packet in changed if packet]
     started = time.monotonic()
-    steps = range(1, _FORGED_PACKETS + 1) if last else ()
-    sent = [each for step in steps if (each := with_replaced_text(last, text, forged, step))]
     for packet in sent:
         tap.send(packet)
     await asyncio.sleep(_AFTER_FORGERY)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
@@ -33,7 +33,7 @@ def demo_table(result: DemoResult) -> str:
             lines += [f"{scenario.name}: {scenario.title}", ""]
         lines += _cast_lines(scenario.cast)
         lines += _scenario(scenario)
-    return "\n".join([*lines, "", _summary(result.rows)])
+    return "\n".join([*lines, "", _summary(result)])
 
 
 def _cast_lines(members: Sequence[CastMember]) -> list[str]:
@@ -42,6 +42,7 @@ def _cast_lines(members: Sequence[CastMember]) -> list[str]:
     lines = [
         f"{_INDENT}{member.part:<{width}}  {member.enclave}"
         + (f" as node {', '.join(member.nodes)}" if member.nodes else "")
+        + (f": {member.why}" if member.why else "")
         for member in members
     ]
     return ["enclave for each part:", *lines, ""] if lines else []
@@ -88,22 +89,42 @@ def _mark(row: RowResult) -> str:
     return "ok" if row.as_expected else "FAIL"
 
 
-def _summary(rows: Sequence[RowResult]) -> str:
+def _summary(result: DemoResult) -> str:
+    """Return the last sentence: what was as expected, and in it all that was not tried."""
+    rows = result.rows
     opened = sum(1 for row in rows if row.open_here)
     wrong = sum(1 for row in rows if not row.as_expected)
-    skipped = sum(1 for row in rows if row.observed is RowStatus.SKIPPED)
     known = sum(1 for row in rows if row.known_open)
-    good = len(rows) - wrong - skipped
+    good = len(rows) - wrong - sum(1 for row in rows if row.observed is RowStatus.SKIPPED)
     parts = [f"{good} of {len(rows)} rows as expected"]
     if known:
         parts.append(f"{known} of them known to be open")
-    if skipped:
-        parts.append(f"{skipped} skipped")
     if opened:
         parts.append(f"{opened} open in this keystore (accept each with --accept-open NAME)")
     if wrong > opened:
         parts.append(f"{wrong - opened} not as expected")
-    return ", ".join(parts) + "."
+    return ", ".join([*parts, *_left_out(result)]) + "."
+
+
+def _left_out(result: DemoResult) -> Iterator[str]:
+    """Yield clauses on what was not tried, also on enclaves of the user's keystore."""
+    skipped = [row for row in result.rows if row.observed is RowStatus.SKIPPED]
+    if others := sum(1 for row in skipped if row.applies):
+        yield f"{others} skipped"
+    if strange := len(skipped) - others:
+        yield f"{strange} that {'does' if strange == 1 else 'do'} not apply to this keystore"
+    if result.left_out:
+        yield f"{result.left_out} left out with --only"
+    for scenario in result.scenarios:
+        if scenario.keystore is None:
+            continue
+        used = {member.enclave for member in scenario.cast}
+        yield f"{len(used)} of {scenario.keystore.enclaves} enclaves in a part"
+        if scenario.keystore.elsewhere:
+            yield f"{scenario.keystore.elsewhere} with their key elsewhere"
+        if scenario.not_tried:
+            names = "; ".join(scenario.not_tried)
+            yield f"not proved for want of what was not tried ({names})"
 
 
 def summary_page(result: DemoResult, now: datetime) -> str:
@@ -145,22 +166,23 @@ def _summary_cast(members: Sequence[CastMember]) -> list[str]:
     lines = [
         "## Enclave for each part",
         "",
-        "| part | enclave | ROS nodes |",
-        "| --- | --- | --- |",
+        "| part | enclave | ROS nodes | why |",
+        "| --- | --- | --- | --- |",
     ]
-    lines += [f"| {each.part} | {each.enclave} | {', '.join(each.nodes)} |" for each in members]
+    lines += [
+        f"| {each.part} | {each.enclave} | {', '.join(each.nodes)} | {each.why} |"
+        for each in members
+    ]
     return [*lines, ""]
 
 
 def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:
     known = sum(1 for row in result.rows if row.known_open)
-    skipped = sum(1 for row in result.rows if row.observed is RowStatus.SKIPPED)
-    parts = [f"{len(wrong)} of {len(result.rows)} rows not as expected" if wrong else "as expected"]
+    good = "as expected" if result.as_expected else "as expected where it was tried"
+    parts = [f"{len(wrong)} of {len(result.rows)} rows not as expected" if wrong else good]
     if known:
         parts.append(f"{known} attacks that are known to succeed")
-    if skipped:
-        parts.append(f"{skipped} rows could not be tried")
-    return ", ".join(parts) + "."
+    return ", ".join([*parts, *_left_out(result)]) + "."
 
 
 def _attacks(attacks: Sequence[RowResult], removed: Sequence[RowResult]) -> list[str]:

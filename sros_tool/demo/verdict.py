@@ -23,7 +23,7 @@ from sros_tool.demo.scenarios.model import (
     RowStatus,
     Wire,
 )
-from sros_tool.demo.wire import Injection, WireCount, forged_text
+from sros_tool.demo.wire import Injection, WireCount
 from sros_tool.runtime.events import Event, EventKind, ProcessStage
 from sros_tool.runtime.vendor_log import (
     endpoint_refusal,
@@ -58,7 +58,7 @@ class RowRecord:
     ready in time.  ``injected`` counts the packets that were sent again or changed; ``skipped`` is
     why the row was not run, or "".  ``expiry`` is when the certificate of a short-lived talker
     expires (CLOCK_MONOTONIC, s); ``memory`` counts the segments of shared memory with the text of
-    each party.
+    each party.  Without ``applies``, the keystore has nobody for a part of the row.
     """
 
     row: Row
@@ -70,6 +70,7 @@ class RowRecord:
     expiry: float | None = None
     memory: Mapping[str, int] = field(default_factory=dict)
     skipped: str = ""
+    applies: bool = True
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ class RowResult:
     remedy: str = ""
     accepted: bool = False
     unaccepted: bool = False
+    applies: bool = True
 
     @property
     def as_expected(self) -> bool:
@@ -108,6 +110,17 @@ class RowResult:
         """Whether the attack succeeds because of the user's keystore, and was not accepted."""
         return self.unaccepted and self.observed is self.expected
 
+    @property
+    def untried(self) -> bool:
+        """Whether an attack that has to fail was not tried, and may succeed unseen.
+
+        A row without its defence, or of an attack that is known to succeed or was accepted, proves
+        nothing of a keystore; and what does not apply to it cannot succeed.
+        """
+        if self.observed is not RowStatus.SKIPPED or not self.applies or self.removed:
+            return False
+        return not self.accepted and (self.unaccepted or not self.open_because)
+
     def as_json(self) -> dict[str, Any]:
         """Return the row as `sros demo --json` shows it."""
         return {
@@ -125,6 +138,7 @@ class RowResult:
             "remedy": self.remedy,
             "accepted": self.accepted,
             "open_here": self.open_here,
+            "applies": self.applies,
         }
 
 
@@ -155,6 +169,7 @@ def judge_row(record: RowRecord) -> RowResult:
         row.remedy,
         row.accepted,
         row.unaccepted,
+        record.applies,
     )
 
 
@@ -349,15 +364,18 @@ def _judge_forgery(
 ) -> _Finding:
     injected = record.injected
     if injected is None or not injected.packets:
-        return _Finding(RowStatus.UNDECIDED, "no packet of the talker could be read and changed")
-    mark = forged_text(talker.text)
+        return _Finding(RowStatus.UNDECIDED, "no packet of the talker could be changed")
+    sent = {event.text for event in talker.events if event.kind is EventKind.SENT}
+    sent.add(f"{talker.text}: {len(sent) + 1}")  # sent, and suspended before it was reported
     believed = sum(
-        1 for e in listener.events if e.kind is EventKind.HEARD and e.text.startswith(mark)
+        1
+        for event in listener.events
+        if event.kind is EventKind.HEARD and event.time >= injected.time and event.text not in sent
     )
     return _Finding(
         STATUS_OF[Relation.BELIEVES, believed > 0],
-        f"{claim.subject} heard {believed} of {injected.packets} messages that the {claim.talker}"
-        " never sent",
+        f"{claim.subject} heard {believed} messages that the {claim.talker} never sent, in"
+        f" {injected.packets} changed packets",
     )
 
 

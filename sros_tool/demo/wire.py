@@ -14,7 +14,7 @@ import os
 import socket
 import time
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -206,6 +206,7 @@ def _shows(path: Path, text: str) -> bool:
         return False
 
 
+_Order = Literal["little", "big"]
 _DATA = 0x15
 _SEQUENCE_NUMBER = 20
 """Bytes from the start of a DATA submessage to the low half of its sequence number."""
@@ -244,23 +245,54 @@ def with_replaced_text(packet: bytes, text: str, forged: str, step: int) -> byte
     DataReader takes it for a later message of the writer (RTPS 2.3 §9.4.5.3).  Returns None if
     ``text`` is not readable in the packet.
     """
-    start = (packet[0] & 0x0F) * 4 + 8
-    position = start + _RTPS_HEADER
     changed = bytearray(packet)
-    while position + 4 <= len(packet):
-        kind, flags = packet[position], packet[position + 1]
-        order: Literal["little", "big"] = "little" if flags & 1 else "big"
-        length = int.from_bytes(packet[position + 2 : position + 4], order)
-        end = position + 4 + length if length else len(packet)
+    for position, end, order in _submessages(packet):
         place = packet.find(text.encode(), position, end)
-        if kind == _DATA and place >= 0:
-            number = slice(position + _SEQUENCE_NUMBER, position + _SEQUENCE_NUMBER + 4)
-            raised = int.from_bytes(packet[number], order) + step
-            changed[number] = raised.to_bytes(4, order)
+        if packet[position] == _DATA and place >= 0:
+            _raise_number(changed, position, order, step)
             changed[place : place + len(forged.encode())] = forged.encode()
             return bytes(changed)
-        position = end
     return None
+
+
+def _raise_number(packet: bytearray, position: int, order: _Order, step: int) -> None:
+    """Raise the sequence number of the DATA submessage at ``position`` by ``step``."""
+    number = slice(position + _SEQUENCE_NUMBER, position + _SEQUENCE_NUMBER + 4)
+    raised = int.from_bytes(packet[number], order) + step
+    packet[number] = (raised & 0xFFFFFFFF).to_bytes(4, order)
+
+
+def with_changed_byte(packet: bytes, step: int) -> bytes | None:
+    """Return an RTPS packet with one byte of its last quarter inverted, another for each ``step``.
+
+    There the payload is, encrypted or not.  The sequence number of a readable DATA submessage is
+    raised by ``step``.  Returns None if the packet has no content.
+    """
+    begin = (packet[0] & 0x0F) * 4 + 8 + _RTPS_HEADER
+    size = (len(packet) - begin) // 4
+    if size <= 0:
+        return None
+    changed = bytearray(packet)
+    for position, end, order in _submessages(packet):
+        if packet[position] == _DATA and end >= position + _SEQUENCE_NUMBER + 4:
+            _raise_number(changed, position, order, step)
+    changed[len(packet) - 1 - step * _STRIDE % size] ^= 0xFF
+    return bytes(changed)
+
+
+_STRIDE = 7
+"""Bytes between two changed bytes; a prime, so that the steps meet different ones."""
+
+
+def _submessages(packet: bytes) -> Iterator[tuple[int, int, _Order]]:
+    """Yield the start, the end and the byte order of each submessage (RTPS 2.3 §9.4.5)."""
+    position = (packet[0] & 0x0F) * 4 + 8 + _RTPS_HEADER
+    while position + 4 <= len(packet):
+        order: _Order = "little" if packet[position + 1] & 1 else "big"
+        length = int.from_bytes(packet[position + 2 : position + 4], order)
+        end = position + 4 + length if length else len(packet)
+        yield position, end, order
+        position = end
 
 
 def without_checksum(packet: bytes) -> bytes:

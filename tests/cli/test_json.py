@@ -19,6 +19,7 @@ from sros_tool.demo import doctor
 from sros_tool.demo import program as demo
 from sros_tool.demo.casting import CastMember
 from sros_tool.demo.doctor import Diagnosis
+from sros_tool.demo.result import KeystoreSummary
 from sros_tool.runtime import ros2cli
 from sros_tool.runtime.ros2cli import SecurityProvider
 from tests.checks.test_doctor_findings import CYCLONE, RMW
@@ -272,8 +273,11 @@ def test_what_demo_prints(
         seen.check("demo", both_ways("demo", case, made_folder, tmp_path))
     shown = result(CLOSED, TWIN, OPEN, cost=COST)
     cast = (CastMember("listener", "/a", ("/n",)),)
-    shown = replace(shown, scenarios=(replace(shown.scenarios[0], cast=cast),))
-    for each, status in ((shown, 0), (result(replace(OPEN, unaccepted=True)), 1)):
+    keystore = KeystoreSummary(3, not_tried=("/b with a governance of its own",))
+    scenario = replace(shown.scenarios[0], cast=cast, keystore=keystore)
+    unproved = replace(shown, scenarios=(scenario,))
+    opened = result(replace(OPEN, unaccepted=True))
+    for each, status in ((shown, 0), (opened, 1), (unproved, 2)):
         monkeypatch.setattr(demo, "run_demo", lambda *_, found=each: found)
         ended = sros("demo", "--json", cwd=tmp_path)
         assert ended.status == status, ended

@@ -25,6 +25,7 @@ CLOSED = {
     *DENIALS,
     RowStatus.NOT_HEARD,
     RowStatus.NOT_HEARD_AGAIN,
+    RowStatus.NOT_DECEIVED,
     RowStatus.NOT_ANSWERED,
     RowStatus.NOT_VISIBLE,
     RowStatus.NOT_READABLE,

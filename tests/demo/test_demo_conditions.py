@@ -18,6 +18,7 @@ OPEN = {
     RowStatus.VISIBLE,
     RowStatus.HEARD_AGAIN,
     RowStatus.READABLE,
+    RowStatus.DECEIVED,
 }
 CYCLONE = Backend("cyclone", "Cyclone DDS 0.10.2", "a test")
 FAST = Backend("rclpy", "Fast DDS 2.14.5", "a test")
@@ -42,9 +43,10 @@ def protected(**choices: object) -> Template:
         (protected(join_access_control=False), "rt/a", {C.OPEN_JOIN}),
         (protected(rtps=Level.NONE, allow_unauthenticated_participants=True), "rt/a", set()),
         (protected(rtps=Level.NONE, allow_unauthenticated_participants=True, default=BARE),
-         "rt/a", {C.IN_CLEAR, C.UNCONTROLLED, C.UNAUTHENTICATED, C.UNAUTHENTICATED_SEE}),
+         "rt/a", {C.IN_CLEAR, C.UNSIGNED, C.UNCONTROLLED, C.UNAUTHENTICATED,
+                  C.UNAUTHENTICATED_SEE}),
         (protected(rtps=Level.NONE, named=(NamedProtection("topics", "/a", BARE),)), "rt/a",
-         {C.IN_CLEAR, C.UNCONTROLLED}),
+         {C.IN_CLEAR, C.UNSIGNED, C.UNCONTROLLED}),
         (protected(rtps=Level.NONE, named=(NamedProtection("topics", "/a", BARE),)), "rt/b", set()),
     ],
 )  # fmt: skip

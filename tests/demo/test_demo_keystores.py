@@ -1,27 +1,166 @@
-"""Keystores of users: which enclaves the demo casts, what it forges in a copy, what is open."""
+"""Keystores of users: which enclaves the demo casts, what is open by rights, what is not tried."""
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import pytest
+
 from sros_tool.demo import forger
+from sros_tool.demo.casting import UserKeystore, open_user_keystore
 from sros_tool.demo.forger import KeystoreCopy
+from sros_tool.demo.program import DemoOptions, run_demo
+from sros_tool.demo.result import KeystoreSummary
+from sros_tool.demo.scenarios.attacks import ATTACKS
+from sros_tool.demo.scenarios.model import RowStatus
+from sros_tool.demo.show import demo_table, summary_page
+from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.layout import CRL_FILE, REQUIRED_FILES
+from tests.demo.test_demo_result import CLOSED, OPEN, TWIN, result
+from tests.demo.weak_robots import GIVEN, OTHERS, OWN_PART, WEAK, WIDEST, Place
 from tests.support.harness import policy_text, publish, sros
 
 HEARS = '<topics subscribe="ALLOW"><topic>/image</topic></topics>'
+SERVES = '<services reply="ALLOW"><service>/map</service></services>'
+CALLS = '<services request="ALLOW"><service>/map</service></services>'
+ROBOT = {
+    "/camera": publish("/image"),
+    "/eye/viewer": HEARS,
+    "/map/client": CALLS,
+    "/map/server": SERVES,
+    "/odd/other": publish("/b"),
+    "/odd/victim": publish("/c"),
+    "/quiet": publish("/a"),
+}
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 def make_keystore(
-    folder: Path, rights: dict[str, str], template: str | Path = "production"
+    folder: Path, rights: dict[str, str], template: str | Path = "production", name: str = "ks"
 ) -> Path:
     """Create a keystore with an enclave for each key, which may do what its policy says."""
-    root = folder / "ks"
+    root = folder / name
     (folder / "policy.xml").write_text(policy_text(rights))
     sros("create_keystore", root, "--template", template).ok()
     sros("generate_artifacts", "-k", root, "-p", folder / "policy.xml").ok()
     return root
+
+
+def opened(root: Path, topic: str = "/image") -> UserKeystore:
+    return open_user_keystore(root, topic, ATTACKS, datetime.now(UTC))
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A robot's keystore, and one of other CAs with the same enclaves."""
+    folder = tmp_path_factory.mktemp("robot")
+    return make_keystore(folder, ROBOT), make_keystore(folder, ROBOT, name="foreign")
+
+
+@pytest.fixture
+def place(pair: tuple[Path, Path], tmp_path: Path) -> Place:
+    root = tmp_path / "robot"
+    shutil.copytree(pair[0], root, symlinks=True)
+    return Place(root, pair[1], "/odd/victim", "/odd/other")
+
+
+def test_in_a_sound_keystore_nothing_is_open_and_the_widest_is_tried(place: Place) -> None:
+    user = opened(place.root)
+    assert user.cast["guest"] == "/odd/other", "the first without another part"
+    assert user.cast["widest publisher"] not in ("/camera", "/eye/viewer", "/odd/other")
+    assert [row.name for row in user.rows] == list(WIDEST)
+    rows = [*ATTACKS.rows, *user.rows]
+    assert [row.name for row in rows if user.opened(row, user.topic) is not row] == []
+    assert (user.enclaves, user.elsewhere, user.not_tried) == (7, 0, ())
+
+
+BY_RIGHTS = {*GIVEN, *WIDEST, *OWN_PART}
+
+
+@pytest.mark.parametrize("name", WEAK)
+def test_what_the_files_of_a_keystore_open_is_expected_to_be_open(name: str, place: Place) -> None:
+    """What a governance opens, and who is not stopped by a list, only a DDS shows."""
+    weak = WEAK[name]
+    weak.weaken(place)
+    user = opened(place.root)
+    rows = [*ATTACKS.rows, *user.rows]
+    found = {row.name: row for row in rows if user.opened(row, user.topic) is not row}
+    by_files = weak.broken if "wild" in name or "everything" in name else ()
+    assert set(found) == BY_RIGHTS.intersection(by_files)
+    for row in found.values():
+        open_row = user.opened(row, user.topic)
+        assert open_row.expected in (RowStatus.HEARD, RowStatus.ANSWERED)
+        assert open_row.claims[0].expected is open_row.expected
+        assert " by *" in open_row.open_because or "/image" in open_row.open_because
+        assert open_row.remedy
+    joins = [row for row in user.rows if OTHERS in row.name]
+    assert [row.parties[0].identity.enclave for row in joins] == [place.victim] * weak.joins
+    assert place.victim not in user.cast.values() or not weak.joins
+    assert user.not_tried == ()
+
+
+def test_one_wide_enclave_is_cast_however_many_are_narrow(place: Place) -> None:
+    WEAK["one enclave that may do everything"].weaken(place)
+    user = opened(place.root)
+    wide = [part for part, enclave in user.cast.items() if enclave == place.victim]
+    assert wide == ["widest publisher", "widest subscriber", "widest client", "widest server"]
+    assert user.why["widest publisher"] == "may publish /image by a wildcard"
+    (row,) = (each for each in user.rows if each.name == WIDEST[0])
+    assert user.opened(row, "/image").open_because == (
+        "the permissions of /odd/victim allow it to publish /image by *"
+    )
+
+
+def test_a_right_by_name_that_everybody_has_is_open_too(tmp_path: Path) -> None:
+    both = f"{publish('/image')}{HEARS}"
+    user = opened(make_keystore(tmp_path, {"/a": both, "/b": both, "/c": publish("/x")}))
+    (row,) = (each for each in ATTACKS.rows if each.name == "a talker listens")
+    assert user.opened(row, "/image").open_because == (
+        "the permissions of /a allow it to subscribe /image"
+    )
+
+
+def test_a_part_is_given_to_whom_it_fits_best(tmp_path: Path) -> None:
+    """Who may do both tells nothing by doing both, if there is somebody else."""
+    both = f"{publish('/image')}{HEARS}"
+    policies = {"/a": both, "/b": publish("/image"), "/c": both, "/d": HEARS, "/e": publish("/x")}
+    user = opened(make_keystore(tmp_path, policies))
+    parts = ("talker", "listener", "guest")
+    assert [user.cast[part] for part in parts] == ["/b", "/d", "/e"]
+
+
+def test_whoever_lacks_the_revocation_list_is_the_listener_or_said_to_be_untried(
+    place: Place,
+) -> None:
+    sros("revoke", place.root, place.other).ok()
+    assert opened(place.root).not_tried == ()
+    (place.root / "enclaves/quiet" / CRL_FILE).unlink()
+    assert opened(place.root).not_tried == ("/quiet without the newest revocation list",)
+    (place.root / "enclaves/eye/viewer" / CRL_FILE).unlink()
+    user = opened(place.root)
+    assert (user.cast["listener"], user.not_tried) == ("/eye/viewer", ())
+    copy = KeystoreCopy(
+        place.root, place.foreign, user.cast, "/image", 0, datetime.now(UTC), user.keyring()
+    )
+    forger.talker_revoked(copy)
+    assert (copy.folder("guest") / CRL_FILE).exists()
+    assert not (copy.folder("listener") / CRL_FILE).exists(), "it does not get the next one, either"
+
+
+def test_a_governance_of_an_enclave_alone_is_said_to_be_untried(place: Place) -> None:
+    copy = replace(place.copy(), cast={"talker": place.victim, "listener": place.victim})
+    forger.weaker_governance(copy)
+    assert opened(place.root).not_tried == ("/odd/victim with a governance of its own",)
+
+
+def test_where_faults_leave_nobody_the_error_names_one(tmp_path: Path) -> None:
+    root = make_keystore(tmp_path, {"/a": publish("/image"), "/b": HEARS})
+    (root / "enclaves/b/permissions.p7s").write_text("x")
+    with pytest.raises(KeystoreError, match=r"/b is left out: permissions\.p7s"):
+        opened(root)
 
 
 def test_an_enclave_alone_in_its_namespace_is_revoked_in_the_copy(tmp_path: Path) -> None:
@@ -35,3 +174,41 @@ def test_an_enclave_alone_in_its_namespace_is_revoked_in_the_copy(tmp_path: Path
     for part in cast:
         files = {path.name for path in copy.folder(part).iterdir()}
         assert files >= {*REQUIRED_FILES, CRL_FILE}
+
+
+def test_the_name_of_an_accepted_row_is_checked(place: Place) -> None:
+    options = DemoOptions(scenarios=(ATTACKS,), keystore=place.root)
+    for accepted in ("wire", "an enclave publishes a topic, wildcard permissions"):
+        with pytest.raises(UsageError, match="no row of an attack is named"):
+            run_demo(replace(options, accept_open=(accepted,)), datetime.now(UTC), print)
+
+
+SKIPPED = replace(CLOSED, observed=RowStatus.SKIPPED, detail="no key")
+
+
+@pytest.mark.parametrize(
+    ("row", "proved"),
+    [
+        (CLOSED, True),
+        (SKIPPED, False),
+        (replace(SKIPPED, accepted=True), True),
+        (replace(SKIPPED, applies=False), True),
+        (replace(TWIN, observed=RowStatus.SKIPPED), True),
+        (replace(OPEN, observed=RowStatus.SKIPPED), True),
+        (replace(OPEN, observed=RowStatus.SKIPPED, unaccepted=True), False),
+    ],
+)
+def test_a_keystore_is_not_proved_by_what_was_not_tried(row: object, proved: bool) -> None:
+    played = result(row, CLOSED)  # type: ignore[arg-type]
+    assert played.exit_status == 0, "the demo's own keystores prove nothing of others"
+    scenario = replace(played.scenarios[0], keystore=KeystoreSummary(7, elsewhere=2))
+    shown = replace(played, scenarios=(scenario,), left_out=3)
+    assert shown.exit_status == (0 if proved else 2)
+    assert shown.as_expected is proved
+    last = demo_table(shown).splitlines()[-1]
+    assert "3 left out with --only, 0 of 7 enclaves in a part, 2 with their key elsewhere" in last
+    assert ("not proved for want of what was not tried" in last) is not proved
+    verdict = "as expected" if proved else "as expected where it was tried"
+    assert f"**{verdict}, " in summary_page(shown, NOW)
+    wrong = replace(scenario, rows=(replace(CLOSED, observed=RowStatus.HEARD), *scenario.rows))
+    assert replace(shown, scenarios=(wrong,)).exit_status == 1

@@ -231,6 +231,7 @@ class Condition(StrEnum):
     SHARED_SUBJECTS = "subject names without a unique part"
     OPEN_DEFAULT = "an enclave without a policy may do everything"
     IN_CLEAR = "payload is not encrypted"
+    UNSIGNED = "messages are neither signed nor encrypted"
     UNAUTHENTICATED = "unauthenticated participants are allowed, and the topic is not protected"
     UNAUTHENTICATED_SEE = "unauthenticated participants are allowed, and discovery is not protected"
     UNCONTROLLED = "access to the topic is not controlled"

@@ -222,7 +222,18 @@ ROWS: tuple[Row, ...] = (
                 "the template controls neither who joins nor who uses the topic",
                 "keep join_access_control and the access control of topics on",
             ),
-            Variant((Condition.OPEN_JOIN,), RowStatus.REFUSED),
+            Variant(
+                (Condition.OPEN_JOIN,),
+                RowStatus.REFUSED,
+                "the template does not control who joins the domain",
+                "keep join_access_control on",
+                mechanism="its DDS joins, and then finds no rule for the topic in this domain",
+            ),
+            Variant(
+                (Condition.UNCONTROLLED,),
+                RowStatus.NOT_HEARD,
+                mechanism="its DDS controls no topic; its peers find no rule for the domain",
+            ),
             Variant(
                 (Condition.FAST,),
                 RowStatus.NOT_HEARD,

@@ -91,6 +91,43 @@ ROWS: tuple[Row, ...] = (
         attack="replay of captured packets",
         removed="security",
     ),
+    Row(
+        "packets of a secured talker changed",
+        RowStatus.NOT_DECEIVED,
+        "every packet has a message authentication code, which nobody without the keys can make",
+        (
+            Party("talker", Role.TALKER, Identity(OWN, "talker")),
+            Party("listener", Role.LISTENER, Identity(OWN, "listener")),
+        ),
+        (Claim(Relation.BELIEVES, "listener", "talker", holds=False),),
+        (Claim(Relation.HEARS, "listener", "talker"),),
+        impersonate="talker",
+        brief=True,
+        variants=(
+            Variant(
+                (Condition.UNSIGNED,),
+                RowStatus.DECEIVED,
+                "the template neither signs nor encrypts the messages of this topic",
+                'set rtps = "SIGN" or "ENCRYPT", or protect the topic',
+            ),
+        ),
+        attack="changed packets",
+    ),
+    Row(
+        "packets of a secured talker changed, not signed",
+        RowStatus.DECEIVED,
+        "with the protection kind NONE, nothing in a packet proves who sent it",
+        (
+            Party("talker", Role.TALKER, Identity(_IN_CLEAR, "talker")),
+            Party("listener", Role.LISTENER, Identity(_IN_CLEAR, "listener")),
+        ),
+        (Claim(Relation.BELIEVES, "listener", "talker"),),
+        (Claim(Relation.HEARS, "listener", "talker"),),
+        impersonate="talker",
+        brief=True,
+        attack="changed packets",
+        removed="signatures and encryption",
+    ),
     *(
         Row(
             f"{what} read in the handshake",

@@ -1,0 +1,100 @@
+"""What the signed permissions of an enclave allow, for casting enclaves and naming their nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from sros_tool.dds.permissions import Grant, Rule, parse_permissions
+from sros_tool.errors import SrosError
+from sros_tool.keystore.layout import enclave_path
+from sros_tool.names import ACTION_SEPARATOR
+from sros_tool.pki import smime
+from sros_tool.policy.patterns import matches
+from sros_tool.topics import dds_names
+
+_TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events", "rt/clock", "ros_discovery_info")
+_WILD = set("*?[")
+
+
+def enclave_grant(root: Path, enclave: str) -> Grant | None:
+    """Return the first grant of an enclave, or None if its permissions cannot be read."""
+    try:
+        signed = (enclave_path(root, enclave) / "permissions.p7s").read_bytes()
+        grants = parse_permissions(smime.parse(signed).document).grants
+    except (SrosError, OSError):
+        return None
+    return grants[0] if grants else None
+
+
+def allows(grant: Grant, verb: str, topic: str) -> bool:
+    """Return whether a grant allows ``verb`` (publish or subscribe) on a DDS topic."""
+    return bool(_allowing(grant, verb, topic))
+
+
+def _allowing(grant: Grant, verb: str, topic: str) -> str:
+    """Return the expression by which a grant allows ``verb`` on a DDS topic; "" if it denies that.
+
+    The first rule that names the topic decides, as with the vendors; of its expressions the topic's
+    own name comes first.  A topic that no rule names is denied.
+    """
+    for rule in grant.rules:
+        fitting = [each for each in _expressions(rule, verb) if matches(each, topic)]
+        if fitting:
+            return (topic if topic in fitting else fitting[0]) if rule.allow else ""
+    return ""
+
+
+def is_denied(grant: Grant, topic: str) -> bool:
+    """Return whether a rule denies publishing or subscribing a DDS topic."""
+    return any(
+        matches(expression, topic)
+        for rule in grant.rules
+        for verb in ("publish", "subscribe")
+        for expression in (() if rule.allow else _expressions(rule, verb))
+    )
+
+
+def expressions_of(grant: Grant, right: str, name: str) -> tuple[str, ...]:
+    """Return the expression of `_allowing` for each DDS topic that a right on a ROS name needs."""
+    topics = dds_names(right, name)
+    return (
+        *(_allowing(grant, "publish", each) for each in topics.publish),
+        *(_allowing(grant, "subscribe", each) for each in topics.subscribe),
+    )
+
+
+def may(grant: Grant, right: str, name: str, *, named: bool = False) -> bool:
+    """Return whether a grant allows a right on a ROS name; with ``named``, without wildcards."""
+    return all(
+        each and not (named and is_wild(each)) for each in expressions_of(grant, right, name)
+    )
+
+
+def is_wild(expression: str) -> bool:
+    """Return whether an expression has wildcards, and so can match topics that nobody named."""
+    return bool(set(expression) & _WILD)
+
+
+def application_topics(grant: Grant, verb: str) -> Iterator[str]:
+    """Yield the application's DDS topics that a grant allows by a name without wildcards.
+
+    Topics of every node, hidden topics and topics of actions are left out.
+    """
+    for topic in named_topics(grant, verb):
+        private = topic.startswith("rt/_") or ACTION_SEPARATOR in topic
+        if topic not in _TOPICS_OF_EVERY_NODE and not private:
+            yield topic
+
+
+def named_topics(grant: Grant, verb: str) -> Iterator[str]:
+    """Yield the DDS topics that a grant allows by a name without wildcards."""
+    for rule in grant.rules:
+        for topic in _expressions(rule, verb) if rule.allow else ():
+            if not is_wild(topic):
+                yield topic
+
+
+def _expressions(rule: Rule, verb: str) -> Iterator[str]:
+    for criteria in rule.publish if verb == "publish" else rule.subscribe:
+        yield from criteria.topics
