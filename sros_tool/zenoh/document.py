@@ -130,7 +130,7 @@ class ConfigurationDocument:
     namespace: str | None = None
     access: Enforcement = field(default_factory=Enforcement)
     unknown: tuple[str, ...] = ()
-    settings: Mapping[str, str] = field(default_factory=dict, repr=False)
+    settings: Mapping[str, str] = field(default_factory=dict, compare=False, repr=False)
     lines: Mapping[str, int] = field(default_factory=dict, compare=False, repr=False)
 
     def open_link(self) -> str:
