@@ -33,7 +33,7 @@ def signed_findings(
         chosen = [one for one in policy.enclaves if one.path in enclaves][:_MOST_ENCLAVES]
         found += findings_in(replace(policy, enclaves=tuple(chosen)), distribution)
     shown = [each for each in found if each.severity >= WARNING]
-    shown.sort(key=lambda each: -each.severity)
+    shown.sort(key=lambda each: -each.severity.weight)
     return list(by_cause(list(dict.fromkeys(shown))))
 
 
