@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import re
 import stat
 from functools import cache
 from pathlib import Path
@@ -165,8 +166,21 @@ def tag_of(element: etree._Element) -> str:
 # `xml.sax.saxutils` has these, too, but imports an HTTP client: a fifth of a node's start.
 
 
+_NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
+
+
 def escape(text: str) -> str:
-    """Return a text as the content of an element."""
+    """Return a text as the content of an element.
+
+    Raises:
+        DocumentError: it has a character that no XML document can have.
+    """
+    if found := _NOT_XML.search(text):
+        raise DocumentError(
+            f"{text!a} cannot be written in XML",
+            f"It has the character U+{ord(found[0]):04X}, which no XML document can have.",
+            "Choose another name.",
+        )
     return text.replace("&", "&amp;").replace(">", "&gt;").replace("<", "&lt;")
 
 

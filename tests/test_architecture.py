@@ -18,7 +18,7 @@ PACKAGE = PROJECT / "sros_tool"
 
 LAYERS = {
     1: {"automata", "errors", "faults", "names", "owners", "topics", "validity", "values"}
-    | {"xml", "files", "folders", "parallel", "resources", "prometheus", "markdown"},
+    | {"xml", "files", "folders", "parallel", "resources", "prometheus", "markdown", "terminal"},
     2: {"pki", "policy", "dds", "zenoh"},
     3: {"fleet", "translate", "translate_zenoh", "translate_zenoh_back"},
     4: {"translate_from_zenoh", "reach", "keystore", "graph", "runtime"},
@@ -396,6 +396,85 @@ def test_everything_is_written_by_two_modules() -> None:
 )  # fmt: skip
 def test_writing_is_seen_and_nothing_else(source: str, seen: bool) -> None:
     assert bool(writing(source)) is seen
+
+
+# ── everything is printed by one module ────────────────────────────────────────────────────
+
+PRINTER = "terminal.py"
+"""It makes names visible that could steer a terminal."""
+
+OTHER_PRINTERS = {
+    "cli/__init__.py": "interrupted while the program is imported",
+    "demo/nodes/": "processes of their own, some without click; what they print is read",
+}
+
+_CLICK = {"echo", "secho", "style", "prompt", "confirm", "echo_via_pager", "getchar", "pause"}
+_LOGGING = {"StreamHandler", "basicConfig", "lastResort"}
+
+
+def printing(source: str) -> list[int]:
+    """The lines that write to the terminal, or import what does under another name."""
+    return sorted({node.lineno for node in ast.walk(tree_of(source)) if _is_printing(node)})  # type: ignore[attr-defined]
+
+
+def _is_printing(node: ast.AST) -> bool:
+    if isinstance(node, ast.ImportFrom):
+        names = {alias.name for alias in node.names}
+        of_sys = node.module == "sys" and bool(names & {"stdout", "stderr"})
+        return of_sys or (node.module == "click" and bool(names & _CLICK))
+    if not isinstance(node, ast.Call):
+        return False
+    owner, _, name = ast.unparse(node.func).rpartition(".")
+    if owner in ("", "builtins") and name in ("print", "getpass"):
+        return True
+    if name in _LOGGING:
+        return True
+    if owner == "click":
+        return name in _CLICK
+    if owner in ("traceback", "getpass", "warnings"):
+        return name in ("print_exc", "print_exception", "getpass", "showwarning")
+    if (owner, name) == ("os", "write"):
+        return "std" in ast.unparse(node.args[0]) or ast.unparse(node.args[0]) in ("1", "2")
+    return name.startswith("write") and owner.startswith(("sys.std", "sys.__std"))
+
+
+def test_everything_is_printed_by_one_module() -> None:
+    found = {module for module in MODULES if printing((PACKAGE / module).read_text())}
+    assert PRINTER in found
+    others = {each for each in OTHER_PRINTERS if any(module.startswith(each) for module in found)}
+    assert others == set(OTHER_PRINTERS)
+    assert [
+        each for each in sorted(found - {PRINTER}) if not each.startswith(tuple(OTHER_PRINTERS))
+    ] == []
+
+
+@pytest.mark.parametrize(
+    ("source", "seen"),
+    [
+        ("print(x)", True),
+        ("print_json(x)", False),
+        ("click.echo(x)", True),
+        ("click.style(x, fg='red')", True),
+        ("echo(x)", False),
+        ("from click import echo", True),
+        ("from sros_tool.terminal import echo", False),
+        ("sys.stdout.write(x)", True),
+        ("sys.stdout.buffer.write(x)", True),
+        ("sys.stderr.writelines(x)", True),
+        ("sys.stdout.flush()", False),
+        ("file.write(x)", False),
+        ("os.write(sys.stderr.fileno(), x)", True),
+        ("os.write(2, x)", True),
+        ("os.write(pipe, x)", False),
+        ("from sys import stderr", True),
+        ("logging.StreamHandler()", True),
+        ("logging.getLogger(x)", False),
+        ("traceback.print_exc()", True),
+        ("getpass.getpass()", True),
+    ],
+)
+def test_printing_is_seen_and_nothing_else(source: str, seen: bool) -> None:
+    assert bool(printing(source)) is seen
 
 
 # ── a public class has one name, and the name one meaning ──────────────────────────────────

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -14,10 +16,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from lxml import etree
 
-from sros_tool.cli.common import MAX_LOG, visible, visible_json
+from sros_tool.cli.common import MAX_LOG
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import Style
+from sros_tool.terminal import visible, visible_json
 from tests.support.children import PATIENCE
 from tests.support.harness import policy_text, publish, snapshot, sros
 from tests.test_bad_input import NOT_FILES, check_refused, check_unchanged
@@ -221,6 +225,70 @@ def test_a_file_name_with_escapes(line: str, keystore: Path, tmp_path: Path) -> 
     ended = sros(*(word.format(**named) for word in line.split()))
     check_tame(ended.out + ended.err)
     assert "\\x1b" in ended.out + ended.err or "\\u001b" in ended.out, "it was not even named"
+
+
+ODD = "x\x1b]0;x\x07\x9b2J\u202e\nok: nothing found"
+"""A name that steers a terminal, and forges a line."""
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "list_enclaves ks",
+        "list_enclaves ks --json",
+        "verify ks",
+        "check ks",
+        "check ks --format markdown",
+        "check ks --format sarif",
+        "inspect ks",
+        "inspect ks --history",
+        "metrics ks",
+        "view ks --format dot",
+        "view ks --format svg",
+        "view ks --format mermaid",
+        "view ks --format html",
+        "view router.json5 --format svg",
+        "view router.json5 --format dot",
+        "zenoh --from router.json5",
+        "explain ks --who publish /x",
+        "diff_policy ks policy.xml",
+        "renew ks --all",
+        "revoke ks --all --dry-run",
+        f"env '{ODD}' /a --format sh",
+    ],
+)
+def test_a_folder_with_escapes(line: str, keystore: Path, tmp_path: Path) -> None:
+    """Enclaves and common names with escapes steer no terminal, also by way of a file."""
+    odd = keystore / "enclaves" / ODD
+    shutil.copytree(keystore / "enclaves/a", odd, symlinks=True)
+    router = {
+        "mode": "router",
+        "access_control": {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": [
+                {
+                    "id": "r",
+                    "permission": "allow",
+                    "flows": ["ingress"],
+                    "messages": ["put", "delete", "reply"],
+                    "key_exprs": ["0/good/*/*"],
+                }
+            ],
+            "subjects": [{"id": "s", "cert_common_names": [ODD, "/b"]}],
+            "policies": [{"rules": ["r"], "subjects": ["s"]}],
+        },
+    }
+    (tmp_path / "router.json5").write_text(json.dumps(router))
+    (tmp_path / "policy.xml").write_text(POLICY)
+    ended = sros(*shlex.split(line), cwd=tmp_path)
+    assert "defect" not in ended.err, ended.err
+    check_tame(ended.out + ended.err)
+    assert not re.search("^ok: nothing", ended.out + ended.err, re.MULTILINE)
+    if line.endswith("svg"):
+        etree.fromstring(ended.out.encode())
+    if line.endswith(("--json", "sarif")):
+        json.loads(ended.out)
 
 
 def test_visible() -> None:

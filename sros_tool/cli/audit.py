@@ -22,7 +22,6 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     save,
-    visible_line,
 )
 from sros_tool.cli.observing import (
     Watching,
@@ -35,6 +34,7 @@ from sros_tool.cli.observing import (
 from sros_tool.cli.written import file_change
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UnavailableError, UsageError, counted
+from sros_tool.terminal import echo
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def audit(
         for line in _denied(judge(observation)):
             if line not in reported:
                 reported.add(line)
-                click.echo(f"denied: {visible_line(line)}", err=True)
+                echo(f"denied: {line}", err=True)
 
     secured = enclave is not None
     then = "the result is shown"
@@ -152,15 +152,15 @@ def audit(
         _show(found, enclaves, kept_changing)
     print_notes((*found.notes, *found.missing.notes))
     if found.allowed and not fine:
-        click.echo(_NOT_ALL, err=True)
+        echo(_NOT_ALL, err=True)
     if written:
         policy = shlex.quote(str(source)) if enclaves.what == "policy" else "POLICY"
         command = f"sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
-        click.echo(visible_line(f"{written}; add it: {command}"), err=True)
+        echo(f"{written}; add it: {command}", err=True)
     elif patch is not None:
         stays = f"; the earlier '{patch}' stays" if existed else ""
         said = "no patch is needed" if found.allowed else _NO_PATCH
-        click.echo(visible_line(said + stays), err=True)
+        echo(said + stays, err=True)
     return 0 if fine else 1
 
 
@@ -238,7 +238,7 @@ def _denied(found: Audit) -> list[str]:
 def _show(found: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None:
     """Print what is denied and unseen; the verdict names everything that it does not cover."""
     for line in (*_denied(found), *(f"not seen: {each}" for each in found.unseen)):
-        click.echo(visible_line(line))
+        echo(line)
     what = [counted(len(found.denied), "right")] if found.denied else []
     what += [counted(len(found.refused), "whole enclave")] if found.refused else []
     verdict = f"{' and '.join(what) or 'nothing'} would be denied of "
@@ -254,9 +254,9 @@ def _show(found: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None
         verdict += f"; not judged: {', '.join(found.unjudged)}"
     if kept_changing:
         verdict += f"; the ROS graph kept changing for {kept_changing:.0f} s"
-    click.echo(verdict, err=True)
+    echo(verdict, err=True)
     if any(each.by_rule for each in found.denied):
-        click.echo("a DENY denies some of it; no right that is added changes that", err=True)
+        echo("a DENY denies some of it; no right that is added changes that", err=True)
 
 
 def _json(

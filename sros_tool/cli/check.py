@@ -32,13 +32,12 @@ from sros_tool.cli.common import (
     print_json,
     save,
     taken_secrets,
-    visible,
-    visible_line,
 )
 from sros_tool.cli.findings import echo_findings
 from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
+from sros_tool.terminal import echo, echo_document, echo_lines, visible
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -242,7 +241,7 @@ def check(
     if suggest:
         if form != "text" or requirements or earlier:
             raise UsageError("--suggest prints TOML", "", "Give it alone.")
-        click.echo(_suggested(_one_path(family, paths, "--suggest"), at, vendor), nl=False)
+        echo_document(_suggested(_one_path(family, paths, "--suggest"), at, vendor))
         return 0
     read = read_all_requirements(requirements)
     if earlier and not requirements:
@@ -391,7 +390,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
         found += path_findings(Path(root), at)
     elif not root:
         looked = "checked the runtime only: no path is given and ROS_SECURITY_KEYSTORE is not set"
-        click.echo(looked, err=True)
+        echo(looked, err=True)
     return list(dict.fromkeys(found))
 
 
@@ -464,12 +463,12 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
         none = "the 1 enclave does not need" if len(found) == 1 else ""
         none = f"{none or f'none of {len(found)} enclaves needs'} to be renewed ({text})"
         if form == "markdown":
-            click.echo(_renewal_markdown(lines, none, text))
+            echo_lines(_renewal_markdown(lines, none, text))
             return NOT_DONE if unreadable else 1 if due else 0
         for line in lines:
-            click.echo(visible_line(line))
+            echo(line)
         if not lines:
-            click.echo(none, err=True)
+            echo(none, err=True)
     return NOT_DONE if unreadable else 1 if due else 0
 
 
@@ -486,7 +485,7 @@ def _renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:
 def _print_markdown(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     from sros_tool.checks.markdown import findings_markdown
 
-    click.echo(findings_markdown(chosen, _summary(chosen)))
+    echo_lines(findings_markdown(chosen, _summary(chosen)))
 
 
 def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
@@ -541,12 +540,12 @@ def _print_text(chosen: ChosenFindings, fleet: Fleet | None = None) -> None:
     for each, others in _by_robot(single, fleet) if fleet else ((each, "") for each in single):
         echo_findings([each])
         if others:
-            click.echo(visible_line(f"    {others}"))
+            echo(f"    {others}")
     for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
-        click.echo(f"accepted by the {choice}: {kinds_text}")
-    click.echo(_summary(chosen), err=True)
+        echo(f"accepted by the {choice}: {kinds_text}")
+    echo(_summary(chosen), err=True)
 
 
 def _summary(chosen: ChosenFindings) -> str:
@@ -599,7 +598,7 @@ def _print_sarif(chosen: ChosenFindings, selection: FindingFilter) -> None:
     from sros_tool.checks.sarif import sarif
 
     kinds, findings = select_kinds(selection), (*chosen.shown, *chosen.accepted)
-    click.echo(json_text(sarif(findings, kinds, version=__version__, base=Path.cwd())))
+    echo_lines(json_text(sarif(findings, kinds, version=__version__, base=Path.cwd())))
 
 
 def _print_kinds(selection: FindingFilter, form: str) -> None:
@@ -612,7 +611,7 @@ def _print_kinds(selection: FindingFilter, form: str) -> None:
         return
     width = max((len(each.id) for each in kinds), default=0)
     for each in kinds:
-        click.echo(f"{each.id:{width}}  {each.severity.word:7}  {each.title}")
+        echo(f"{each.id:{width}}  {each.severity.word:7}  {each.title}")
 
 
 _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
@@ -682,18 +681,18 @@ def doctor(report: Path | None, force: bool, as_json: bool) -> None:
         ros2 = {"provider": provider.provider, "hidden": provider.hidden} if provider else None
         print_json({**diagnosis.as_json(), "ros2_security": ros2, "findings": shown})
     else:
-        click.echo(visible(diagnosis_text(diagnosis)))
+        echo_lines(diagnosis_text(diagnosis))
         if provider:
-            click.echo(visible_line(str(provider)))
+            echo(str(provider))
         for each in findings:
             if each.severity >= WARNING:
-                click.echo()
+                echo("")
                 echo_findings([each])
     if report:
         lines = _report_sections(diagnosis, provider, findings)
         text = support_report(os.environ, lines, secrets=taken_secrets())
         document = visible(text).encode("utf-8", "backslashreplace")
-        click.echo(f"{save(report, document)}; read it before you attach it", err=True)
+        echo(f"{save(report, document)}; read it before you attach it", err=True)
     if not diagnosis.sound or any(each.severity >= ERROR for each in findings):
         sys.exit(1)
 

@@ -22,6 +22,7 @@ from click.core import ParameterSource
 
 from sros_tool.cli.progress import paused
 from sros_tool.errors import DocumentError, PkiError, SrosError, UsageError
+from sros_tool.terminal import ask_secret, echo, echo_lines, visible_json, visible_line
 from sros_tool.values import versioned
 
 if TYPE_CHECKING:
@@ -268,8 +269,13 @@ def complete_keystore_and_enclave(
     root = Path(given[0]) if given else Path(os.environ.get(KEYSTORE_VARIABLE, ""))
     if given or (os.environ.get(KEYSTORE_VARIABLE) and incomplete.startswith("/")):
         names = search_enclaves(root)[0] if is_keystore(root) else ()
-        return [name for name in names if name.startswith(incomplete)]
+        return [*_completions(names, incomplete)]
     return [CompletionItem(incomplete, type="dir")]
+
+
+def _completions(names: Iterable[str], incomplete: str) -> list[str]:
+    """Return the names that begin so, and that a shell can show on its line."""
+    return [each for each in names if each.startswith(incomplete) and visible_line(each) == each]
 
 
 def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
@@ -281,7 +287,7 @@ def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: 
     fleet = None
     with suppress(SrosError):
         fleet = load_fleet(Path(given)) if given else None
-    return [name for name in (fleet.robots if fleet else ()) if name.startswith(incomplete)]
+    return _completions(fleet.robots if fleet else (), incomplete)
 
 
 def complete_file(incomplete: str) -> list[CompletionItem | str]:
@@ -297,58 +303,10 @@ def complete_template(
     """Complete the names of templates."""
     from sros_tool.keystore.template import template_names
 
-    return [name for name in template_names() if name.startswith(incomplete)]
+    return _completions(template_names(), incomplete)
 
 
 # ── output ──────────────────────────────────────────────────────────────────────────────
-
-
-_CONTROLS = [
-    *(code for code in range(0x20) if chr(code) not in "\n\t"),
-    *range(0x7F, 0xA0),  # DEL, and C1, which holds CSI as one character
-    *(0x061C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)),  # bidirectional
-]
-_BYTES = range(0xDC80, 0xDD00)  # bytes of names that are not UTF-8; 0x9B is CSI to some terminals
-_SHOWN = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROLS}
-_SHOWN |= {code: f"\\x{code - 0xDC00:02x}" for code in _BYTES}
-_IN_JSON = {code: f"\\u{code:04x}" for code in (*_CONTROLS, *_BYTES)}
-
-
-def visible(text: str) -> str:
-    """Replace the control characters in ``text``, except newline and tab, with visible escapes.
-
-    Names in files, certificates and logs may come from an attacker: their control characters
-    could clear the screen, hide a denial, or reverse the characters of a name.
-    """
-    return text.translate(_SHOWN)
-
-
-def visible_line(text: str) -> str:
-    """Return ``text`` as `visible` does, on one line: a line feed could forge the next one."""
-    return visible(text).replace("\n", "\\x0a")
-
-
-def visible_json(document: str) -> str:
-    """Replace the control characters in a JSON document with JSON escapes of the same value."""
-    return document.translate(_IN_JSON)
-
-
-_COLOURS = {
-    "error": "red",
-    "warning": "yellow",
-    "note": "cyan",
-    "yes": "green",
-    "no": "red",
-    "NOT LOADABLE": "red",
-}
-
-
-def coloured(word: str) -> str:
-    """Return a word in its colour, which `click.echo` takes away unless it prints on a terminal.
-
-    Neither is it shown with $NO_COLOR (https://no-color.org).
-    """
-    return click.style(word, fg=_COLOURS[word], bold=True)
 
 
 def json_text(value: object) -> str:
@@ -358,30 +316,30 @@ def json_text(value: object) -> str:
 
 def print_json(value: Mapping[str, Any]) -> None:
     """Print what ``--json`` shows of a verb on stdout; docs/json.md has the keys."""
-    click.echo(json_text(versioned(value)))
+    echo_lines(json_text(versioned(value)))
 
 
 def print_notes(notes: Sequence[Note]) -> None:
     """Print notes on stderr."""
     for note in notes:
-        click.echo(visible_line(f"note [{note.id}]: {note.text}"), err=True)
+        echo(f"note [{note.id}]: {note.text}", err=True)
 
 
 def print_plan(root: Path, changes: Sequence[Change]) -> None:
     """Print the changes that a dry run did not make."""
     for change in changes:
-        click.echo(visible_line(f"would {change.action} {root / change.path}"))
+        echo(f"would {change.action} {root / change.path}")
     if not changes:
-        click.echo("nothing would change")
+        echo("nothing would change")
 
 
 def print_closed(root: Path, changes: Sequence[Change]) -> None:
     """Say on stderr which keys of a keystore were closed to other users, and what that means."""
-    closed = [visible(str(root / each.path)) for each in changes if each.action == "close"]
+    closed = [str(root / each.path) for each in changes if each.action == "close"]
     if closed:
         more = f" and {len(closed) - 3} more" if len(closed) > 3 else ""
         where = quote(str(root))
-        click.echo(
+        echo(
             f"closed to other users, who could open them until now: {', '.join(closed[:3])}{more}. "
             "Run the nodes as the owner of the keystore, or from an export of that user (`sros "
             "distribute_key`). Replace keys that somebody may have copied: `sros renew "
@@ -398,7 +356,7 @@ _MAX_NAMES = 20
 def print_remarks(remarks: Iterable[Note]) -> None:
     """Print remarks on a result on stderr, each on a line."""
     for remark in remarks:
-        click.echo(visible(remark.text), err=True)
+        echo(remark.text, err=True)
 
 
 def print_restart(
@@ -415,7 +373,7 @@ def print_restart(
     if zenoh and zenoh.files and set(zenoh.restart) != set(names):
         text += f"; of those on Zenoh: {_some(zenoh.restart) or 'none'}"
     again = "; where they run from an export, export them again first" if exported else ""
-    click.echo(visible(text + again), err=True)
+    echo(text + again, err=True)
 
 
 def _some(names: Sequence[str]) -> str:
@@ -450,7 +408,7 @@ def save(output: Path, document: bytes) -> str:
 
     verb = "replaced" if output.exists() else "wrote"
     replace_file(output, document)
-    return visible(f"{verb} '{output}'")
+    return f"{verb} '{output}'"
 
 
 # ── moments, zones and domains ──────────────────────────────────────────────────────────
@@ -640,12 +598,7 @@ class _Secrets:
         if not value and sys.stdin.isatty():
             confirm = self._new and not is_pin
             with paused():
-                value = click.prompt(
-                    visible(f"{what[:1].upper()}{what[1:]}"),  # a keystore may name the token
-                    hide_input=True,
-                    err=True,
-                    confirmation_prompt=confirm,
-                )
+                value = ask_secret(what, confirm=confirm)
         if not value:
             names = _PIN if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"
             raise PkiError(

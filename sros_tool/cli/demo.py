@@ -20,10 +20,9 @@ from sros_tool.cli.common import (
     json_option,
     now,
     print_json,
-    visible,
-    visible_line,
 )
 from sros_tool.errors import UsageError
+from sros_tool.terminal import echo, echo_lines
 
 if TYPE_CHECKING:
     from sros_tool.demo.scenarios.model import Scenario
@@ -233,7 +232,7 @@ def demo(
     if as_json:
         print_json(result.as_json())
     else:
-        click.echo(visible(demo_table(result)))
+        echo_lines(demo_table(result))
     sys.exit(result.exit_status)
 
 
@@ -253,7 +252,7 @@ def _run_by_hand(ctx: click.Context, role: str, backend: str, topic: str | None)
         on_zenoh = os.environ.get("RMW_IMPLEMENTATION") == "rmw_zenoh_cpp" or role == "router"
         backend = "zenoh" if on_zenoh else "cyclone"
     node = HandNode(Role(role), backend, check_topic(DEFAULT_TOPIC if topic is None else topic))
-    sys.exit(run_by_hand(node, lambda line: click.echo(visible_line(line))))
+    sys.exit(run_by_hand(node, echo))
 
 
 def _list(backend: str, as_json: bool) -> None:
@@ -273,14 +272,15 @@ def _list(backend: str, as_json: bool) -> None:
         return
     _echo_scenarios(on_dds)
     if on_dds and on_zenoh:
-        click.echo("\nwith --backend zenoh:")
+        echo("")
+        echo("with --backend zenoh:")
     _echo_scenarios(on_zenoh)
 
 
 def _echo_scenarios(scenarios: Sequence[Scenario]) -> None:
     width = max((len(scenario.name) for scenario in scenarios), default=0)
     for scenario in scenarios:
-        click.echo(f"{scenario.name:<{width}}  {len(scenario.rows):>3} rows  {scenario.title}")
+        echo(f"{scenario.name:<{width}}  {len(scenario.rows):>3} rows  {scenario.title}")
 
 
 def _write_report(report: Path, result: dict[str, Any], keep: Path | None) -> None:
@@ -295,4 +295,4 @@ def _write_report(report: Path, result: dict[str, Any], keep: Path | None) -> No
 
 def _progress(line: str) -> None:
     if sys.stderr.isatty():
-        click.echo(visible(line), err=True)
+        echo(line, err=True)

@@ -11,7 +11,6 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
-    coloured,
     complete_file,
     complete_keystore_and_enclave,
     domain_of,
@@ -44,6 +43,7 @@ from sros_tool.cli.written import (
     notes_json,
 )
 from sros_tool.errors import UsageError
+from sros_tool.terminal import Coloured, echo, echo_bytes
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -122,10 +122,10 @@ def distribute_key(
         changes = [{"action": "send", "path": path} for path in packed.paths]
         notes = packed.notes
         if not dry_run:
-            _write_stdout(packed.data)
+            echo_bytes(packed.data)
         elif not as_json:
             for path in packed.paths:
-                click.echo(f"would send {path}")
+                echo(f"would send {path}")
         where, done = "standard output", not dry_run
     else:
         with progress("exporting"):
@@ -146,18 +146,18 @@ def distribute_key(
             print_plan(below, export.changes)
         elif not export.changes and not dry_run:
             for name in selection.names:
-                click.echo(f"enclave {name} in '{target}' is already up to date", err=True)
+                echo(f"enclave {name} in '{target}' is already up to date", err=True)
         for change in export.changes if done else ():
             if word := {"replace": "replaced", "remove": "removed"}.get(change.action):
-                click.echo(f"{word} {change.path}", err=True)
+                echo(f"{word} {change.path}", err=True)
     for name in selection.names if done and not as_json else ():
-        click.echo(f"exported enclave {name} to {where}", err=target == _STREAM)
+        echo(f"exported enclave {name} to {where}", err=target == _STREAM)
     if as_json:
         print_json(_export_json(root, target, selection, changes, notes, dry_run))
     else:
         print_notes(notes)
     for name in selection.left_out:
-        click.echo(f"left out enclave {name}: its key was made on its robot", err=True)
+        echo(f"left out enclave {name}: its key was made on its robot", err=True)
 
 
 def _export_json(
@@ -209,13 +209,6 @@ def _check_target(root: Path, word: str) -> None:
             "",
             "Add a folder, a .tar.gz, or - for standard output.",
         )
-
-
-def _write_stdout(data: bytes) -> None:
-    """Write binary data to standard output, after all text printed before."""
-    sys.stdout.flush()
-    sys.stdout.buffer.write(data)
-    sys.stdout.buffer.flush()
 
 
 def _refuse_json(as_json: bool) -> None:
@@ -307,10 +300,10 @@ def verify(
             if each.loadable
             else "its key is on its robot: verify it there"
             if each.key_elsewhere
-            else coloured("NOT LOADABLE")
+            else Coloured("NOT LOADABLE")
         )
         place = f", key on the token {each.token.token}" if each.token else ""
-        click.echo(f"{each.name}  {state}{place}")
+        echo(f"{each.name}  ", state, place)
     for finding in arrival.findings:
         echo_findings([finding])
     return 1 if arrival.findings else 0
@@ -355,16 +348,16 @@ def create_request(
         print_plan(folder, made.changes)
         return
     if again:
-        click.echo(f"made the request of enclave {name} again, for the existing key")
+        echo(f"made the request of enclave {name} again, for the existing key")
     elif made.token:
-        click.echo(
+        echo(
             f"the key of enclave {name} is {made.token.object!r} on the token "
             f"{made.token.token}, and stays there"
         )
     else:
-        click.echo(f"made the key of enclave {name}, which stays in '{folder}'")
-    click.echo(f"  its SHA-256 is {made.key}")
-    click.echo(f"  have '{made.file}' signed: sros sign_request")
+        echo(f"made the key of enclave {name}, which stays in '{folder}'")
+    echo(f"  its SHA-256 is {made.key}")
+    echo(f"  have '{made.file}' signed: sros sign_request")
     print_notes(made.notes)
 
 
@@ -505,18 +498,18 @@ def sign_request(
     elif dry_run:
         print_plan(root, signed.changes)
         if not stream:
-            click.echo(f"would {'replace' if existed else 'create'} {output}")
+            echo(f"would {'replace' if existed else 'create'} {output}")
     else:
         if stream:
-            _write_stdout(signed.archive)
+            echo_bytes(signed.archive)
         word = "renewed" if renew else "signed the request of"
-        click.echo(f"{word} enclave {signed.name} for the key {signed.key}", err=stream)
+        echo(f"{word} enclave {signed.name} for the key {signed.key}", err=stream)
         permissions_ca = load_ca_certificate(root, PERMISSIONS)
-        click.echo(f"  the robot will trust {_named(signed.identity_ca)}", err=stream)
+        echo(f"  the robot will trust {_named(signed.identity_ca)}", err=stream)
         if permissions_ca != signed.identity_ca:
-            click.echo(f"  and {_named(permissions_ca)}", err=stream)
+            echo(f"  and {_named(permissions_ca)}", err=stream)
         if not stream:
-            click.echo(
+            echo(
                 f"  send '{output}' to the robot: sros import {output.name} DIR --ca "
                 f"{digest(permissions_ca)}"
             )
@@ -566,10 +559,10 @@ def _certify(
     else:
         for name, key in done.keys.items():
             if name in done.kept:
-                click.echo(f"the key of enclave {name} has a certificate already", err=True)
+                echo(f"the key of enclave {name} has a certificate already", err=True)
             else:
                 word = "renewed" if renew else "signed the request of"
-                click.echo(f"{word} enclave {name} for the key {key}")
+                echo(f"{word} enclave {name} for the key {key}")
     if not dry_run:
         print_closed(root, done.changes)
     print_notes(done.notes)
@@ -684,16 +677,16 @@ def import_verb(
         print_plan(folder, done.changes)
         return
     if not done.changes:
-        click.echo(f"enclave {done.name} in '{folder}' is already up to date", err=True)
+        echo(f"enclave {done.name} in '{folder}' is already up to date", err=True)
         return
     from sros_tool.validity import iso
 
-    click.echo(f"imported enclave {done.name}, which can run until {iso(done.until)}")
-    click.echo(f"  it trusts {_named(done.identity_ca)}")
+    echo(f"imported enclave {done.name}, which can run until {iso(done.until)}")
+    echo(f"  it trusts {_named(done.identity_ca)}")
     if done.permissions_ca != done.identity_ca:
-        click.echo(f"  and {_named(done.permissions_ca)}")
+        echo(f"  and {_named(done.permissions_ca)}")
     if done.first and not pinned:
-        click.echo(
+        echo(
             "  compare both with the output of sign_request, or use --ca: otherwise they are "
             "not verified"
         )

@@ -16,7 +16,6 @@ import click
 from sros_tool.cli.common import (
     KEYSTORE_VARIABLE,
     PATH,
-    coloured,
     complete_keystore_and_enclave,
     domain_of,
     fleet_option,
@@ -28,7 +27,6 @@ from sros_tool.cli.common import (
     print_notes,
     read_log,
     ros_domain,
-    visible,
 )
 from sros_tool.cli.explain_zenoh import (
     ZENOH,
@@ -44,6 +42,7 @@ from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import NEWEST, Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.names import check_enclave_name, is_expression
+from sros_tool.terminal import Coloured, echo
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
 
@@ -416,7 +415,7 @@ def _show_answer(
     else:
         lines = _answer_lines(enclave, answer, why, policy)
         word, _, head = next(lines).partition(":")
-        click.echo(f"{coloured(word)}:{visible(head)}")
+        echo(Coloured(word), f":{head}")
         _echo(lines)
         _echo(_beside_lines(zenoh))
     notes = [
@@ -466,7 +465,7 @@ def _question(rest: tuple[str, ...], kind: str | None) -> Question:
 
 def _echo(lines: Iterator[str]) -> None:
     for line in lines:
-        click.echo(visible(line))
+        echo(line)
 
 
 def _enclave(
@@ -712,7 +711,7 @@ def _show_zenoh_answer(
     else:
         lines = zenoh_lines(answer, why)
         word, _, head = next(lines).partition(":")
-        click.echo(f"{coloured(word)}:{visible(head)}")
+        echo(Coloured(word), f":{head}")
         _echo(lines)
         _echo(_zenoh_change_lines(enclave, answer, by_permissions, policy, written))
     print_notes([*taken, *_zenoh_notes(answer, by_permissions, outdated)])
@@ -880,7 +879,7 @@ def _show_zenoh_who(
         )
     else:
         _echo(zenoh_who_lines(found))
-        click.echo(f"{question}, on {ZENOH_TITLE} ({why})", err=True)
+        echo(f"{question}, on {ZENOH_TITLE} ({why})", err=True)
     if any(each.mode == "peer" for each in found):
         text = "peers decide by their own files, and this is by that of the router, which has the "
         text += (
@@ -1194,9 +1193,9 @@ def _show_who(
         )
     else:
         for line in _who_lines(found, load_fleet(keystore)):
-            click.echo(line)
+            echo(line)
         documented = ", as documented" if chosen.documented_only else ""
-        click.echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
+        echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
         if question.type == "service" and question.word == "call" and not kind and not allowed:
             action = ask("call", question.name, "action")
             as_action = who(keystore, action, chosen, options.context, at=options.at, names=names)
@@ -1313,12 +1312,12 @@ def _show_reach(
         )
     else:
         for line in _reach_lines(reach, source.fleet):
-            click.echo(line)
+            echo(line)
     print_notes(source.notes)
     if without and not as_json:
         text = f"left out: {', '.join(without)}, which every node writes and reads, and requests "
         text += "that only ask nodes about themselves, such as get_parameters and get_state"
-        click.echo(f"{text} (include them with --infrastructure)", err=True)
+        echo(f"{text} (include them with --infrastructure)", err=True)
     return 0
 
 
@@ -1452,9 +1451,9 @@ def _show_log(
                 if not lines
                 else " looks like a message of DDS Security, or of a denial by Zenoh"
             )
-            click.echo(number, err=True)
+            echo(number, err=True)
             if _ZENOH_TESTS in text:
-                click.echo(_ONLY_TESTS, err=True)
+                echo(_ONLY_TESTS, err=True)
     return 1 if findings else 0
 
 

@@ -9,9 +9,7 @@ from shlex import quote
 from textwrap import wrap
 from typing import TYPE_CHECKING
 
-import click
-
-from sros_tool.cli.common import coloured, visible_line
+from sros_tool.terminal import Coloured, echo, visible_line
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -26,10 +24,12 @@ def echo_findings(findings: Sequence[Finding], *, err: bool = False) -> None:
         for text in (first.cause.text, first.cause.remedy):
             lines += _wrapped(text, "    ")
     else:
-        lines = [visible_line(line) for line in _finding_lines(first)]
-    word = f": {first.severity.word}: "
-    lines[0] = lines[0].replace(word, f": {coloured(word[2:-2])}: ", 1)
-    click.echo("\n".join(lines), err=err)
+        lines = _finding_lines(first)
+    word = first.severity.word
+    place, _, title = lines[0].partition(f": {word}: ")
+    echo(f"{place}: ", Coloured(word), f": {title}", err=err)
+    for line in lines[1:]:
+        echo(line, err=err)
 
 
 def _finding_lines(finding: Finding) -> list[str]:
@@ -69,7 +69,7 @@ def print_signed(groups: Sequence[Sequence[Finding]], files: Iterable[str]) -> N
     ]
     if more:
         command = f"sros check {' '.join(map(quote, dict.fromkeys(files)))}"
-        click.echo(visible_line(f"and {', '.join(more)}: see `{command}`"), err=True)
+        echo(f"and {', '.join(more)}: see `{command}`", err=True)
 
 
 _MOST_SHOWN = 3

@@ -26,13 +26,12 @@ from sros_tool.cli.common import (
     robot_option,
     save,
     split_root,
-    visible,
-    visible_line,
 )
 from sros_tool.cli.metrics import check_suffix
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import file_change, notes_json
 from sros_tool.errors import Note, UsageError
+from sros_tool.terminal import echo, echo_document, visible_line
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -83,7 +82,7 @@ def _inventory(root: Path | None, as_yaml: bool, as_list: bool) -> None:
         raise UsageError("--yaml and --list exclude each other", "", "Choose one.")
     recorded = recorded_fleet(root or keystore_from_environment())
     value = script_inventory(recorded) if as_list else inventory(recorded)
-    click.echo(yaml_text(value) if as_yaml else json_text(value), nl=not as_yaml)
+    echo_document(yaml_text(value) if as_yaml else f"{json_text(value)}\n")
 
 
 # ── on the robot ───────────────────────────────────────────────────────────────────────────
@@ -109,7 +108,7 @@ def _report(folder: Path | None, robot: str) -> None:
     folder = folder or keystore_from_environment()
     with progress("reading"):
         made = make_confirmation(folder, robot, now=now())
-    click.echo(render_confirmation(made), nl=False)
+    echo_document(render_confirmation(made))
 
 
 # ── at home ────────────────────────────────────────────────────────────────────────────────
@@ -173,7 +172,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
         print_json({"keystore": str(root), "robot": robot, **moments, **numbers, **shown})
     else:
         done = "would keep" if dry_run else "kept"
-        click.echo(
+        echo(
             f"{done} what {robot} has: {_number(len(confirmation.files), 'file')} of "
             f"{_number(len(enclaves), 'enclave')}"
         )
@@ -257,11 +256,11 @@ def _status(
     else:
         text = "".join(f"{visible_line(line)}\n" for line in _lines(found, moment, robots))
     if output and not dry_run:
-        click.echo(save(output, text.encode()), err=True)
+        echo(save(output, text.encode()), err=True)
     elif output:
-        click.echo(f"would {'replace' if output.exists() else 'create'} {visible(str(output))}")
+        echo(f"would {'replace' if output.exists() else 'create'} {output}")
     else:
-        click.echo(text, nl=False)
+        echo_document(text)
     return 0 if found.complete else 1
 
 

@@ -16,8 +16,6 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     read_log,
-    visible,
-    visible_line,
 )
 from sros_tool.cli.observing import (
     Watching,
@@ -29,6 +27,7 @@ from sros_tool.cli.observing import (
 )
 from sros_tool.cli.written import file_change
 from sros_tool.errors import SrosError, UsageError, counted
+from sros_tool.terminal import echo, echo_document
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
@@ -177,7 +176,7 @@ def generate_policy(
 
     def report(observation: Observation) -> None:
         for line in news.lines(named(observation).observation):
-            click.echo(line, err=True)
+            echo(line, err=True)
 
     environment = observer_environment(enclave, keystore, domain)
     snapshot, rmw = observe(
@@ -193,9 +192,9 @@ def generate_policy(
     if not learned.profiles:
         if as_json:
             print_json(_json(None, file, learned, found.observation, dry_run))
-        click.echo(_NO_NODES, err=True)
+        echo(_NO_NODES, err=True)
         print_notes(learned.notes)
-        click.echo(why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
+        echo(why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
         return 1
     plan = draft(file, learned, None if flat else common)
     if not dry_run:
@@ -206,9 +205,9 @@ def generate_policy(
         _show(plan, learned, written=not dry_run)
     if gone := sorted(each for each in snapshot.gone if not is_tool_name(each.rpartition("/")[2])):
         text = f"left out, because these nodes went while the graph was observed: {listed(gone)}"
-        click.echo(visible_line(f"{text}; --watch keeps them."), err=True)
+        echo(f"{text}; --watch keeps them.", err=True)
     if not snapshot.settled:
-        click.echo(
+        echo(
             f"the ROS graph kept changing for {snapshot.seconds:.0f} s; use --watch to collect "
             "nodes that come and go.",
             err=True,
@@ -279,21 +278,21 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
     would = "" if written else "would have "
     if plan.before is None:
         enclaves = {each.enclave for each in learned.profiles}
-        click.echo(
+        echo(
             f"{would}{'wrote' if written else 'written'} '{plan.path}': "
             f"{counted(len(enclaves), 'enclave')}, {counted(len(learned.profiles), 'node')}, "
             f"{counted(len(plan.added), 'right')}"
         )
     elif plan.added:
-        click.echo(f"{would}added {counted(len(plan.added), 'right')} to '{plan.path}'")
+        echo(f"{would}added {counted(len(plan.added), 'right')} to '{plan.path}'")
     else:
         known = "denied" if from_log else "observed"
-        click.echo(f"nothing to add: '{plan.path}' already covers everything that was {known}")
+        echo(f"nothing to add: '{plan.path}' already covers everything that was {known}")
     if plan.before is not None or from_log:
         for each in plan.added:
-            click.echo(f"  {each}")
+            echo(f"  {each}")
     if plan.copies:
-        click.echo(f"{would}copied {', '.join(sorted(plan.copies))} next to it")
+        echo(f"{would}copied {', '.join(sorted(plan.copies))} next to it")
     print_notes((*merge_notes(plan.contradictions), *learned.notes))
 
 
@@ -333,7 +332,7 @@ def _learned_from_logs(
     ]
     if not learned.profiles:
         print_notes(learned.notes)
-        click.echo(
+        echo(
             "No right can be proposed for the denials in the logs."
             if any(denials.values())
             else "The logs report no denial.",
@@ -368,7 +367,7 @@ def _propose(
             return 1
         if not as_json:
             print_notes(learned.notes)
-            click.echo(render(learned).decode(), nl=False)
+            echo_document(render(learned).decode())
             _show_lines(lines, err=True)
         return 0
     common = common_parts(file.parent, policies_dir()) if learned.includes else None
@@ -395,11 +394,11 @@ def _propose(
 
 def _show_lines(lines: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:
     if lines:
-        click.echo("these lines of logs ask for it; a process can print any line:", err=err)
+        echo("these lines of logs ask for it; a process can print any line:", err=err)
     for each in lines:
         by = each["process"] or "a process without a label"
         what = f"{each['direction']} {each['topic']} in {each['enclave']}"
-        click.echo(visible(f"  {each['log']}:{each['line']}: {by}: {what}"), err=err)
+        echo(f"  {each['log']}:{each['line']}: {by}: {what}", err=err)
 
 
 def _log_text(log: Path) -> str:

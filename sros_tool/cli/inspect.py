@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from sros_tool.cli.common import PATH, json_option, now, print_json, visible, visible_line
+from sros_tool.cli.common import PATH, json_option, now, print_json
+from sros_tool.terminal import echo
 from sros_tool.values import as_plain
 
 _INDENT = "  "
@@ -70,7 +71,7 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
         print_json(described)
     else:
         for line in _TEXT[described["kind"]](described):
-            click.echo(visible_line(line))
+            echo(line)
     zenoh = described.get("zenoh") or described
     if zenoh.get("problems"):
         return 1
@@ -104,12 +105,12 @@ def _show_history(root: Path, as_json: bool) -> int:
             subject = f"{entry.enclave or entry.subject}{named}"
             words = (subject, until, entry.serial, entry.reason)
             line = "  ".join(word for word in words if word)
-            shown = visible(f"{entry.time}  {entry.what:11}  {item.status:10}  {line}")
-            click.echo(shown.rstrip())
+            shown = f"{entry.time}  {entry.what:11}  {item.status:10}  {line}"
+            echo(shown.rstrip())
         for name in found.unexplained:
-            click.echo(visible(f"NOT IN THE LEDGER  {name}"))
+            echo(f"NOT IN THE LEDGER  {name}")
         for gap in found.gaps:
-            click.echo(visible(f"LEDGER DAMAGED  {gap}"))
+            echo(f"LEDGER DAMAGED  {gap}")
     return 1 if found.unexplained or found.gaps else 0
 
 

@@ -35,12 +35,12 @@ from sros_tool.cli.common import (
     ros_domain,
     several_enclaves,
     split_root,
-    visible,
 )
 from sros_tool.cli.findings import print_signed
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import authority_json, changes_json, enclave_json, notes_json
 from sros_tool.errors import Note, UsageError
+from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.create import Creation
@@ -277,7 +277,7 @@ def generate_artifacts(
             progress=step,
         )
     if result.new_keystore and not dry_run:
-        click.echo(f"'{root}' is not a valid keystore, creating new keystore", err=True)
+        echo(f"'{root}' is not a valid keystore, creating new keystore", err=True)
         if not as_json:
             _print_new_keystore(root, template, result.domains)
     _show(result, dry_run, as_json, policies)
@@ -313,16 +313,16 @@ def _show(
             (result.completed, "completed enclave {}"),
         ):
             for name in names:
-                click.echo(text.format(name))
+                echo(text.format(name))
     if result.kept:
         number = "1 enclave" if len(result.kept) == 1 else f"{len(result.kept)} enclaves"
-        click.echo(visible(f"unchanged: {number}: {_shown_names(result.kept)}"), err=True)
+        echo(f"unchanged: {number}: {_shown_names(result.kept)}", err=True)
     if not dry_run:
         print_closed(result.root, result.changes)
     _show_rights(result.replaced, dry_run, err=True)  # stdout is that of ros2/sros2
     for each in result.replaced:
         if text := lasting_text(result.root, each):
-            click.echo(visible(text), err=True)
+            echo(text, err=True)
     print_restart(result.restart, result.zenoh)
     print_remarks(result.remarks)
     print_notes(result.notes)
@@ -360,7 +360,7 @@ def _show_rights(replaced: Sequence[ReplacedRights], dry_run: bool, *, err: bool
                 together.setdefault((verb, text), []).append(each.enclave)
     for (verb, text), names in together.items():
         word = f"would {verb}" if dry_run else verb if len(names) > 1 else f"{verb}s"
-        click.echo(visible(f"{_shown_names(names)} {word}: {text}"), err=err)
+        echo(f"{_shown_names(names)} {word}: {text}", err=err)
 
 
 def _shown_names(names: Sequence[str]) -> str:
@@ -401,7 +401,7 @@ def list_enclaves(
         print_json({"keystore": str(root), "enclaves": names, **_robots_of(root, names)})
         return
     for name in names:
-        click.echo(name)
+        echo(name)
 
 
 def _robots_of(root: Path, names: Sequence[str]) -> dict[str, dict[str, str]]:
@@ -602,13 +602,13 @@ def _adopt(root: Path, earlier: Path, dry_run: bool, as_json: bool) -> None:
     else:
         count = len(result.created)
         nodes = f"{count} node{'s' * (count != 1)}"
-        click.echo(visible(f"created keystore '{root}' for domain {result.domains}"))
-        click.echo(visible(f"  with the CA, the governance and {nodes} of '{earlier}'"))
+        echo(f"created keystore '{root}' for domain {result.domains}")
+        echo(f"  with the CA, the governance and {nodes} of '{earlier}'")
         for name in result.created:
-            click.echo(f"  enclave {name}")
+            echo(f"  enclave {name}")
     if dry_run:
         return
-    click.echo(
+    echo(
         "Keys and certificates are those of the nodes; their permissions are signed again. "
         f"'{earlier}' is as it was: its permissions work until they expire, with ROS 2 Eloquent or "
         "earlier. Start a node with ROS_SECURITY_KEYSTORE in place of ROS_SECURITY_ROOT_DIRECTORY "
@@ -670,13 +670,13 @@ def _print_new_keystore(
         if template.separate_authorities
         else "one CA for identity and permissions"
     )
-    click.echo(f"created keystore '{root}' for domain {domains}")
-    click.echo(f"  template {template.name}: {template.description}")
+    echo(f"created keystore '{root}' for domain {domains}")
+    echo(f"  template {template.name}: {template.description}")
     roles = ROLES if template.separate_authorities else ROLES[:1]
     if not imported.issuperset(roles):
         new = "a new one " if imported else ""
         layout += f", {new}valid for {span_text(template.authority_validity)}"
-    click.echo(
+    echo(
         f"  {layout}; certificates "
         f"{span_text(template.certificate_validity)}, permissions "
         f"{span_text(template.permissions_validity)}"
@@ -685,14 +685,14 @@ def _print_new_keystore(
     for role in roles:
         name = f"{role} CA" if template.separate_authorities else "CA"
         certificate = load_ca_certificate(root, role)
-        click.echo(f"  {name} SHA-256 {digest(certificate)}")
+        echo(f"  {name} SHA-256 {digest(certificate)}")
         if role in imported:
-            click.echo(f"    imported, valid until {iso(validity_of(certificate).not_after)}")
+            echo(f"    imported, valid until {iso(validity_of(certificate).not_after)}")
 
 
 def _print_open_rights(root: Path, template: Template) -> None:
     for note in _open_rights(root, template):
-        click.echo(f"still open: {note.text}", err=True)
+        echo(f"still open: {note.text}", err=True)
 
 
 def _open_rights(root: Path, template: Template) -> list[Note]:
@@ -885,7 +885,7 @@ def update_keystore(
     _show_update(update, undone, again, dry_run=dry_run, as_json=as_json)
     refused = bool(update.looser()) and not allow_looser
     if refused:  # only a dry run comes here
-        click.echo("this would be refused: it needs --allow-looser", err=True)
+        echo("this would be refused: it needs --allow-looser", err=True)
     return 1 if refused else 0
 
 
@@ -962,21 +962,21 @@ def _show_update(
         )
         return
     if not update.done:
-        click.echo("nothing is left to do", err=True)
+        echo("nothing is left to do", err=True)
         print_remarks(update.remarks)
         return
     template = f": template {update.before} -> {update.after}"
     verb = "would update" if dry_run else "updated"
     named = template if update.before != update.after else ""
-    click.echo(visible(f"{verb} keystore '{update.root}'{named}"))
+    echo(f"{verb} keystore '{update.root}'{named}")
     for clause in undone:
-        click.echo(visible(f"  {'undone':7}  {clause}"))
+        echo(f"  {'undone':7}  {clause}")
     for change in update.settings:
-        click.echo(visible(f"  {change.effect:7}  {change}"))
+        echo(f"  {change.effect:7}  {change}")
     _show_rights(update.rights, dry_run)
     for names, what in ((update.renewed, "renewed"), (update.signed, "signed the permissions of")):
         if names and not dry_run:
-            click.echo(f"{what} {_shown_names(names)}")
+            echo(f"{what} {_shown_names(names)}")
     if dry_run:
         print_plan(update.root, update.changes)
     if not dry_run:
@@ -987,7 +987,7 @@ def _show_update(
         ends = f"run `sros renew {quote(str(update.root))} {shown} --revoke-old`"
         if update.left:
             ends = f"add --revoke-old to the stage {update.left[-1]}, or {ends}"
-        click.echo(
+        echo(
             "the replaced certificates and permissions, with the rights that they had, work until "
             f"{iso(update.works_until)} for whoever kept them with the key. To end it, {ends}.",
             err=True,
@@ -996,9 +996,9 @@ def _show_update(
         print_restart(update.restart, update.zenoh, exported=False)
     print_remarks(update.remarks)
     if update.left:
-        click.echo(
+        echo(
             f"stage {update.done[-1]} {'would be' if dry_run else 'is'} done; left: "
-            f"{', '.join(update.left)}. Once the processes were restarted, run `{visible(again)}`.",
+            f"{', '.join(update.left)}. Once the processes were restarted, run `{again}`.",
             err=True,
         )
     print_notes(update.notes)

@@ -27,11 +27,11 @@ from sros_tool.cli.common import (
     print_restart,
     several_enclaves,
     split_root,
-    visible,
 )
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import changes_json, enclave_json, notes_json
 from sros_tool.errors import SrosError, UsageError
+from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.renew import Renewal
@@ -119,11 +119,11 @@ def renew(
         print_plan(root, result.changes)
     else:
         for name in result.renewed:
-            click.echo(f"renewed enclave {name}")
+            echo(f"renewed enclave {name}")
     if not dry_run:
         print_closed(root, result.changes)
     if not result.renewed and not dry_run:
-        click.echo("no enclave needs to be renewed", err=True)
+        echo("no enclave needs to be renewed", err=True)
     print_notes(result.notes)
     _print_replaced(result)
 
@@ -157,9 +157,9 @@ def _print_replaced(result: Renewal) -> None:
             if len(result.renewed) == 1
             else f"the replaced certificates work until {end} at the latest"
         )
-        click.echo(f"{what}, unless revoked: see --revoke-old", err=True)
+        echo(f"{what}, unless revoked: see --revoke-old", err=True)
     if result.renewed and not result.restart:
-        click.echo(
+        echo(
             "exports and running processes still have the earlier certificates and permissions: "
             "export again, and restart, before those expire",
             err=True,
@@ -247,7 +247,7 @@ def revoke(
         print_plan(root, result.changes)
     else:
         for name in result.revoked:
-            click.echo(f"revoked enclave {name}")
+            echo(f"revoked enclave {name}")
     if not dry_run:
         print_closed(root, result.changes)
     print_restart(result.restart, result.zenoh)
@@ -313,13 +313,13 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
         print_json(_lists_json(root, lists, result, expires_soon=soon, dry_run=dry_run))
     elif lists:
         for line in _list_lines(lists):
-            click.echo(line)
+            echo(line)
     else:
-        click.echo("nothing was ever revoked", err=True)
+        echo("nothing was ever revoked", err=True)
     if result and dry_run:
         return 0
     if soon:
-        click.echo(
+        echo(
             "the list expires soon, and DDS then refuses every participant: "
             f"run `sros crl {quote(str(root))} --refresh`.",
             err=True,
@@ -526,7 +526,7 @@ def rotate_ca(
         print_closed(root, step.changes)
     if step.cut_off:
         verb = "would be" if dry_run else "are"
-        click.echo(
+        echo(
             f"cut off: {', '.join(step.cut_off)} {verb} unable to talk to robots with the files of "
             "this stage until they get them, too",
             err=True,
@@ -566,11 +566,11 @@ def _print_step(
             if status.rotation.stage == "none"
             else f"the keystore is at the stage {status.rotation.stage}"
         )
-        click.echo(f"nothing is left to do: {done}", err=True)
+        echo(f"nothing is left to do: {done}", err=True)
         return
     if same_key:
-        click.echo("renewed the identity CA with the same key; certificates it issued stay valid")
-        click.echo(
+        echo("renewed the identity CA with the same key; certificates it issued stay valid")
+        echo(
             "Restart the processes at any time; processes before and after the restart "
             "communicate. Certificates keep their expiry: `sros renew "
             f"{step.root} --all-expiring 30d` renews those that expire soon.",
@@ -579,18 +579,18 @@ def _print_step(
         return
     reissued = any(each.path.endswith("/cert.pem") for each in step.changes)
     done = f"{_DONE['reissue']}, and " if together and reissued else ""
-    click.echo(f"{done}{_DONE[step.stage]}: {', '.join(step.files)}")
+    echo(f"{done}{_DONE[step.stage]}: {', '.join(step.files)}")
     for place in step.kept_elsewhere:
-        click.echo(f"the old key at '{place}' is no longer used; it was not deleted", err=True)
+        echo(f"the old key at '{place}' is no longer used; it was not deleted", err=True)
     if step.stage == "retire":
         how = (
             "together"
             if together
             else "at any time; processes before and after the restart communicate"
         )
-        click.echo(f"Restart all processes {how}. {EXPORT_FIRST}", err=True)
+        echo(f"Restart all processes {how}. {EXPORT_FIRST}", err=True)
     for remark in status.remarks:
-        click.echo(remark, err=True)
+        echo(remark, err=True)
 
 
 def _unconfirmed(root: Path) -> tuple[str, ...] | str:
@@ -638,26 +638,26 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
             }
         )
         return
-    click.echo(f"stage: {rotation.stage}, next: {rotation.next_stage()}")
+    echo(f"stage: {rotation.stage}, next: {rotation.next_stage()}")
     for each in status.authorities:
         name = f"{each.roles[0]} CA" if len(each.roles) == 1 else "CA"
         end = f"until {iso(each.validity.not_after)}"
         if each.validity.not_after < now():
             end = f"EXPIRED {iso(each.validity.not_after)}"
-        click.echo(
+        echo(
             f"  {name:14} {each.state:7} {each.enclaves} of {status.enclaves} enclaves  {end}"
             f"  {each.subject} (SHA-256 {each.sha256[:8]})"
         )
     if isinstance(unconfirmed, str):
-        click.echo(visible(f"which robots confirmed this stage is unknown: {unconfirmed}"))
+        echo(f"which robots confirmed this stage is unknown: {unconfirmed}")
     elif unconfirmed:
         more = len(unconfirmed) - _MOST_ROBOTS
-        click.echo(
+        echo(
             f"not confirmed by {', '.join(unconfirmed[:_MOST_ROBOTS])}"
             f"{f' and {more} more' if more > 0 else ''}: see `sros fleet status`"
         )
     for remark in status.remarks:
-        click.echo(remark)
+        echo(remark)
 
 
 def _new_keys(identity: str | None, permissions: str | None, encrypt: bool) -> Keyring:

@@ -24,6 +24,7 @@ from sros_tool.cli.common import (
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import file_change
 from sros_tool.errors import UsageError
+from sros_tool.terminal import echo, echo_document
 from sros_tool.values import as_plain
 
 _SUFFIX = ".prom"
@@ -92,11 +93,11 @@ def metrics(
         shown = {"dry_run": dry_run, "changes": changes, "notes": []}
         print_json({"keystore": str(root), "metrics": as_plain(found), **shown})
     elif dry_run:
-        click.echo(f"would write {output or 'to standard output'}: {len(text)} characters")
+        echo(f"would write {output or 'to standard output'}: {len(text)} characters")
     elif output:
-        click.echo(saved, err=True)
+        echo(saved, err=True)
     else:
-        click.echo(text, nl=False)
+        echo_document(text)
 
 
 def check_suffix(output: Path) -> None:

@@ -6,10 +6,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from sros_tool.cli.common import print_json, print_notes, visible_line
+from sros_tool.cli.common import print_json, print_notes
 from sros_tool.cli.progress import progress
+from sros_tool.terminal import echo, echo_document
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
@@ -43,11 +42,11 @@ def show_new_access(
     if form == "json":
         print_json(_growth_json(before, after, growth))
     elif form == "markdown":
-        click.echo(_growth_markdown(before, after, growth), nl=False)
+        echo_document(_growth_markdown(before, after, growth))
     else:
         for line in (*_added_lines(after, growth), *_removed_lines(before, growth)):
-            click.echo(visible_line(line))
-        click.echo(visible_line(_summary(growth)), err=True)
+            echo(line)
+        echo(_summary(growth), err=True)
     if form != "json":
         print_notes((*before.notes, *after.notes))
     return int(bool(growth))

@@ -16,6 +16,7 @@ import click
 
 from sros_tool.cli.common import PATH, Decorated, keystore_from_environment
 from sros_tool.errors import SrosError, UnavailableError, UsageError
+from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
     from sros_tool.graph.observation import Observation
@@ -176,7 +177,7 @@ def _watch(
 
     with _until_signalled() as stopped:
         until = f"for {seconds:.0f} s, or {_FOREVER}" if seconds else _FOREVER
-        click.echo(f"watching {until}; then {then}", err=True)
+        echo(f"watching {until}; then {then}", err=True)
         return watch(graph, seconds, time.monotonic, stop=stopped, report=report)
 
 

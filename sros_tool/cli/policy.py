@@ -26,11 +26,11 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     save,
-    visible,
 )
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import file_change, notes_json
 from sros_tool.errors import Note, PolicyError, UsageError
+from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
@@ -105,28 +105,28 @@ def merge_policy(
         print_json({**value, "dry_run": dry_run, "changes": changes, "notes": notes})
     elif dry_run:
         for right in merged.added:
-            click.echo(f"would add {right}")
+            echo(f"would add {right}")
         if target and (merged.added or output):
-            click.echo(f"would {'replace' if target.exists() else 'write'} {target}")
+            echo(f"would {'replace' if target.exists() else 'write'} {target}")
         if not merged.added:
-            click.echo("no right would be added")
+            echo("no right would be added")
     elif target is None:
-        click.echo(merged.document, nl=False)
+        echo_document(merged.document)
     if not dry_run and not as_json:
         _print_added(merged)
     print_notes(merge_notes(merged.contradictions))
     if saved:
-        click.echo(saved, err=True)
+        echo(saved, err=True)
 
 
 def _print_added(merged: Merged) -> None:
     count = len(merged.added)
     if not count:
-        click.echo("no right was missing", err=True)
+        echo("no right was missing", err=True)
         return
-    click.echo(f"added {count} right{'s' if count > 1 else ''}", err=True)
+    echo(f"added {count} right{'s' if count > 1 else ''}", err=True)
     for right in merged.added:
-        click.echo(f"  {right}", err=True)
+        echo(f"  {right}", err=True)
 
 
 def _merged_json(policy: Path, merged: Merged, written: Path | None) -> dict[str, Any]:
@@ -236,18 +236,18 @@ def diff_policy(
         print_json(_difference_json(first, second, difference, protections))
     elif form == "markdown":
         drawn = _drawn_difference(first, second, difference)
-        click.echo(_difference_markdown(first, second, difference, protections, drawn))
+        echo_lines(_difference_markdown(first, second, difference, protections, drawn))
     else:
         for line in _difference_lines(difference, first.fleet, second.fleet):
-            click.echo(line)
+            echo(line)
         for sign, each in protections:
-            click.echo(f"{sign} {each.enclave} protect {each} with {each.word}")
+            echo(f"{sign} {each.enclave} protect {each} with {each.word}")
         count = len(difference.only_first) + len(difference.only_second)
         of = f" of {', '.join(sorted(scope))}" if scope else ""
         differ = f"1 right{of} differs" if count == 1 else f"{count} rights{of} differ"
-        click.echo(differ if count else f"the rights{of} are the same", err=True)
+        echo(differ if count else f"the rights{of} are the same", err=True)
         if protections:
-            click.echo("what the policies say about protection differs", err=True)
+            echo("what the policies say about protection differs", err=True)
     print_notes((*first.notes, *second.notes))
     return 0 if not difference and not protections and first.sound and second.sound else 1
 
@@ -495,12 +495,12 @@ def minimize_policy(
     else:
         for use in result.uses:
             for line in _use_lines(use, measured[use.enclave]):
-                click.echo(of_fleet.as_written(line))
+                echo(of_fleet.as_written(line))
     print_notes(notes)
     if output and dry_run:
-        click.echo(f"would {'replace' if output.exists() else 'write'} {output}", err=as_json)
+        echo(f"would {'replace' if output.exists() else 'write'} {output}", err=as_json)
     if saved:
-        click.echo(saved, err=True)
+        echo(saved, err=True)
 
 
 def _node_basics() -> Sequence[Group]:
@@ -757,8 +757,8 @@ def policies(
         return 0
     width = max(len(path.name) for path in found)
     for path, policy in found.items():
-        click.echo(f"{path.name:{width}}  {', '.join(each.path for each in policy.enclaves)}")
-    click.echo(f"they are in '{source}'", err=True)
+        echo(f"{path.name:{width}}  {', '.join(each.path for each in policy.enclaves)}")
+    echo(f"they are in '{source}'", err=True)
     return 0
 
 
@@ -799,9 +799,9 @@ def _copy(source: Path, target: Path, *, as_json: bool, dry_run: bool) -> None:
         changes = [{"action": "create", "path": str(target / each)} for each in missing]
         print_json({"folder": str(target), "dry_run": dry_run, "changes": changes, "notes": []})
     elif not missing:
-        click.echo(f"nothing to copy: '{target}' has the {what}")
+        echo(f"nothing to copy: '{target}' has the {what}")
     else:
-        click.echo(f"{'would copy' if dry_run else 'copied'} the {what} to '{target}'")
+        echo(f"{'would copy' if dry_run else 'copied'} the {what} to '{target}'")
 
 
 def _convert(
@@ -850,27 +850,27 @@ def _convert(
         }
         print_json(value if output or dry_run else {**value, "document": document.decode()})
     elif output is None and not dry_run:
-        click.echo(document, nl=False)
+        echo_document(document)
     count = len(policy.enclaves)
     what = f"{count} node{'s' * (count != 1)} of '{earlier}' to enclaves: {names}"
     if dry_run and not as_json:
-        click.echo(visible(f"would convert {what}"))
+        echo(f"would convert {what}")
         if output:
-            click.echo(visible(f"would {'replace' if output.exists() else 'write'} {output}"))
+            echo(f"would {'replace' if output.exists() else 'write'} {output}")
     elif not dry_run:
-        click.echo(visible(f"converted {what}"), err=True)
+        echo(f"converted {what}", err=True)
     print_notes(converted.notes)
     for each in converted.left_out:
-        click.echo(visible(f"left out: {each.text}"), err=True)
+        echo(f"left out: {each.text}", err=True)
     if saved:
-        click.echo(saved, err=True)
+        echo(saved, err=True)
         if not complete:
             again = f"{quote(str(earlier))} -o {quote(str(output))} --force"
-            click.echo(
+            echo(
                 "the rights are the old ones; nodes of a later ROS 2 need more, such as to publish "
                 "/rosout from a namespace: add it with `sros policies --convert "
                 f"{again} --with-node-rights`",
                 err=True,
             )
-        click.echo(f"look at the result with `sros check {quote(str(output))}`", err=True)
+        echo(f"look at the result with `sros check {quote(str(output))}`", err=True)
     return 1 if converted.left_out else 0

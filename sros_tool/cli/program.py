@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 import click
 
 from sros_tool import __version__
-from sros_tool.cli.common import visible
 from sros_tool.errors import NOT_DONE, SrosError
+from sros_tool.terminal import echo, echo_lines
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -113,17 +113,15 @@ def _report_steps(ctx: click.Context, _parameter: click.Parameter, count: int) -
     if _HANDLER in ctx.meta:
         return
 
-    def make_visible(record: logging.LogRecord) -> bool:
-        record.msg, record.args = visible(record.getMessage()), ()
-        return True
+    class EchoHandler(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            echo(f"{record.name}: {record.getMessage()}", err=True)
 
     def stop() -> None:
         logger.removeHandler(handler)
         logger.setLevel(logging.NOTSET)
 
-    ctx.meta[_HANDLER] = handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
-    handler.addFilter(make_visible)
+    ctx.meta[_HANDLER] = handler = EchoHandler()
     logger.addHandler(handler)
     ctx.find_root().call_on_close(stop)
 
@@ -265,7 +263,7 @@ def report_error(error: BaseException, arguments: Sequence[str], name: str = "sr
     if isinstance(error, click.exceptions.Exit):
         return error.exit_code
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
-        print("sros: interrupted", file=sys.stderr)
+        echo("sros: interrupted", err=True)
         return 130
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         error.show()
@@ -291,7 +289,7 @@ def _named_command(arguments: Sequence[str], name: str) -> str:
 
 
 def _print_error(text: str) -> int:
-    print(visible(" ".join(text.split())), file=sys.stderr)
+    echo(" ".join(text.split()), err=True)
     return NOT_DONE
 
 
@@ -353,7 +351,7 @@ def _defect(error: BaseException, arguments: Sequence[str]) -> int:
     if isinstance(error, (ImportError, AttributeError)) and (problem := _outdated_dependency()):
         return _print_error(_prefixed(problem, arguments))
     if os.environ.get("SROS_DEBUG"):
-        print(visible("".join(traceback.format_exception(error))), end="", file=sys.stderr)
+        echo_lines("".join(traceback.format_exception(error)).rstrip("\n"), err=True)
     return _print_error(
         _prefixed(
             f"this is a defect of sros: {type(error).__name__}: {error}. Please report it; "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import threading
@@ -12,13 +11,14 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from sros_tool.terminal import redraw
+
 if TYPE_CHECKING:
     from sros_tool.parallel import Tally
 
 _FIRST, _EVERY = 1.0, 0.5  # seconds
 _ESTIMATED = 3.0
 """Seconds from which on the time that is left is shown."""
-_ERASE = "\r\x1b[K"
 
 
 class _Line:
@@ -44,7 +44,7 @@ class _Line:
         """Erase the line and draw no more."""
         signal.setitimer(signal.ITIMER_REAL, 0)
         if self._drawn:
-            _write(_ERASE)
+            redraw("")
 
     def go_on(self) -> None:
         """Draw again."""
@@ -62,18 +62,13 @@ class _Line:
         count = f" {done} of {total}" if total and done else ""
         seconds = time.monotonic() - self._began
         rest = "" if left is None or seconds < _ESTIMATED else f", about {_rounded(left)} left"
-        _write(f"{_ERASE}{self._label}{count} ... {seconds:.0f} s{rest}")
+        redraw(f"{self._label}{count} ... {seconds:.0f} s{rest}")
         self._drawn = True
 
 
 def _rounded(seconds: float) -> str:
     """Return a time as text, in minutes from two on."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
-
-
-def _write(text: str) -> None:
-    """Write to the terminal itself: a signal may come while the stream's buffer is in use."""
-    os.write(sys.stderr.fileno(), text.encode())
 
 
 _lines: list[_Line] = []

@@ -29,6 +29,7 @@ from sros_tool.cli.written import notes_json
 from sros_tool.errors import Note, UnavailableError, UsageError
 from sros_tool.runtime.containers import COMPOSE, KUBERNETES
 from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
+from sros_tool.terminal import echo, echo_document, echo_lines
 
 COMMAND = "sros.command"
 """The key of ``ctx.meta`` with the words after ``--`` of a `WithCommand`."""
@@ -107,7 +108,7 @@ def _refusal_printed(form: str, as_json: bool) -> Iterator[None]:
         if as_json:
             print_json({"keystore": None, "enclave": None, "variables": REFUSING, "notes": []})
         else:
-            click.echo(render_refusal(form), nl=False)
+            echo_document(render_refusal(form))
         raise
 
 
@@ -228,7 +229,7 @@ def env(
             }
         )
     else:
-        click.echo(text, nl=False)
+        echo_document(text)
         print_notes(notes)
 
 
@@ -331,7 +332,7 @@ def run(
     given = tuple(command)
     if not no_ros_args and (command := list(with_enclave(given, name))) != list(given):
         added = " ".join(command[len(given) :])
-        click.echo(
+        echo(
             f"added {added}, so that the ROS graph shows the enclave (--no-ros-args: do not)",
             err=True,
         )
@@ -408,4 +409,4 @@ def completion(shell: str) -> None:
         raise UnavailableError(
             f"there is no completion for {shell}", "", "Choose bash, zsh or fish."
         )
-    click.echo(kind(program, {}, "sros", "_SROS_COMPLETE").source())
+    echo_lines(kind(program, {}, "sros", "_SROS_COMPLETE").source())

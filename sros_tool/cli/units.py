@@ -22,7 +22,6 @@ from sros_tool.cli.common import (
     print_notes,
     several_enclaves,
     split_root,
-    visible_line,
 )
 from sros_tool.cli.containers import INSTALLED, target_path
 from sros_tool.cli.enclave_environment import loadable_environment
@@ -31,6 +30,7 @@ from sros_tool.cli.running import ACCEPT_KEY, COMMAND, DOMAIN, RMW, WithCommand
 from sros_tool.cli.written import notes_json
 from sros_tool.errors import UsageError
 from sros_tool.runtime.units import Job
+from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
     from sros_tool.errors import Note
@@ -200,9 +200,9 @@ def units(
         return
     for path, action in changes.items():
         word = f"would {action}" if dry_run else {"create": "wrote", "replace": "replaced"}[action]
-        click.echo(visible_line(f"{word} {folder / path}"))
+        echo(f"{word} {folder / path}")
     if not changes:
-        click.echo(visible_line(f"the units in '{folder}' are already up to date"), err=True)
+        echo(f"the units in '{folder}' are already up to date", err=True)
     print_notes(list(dict.fromkeys(notes)))
 
 

@@ -25,11 +25,11 @@ from sros_tool.cli.common import (
     now,
     print_json,
     save,
-    visible_line,
 )
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import file_change
 from sros_tool.errors import SrosError, UsageError
+from sros_tool.terminal import echo, echo_document
 from sros_tool.values import as_plain, versioned
 
 if TYPE_CHECKING:
@@ -203,20 +203,20 @@ def view(
         document = _rendered(picture, folding, written, everything, graphviz, moment, hops)
     if written != "json":
         for line in picture.headlines:
-            click.echo(visible_line(line), err=True)
+            echo(line, err=True)
     if dry_run and as_json:
         changes = file_change(output, existed=output.exists()) if output else []
         print_json({"dry_run": True, "changes": changes, "notes": []})
         return
     if dry_run:
-        click.echo(f"would write {output or 'to standard output'}: {len(document)} characters")
+        echo(f"would write {output or 'to standard output'}: {len(document)} characters")
         return
     if show and output is None:
         output = Path(tempfile.mkdtemp(prefix="sros-view-")) / f"view.{written}"
     if output is None:
-        click.echo(document, nl=False)
+        echo_document(document)
         return
-    click.echo(save(output, document.encode("utf-8", "replace")), err=True)
+    echo(save(output, document.encode("utf-8", "replace")), err=True)
     if show:
         click.launch(output.absolute().as_uri())
 

@@ -22,12 +22,12 @@ from sros_tool.cli.common import (
     print_notes,
     print_plan,
     print_restart,
-    visible,
 )
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import changes_json, notes_json
 from sros_tool.cli.zenoh_from import show_from
 from sros_tool.errors import UsageError
+from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.create import Creation
@@ -150,13 +150,13 @@ def zenoh(
         print_plan(root, result.changes)
     else:
         for name in result.created:
-            click.echo(f"{'missing:' if only_check else 'created'} enclave {name}")
+            echo(f"{'missing:' if only_check else 'created'} enclave {name}")
         for path in changed:
             action = actions.get(path, "replace")
             word = f"{_FOUND[action]}:" if only_check else _DONE[action]
-            click.echo(visible(f"{word} {root / path}"))
+            echo(f"{word} {root / path}")
     if not result.changes:
-        click.echo("the files of Zenoh are up to date", err=True)
+        echo("the files of Zenoh are up to date", err=True)
     if not (dry_run or only_check):
         print_closed(root, result.changes)
         print_restart(result.restart)

@@ -6,12 +6,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from sros_tool.cli.common import check_output, print_json, print_notes, save, visible, visible_line
+from sros_tool.cli.common import check_output, print_json, print_notes, save
 from sros_tool.cli.findings import echo_findings
 from sros_tool.cli.written import file_change, notes_json
 from sros_tool.errors import Note, PolicyError
+from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -69,30 +68,30 @@ def show_from(file: Path, output: Path | None, *, force: bool, dry_run: bool, as
         )
     else:
         for line in _lines(document, rights):
-            click.echo(visible(line))
+            echo(line)
         for each in shown:
             echo_findings([each])
         if output and dry_run:
-            click.echo(visible(f"would {changes[0]['action']} {output}"))
+            echo(f"would {changes[0]['action']} {output}")
     print_notes(notes)
     if saved:
-        click.echo(saved, err=True)
+        echo(saved, err=True)
     return 1 if any(each.severity >= ERROR for each in findings) else 0
 
 
 def _lines(document: ConfigurationDocument, found: Sequence[RightsBehindRules]) -> Iterator[str]:
-    yield visible_line(f"{document.name}: the configuration of a {_kind(document)}")
+    yield f"{document.name}: the configuration of a {_kind(document)}"
     for each in found:
         if not (each.rights or each.unsaid or each.denied):
             continue
         obeys = ", by rules that bind only itself" if each.own else ""
-        yield visible_line(f"{_who(each)}{obeys}")
+        yield f"{_who(each)}{obeys}"
         for right in _VERBS:
             stated = [one for one in each.rights if one.right == right]
             for one in stated:
                 domain = "" if one.domain == "0" else f" (domain {one.domain})"
                 lacks = f" (of no use without {', '.join(one.lacks)})" if one.lacks else ""
-                yield visible_line(f"  may {_VERBS[right]} {one.name}{domain}{lacks}")
+                yield f"  may {_VERBS[right]} {one.name}{domain}{lacks}"
         yield from _keys("may also", each.unsaid)
         yield from _keys("is denied, if no wildcard is used,", each.denied)
 
@@ -102,7 +101,7 @@ def _keys(what: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
         keys = [key for of, key in pairs if of == right]
         more = f" and {len(keys) - _MOST_KEYS} more" if len(keys) > _MOST_KEYS else ""
         if keys:
-            yield visible_line(f"  {what} {verb} the keys {', '.join(keys[:_MOST_KEYS])}{more}")
+            yield f"  {what} {verb} the keys {', '.join(keys[:_MOST_KEYS])}{more}"
 
 
 def _kind(document: ConfigurationDocument) -> str:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from html import escape
 from textwrap import wrap
 from typing import Any
+
+from sros_tool.report.markup import escape
 
 Json = Mapping[str, Any]
 _WIDTH, _HEIGHT, _LEFT, _TOP = 380, 240, 58, 12

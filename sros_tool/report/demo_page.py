@@ -7,11 +7,11 @@ script; it can be opened from disk, and printed.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from html import escape
 from itertools import groupby
 from typing import Any
 
 from sros_tool.report.cost_plot import cost_section
+from sros_tool.report.markup import escape
 from sros_tool.report.page import asset, document
 
 Json = Mapping[str, Any]

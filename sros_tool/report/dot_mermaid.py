@@ -11,6 +11,7 @@ from sros_tool.errors import UnavailableError
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.layout import KIND_NAMES, LEVEL_NAMES, ONLOOKERS, Card, Link, Scene
 from sros_tool.report.picture import OverlaySide, Picture, WireLevel
+from sros_tool.terminal import visible_line
 
 _DOT_STYLES = {"encrypt": "solid", "sign": "dashed", "none": "dotted", "unknown": "solid"}
 _COLOURS = {
@@ -157,10 +158,10 @@ def _link_label(picture: Picture, link: Link) -> str:
 
 
 def _dot_node(scene: Scene, key: str, card: Card) -> str:
-    label = _quoted("\n".join(_texts(scene, card))).replace("\n", r"\l")
-    label = label[:-1] + r'\l"' if r"\l" in label else label
+    texts = [_escaped(each) for each in _texts(scene, card)]
+    label = r"\l".join((*texts, "") if len(texts) > 1 else texts)
     shape = ", style=filled, fillcolor=white, shape=note" if card.role == "names" else ""
-    return f"{_quoted(key)} [label={label}{shape}]"
+    return f'{_quoted(key)} [label="{label}"{shape}]'
 
 
 def _dot_edge(picture: Picture, link: Link) -> str:
@@ -177,7 +178,11 @@ def _dot_edge(picture: Picture, link: Link) -> str:
 
 
 def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return f'"{_escaped(text)}"'
+
+
+def _escaped(text: str) -> str:
+    return visible_line(text).replace("\\", "\\\\").replace('"', '\\"')
 
 
 # ── Mermaid ────────────────────────────────────────────────────────────────────────────────
@@ -206,7 +211,7 @@ def _id(key: str) -> str:
 
 def _entities(text: str) -> str:
     """Return ``text`` with all possible markup escaped as Mermaid's numbered entities."""
-    return re.sub(r"[^A-Za-z0-9 /_.,:+-]", lambda found: f"#{ord(found[0])};", text)
+    return re.sub(r"[^A-Za-z0-9 /_.,:+-]", lambda found: f"#{ord(found[0])};", visible_line(text))
 
 
 def _yaml(text: str) -> str:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from html import escape
 from typing import Any
 
+from sros_tool.report.markup import escape
 from sros_tool.report.page import asset, document
 
 Json = Mapping[str, Any]

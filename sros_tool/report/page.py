@@ -11,7 +11,6 @@ import base64
 import hashlib
 import json
 from datetime import datetime
-from html import escape
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -20,7 +19,9 @@ from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.reach import OF_EVERY_NODE
 from sros_tool.report.layout import Scene
+from sros_tool.report.markup import escape
 from sros_tool.report.picture import Bundle, Picture, PicturedEnclave, fold, lack_text
+from sros_tool.terminal import visible_json
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
 
@@ -80,7 +81,7 @@ def document(title: str, body: str, style: str, script: str = "", data: object =
 def _safe_json(value: object) -> str:
     """Return JSON for a script element: < > & and line separators are escaped."""
     text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
-    return text.translate(_ESCAPES)
+    return visible_json(text.translate(_ESCAPES))
 
 
 def _digest(text: str) -> str:

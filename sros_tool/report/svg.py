@@ -20,6 +20,7 @@ from sros_tool.report.layout import (
     Link,
     Scene,
 )
+from sros_tool.report.markup import escape
 from sros_tool.report.picture import (
     Overlay,
     OverlaySide,
@@ -27,7 +28,6 @@ from sros_tool.report.picture import (
     WireLevel,
     lack_text,
 )
-from sros_tool.xml import escape
 
 _HEAD, _SAID = 40, 19
 _STYLE = """\

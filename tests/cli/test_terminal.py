@@ -16,6 +16,7 @@ import pytest
 from sros_tool.cli import main
 from sros_tool.cli import progress as showing
 from sros_tool.parallel import map_slices, tick
+from sros_tool.terminal import Coloured, echo, echo_document
 from tests.support.harness import sros
 
 ERASE = "\r\x1b[K"
@@ -135,3 +136,16 @@ def test_colours_are_for_terminals_and_can_be_turned_off(keystore: Path) -> None
         assert ESCAPE not in run(*words, no_colour="1")
         ended = sros(*words)
         assert ESCAPE not in ended.out + ended.err
+
+
+def test_a_document_is_exact_but_on_a_terminal(capsysbinary: pytest.CaptureFixture[bytes]) -> None:
+    document = b"export A='\x1b]0;x\x07\xff'\n"
+    echo_document(document)
+    echo_document(os.fsdecode(document[:12]))
+    assert capsysbinary.readouterr().out == document + document[:12]
+    assert on_terminal(lambda: echo_document(document)) == "export A='\\x1b]0;x\\x07\\xff'\r\n"
+
+
+def test_a_name_cannot_colour_itself() -> None:
+    said = on_terminal(lambda: echo("/a", Coloured("no"), f"{ESCAPE}32myes\nforged"))
+    assert said == f"/a{ESCAPE}31m{ESCAPE}1mno{ESCAPE}0m\\x1b[32myes\\x0aforged\r\n"

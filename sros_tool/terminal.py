@@ -1,0 +1,113 @@
+"""The only place that prints, and the characters that no text may have that others chose.
+
+Names of files, certificates and tokens, lines of logs and policies may come from an attacker.
+Their control characters could clear the screen, hide a denial, reverse a name, or forge a line.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+
+_CONTROLS = [
+    *(code for code in range(0x20) if chr(code) not in "\n\t"),
+    *range(0x7F, 0xA0),  # DEL, and C1, which holds CSI as one character
+    *(0x061C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)),  # bidirectional
+    *(0x2028, 0x2029),  # ends of lines
+]
+_BYTES = range(0xDC80, 0xDD00)  # bytes of names that are not UTF-8; 0x9B is CSI to some terminals
+_SHOWN = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROLS}
+_SHOWN |= {code: f"\\u{code:04x}" for code in (*range(0xD800, 0xE000), 0xFFFE, 0xFFFF)}
+_SHOWN |= {code: f"\\x{code - 0xDC00:02x}" for code in _BYTES}
+_SHOWN_ON_A_LINE = {**_SHOWN, 0x0A: "\\x0a"}
+_IN_JSON = {code: f"\\u{code:04x}" for code in (*_CONTROLS, *range(0xD800, 0xE000))}
+_COLOURS = {
+    "error": "red",
+    "warning": "yellow",
+    "note": "cyan",
+    "yes": "green",
+    "no": "red",
+    "NOT LOADABLE": "red",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Coloured:
+    """A word of sros in its colour, on a terminal and without $NO_COLOR (https://no-color.org)."""
+
+    word: str
+
+
+def visible(text: str) -> str:
+    """Replace what can steer a terminal, and is in no XML document, with visible escapes.
+
+    Newline and tab stay.
+    """
+    return text.translate(_SHOWN)
+
+
+def visible_line(text: str) -> str:
+    """Return ``text`` as `visible` does, on one line: a line feed could forge the next one."""
+    return text.translate(_SHOWN_ON_A_LINE)
+
+
+def visible_json(document: str) -> str:
+    """Replace the control characters in a JSON document with JSON escapes of the same value."""
+    return document.translate(_IN_JSON)
+
+
+def echo(*parts: str | Coloured, err: bool = False) -> None:
+    """Print one line, on standard error with ``err``."""
+    _print(parts, _SHOWN_ON_A_LINE, err=err)
+
+
+def echo_lines(*parts: str | Coloured, err: bool = False) -> None:
+    """Print lines of which sros made the ends, on standard error with ``err``."""
+    _print(parts, _SHOWN, err=err)
+
+
+def echo_document(document: str | bytes) -> None:
+    """Print a document for another program: exactly, except on a terminal."""
+    import click
+
+    if sys.stdout is not None and sys.stdout.isatty():
+        text = document if isinstance(document, str) else os.fsdecode(document)
+        document = visible(text)
+    click.echo(document, nl=False)
+
+
+def echo_bytes(data: bytes) -> None:
+    """Write an archive to standard output, after all text printed before."""
+    sys.stdout.flush()
+    sys.stdout.buffer.write(data)
+    sys.stdout.buffer.flush()
+
+
+def redraw(text: str) -> None:
+    """Replace the present line of the terminal on standard error; erase it with "".
+
+    It goes to the terminal itself: a signal may come while the stream's buffer is in use.
+    """
+    os.write(sys.stderr.fileno(), f"\r\x1b[K{visible_line(text)}".encode())
+
+
+def ask_secret(what: str, *, confirm: bool) -> str:
+    """Ask on the terminal for a secret that is not shown, twice with ``confirm``."""
+    import click
+
+    asked = visible_line(f"{what[:1].upper()}{what[1:]}")  # a keystore may name the token
+    answer = click.prompt(asked, hide_input=True, err=True, confirmation_prompt=confirm)
+    return str(answer)
+
+
+def _print(parts: tuple[str | Coloured, ...], shown: dict[int, str], *, err: bool) -> None:
+    import click
+
+    texts = (
+        click.style(part.word, fg=_COLOURS[part.word], bold=True)
+        if isinstance(part, Coloured)
+        else part.translate(shown)
+        for part in parts
+    )
+    click.echo("".join(texts), err=err)
