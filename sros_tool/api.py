@@ -8,7 +8,7 @@ exception.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from os import PathLike, fspath
@@ -438,8 +438,10 @@ def check(
 
 def check_requirements(
     path: AnyPath,
-    requirements: AnyPath,
+    requirements: AnyPath | Sequence[AnyPath],
     *,
+    fleet: AnyPath | None = None,
+    template: str = "",
     vendor: str = "",
     domain: int | None = None,
     now: datetime | None = None,
@@ -449,7 +451,11 @@ def check_requirements(
 
     Args:
         path: A policy file or a keystore.
-        requirements: The TOML file of the requirements.
+        requirements: The TOML file of the requirements, or several.
+        fleet: The file with the robots that the placeholders of a policy stand for.
+        template: The keystore template, by name or file, whose protection a policy gets; without
+            one, that of the default template is assumed where the policy does not say it, and a
+            finding tells so.
         vendor: The only vendor of DDS to decide for, or "zenoh"; every measured one and Zenoh by
             default.
         domain: The only ROS domain id to decide for; by default one of each kind that the
@@ -470,17 +476,28 @@ def check_requirements(
         >>> for finding in sros_tool.check_requirements("robot.xml", "robot.requirements.toml"):
         ...     print(finding.place, finding.text)
     """
-    from sros_tool.checks.kind import WARNING
+    from sros_tool.checks.kind import NOTE
+    from sros_tool.fleet.document import read_fleet
+    from sros_tool.keystore.template import load_template
     from sros_tool.proof.findings import requirement_findings
-    from sros_tool.proof.requirements import read_requirements
+    from sros_tool.proof.requirements import read_all_requirements
     from sros_tool.proof.system import WORLDS, load_system
 
     if vendor and vendor not in WORLDS:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(WORLDS)}.")
-    read = read_requirements(Path(requirements))
-    system = load_system(Path(path), at=_moment(now), zone=zone, domain=domain, world=vendor)
+    files = [requirements] if isinstance(requirements, str | PathLike) else requirements
+    read = read_all_requirements(map(Path, files))
+    system = load_system(
+        Path(path),
+        at=_moment(now),
+        zone=zone,
+        domain=domain,
+        fleet=read_fleet(Path(fleet)) if fleet else None,
+        world=vendor,
+        template=load_template(template) if template else None,
+    )
     found = requirement_findings(read, system)
-    return tuple(each for each in found if each.severity >= WARNING)
+    return tuple(each for each in found if each.severity > NOTE or each.kind.prominent)
 
 
 def new_access(base: AnyPath, head: AnyPath, *, fleet: AnyPath | None = None) -> Growth:

@@ -250,6 +250,15 @@ def test_requirements_are_decided(tmp_path: Path) -> None:
     assert [str(each) for each in broken.related] == [f"{required}:1"]
     assert (vacuous.id, vacuous.file, vacuous.line) == ("requirement.vacuous", str(required), 3)
     assert sros_tool.check_requirements(policy, required, vendor="zenoh") == (broken, vacuous)
+    policy.write_text(policy_text({"/{robot}/a": publish("/{robot}/x")}))
+    fleet, more = tmp_path / "fleet.toml", tmp_path / "more.toml"
+    fleet.write_text("[robots.r1]\n")
+    required.write_text('[[nobody]]\npublish = ["/r1/x"]\n')
+    more.write_text('[[protected]]\ntopics = ["/r1/x"]\nlevel = "sign"\n')
+    found = sros_tool.check_requirements(policy, [required, more], fleet=fleet)
+    assert [each.id for each in found] == ["requirement.violated", "requirement.assumed"]
+    (known,) = sros_tool.check_requirements(policy, [more, required], fleet=fleet, template="sros2")
+    assert known.subject == "/r1/a"
     with pytest.raises(UsageError, match="unknown vendor"):
         sros_tool.check_requirements(policy, required, vendor="none")
 

@@ -29,6 +29,17 @@ DROPPED = FindingKind(
     "The requirements file, and the one given as --requirements-before.",
     "Demand it again, or agree that it goes.",
 )
+ASSUMED = FindingKind(
+    "requirement.assumed",
+    NOTE,
+    "a protection that is assumed, and not demanded",
+    "A policy alone has no governance: it becomes that of the keystore, whose template can protect "
+    "less than the default one.",
+    "The requirements file.",
+    "Name the keystore's template with --template, say protect= in the policy, or check the "
+    "keystore.",
+    prominent=True,
+)
 NOT_ON_ZENOH = FindingKind(
     "requirement.not-on-zenoh",
     NOTE,

@@ -21,6 +21,7 @@ from sros_tool.cli.common import (
     PATH,
     check_one_format,
     check_output,
+    complete_template,
     domain_of,
     fleet_option,
     force_option,
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from sros_tool.checks.targets import Circumstances
     from sros_tool.demo.doctor import Diagnosis
     from sros_tool.fleet.model import Fleet
-    from sros_tool.proof.requirements import Requirement
     from sros_tool.proof.system import System
     from sros_tool.runtime.ros2cli import SecurityProvider
 
@@ -138,6 +138,12 @@ severity or higher is shown, else 0.""",
     help="Report what this earlier file demanded, and --requirements does not.",
 )
 @click.option(
+    "--template",
+    metavar="TEMPLATE",
+    shell_complete=complete_template,
+    help="Decide --requirements with the protection of this keystore template.",
+)
+@click.option(
     "--suggest",
     is_flag=True,
     help="Print requirements that hold today, as TOML, to keep or to strike.",
@@ -189,6 +195,7 @@ def check(
     fleet_file: Path | None,
     requirements: tuple[Path, ...],
     earlier: tuple[Path, ...],
+    template: str | None,
     suggest: bool,
     vendor: str | None,
     domain: str | None,
@@ -208,6 +215,7 @@ def check(
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
     from sros_tool.proof.dropped import dropped_findings
+    from sros_tool.proof.findings import requirement_findings
     from sros_tool.proof.requirements import read_all_requirements
 
     check_one_format()
@@ -241,15 +249,21 @@ def check(
     if suggest:
         if form != "text" or requirements or earlier:
             raise UsageError("--suggest prints TOML", "", "Give it alone.")
-        echo_document(_suggested(_one_path(family, paths, "--suggest"), at, vendor))
+        path = _one_path(family, paths, "--suggest")
+        with progress("deciding"):
+            text = _suggested(_system(path, at, vendor, template))
+        echo_document(text)
         return 0
+    if template and not requirements:
+        raise UsageError("--template is for --requirements and --suggest", "", "Leave it out.")
     read = read_all_requirements(requirements)
     if earlier and not requirements:
         raise UsageError("--requirements-before needs --requirements", "", "Name the new file.")
     one = _one_path(family, paths, "--requirements") if read else None
     with progress("checking"):
         every = _findings(family, paths, at)
-        every += _broken(one, read, at, vendor) if one else []
+        if one:
+            every += requirement_findings(read, _system(one, at, vendor, template))
         if earlier:
             every += dropped_findings(read_all_requirements(earlier), read, str(requirements[0]))
         found = [_shown(each) for each in every]
@@ -278,29 +292,27 @@ def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
     raise UsageError(f"{option} takes one policy file or keystore")
 
 
-def _system(path: Path, at: Circumstances, vendor: str | None) -> System:
+def _system(
+    path: Path, at: Circumstances, vendor: str | None, template: str | None = None
+) -> System:
+    from sros_tool.keystore.template import load_template
     from sros_tool.proof.system import load_system
 
     return load_system(
-        path, at=at.now, zone=at.zone, domain=at.domain, fleet=at.fleet, world=vendor or ""
+        path,
+        at=at.now,
+        zone=at.zone,
+        domain=at.domain,
+        fleet=at.fleet,
+        world=vendor or "",
+        template=load_template(template) if template else None,
     )
 
 
-def _suggested(path: Path, at: Circumstances, vendor: str | None) -> str:
+def _suggested(system: System) -> str:
     from sros_tool.proof.suggest import render_requirements, suggest
 
-    with progress("deciding"):
-        system = _system(path, at, vendor)
-        return render_requirements(suggest(system.rights, system.worlds), str(path))
-
-
-def _broken(
-    path: Path, requirements: Sequence[Requirement], at: Circumstances, vendor: str | None
-) -> list[Finding]:
-    """Return the findings of requirements."""
-    from sros_tool.proof.findings import requirement_findings
-
-    return requirement_findings(requirements, _system(path, at, vendor))
+    return render_requirements(suggest(system.rights, system.worlds), system.file)
 
 
 def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:

@@ -6,6 +6,7 @@ import gc
 import os
 import tempfile
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,7 +34,7 @@ from sros_tool.terminal import echo, echo_document
 from sros_tool.values import as_plain, versioned
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Container, Iterator, Mapping, Sequence
     from datetime import datetime
 
     from click.shell_completion import CompletionItem
@@ -169,8 +170,6 @@ def view(
 
     The page is one file that needs no network. No format contains keys or paths of this machine.
     """
-    from dataclasses import replace
-
     from sros_tool.report.folding import Folding
 
     check_one_format()
@@ -257,8 +256,6 @@ def _picture(
     with_findings: bool,
 ) -> tuple[Picture, Sequence[PictureSource], Mapping[str, Robot]]:
     """Return the picture, the sources whose rights are in it, and the robots by their enclaves."""
-    from dataclasses import replace
-
     from sros_tool.report.compose import Context, compose, overlay, union
     from sros_tool.report.sources import common_rights, read_source, template_governance
     from sros_tool.report.sources import with_findings as added
@@ -307,7 +304,7 @@ def _picture(
 
 def _with_requirements(
     picture: Picture,
-    requirements: Path,
+    file: Path,
     sources: tuple[Path, ...],
     template: str | None,
     moment: datetime,
@@ -315,33 +312,42 @@ def _with_requirements(
 ) -> Picture:
     """Return the picture with what breaks requirements, decided as `sros check` does."""
     from sros_tool.cli.common import local_zone
-    from sros_tool.proof.findings import decide_all, violation_text
-    from sros_tool.proof.requirements import read_requirements
+    from sros_tool.keystore.template import load_template
+    from sros_tool.proof.findings import assumption_text, decide_all, decided_findings
+    from sros_tool.proof.requirements import demand, read_requirements
     from sros_tool.proof.system import load_system
     from sros_tool.report.compose import with_requirements
     from sros_tool.report.picture import PicturedUse, PicturedViolation, Requirements
 
-    if len(sources) > 1 or template:
-        raise UsageError(
-            "--requirements takes one policy or keystore, without --template",
-            "Protection is that of the keystore.",
-            "Draw a keystore that was made from the template.",
-        )
-    wanted = read_requirements(requirements)
-    system = load_system(sources[0], at=moment, zone=local_zone(os.environ), fleet=fleet)
+    if len(sources) > 1:
+        raise UsageError("--requirements takes one policy or keystore", "", "Draw one of them.")
+    wanted = read_requirements(file)
+    system = load_system(
+        sources[0],
+        at=moment,
+        zone=local_zone(os.environ),
+        fleet=fleet,
+        template=load_template(template) if template else None,
+    )
     decided = decide_all(wanted, system)
+    found = decided_findings(decided, system)
     violations = tuple(
         PicturedViolation(
-            violation_text(each),
+            _finding_text(finding, finding.subject),
             tuple(
                 PicturedUse(step.use.enclave, *step.drawn())
                 for step in each.steps
                 if step.place and step.use.right
             ),
         )
-        for each in decided.violations
+        for each, finding in zip(decided.violations, found, strict=False)
     )
-    return with_requirements(picture, Requirements(len(wanted) - len(violations), violations))
+    assumed = tuple(f"{demand(each)}: {assumption_text(name)}" for each, name in decided.assumed)
+    requirements = Requirements(len(wanted) - len(violations), violations, assumed)
+    paths = {each.path for each in picture.enclaves}
+    pictured = tuple(_pictured(each, paths) for each in found)
+    picture = replace(picture, findings=(*picture.findings, *pictured))
+    return with_requirements(picture, requirements)
 
 
 def _check_no_governance(sources: tuple[Path, ...], read: list[PictureSource]) -> None:
@@ -363,7 +369,6 @@ def _checked(
     from sros_tool.checks.policies import policy_file_findings
     from sros_tool.checks.targets import Circumstances, path_findings
     from sros_tool.cli.common import local_zone
-    from sros_tool.report.picture import PicturedFinding
 
     at = Circumstances(moment, local_zone(os.environ), fleet=fleet)
     try:
@@ -374,17 +379,24 @@ def _checked(
         )
     except SrosError:
         return []
-    return [
-        PicturedFinding(each.id, each.severity.word, _finding_text(each), each.remedy, each.subject)
-        for each in found
-    ]
+    return [_pictured(each, {each.subject}) for each in found]
 
 
-def _finding_text(finding: Checked) -> str:
-    """Return the text of a finding, with the base name of its file and the line."""
-    if not finding.line:
-        return finding.text
-    return f"{Path(finding.file).name}:{finding.line}: {finding.text}"
+def _pictured(finding: Checked, enclaves: Container[str]) -> PicturedFinding:
+    """Return a finding for the picture; its subject is in the text unless it is an enclave."""
+    from sros_tool.report.picture import PicturedFinding
+
+    known = finding.subject in enclaves
+    about = "" if known or finding.subject == finding.file else finding.subject
+    text = _finding_text(finding, about)
+    enclave = finding.subject if known else ""
+    return PicturedFinding(finding.id, finding.severity.word, text, finding.remedy, enclave)
+
+
+def _finding_text(finding: Checked, about: str = "") -> str:
+    """Return the text of a finding ``about`` something, with the base name of file and the line."""
+    place = f"{Path(finding.file).name}:{finding.line}" if finding.line else ""
+    return ": ".join(filter(None, (place, about, finding.text)))
 
 
 def _hosts(words: tuple[str, ...]) -> dict[str, str]:

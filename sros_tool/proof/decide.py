@@ -78,13 +78,14 @@ class Verdict:
 
     ``witness`` is None if the requirement holds.  ``empty`` are names and enclaves in it that
     nothing has, for which it cannot fail.  ``always`` says why it cannot fail whatever rights the
-    enclaves get, or is "".
+    enclaves get, or is "".  ``assumed`` is a name whose protection nobody has said, or "".
     """
 
     requirement: Requirement
     witness: Witness | None
     empty: tuple[str, ...] = ()
     always: str = ""
+    assumed: str = ""
 
 
 class Worlds:
@@ -139,7 +140,8 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
         _confirm(requirement, witness, world)
     empty = tuple(_empty(requirement, world, limit))
     always = "" if witness or empty else _always(requirement, world)
-    return Verdict(requirement, witness, empty, always)
+    assumed = "" if witness else _assumed(requirement, world, limit)
+    return Verdict(requirement, witness, empty, always, assumed)
 
 
 def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
@@ -373,6 +375,17 @@ def _unprotected(requirement: Protected, world: World, limit: SearchLimit) -> Wi
         if topic := world.example(weak, topics, limit):
             found.append(Use("", "", topics.ros_name(topic), topic, True))
     return Witness((min(found, key=_better),)) if found else None
+
+
+def _assumed(requirement: Requirement, world: World, limit: SearchLimit) -> str:
+    """Return the shortest name whose protection is assumed in the world, or ""."""
+    if not isinstance(requirement, Protected) or world.demanded is None:
+        return ""
+    found = []
+    for topics in _of_kinds(requirement.names):
+        if topic := world.example(~world.demanded, topics, limit):
+            found.append(topics.ros_name(topic))
+    return shortest(found) or ""
 
 
 def _of_kinds(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:

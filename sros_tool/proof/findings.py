@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
-from sros_tool.checks.requirements import NOT_ON_ZENOH, VACUOUS, VIOLATED
+from sros_tool.checks.requirements import ASSUMED, NOT_ON_ZENOH, VACUOUS, VIOLATED
+from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import action_part, is_expression
 from sros_tool.policy.model import Source
 from sros_tool.policy.rights import KIND_OF
@@ -80,10 +81,15 @@ class Violation:
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """All decisions: what does not hold, and why requirements, or parts of them, cannot fail."""
+    """All decisions: what does not hold, and why requirements, or parts of them, cannot fail.
+
+    ``assumed`` are those that hold only with the protection of the default template, which nobody
+    has chosen, each with a name of which the policy does not say it.
+    """
 
     violations: tuple[Violation, ...]
     vacuous: tuple[tuple[Requirement, tuple[str, ...]], ...]
+    assumed: tuple[tuple[Requirement, str], ...] = ()
 
 
 MOST_STEPS = 8_000_000
@@ -96,7 +102,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     Raises:
         DocumentError: one cannot be decided with so many wildcards.
     """
-    violations, vacuous = [], []
+    violations, vacuous, assumed = [], [], []
     limit = SearchLimit(MOST_STEPS)
     worlds = Worlds(system.worlds)
     for requirement in requirements:
@@ -112,7 +118,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             violations.append(Violation(requirement, witness, steps, titles, missing))
         if reasons := tuple(_never_fails([each for _, each in verdicts])):
             vacuous.append((requirement, reasons))
-    return Decided(tuple(violations), tuple(vacuous))
+        if not broken and (names := [each.assumed for _, each in verdicts if each.assumed]):
+            assumed.append((requirement, names[0]))
+    return Decided(tuple(violations), tuple(vacuous), tuple(assumed))
 
 
 def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
@@ -136,19 +144,19 @@ def requirement_findings(requirements: Sequence[Requirement], system: System) ->
     Raises:
         DocumentError: one cannot be decided with so many wildcards.
     """
-    decided = decide_all(requirements, system)
+    return decided_findings(decide_all(requirements, system), system)
+
+
+def decided_findings(decided: Decided, system: System) -> list[Finding]:
+    """Return the findings of decisions, those of what does not hold first and in their order."""
     found = [_violated(each) for each in decided.violations]
     found += [_vacuous(requirement, why) for requirement, why in decided.vacuous]
+    found += [_assumed(*each) for each in decided.assumed]
     if system.left_out:
         error = system.left_out
         text = f"{error.what}: {error.why}" if error.why else error.what
         found.append(NOT_ON_ZENOH.found(system.file, text, system.file))
     return found
-
-
-def violation_text(violation: Violation) -> str:
-    """Return who breaks a requirement, and what it demands, in one sentence."""
-    return f"{_subject(violation)}: {_text(violation)}"
 
 
 def _text(violation: Violation) -> str:
@@ -238,3 +246,15 @@ def _vacuous(requirement: Requirement, why: Sequence[str]) -> Finding:
     own = requirement.source
     text = f"{'; '.join(why)}: {demand(requirement)}"
     return VACUOUS.found(own.file, text, own.file, own.line)
+
+
+def _assumed(requirement: Requirement, name: str) -> Finding:
+    own = requirement.source
+    text = f"{demand(requirement)}: {assumption_text(name)}"
+    return ASSUMED.found(own.file, text, own.file, own.line)
+
+
+def assumption_text(name: str) -> str:
+    """Return of which name a policy does not say the protection, and what is assumed."""
+    assumed = f"that of the template {DEFAULT_TEMPLATE} is assumed"
+    return f"the policy does not say how {name} is protected, and {assumed}"

@@ -30,12 +30,12 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
-from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
+from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Policy, Source
-from sros_tool.policy.protection import Level
+from sros_tool.policy.protection import PROTECT, Level
 from sros_tool.policy.rights import Right, policy_rights
-from sros_tool.policy.stated import stated_protections
+from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.proof.access import (
     dds_access,
     domains_of,
@@ -46,8 +46,8 @@ from sros_tool.proof.access import (
 )
 from sros_tool.proof.places import Place, Places, topics_of
 from sros_tool.proof.sources import UNCERTAIN
-from sros_tool.proof.worlds import LONGEST, TopicAccess, World
-from sros_tool.translate import governance_for, permissions_for
+from sros_tool.proof.worlds import LONGEST, TopicAccess, World, named
+from sros_tool.translate import governance_for, permissions_for, protected_topics
 from sros_tool.translate_zenoh import remote_rights, stated_rights
 from sros_tool.validity import window
 from sros_tool.zenoh.access import AccessControl
@@ -86,28 +86,47 @@ def load_system(
     domain: int | None = None,
     fleet: Fleet | None = None,
     world: str = "",
+    template: Template | None = None,
 ) -> System:
     """Return the worlds of a policy file, or of a keystore as it is signed.
 
-    ``world`` is the only one that is wanted, of `WORLDS`; "" stands for all.  A keystore without
-    configurations of Zenoh has no world of Zenoh.
+    ``template`` is the one of the keystore that a policy is for.  ``world`` is the only one that is
+    wanted, of `WORLDS`; "" stands for all.  A keystore without configurations of Zenoh has no world
+    of Zenoh.
 
     Raises:
         DocumentError: the file cannot be read, or only Zenoh is wanted and cannot carry it out.
         KeystoreError: the keystore cannot be read, or has no configurations of Zenoh that decide.
+        UsageError: a keystore has a template of its own.
     """
     if is_keystore(path):
+        if template:
+            raise UsageError(
+                f"'{path}' is a keystore, which has its own governance",
+                "A template is for a policy that is not signed yet.",
+                "Leave --template out, or check the policy.",
+            )
         return _keystore_system(path, at, zone, domain, world)
-    return policy_system(read_policy_for(path, fleet), at=at, domain=domain or 0, world=world)
+    policy = read_policy_for(path, fleet)
+    return policy_system(policy, at=at, domain=domain or 0, world=world, template=template)
 
 
 # ── a policy ───────────────────────────────────────────────────────────────────────────────
 
 
-def policy_system(policy: Policy, *, at: datetime, domain: int = 0, world: str = "") -> System:
+def policy_system(
+    policy: Policy,
+    *,
+    at: datetime,
+    domain: int = 0,
+    world: str = "",
+    template: Template | None = None,
+) -> System:
     """Return the worlds of a policy as it would be signed at ``at``.
 
-    The governance is that of the default template, raised as the policy says.
+    The governance is that of the template, raised as the policy says.  Without a template, a name
+    for which the policy says its protection has just that one, and for all others that of the
+    default template is assumed.
 
     Raises:
         PolicyError: only Zenoh is wanted, and it cannot carry out the policy.
@@ -115,9 +134,10 @@ def policy_system(policy: Policy, *, at: datetime, domain: int = 0, world: str =
     domains = DomainSet.of((domain, domain))
     rights = frozenset(each for each in policy_rights(policy) if each.qualifier is ALLOW)
     stated = _stated([each.path for each in policy.enclaves], rights)
-    protection = load_template(DEFAULT_TEMPLATE).protection
-    protection = with_stated(protection, stated_protections(policy.enclaves))
-    governance = governance_for(protection, domains)
+    protections = stated_protections(policy.enclaves)
+    protection = (template or load_template(DEFAULT_TEMPLATE)).protection
+    governance = governance_for(with_stated(protection, protections), domains)
+    demanded = None if template else _demanded(protections)
     signed = {
         each.path: permissions_for(
             each,
@@ -134,7 +154,7 @@ def policy_system(policy: Policy, *, at: datetime, domain: int = 0, world: str =
                 name: (Access(vendor, governance, each, f"CN={name}", domain=domain, at=at),)
                 for name, each in signed.items()
             }
-            worlds.append(_dds_world(vendor, access, stated))
+            worlds.append(_dds_world(vendor, access, stated, demanded=demanded))
     left_out = None
     if world in ("", _ZENOH):
         try:
@@ -172,8 +192,12 @@ def _dds_world(
     *,
     title: str = "",
     idle: Collection[str] = (),
+    demanded: Mapping[Level, NameSet] | None = None,
 ) -> World:
-    """Return the world of a vendor; an enclave may do what one of its accesses gives."""
+    """Return the world of a vendor; an enclave may do what one of its accesses gives.
+
+    ``demanded`` maps levels to the topics for which a policy says just that, and no keystore yet.
+    """
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
         verb = AccessVerb.PUBLISH if writes else AccessVerb.SUBSCRIBE
@@ -186,12 +210,16 @@ def _dds_world(
         writes, reads = ([getattr(e, side) for e in every] for side in ("writes", "reads"))
         return TopicAccess(NameSet.union(writes), NameSet.union(reads))
 
+    weak = _weak(each for some in access.values() for each in some)
+    if demanded is not None:
+        weak[Level.ENCRYPT] |= demanded[Level.SIGN]
     return World(
         title or vendor.title,
         {name: topics(some) for name, some in access.items()},
         confirm=confirm,
         stated=stated,
-        weak=_weak(each for some in access.values() for each in some),
+        weak=weak,
+        demanded=None if demanded is None else NameSet.union(demanded.values()),
         needed=_OF_EVERY_NODE,
         idle=idle,
         longest=vendor.traits.longest_topic_name or LONGEST,
@@ -211,6 +239,14 @@ def _weak(access: Iterable[Access]) -> dict[Level, NameSet]:
         )
         for level, rank in _RANK.items()
     }
+
+
+def _demanded(protections: Iterable[StatedProtection]) -> dict[Level, NameSet]:
+    """Map levels to the topics for which a policy says them."""
+    topics: dict[Level, list[str]] = {level: [] for level in PROTECT.values()}
+    for each in protections:
+        topics[each.level] += protected_topics(each.kind, each.name)
+    return {level: NameSet.union(map(named, some)) for level, some in topics.items()}
 
 
 def _rank(domain: DomainRule, rule: TopicRule) -> int:

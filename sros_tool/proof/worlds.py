@@ -232,6 +232,7 @@ class World:
         confirm: Confirm,
         stated: Mapping[str, TopicAccess],
         weak: Mapping[Level, NameSet] = MappingProxyType({}),
+        demanded: NameSet | None = None,
         needed: Sequence[tuple[bool, str]] = (),
         idle: Collection[str] = (),
         longest: int = LONGEST,
@@ -242,9 +243,11 @@ class World:
         rights of an enclave name without wildcards.
 
         ``weak`` are the topics that are protected less than a level demands; without a level, there
-        are none.  ``needed`` are topics that every node has to write (True) and read (False).
-        ``idle`` are enclaves in which no process starts with their files as they are: they may do
-        what their rights give, and are able to do nothing.
+        are none.  ``demanded`` are the topics whose protection is known, because a policy demands
+        it, while that of all others is assumed; None if nothing is.  ``needed`` are topics that
+        every node has to write (True) and read (False).  ``idle`` are enclaves in which no process
+        starts with their files as they are: they may do what their rights give, and are able to do
+        nothing.
         """
         self.title = title
         self.confirm = confirm
@@ -255,6 +258,7 @@ class World:
         self.needed = tuple(needed)
         self.idle = frozenset(idle)
         self._weak = weak
+        self.demanded = demanded
         self._readers_of: dict[str, list[str]] = {}
         self._shared: dict[tuple[str, str], str | None] = {}
 
@@ -263,7 +267,7 @@ class World:
         return (
             (self.longest, self.needed, self.idle) == (other.longest, other.needed, other.idle)
             and self.stated == other.stated
-            and self._weak == other._weak
+            and (self._weak, self.demanded) == (other._weak, other.demanded)
             and self._access == other._access
         )
 

@@ -294,14 +294,20 @@ _SHOWN = 2  # rights that they say of one unit
 
 @dataclass(frozen=True, slots=True)
 class Requirements:
-    """The number of requirements that hold, and those that do not."""
+    """The number of requirements that hold, and those that do not.
+
+    ``assumed`` are those that hold by an assumption, in words.
+    """
 
     hold: int
     violations: tuple[PicturedViolation, ...] = ()
+    assumed: tuple[str, ...] = ()
 
     def sentences(self) -> tuple[str, ...]:
         """Return the result in sentences without a full stop."""
         holds = f"{counted(self.hold, 'requirement')} hold{'s' if self.hold == 1 else ''}"
+        if self.assumed:
+            holds += f", {len(self.assumed)} of them by an assumption: {self.assumed[0]}"
         if not self.violations:
             return (holds,)
         number = len(self.violations)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.proof import findings
+from sros_tool.resources import templates_dir
 from tests.support.harness import policy_text, publish, sros
 
 LISTEN = '<topics subscribe="ALLOW"><topic>{}</topic></topics>'
@@ -51,6 +52,7 @@ CASES = {
     "requirement.violated",
     "requirement.vacuous",
     "requirement.dropped",
+    "requirement.assumed",
     "requirement.not-on-zenoh",
 }
 """The kinds of findings that tests here bring about."""
@@ -169,6 +171,7 @@ def test_a_suggestion_holds(folder: Path, tmp_path: Path) -> None:
         (("robot.xml", "--requirements", "robot.xml"), "not valid TOML"),
         (("required.toml", "--requirements", "required.toml"), "required.toml"),
         (("robot.xml", "--requirements-before", "required.toml"), "needs --requirements"),
+        (("robot.xml", "--template", "production"), "--template is for --requirements"),
         (("robot.xml", "--suggest", "--json"), "--suggest prints TOML"),
         (("robot.xml", "--suggest", "--requirements", "required.toml"), "--suggest prints TOML"),
     ],
@@ -227,6 +230,29 @@ def test_a_keystore_gives_proposals_that_hold(keystore: Path, tmp_path: Path) ->
     suggested.write_text(sros("check", keystore, "--suggest").ok().out)
     assert '[[only]]\npublish = ["/scan"]\nenclaves = ["/lidar"]' in suggested.read_text()
     sros("check", keystore, *ONLY[2:], "--requirements", suggested).ok()
+
+
+def test_an_assumed_template_is_said(folder: Path, keystore: Path, tmp_path: Path) -> None:
+    required = tmp_path / "protected.toml"
+    required.write_text('[[protected]]\ntopics = ["/scan"]\nlevel = "encrypt"\n')
+    asked = (*ONLY, "--requirements", required)
+    said = sros(*asked, cwd=folder).ok().out
+    assert "note: a protection that is assumed, and not demanded [requirement.assumed]" in said
+    assert (
+        "topic /scan has to be encrypted: the policy does not say how /scan is protected, and that "
+        "of the template development is assumed\n"
+    ) in said
+    assert sros(*asked, "--template", "production", cwd=folder).ok().out == ""
+    weak = tmp_path / "weak.toml"
+    weak.write_text((templates_dir() / "production.toml").read_text().replace("ENCRYPT", "SIGN"))
+    ended = sros(*asked, "--template", weak, cwd=folder)
+    assert ended.status == 1
+    assert "/scan: its messages are not, but topic /scan has to be encrypted" in ended.out
+    demanded = tmp_path / "robot.xml"
+    demanded.write_text(POLICY.replace("/scan<", '/scan<?sros protect="sign"?><'))
+    assert sros("check", demanded, *asked[2:], cwd=folder).status == 1
+    ended = sros("check", keystore, *asked[2:], "--template", "production")
+    assert (ended.status, "has its own governance" in ended.err) == (2, True)
 
 
 def test_a_requirement_of_protection_is_about_the_governance(folder: Path, tmp_path: Path) -> None:

@@ -9,11 +9,23 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from itertools import product
 
 from sros_tool.names import READING_SERVICES
+from sros_tool.policy.model import RIGHTS
 from sros_tool.policy.patterns import matches
-from sros_tool.proof.requirements import Apart, AtMost, Must, Nobody, Only, Requirement, Widest
+from sros_tool.policy.protection import Level
+from sros_tool.proof.requirements import (
+    Apart,
+    AtMost,
+    Must,
+    Nobody,
+    Only,
+    Protected,
+    Requirement,
+    Widest,
+)
 from sros_tool.topics import dds_names
 
 LETTERS = "abc"
@@ -60,10 +72,15 @@ class Finite:
     writes: Mapping[str, frozenset[str]]
     reads: Mapping[str, frozenset[str]]
     stated: Mapping[tuple[str, bool], frozenset[str]]
+    level: Callable[[str], int]
+    """How well the messages of a topic are protected: 0, 1 (signed), or 2 (encrypted)."""
 
     def may(self, enclave: str, writes: bool, topic: str) -> bool:
         """Whether an enclave may write or read a topic."""
         return topic in (self.writes if writes else self.reads).get(enclave, ())
+
+
+_RANK = {Level.SIGN: 1, Level.ENCRYPT: 2}
 
 
 Uses = Collection[tuple[str, str]]
@@ -111,6 +128,11 @@ def breaches(requirement: Requirement, world: Finite) -> Iterator[tuple[str, ...
                                 enclave, writes, topic
                             ):
                                 yield (name,)
+        case Protected(names=pairs, level=level):
+            for kind, pattern in pairs:
+                for name in (each for each in WITH_PARTS if matches(pattern, each)):
+                    if any(world.level(each) < _RANK[level] for each in topics_of(kind, name)):
+                        yield (name,)
         case Apart():
             yield from chains(requirement, world)
         case _:
@@ -126,6 +148,12 @@ def doings(rights: Collection[tuple[str, tuple[str, ...]]]) -> Iterator[tuple[st
                 yield from ((name, topic, True) for topic in needed.publish)
                 if right == "subscribe":
                     yield from ((name, topic, False) for topic in needed.subscribe)
+
+
+@lru_cache(None)
+def topics_of(kind: str, name: str) -> frozenset[str]:
+    """The DDS topics of a topic, service or action."""
+    return frozenset(t for right in RIGHTS[kind] for side in dds_names(right, name) for t in side)
 
 
 QUESTIONS = tuple(f"rq/*/{each}Request" for each in READING_SERVICES)
@@ -165,6 +193,7 @@ def finite(
     enclaves: Collection[str],
     stated: Mapping[tuple[str, bool], frozenset[str]],
     decide: Decide,
+    level: Callable[[str], int],
 ) -> Finite:
     """The world in which ``decide`` says whether an enclave may write (or read) a topic."""
     sides = [
@@ -174,4 +203,4 @@ def finite(
         }
         for writes in (True, False)
     ]
-    return Finite(sides[0], sides[1], stated)
+    return Finite(sides[0], sides[1], stated, level)

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
-from sros_tool.proof.findings import Decided, decide_all, violation_text
+from sros_tool.proof.findings import Decided, decide_all, requirement_findings
 from sros_tool.proof.requirements import Only, Protected, parse_requirements
 from sros_tool.proof.suggest import suggest
-from sros_tool.proof.system import policy_system
+from sros_tool.proof.system import System, policy_system
+from sros_tool.resources import templates_dir
 from tests.support.harness import policy_text
 
 NOW = datetime(2027, 1, 1, tzinfo=UTC)
@@ -26,10 +28,19 @@ def may(right: str, *names: str) -> str:
     return f'<{item}s {right}="ALLOW">{inside}</{item}s>'
 
 
-def decided(rights: Mapping[str, str], required: str) -> Decided:
+def robot(rights: Mapping[str, str]) -> System:
     policy = read_policy(Path("robot.xml"), policy_text(dict(rights)).encode())
-    requirements = parse_requirements(required.encode(), "r.toml")
-    return decide_all(requirements, policy_system(policy, at=NOW))
+    return policy_system(policy, at=NOW)
+
+
+def decided(rights: Mapping[str, str], required: str) -> Decided:
+    return decide_all(parse_requirements(required.encode(), "r.toml"), robot(rights))
+
+
+def texts(rights: Mapping[str, str], required: str) -> list[str]:
+    """Return the findings of a policy, each with its subject."""
+    found = requirement_findings(parse_requirements(required.encode(), "r.toml"), robot(rights))
+    return [f"{each.subject}: {each.text}" for each in found]
 
 
 GOAL, CANCEL = "/dock/_action/send_goal", "/dock/_action/cancel_goal"
@@ -81,8 +92,7 @@ HOLDERS = {
 @pytest.mark.parametrize("case", HOLDERS)
 def test_whoever_has_a_part_of_an_action_holds_the_right_to_it(case: str) -> None:
     rights, required, text = HOLDERS[case]
-    found = [violation_text(each) for each in decided(rights, required).violations]
-    assert found == ([text] if text else [])
+    assert texts(rights, required) == ([text] if text else [])
 
 
 ROBOT = {
@@ -123,8 +133,44 @@ def test_what_cannot_fail_is_said(required: str) -> None:
 
 def test_what_is_proposed_can_fail() -> None:
     two = {"/a": may("publish", "/x", "/*"), "/b": may("subscribe", "/x")}
-    policy = read_policy(Path("robot.xml"), policy_text(two).encode())
-    system = policy_system(policy, at=NOW)
+    system = robot(two)
     proposed = suggest(system.rights, system.worlds)
     assert {type(each) for each in proposed} >= {Only, Protected}
     assert decide_all(proposed, system).vacuous == ()
+
+
+ENCRYPTED = '[[protected]]\ntopics = ["/scan"]\nlevel = "encrypt"\n'
+SIGNED = ENCRYPTED.replace("encrypt", "sign")
+SCAN = '<topics publish="ALLOW"><topic>{}</topic></topics>'
+WEAK = "a template that signs, and encrypts nothing"
+PROTECTION = {
+    # name in the policy, requirement, template: does it hold, and is it assumed?
+    ("/scan", ENCRYPTED, ""): (True, True),
+    ('/scan<?sros protect="encrypt"?>', ENCRYPTED, ""): (True, False),
+    ('/sc*<?sros protect="encrypt"?>', ENCRYPTED, ""): (True, False),
+    ('/scan<?sros protect="encrypt"?>', ENCRYPTED.replace("/scan", "/sc*"), ""): (True, True),
+    ('/scan<?sros protect="sign"?>', ENCRYPTED, ""): (False, False),
+    ('/scan<?sros protect="sign"?>', ENCRYPTED.replace("/scan", "/*"), ""): (False, False),
+    ('/scan<?sros protect="sign"?>', SIGNED, ""): (True, False),
+    ("/scan", SIGNED, ""): (True, True),
+    ("/scan", ENCRYPTED, "production"): (True, False),
+    ("/scan", ENCRYPTED, WEAK): (False, False),
+    ("/scan", SIGNED, WEAK): (True, False),
+    ('/scan<?sros protect="encrypt"?>', ENCRYPTED, WEAK): (True, False),
+    # What a template protects better, a policy does not lower.
+    ('/scan<?sros protect="sign"?>', ENCRYPTED, "production"): (True, False),
+}
+
+
+@pytest.mark.parametrize("case", PROTECTION, ids=str)
+def test_protection_is_that_of_the_policy_and_of_a_chosen_template(
+    case: tuple[str, str, str], tmp_path: Path
+) -> None:
+    name, required, chosen = case
+    weak = tmp_path / "weak.toml"
+    weak.write_text((templates_dir() / "production.toml").read_text().replace("ENCRYPT", "SIGN"))
+    template = load_template(str(weak) if chosen == WEAK else chosen) if chosen else None
+    policy = read_policy(Path("r.xml"), policy_text({"/a": SCAN.format(name)}).encode())
+    system = policy_system(policy, at=NOW, template=template)
+    found = decide_all(parse_requirements(required.encode(), "r.toml"), system)
+    assert (not found.violations, bool(found.assumed)) == PROTECTION[case]

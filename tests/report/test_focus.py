@@ -257,12 +257,17 @@ def test_what_breaks_a_requirement_is_red_and_said(tmp_path: Path) -> None:
     found = value(policy, "--requirements", wanted)
     assert found["requirements"]["hold"] == 1
     (violation,) = found["requirements"]["violations"]
-    assert violation["text"].startswith("/web: may publish /cmd_vel by /cmd*, but ")
+    line = 1 + policy.read_text().split("/cmd*")[0].count("\n")
+    text = f"{policy.name}:{line}: /web: may publish /cmd_vel by /cmd*, but "
+    assert violation["text"].startswith(text)
+    (finding,) = (each for each in found["findings"] if each["id"].startswith("requirement."))
+    assert (finding["enclave"], finding["severity"]) == ("/web", "error")
+    assert finding["text"].startswith(f"{policy.name}:{line}: may publish /cmd_vel")
     assert [(e["enclave"], e["name"]) for e in found["edges"] if e["violates"]] == [
         ("/web", "/cmd_vel")
     ]
     shown = sros("view", policy, "--requirements", wanted, "--format", "svg").ok()
-    assert "Violated: /web: may publish /cmd_vel" in shown.err
+    assert f"Violated: {text}" in shown.err
     assert shown.out.count('class="link unknown wild violates"') == 1
     assert "breaks a requirement" in shown.out
     policy.write_text(policy_text(CHAIN))
