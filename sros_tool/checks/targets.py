@@ -87,13 +87,17 @@ def policy_findings(path: Path, at: Circumstances) -> list[Finding]:
 
 
 def _policies_below(folder: Path) -> Iterator[Path]:
-    """Return the policy files in a folder and below it, sorted, without fragments for includes."""
+    """Yield the policy files in a folder and below it, sorted, without fragments for includes.
+
+    A file that cannot be read is one of them if its name says so: ``*.policy.xml``.
+    """
     for path in sorted(folder.rglob("*.xml")):
         try:
             if parse(read_bytes(path, "file"), str(path)).tag == "policy":
                 yield path
         except SrosError:
-            continue
+            if f".{path.name.lower()}".endswith(".policy.xml"):
+                yield path
 
 
 def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:

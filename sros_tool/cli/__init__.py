@@ -5,7 +5,7 @@
 - keystores: `keystore` (with the JSON of `written`), `inspect`, `life`, `zenoh` and `zenoh_from`
 - robots: `deployment`, `fleet`, `units`, `metrics`
 - processes: `running` (with `enclave_environment` and `containers`), `demo`
-- policies: `policy` (with `new_access`), `view`
+- policies: `policy` (with `new_access`), `review`, `view`
 - robots that run: `generate_policy` and `audit` (with `observing`)
 - answers: `explain` (with `explain_zenoh`), `check`
 

@@ -444,15 +444,12 @@ def _relative(file: str) -> str:
 
 
 def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
-    from sros_tool.keystore.expiry import describe_lifetime, parse_threshold, survey
+    from sros_tool.keystore.expiry import describe_lifetime, due_enclaves, parse_threshold
     from sros_tool.keystore.reader import load_settings
     from sros_tool.validity import iso
 
     threshold = parse_threshold(text)
-    found, unreadable = survey(root)
-    settings = load_settings(root)
-    lasting = (each for each in found if settings.longest_validity(each.name) is None)
-    due = [each for each in lasting if each.due(threshold, moment)]
+    due, unreadable, count = due_enclaves(root, threshold, moment, load_settings(root))
     if form == "json":
         print_json(
             {
@@ -472,10 +469,10 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     else:
         lines = [describe_lifetime(each, moment) for each in due]
         lines += [f"{other.name}  unknown: {other.error}" for other in unreadable]
-        none = "the 1 enclave does not need" if len(found) == 1 else ""
-        none = f"{none or f'none of {len(found)} enclaves needs'} to be renewed ({text})"
+        none = "the 1 enclave does not need" if count == 1 else ""
+        none = f"{none or f'none of {count} enclaves needs'} to be renewed ({text})"
         if form == "markdown":
-            echo_lines(_renewal_markdown(lines, none, text))
+            echo_lines(renewal_markdown(lines, none, text))
             return NOT_DONE if unreadable else 1 if due else 0
         for line in lines:
             echo(line)
@@ -484,7 +481,8 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     return NOT_DONE if unreadable else 1 if due else 0
 
 
-def _renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:
+def renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:
+    """Return the enclaves that need to be renewed within a time as Markdown, or that none does."""
     from sros_tool.markdown import bounded, code, plain
 
     if not lines:
@@ -497,7 +495,7 @@ def _renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:
 def _print_markdown(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     from sros_tool.checks.markdown import findings_markdown
 
-    echo_lines(findings_markdown(chosen, _summary(chosen)))
+    echo_lines(findings_markdown(chosen, findings_summary(chosen)))
 
 
 def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
@@ -557,10 +555,11 @@ def _print_text(chosen: ChosenFindings, fleet: Fleet | None = None) -> None:
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
         echo(f"accepted by the {choice}: {kinds_text}")
-    echo(_summary(chosen), err=True)
+    echo(findings_summary(chosen), err=True)
 
 
-def _summary(chosen: ChosenFindings) -> str:
+def findings_summary(chosen: ChosenFindings) -> str:
+    """Return the number of findings, in words."""
     counts = _counts(chosen)
     counted = [f"{number} {word}{'s' * (number != 1)}" for word, number in counts.items() if number]
     number = chosen.hidden

@@ -42,11 +42,11 @@ def show_new_access(
     if form == "json":
         print_json(_growth_json(before, after, growth))
     elif form == "markdown":
-        echo_document(_growth_markdown(before, after, growth))
+        echo_document(access_markdown(before, after, growth))
     else:
         for line in (*_added_lines(after, growth), *_removed_lines(before, growth)):
             echo(line)
-        echo(_summary(growth), err=True)
+        echo(access_summary(growth), err=True)
     if form != "json":
         print_notes((*before.notes, *after.notes))
     return int(bool(growth))
@@ -116,7 +116,8 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:_MOST_LINES]) + (f" and {more} more" if more > 0 else "")
 
 
-def _summary(growth: Growth) -> str:
+def access_summary(growth: Growth) -> str:
+    """Return what a change adds, in one sentence."""
     worlds = ", ".join(growth.worlds)
     basis = "".join(
         f"; {title}: {', '.join(clauses)}"
@@ -148,11 +149,12 @@ def _count(number: int, what: str) -> str:
     return f"1 {what} is" if number == 1 else f"{number} {what}s are"
 
 
-def _growth_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> str:
+def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> str:
+    """Return what a change adds, and removes, as Markdown."""
     from sros_tool.markdown import bounded, code, plain
 
     rest = "which `sros diff_policy --no-new-access` shows"
-    parts = [f"### New access: {plain('yes' if growth else 'none')}", plain(_summary(growth))]
+    parts = [f"### New access: {plain('yes' if growth else 'none')}", plain(access_summary(growth))]
     lists = (("added", _added_lines(head, growth)), ("removed", _removed_lines(base, growth)))
     for title, lines in lists:
         if lines:

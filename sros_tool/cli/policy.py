@@ -216,7 +216,6 @@ def diff_policy(
     what is assumed and what is left out, such as dates.
     """
     from sros_tool.keystore.rights import load_rights
-    from sros_tool.policy.rights import compare
 
     check_one_format()
     form = "json" if as_json else form
@@ -227,16 +226,11 @@ def diff_policy(
     with progress("reading"):
         fleets = fleets_of(fleet_files)
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])
-    scope = None
-    if first.scope is None or second.scope is None:
-        scope = second.scope if first.scope is None else first.scope
-    difference = compare(first.rights, second.rights, scope)
-    protections = _protection_differences(first, second)
+    scope, difference, protections = _compared(first, second)
     if form == "json":
         print_json(_difference_json(first, second, difference, protections))
     elif form == "markdown":
-        drawn = _drawn_difference(first, second, difference)
-        echo_lines(_difference_markdown(first, second, difference, protections, drawn))
+        echo_lines(rights_markdown(first, second))
     else:
         for line in _difference_lines(difference, first.fleet, second.fleet):
             echo(line)
@@ -257,6 +251,26 @@ _MOST_LINES, _MOST_PICTURE, _MOST_LINKS = 12_000, 25_000, 250
 
 A comment on GitHub has at most 65,536 characters; Mermaid draws at most 50,000, and 500 arrows.
 """
+
+
+def _compared(
+    first: RightsSource, second: RightsSource
+) -> tuple[frozenset[str] | None, RightsDifference, list[tuple[str, StatedProtection]]]:
+    """Return the enclaves that are compared (None for all), and what differs."""
+    from sros_tool.policy.rights import compare
+
+    scope = None
+    if first.scope is None or second.scope is None:
+        scope = second.scope if first.scope is None else first.scope
+    difference = compare(first.rights, second.rights, scope)
+    return scope, difference, _protection_differences(first, second)
+
+
+def rights_markdown(first: RightsSource, second: RightsSource) -> str:
+    """Return how rights differ as Markdown, with a picture."""
+    _, difference, protections = _compared(first, second)
+    drawn = _drawn_difference(first, second, difference)
+    return _difference_markdown(first, second, difference, protections, drawn)
 
 
 def _difference_markdown(

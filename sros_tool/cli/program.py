@@ -81,6 +81,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "check": VerbEntry(
             "check", "Find errors and weaknesses in policies, keystores, the runtime."
         ),
+        "review": VerbEntry("review", "Review a change of policies and keystores in git."),
         "metrics": VerbEntry("metrics", "Give Prometheus the expiry and findings of a keystore."),
         "audit": VerbEntry("audit", "Report what a policy would deny to the running robot."),
         "doctor": VerbEntry("check", "Find out which DDS here enforces security."),
@@ -248,6 +249,7 @@ _PHRASES = {
     "doctor": "examine this machine",
     "audit": "audit the robot",
     "metrics": "give the metrics",
+    "review": "review the change",
     "fleet": "do this for the fleet",
 }
 

@@ -19,6 +19,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.reader import read_certificate, read_signed_grant
+from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
@@ -125,6 +126,20 @@ def survey(root: Path) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, .
         tuple(each for each in found if isinstance(each, Lifetime)),
         tuple(each for each in found if isinstance(each, UnreadableEnclave)),
     )
+
+
+def due_enclaves(
+    root: Path, threshold: Threshold, moment: datetime, settings: Template
+) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...], int]:
+    """Return the enclaves of a keystore that need to be renewed, those unreadable, and a count.
+
+    Enclaves that the settings let be valid for a short time are renewed in another way.  The count
+    is that of all readable enclaves.
+    """
+    found, unreadable = survey(root)
+    lasting = (each for each in found if settings.longest_validity(each.name) is None)
+    due = tuple(each for each in lasting if each.due(threshold, moment))
+    return due, unreadable, len(found)
 
 
 def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> None:

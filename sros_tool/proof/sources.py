@@ -421,3 +421,12 @@ def _of_policies(shown: str, policies: list[_Read]) -> AccessSource:
     return AccessSource(
         shown, "policy", rights, permissions, fleet=fleet, protections=stated, enclaves=enclaves
     )
+
+
+def load_policies(files: Iterable[Path], shown: str, fleet: Fleet | None = None) -> AccessSource:
+    """Return what the policies of one robot, or of one fleet, give together.
+
+    Raises:
+        SrosError: one cannot be read, or two have the same enclave.
+    """
+    return _of_policies(shown, [_read(each, fleet) for each in files])

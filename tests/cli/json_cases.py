@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -98,6 +99,13 @@ def make_folder(folder: Path) -> None:
     sros("zenoh", "closed", cwd=folder).ok()
     (folder / "closed/enclaves/b/session.json5").unlink()
     (folder / "open.json5").write_text("{mode: 'router'}")
+    repository = folder / "git"
+    repository.mkdir()
+    for name in ("policy.xml", "required.toml"):
+        shutil.copy(folder / name, repository)
+    person = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+    for words in (["init", "-q"], ["add", "--all"], [*person, "commit", "-q", "-m", "first"]):
+        subprocess.run(["git", "-C", str(repository), *words], check=True)
     (folder / "self_limiting.json5").write_text(self_limiting())
     (folder / "denying.json5").write_text(denying())
     (folder / "lost/public/identity_ca.crl.pem").unlink()
@@ -346,6 +354,11 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks --job check --sros /bin/sros new --dry-run"),
         Case("zenoh /a new --rmw rmw_zenoh_cpp", before=("zenoh zenoh",)),
     ),
+    "review": (
+        Case("--base none --policy policy.xml --repository git", 1),
+        Case("--base none --policy policy.xml --requirements required.toml --repository git", 1),
+        Case("--base none --policy none.xml --repository git", 2),
+    ),
     "metrics": (
         Case("ks"),
         Case("broken -o new.prom"),
@@ -410,6 +423,7 @@ ERRORS = {
     "explain": "ks /none publish /x",
     "view": "none",
     "metrics": "none",
+    "review": "--base none --policy policy.xml --repository ks",
     "fleet confirm": "fleet b.json --robot a",
     "fleet status": "ks",
     "units": "none /a new",

@@ -28,7 +28,7 @@ NO_JSON = {
 }
 READS = {
     "list_enclaves", "inspect", "verify", "diff_policy", "explain", "check", "doctor", "env",
-    "completion", "fleet report", "fleet inventory",
+    "completion", "fleet report", "fleet inventory", "review",
 }  # fmt: skip
 RUNS = {"run", "demo"}
 NEW_NAMES = {("create_request", "name")}
@@ -36,7 +36,7 @@ NEW_NAMES = {("create_request", "name")}
 GROWS = {
     "create_enclave", "generate_artifacts", "update_keystore", "renew", "revoke", "rotate_ca",
     "distribute_key", "verify", "diff_policy", "explain", "view", "check", "metrics", "units",
-    "zenoh", "fleet report", "fleet status",
+    "review", "zenoh", "fleet report", "fleet status",
 }  # fmt: skip
 
 
@@ -162,9 +162,9 @@ STATUS: dict[str, tuple[str, str, str]] = {
 ELSEWHERE = {
     "generate_policy": "tests/graph", "minimize_policy": "tests/policy",
     "audit": "tests/cli/test_audit.py", "doctor": "tests/checks", "run": "tests/runtime",
-    "demo": "tests/demo",
+    "demo": "tests/demo", "review": "tests/test_pull_requests.py",
 }  # fmt: skip
-"""Verbs that need a running robot or another program, and where their status is tested."""
+"""Verbs that need a robot, a repository or another program, and where their status is tested."""
 
 
 def test_the_status_of_every_verb_is_tested() -> None:

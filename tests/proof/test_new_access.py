@@ -469,7 +469,7 @@ def test_a_git_that_fails_without_a_word_is_no_missing_file(
     real = shutil.which("git")
     fake = repository / "bin" / "git"
     fake.parent.mkdir()
-    fake.write_text(f'#!/bin/sh\ncase "$*" in *ls-tree*) exit 9;; esac\nexec {real} "$@"\n')
+    fake.write_text(f'#!/bin/sh\ncase "$*" in *cat-file*) exit 9;; esac\nexec {real} "$@"\n')
     fake.chmod(0o755)
     monkeypatch.setenv("PATH", f"{fake.parent}:{os.environ['PATH']}")
     sides = ("git:main:policies/robot.xml", "policies/robot.xml")

@@ -1,0 +1,466 @@
+"""The verb `review`: what a change of policies and keystores adds, read from commits."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sros_tool import __version__
+from sros_tool.cli.common import (
+    PATH,
+    Decorated,
+    json_option,
+    json_text,
+    local_zone,
+    now,
+    print_json,
+)
+from sros_tool.cli.progress import progress
+from sros_tool.terminal import echo
+from sros_tool.errors import NOT_DONE, SrosError, UsageError
+
+if TYPE_CHECKING:
+    from sros_tool.checks.kind import Finding
+    from sros_tool.proof.repository import Repository
+    from sros_tool.proof.review import Review, ReviewRequest, ReviewStep
+
+_NO_BASE = "none"
+_MOST = 60_000
+"""Characters of the Markdown: a comment on GitHub has at most 65,536."""
+_SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
+_WORDS = {0: "nothing found", 1: "found", 2: "could not be decided"}
+_TITLES = {
+    "files": "Files",
+    "policy": "Policy",
+    "requirements": "Requirements",
+    "requirements-before": "Requirements of before",
+    "new-access": "New access",
+    "rights": "Rights",
+    "keystore": "Keystore",
+    "expiry": "Expiry",
+}
+
+
+class _Lines(click.ParamType[tuple[str, ...]]):
+    """Paths from the top of the repository, one on each line, as code hosts pass lists."""
+
+    name = "paths"
+
+    def convert(
+        self, value: Any, _param: click.Parameter | None, _ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        """Return the checked paths."""
+        from sros_tool.proof.commit_files import checked_path
+
+        if isinstance(value, tuple):
+            return value
+        lines = (line.strip() for line in str(value).splitlines())
+        return tuple(checked_path(line) for line in lines if line)
+
+
+def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorated], Decorated]:
+    return click.option(
+        f"--{name}",
+        name.replace("-", "_"),
+        type=_Lines(),
+        multiple=True,
+        metavar=metavar,
+        help=f"{help_text}  Can be repeated, or have several lines.",
+    )
+
+
+@click.command(
+    "review",
+    epilog="""\b
+Example:
+  $ sros review --base refs/remotes/origin/main --policy robot/robot.xml
+  policy robot/robot.xml: nothing found
+  new-access robot/robot.xml: 1 right is new
+  ...
+  $ sros review --base 5d1c0a41c3ec2f2a9d2d1b3c63ff7b6e0aa1d9f4 \\
+        --policy robot/robot.xml --requirements robot/requirements.toml \\
+        --keystore keystore --summary /tmp/review.md --sarif /tmp/review.sarif
+
+Exit status: 0 if nothing was found, 1 if something was, 2 if something could not be
+decided.""",
+)
+@click.option(
+    "--base",
+    required=True,
+    metavar="COMMIT|none",
+    help="The commit with the access of before: its full id, or a full reference such as "
+    "refs/remotes/origin/main. Without a comparison: none.",
+)
+@click.option(
+    "--head",
+    default="HEAD",
+    show_default=True,
+    metavar="COMMIT",
+    help="The commit that is reviewed: HEAD, a full id or a full reference.",
+)
+@_paths_option("policy", "PATH", "A policy, or a folder of policies, of the robot or fleet.")
+@_paths_option("requirements", "PATH", "A file of requirements on the policies and keystores.")
+@click.option(
+    "--fleet",
+    default="",
+    metavar="PATH",
+    help="The file with the robots that the placeholders of policies stand for.",
+)
+@_paths_option("keystore", "PATH", "A keystore, or its public part.")
+@_paths_option("leave-out", "PATH", "A folder whose policies are not of the robot, such as tests.")
+@click.option(
+    "--new-access",
+    type=click.Choice(["fail", "allow"]),
+    default="fail",
+    show_default=True,
+    help="Whether more access than in the base, and what a dropped requirement forbids, fails.",
+)
+@click.option(
+    "--renew-within",
+    default="30d",
+    show_default=True,
+    metavar="DURATION|PERCENT",
+    help="Fail if an enclave of a keystore expires within this time, or share of its validity.",
+)
+@click.option(
+    "--repository",
+    "folder",
+    type=PATH,
+    default=".",
+    metavar="FOLDER",
+    help="The repository, if it is not that of the working directory.",
+)
+@click.option(
+    "--fetch",
+    "remote",
+    metavar="REMOTE",
+    help="Fetch the base from this remote, such as origin, if the repository does not have it.",
+)
+@click.option(
+    "--summary",
+    type=PATH,
+    metavar="FILE",
+    help="Write the result as Markdown, for a comment. FILE is outside of the repository.",
+)
+@click.option(
+    "--sarif",
+    type=PATH,
+    metavar="FILE",
+    help="Write the findings as SARIF. FILE is outside of the repository.",
+)
+@json_option
+def review(
+    base: str,
+    head: str,
+    policy: tuple[tuple[str, ...], ...],
+    requirements: tuple[tuple[str, ...], ...],
+    fleet: str,
+    keystore: tuple[tuple[str, ...], ...],
+    leave_out: tuple[tuple[str, ...], ...],
+    new_access: str,
+    renew_within: str,
+    folder: Path,
+    remote: str | None,
+    summary: Path | None,
+    sarif: Path | None,
+    as_json: bool,
+) -> int:
+    """Review a change of policies, requirements and keystores, as in a pull request.
+
+    Checks what the commit HEAD has, decides its requirements and those that it drops, and compares
+    all access with that of the commit BASE. PATHs are from the top of the repository.
+
+    Both commits are read from git itself: nothing is checked out, no file of the work tree is read
+    but to say that it differs, no link of a commit is followed, and nothing that the repository has
+    or configures is run. What was not looked at is in the result.
+    """
+    from sros_tool.keystore.expiry import parse_threshold
+    from sros_tool.proof.commit_files import checked_path
+    from sros_tool.proof.repository import Repository
+    from sros_tool.proof.review import ReviewRequest
+    from sros_tool.proof.review import review as review_change
+
+    if not base:
+        raise UsageError(
+            "the base is empty",
+            "Nothing would be compared.",
+            "Name a commit with --base, or write --base none.",
+        )
+    if not folder.is_dir():
+        raise UsageError(f"'{folder}' is no folder", "", "Name the folder of the repository.")
+    policies, requirement_files, keystores, left_out = (
+        tuple(dict.fromkeys(path for part in parts for path in part))
+        for parts in (policy, requirements, keystore, leave_out)
+    )
+    if not policies and not keystores:
+        raise UsageError("no policy and no keystore is named", "", "Add --policy or --keystore.")
+    repository = Repository(folder.resolve())
+    threshold = parse_threshold(renew_within)
+    outputs = _Outputs(repository, summary, sarif)
+    try:
+        request = ReviewRequest(
+            repository,
+            _base_commit(repository, base, remote),
+            _head_commit(repository, head),
+            policies,
+            requirement_files,
+            checked_path(fleet) if fleet else "",
+            keystores,
+            new_access == "allow",
+            threshold,
+            left_out,
+            now(),
+            local_zone(os.environ),
+        )
+        with progress("reviewing"), TemporaryDirectory(prefix="sros-") as private:
+            result = review_change(request, Path(os.path.realpath(private)))
+            outputs.write(result, request)
+    except SrosError as error:
+        outputs.write_error(error)
+        raise
+    if as_json:
+        print_json(_as_json(result))
+    else:
+        for line in _text(result):
+            echo(line)
+    return result.status
+
+
+def _base_commit(repository: Repository, name: str, remote: str | None) -> str:
+    """Return the commit of BASE, fetched if it has to be, or "" for none."""
+    if name == _NO_BASE:
+        return ""
+    if remote and not name.startswith("refs/") and len(name) in (40, 64):
+        repository.fetch_missing(name, remote)
+    return repository.exact_commit(name)
+
+
+def _head_commit(repository: Repository, name: str) -> str:
+    return repository.commit(name) if name == "HEAD" else repository.exact_commit(name)
+
+
+# ── output ──────────────────────────────────────────────────────────────────────────────
+
+
+class _Outputs:
+    """The files that the review is written to, which nothing of the repository can be."""
+
+    def __init__(self, repository: Repository, summary: Path | None, sarif: Path | None) -> None:
+        """Check the files.  Raises `UsageError`."""
+        self._summary, self._sarif = summary, sarif
+        self._top = repository.top() or repository.folder
+        named = [each for each in (summary, sarif) if each]
+        for file in named:
+            _check_outside(file, self._top)
+        if len({each.absolute() for each in named}) < len(named):
+            raise UsageError("--summary and --sarif name the same file")
+
+    def write(self, result: Review, request: ReviewRequest) -> None:
+        """Write the result."""
+        self._write(_markdown(result, request), [result.shown_finding(e) for e in _all(result)])
+
+    def write_error(self, error: SrosError) -> None:
+        """Write why there is no result."""
+        from sros_tool.markdown import code
+
+        self._write(f"## Review: could not be decided\n\n{code(str(error))}\n", [])
+
+    def _write(self, markdown: str, findings: Sequence[Finding]) -> None:
+        from sros_tool.checks.registry import FindingFilter, select_kinds
+        from sros_tool.checks.sarif import sarif
+
+        if self._summary:
+            _save(self._summary, markdown.encode("utf-8", "backslashreplace"))
+        if self._sarif:
+            kinds = select_kinds(FindingFilter())
+            log = sarif(findings, kinds, version=__version__, base=self._top)
+            _save(self._sarif, f"{json_text(log)}\n".encode("utf-8", "backslashreplace"))
+
+
+def _check_outside(file: Path, top: Path) -> None:
+    """Raise `UsageError` for a file that a change could have put a link or another file at."""
+    parent = Path(os.path.realpath(file.absolute().parent))
+    if parent.is_relative_to(os.path.realpath(top)):
+        raise UsageError(
+            f"'{file}' is in the repository",
+            "A change that is reviewed could have a link there, which leads elsewhere.",
+            "Name a file outside of it, in a folder that only you can write to.",
+        )
+    if not parent.is_dir():
+        raise UsageError(f"cannot write '{file}'", "Its folder does not exist.", "Create it first.")
+    if file.is_symlink() or (file.exists() and not stat.S_ISREG(file.stat().st_mode)):
+        raise UsageError(f"'{file}' is no file", "It would not be followed.", "Name a new file.")
+
+
+def _save(file: Path, data: bytes) -> None:
+    from sros_tool.files import staged_file
+
+    with staged_file(file.absolute(), data, mode=0o644) as put_in_place:
+        put_in_place()
+
+
+def _all(result: Review) -> list[Finding]:
+    """Return the findings on HEAD."""
+    from sros_tool.checks.registry import ChosenFindings
+
+    found = (each.content for each in result.steps)
+    chosen = [each for each in found if isinstance(each, ChosenFindings)]
+    return list(dict.fromkeys(f for each in chosen for f in (*each.shown, *each.accepted)))
+
+
+def _sentence(result: Review, step: ReviewStep) -> str:
+    """Return what a step found, in one clause."""
+    from sros_tool.checks.registry import ChosenFindings
+    from sros_tool.cli.check import findings_summary
+    from sros_tool.cli.new_access import access_summary
+    from sros_tool.proof.review import (
+        AccessChange,
+        DroppedRequirements,
+        ExpiryCheck,
+        Facts,
+        RightsChange,
+    )
+
+    match step.content:
+        case ChosenFindings() as chosen:
+            return findings_summary(chosen)
+        case AccessChange(growth=growth):
+            return access_summary(growth)
+        case RightsChange():
+            return "the rights that are written differ"
+        case DroppedRequirements(dropped=dropped, chosen=chosen):
+            count = "1 requirement" if len(dropped) == 1 else f"{len(dropped)} requirements"
+            return f"{count} dropped or changed, decided as before: {findings_summary(chosen)}"
+        case ExpiryCheck(due=due, unreadable=unreadable, count=count):
+            unread = f", {len(unreadable)} cannot be read" if unreadable else ""
+            return f"{len(due)} of {count} enclaves need to be renewed{unread}"
+        case Facts(lines=lines):
+            more = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
+            return f"'{lines[0][1]}' {lines[0][0]}{more}"
+        case error:
+            return result.shown(str(error))
+
+
+def _text(result: Review) -> list[str]:
+    """Return the review as lines."""
+    lines = []
+    for step in result.steps:
+        subject = f" {result.shown(step.subject)}" if step.subject else ""
+        lines.append(f"{step.kind}{subject}: {_sentence(result, step)}")
+    return [*lines, _verdict(result)]
+
+
+def _verdict(result: Review) -> str:
+    """Return the result in one sentence, with what it leaves out."""
+    counts = [sum(each.status == status for each in result.steps) for status in (1, 2)]
+    words = [
+        f"{count} step{'s' * (count > 1)} {word}"
+        for count, word in zip(counts, ("failed", "could not be decided"), strict=True)
+        if count
+    ]
+    left_out = f"; but {'; '.join(result.left_out)}" if result.left_out else ""
+    compared = f" compared with {result.base}" if result.base else ""
+    return f"{result.head}{compared}: {' and '.join(words) or 'nothing found'}{left_out}"
+
+
+def _markdown(result: Review, request: ReviewRequest) -> str:
+    """Return the review as Markdown: the steps in short, then each of them, the worst first."""
+    from sros_tool.markdown import bounded, code, plain
+
+    verdict = _WORDS[result.status] if result.status != 1 else "something found"
+    lines = (
+        f"{_SIGNS[each.status]} {_TITLES[each.kind]}"
+        f"{' ' + code(result.shown(each.subject)) if each.subject else ''}: "
+        f"{code(_sentence(result, each))}"
+        for each in result.steps
+    )
+    count = len(result.left_out)
+    out = f", but {count} thing{'s were' if count > 1 else ' was'} left out:" if count else ""
+    sides = f"Commit {code(result.head)}"
+    sides += f", compared with {code(result.base)}." if result.base else "."
+    printed = "which `sros review` prints"
+    parts = [f"## Review: {plain(verdict)}{out}"]
+    parts += [bounded(map(code, result.left_out), 6000, printed)] if count else []
+    parts += [sides, bounded(lines, 12_000, printed)]
+    room = _MOST - sum(map(len, parts))
+    for step in sorted(result.steps, key=lambda each: -each.status):
+        detail = result.shown(_detail(result, step, request))
+        if detail and len(detail) > room:
+            detail = f"### {_TITLES[step.kind]}: too long for a comment"
+        if detail:
+            parts.append(detail)
+            room -= len(detail) + 2
+    return "\n\n".join(each.rstrip("\n") for each in parts) + "\n"
+
+
+def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
+    """Return what a step found as Markdown, or "" if the sentence says it all."""
+    from sros_tool.checks.markdown import findings_markdown
+    from sros_tool.checks.registry import ChosenFindings
+    from sros_tool.cli.check import findings_summary, renewal_markdown
+    from sros_tool.cli.new_access import access_markdown
+    from sros_tool.cli.policy import rights_markdown
+    from sros_tool.keystore.expiry import describe_lifetime
+    from sros_tool.markdown import bounded, code
+    from sros_tool.proof.review import (
+        AccessChange,
+        DroppedRequirements,
+        ExpiryCheck,
+        Facts,
+        RightsChange,
+    )
+
+    def findings(chosen: ChosenFindings) -> str:
+        shown = tuple(map(result.shown_finding, chosen.shown))
+        chosen = ChosenFindings(shown, chosen.accepted, chosen.hidden)
+        return findings_markdown(chosen, findings_summary(chosen))
+
+    rest = "which `sros review` prints"
+    match step.content:
+        case ChosenFindings() as chosen:
+            return findings(chosen) if chosen.shown else ""
+        case AccessChange(before=before, after=after, growth=growth):
+            return access_markdown(before, after, growth)
+        case RightsChange(before=before, after=after):
+            return rights_markdown(before, after)
+        case DroppedRequirements(dropped=dropped, chosen=chosen):
+            listed = bounded((code(str(each)) for each in dropped), 6000, rest)
+            title = "### The requirements change: these are decided as they were before"
+            return f"{title}\n\n{listed}\n\n{findings(chosen)}"
+        case ExpiryCheck(due=due, unreadable=unreadable):
+            lines = [describe_lifetime(each, request.at) for each in due]
+            lines += [f"{each.name}  unknown: {each.error}" for each in unreadable]
+            return renewal_markdown(lines, "", "as asked") if lines else ""
+        case Facts(lines=facts):
+            said = (f"{code(name)} {code(text)}" for text, name in facts)
+            return f"### {_TITLES[step.kind]}\n\n{bounded(said, 6000, rest)}"
+        case error:
+            return f"### {_TITLES[step.kind]}: could not be decided\n\n{code(str(error))}"
+
+
+def _as_json(result: Review) -> dict[str, Any]:
+    return {
+        "base": result.base or None,
+        "head": result.head,
+        "status": result.status,
+        "steps": [
+            {
+                "step": each.kind,
+                "subject": result.shown(each.subject) or None,
+                "status": each.status,
+                "result": _sentence(result, each),
+            }
+            for each in result.steps
+        ],
+        "findings": [result.shown_finding(each).as_json() for each in _all(result)],
+        "left_out": list(result.left_out),
+    }
+
+
+assert max(_SIGNS) == NOT_DONE

@@ -1,0 +1,485 @@
+"""Objects and references of a git repository, read without trusting the repository.
+
+Git only reads objects here, and each one is verified by its hash: what is returned for a commit is
+what the commit says, whatever replacements, grafts, alternates, attributes or settings the
+repository has.  No program that it configures is run (hooks, filters, textconv, fsmonitor,
+transports), nothing is fetched but by `Repository.fetch`, and no file of the work tree is read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from sros_tool.errors import DocumentError, UnavailableError, UsageError
+
+FOLDER, LINK, SUBMODULE = "40000", "120000", "160000"
+FILES = ("100644", "100755", "100664")
+"""Modes of entries of a folder, in octal digits as git stores them."""
+
+_MOST_BYTES = 32 * 1024 * 1024
+"""Bytes of the largest object that is read."""
+_MOST_TAGS = 10
+_WAIT = 60  # seconds
+_WAIT_FOR_SERVER = 600
+_SAFE = (
+    "--no-pager",
+    "--no-replace-objects",
+    *("-c", "core.fsmonitor=false"),
+    *("-c", "core.hooksPath=/dev/null"),
+    *("-c", "core.alternateRefsCommand=:"),
+    *("-c", "safe.bareRepository=explicit"),
+)
+_READING = {"GIT_ALLOW_PROTOCOL": "", "GIT_NO_LAZY_FETCH": "1"}
+_FETCHING = {"GIT_ALLOW_PROTOCOL": "file:git:http:https:ssh"}
+_ALWAYS = {
+    "GIT_NO_REPLACE_OBJECTS": "1",
+    "GIT_OPTIONAL_LOCKS": "0",
+    "GIT_TERMINAL_PROMPT": "0",
+    "LC_ALL": "C",
+}
+_ELSEWHERE = (
+    *("GIT_ALTERNATE_OBJECT_DIRECTORIES", "GIT_COMMON_DIR", "GIT_CONFIG", "GIT_DIR"),
+    *("GIT_GRAFT_FILE", "GIT_INDEX_FILE", "GIT_NAMESPACE", "GIT_OBJECT_DIRECTORY", "GIT_PREFIX"),
+    *("GIT_REPLACE_REF_BASE", "GIT_SHALLOW_FILE", "GIT_WORK_TREE"),
+)
+"""Variables that would have git read another repository than that of its folder."""
+_HASH = re.compile(r"[0-9a-f]{40}(?:[0-9a-f]{24})?\Z")
+_ABBREVIATED = re.compile(r"[0-9a-fA-F]{4,64}\Z")
+_NO_REFERENCE = re.compile(r"[\x00-\x20\x7f*?\[\\~^:]|\A-|\A\Z")
+_EXPRESSION = re.compile(r"(?P<name>(?:[^~^@:]|@(?!\{))+|@)(?P<rest>.*)\Z", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class TreeEntry:
+    """What a folder of a commit has under a name."""
+
+    mode: str
+    id: str
+
+    @property
+    def kind(self) -> str:
+        """What it is, in words."""
+        kinds = {FOLDER: "a folder", LINK: "a symbolic link", SUBMODULE: "a submodule"}
+        return kinds.get(self.mode, "a file" if self.mode in FILES else "no file")
+
+
+@dataclass(frozen=True, slots=True)
+class Repository:
+    """The git repository that the folder ``folder`` is in."""
+
+    folder: Path
+
+    # ── references ─────────────────────────────────────────────────────────────────────────
+
+    def exact_commit(self, name: str) -> str:
+        """Return the full id of the commit that a full id or a full reference names.
+
+        Nothing else is taken: git looks up a shorter name in several places, and who may push a tag
+        can put one there that is found first.
+
+        Raises:
+            UsageError: the name has another form.
+            DocumentError: the repository has no such commit.
+        """
+        if not _HASH.match(name) and not name.startswith("refs/"):
+            candidates = self._references(name)
+            there = f" There is {_either(candidates)}." if candidates else ""
+            raise UsageError(
+                f"'{name}' is neither the full id of a commit nor a full reference",
+                f"A tag or branch of that name could stand for another commit.{there}",
+                "Write the 40 digits of the commit, or a name such as refs/remotes/origin/main.",
+            )
+        found = name if _HASH.match(name) else self._target(name)
+        if not found:
+            raise DocumentError(
+                f"git finds no reference '{name}'",
+                "",
+                "`git for-each-ref` shows what there is. Fetch it first.",
+            )
+        return self._peeled(found, name)
+
+    def commit(self, name: str) -> str:
+        """Return the full id of the commit that a name stands for, such as ``main`` or ``HEAD~2``.
+
+        Raises:
+            DocumentError: git finds none, or the name could stand for several things.
+        """
+        expression = _EXPRESSION.match(name)
+        if not expression or name.startswith("-"):
+            raise _unknown(name)
+        base, rest = expression["name"], expression["rest"]
+        if _HASH.match(base):
+            found = base
+        elif base in ("HEAD", "@"):
+            base, found = "HEAD", self._ask("rev-parse", "--verify", "--quiet", "HEAD")
+        else:
+            candidates = self._candidates(base)
+            if len(candidates) > 1:
+                raise DocumentError(
+                    f"the name '{base}' is ambiguous",
+                    f"It is {_either(candidates)}.",
+                    "Write the one that you mean in full.",
+                )
+            base, found = next(iter(candidates.items()), (base, ""))
+        if found and rest:
+            start = base if rest.startswith("@") else found
+            words = ("--verify", "--quiet", "--end-of-options", f"{start}{rest}^{{commit}}")
+            found = self._ask("rev-parse", *words)
+        if not found:
+            raise _unknown(name)
+        return self._peeled(found, name)
+
+    def _candidates(self, name: str) -> dict[str, str]:
+        """Return everything that a short name can stand for, and the ids.
+
+        Raises:
+            DocumentError: it is the name of a branch of a remote repository, but here a tag or a
+                branch of its own.
+        """
+        if name.startswith("refs/"):
+            found = self._target(name)
+            return {name: found} if found else {}
+        candidates = self._references(name)
+        remote, slash, _ = name.partition("/")
+        if slash and remote in self._ask("remote").split():
+            wanted = f"refs/remotes/{name}"
+            if candidates and wanted not in candidates:
+                raise DocumentError(
+                    f"'{name}' is {_either(candidates)}, but no branch of the remote '{remote}'",
+                    "Who may push tags or branches can give one this name.",
+                    f"Fetch '{wanted}', or write in full what you mean.",
+                )
+        described = name.rpartition("-g")[2]
+        if _ABBREVIATED.match(name) or (_ABBREVIATED.match(described) and not candidates):
+            digits = name if _ABBREVIATED.match(name) else described
+            ids = self._ask("rev-parse", f"--disambiguate={digits.lower()}").split()
+            kinds = {each: kind for each, (kind, _) in self._described(ids).items()}
+            candidates |= {each: each for each in ids if kinds.get(each) in ("commit", "tag")}
+        return candidates
+
+    def _references(self, name: str) -> dict[str, str]:
+        """Return the references that git looks up for a short name, and their ids."""
+        places = ("refs/", "refs/tags/", "refs/heads/", "refs/remotes/")
+        names = [f"{place}{name}" for place in places] + [f"refs/remotes/{name}/HEAD"]
+        found = self._targets(names)
+        if re.fullmatch(r"[A-Z_]+", name):  # such as FETCH_HEAD
+            target = self._ask("rev-parse", "--verify", "--quiet", "--end-of-options", name)
+            found |= {name: target} if target and target not in found.values() else {}
+        return found
+
+    def _target(self, reference: str) -> str:
+        """Return the id that exactly this reference has, or ""."""
+        return self._targets([reference]).get(reference, "")
+
+    def _targets(self, references: Sequence[str]) -> dict[str, str]:
+        """Return the ids of exactly these references; those that do not exist are left out."""
+        wanted = [each for each in references if not _NO_REFERENCE.search(each)]
+        if not wanted:
+            return {}
+        lines = self._ask("for-each-ref", "--format=%(objectname) %(refname)", "--", *wanted)
+        found = {name: digits for digits, _, name in map(_parted, lines.splitlines())}
+        return {each: found[each] for each in wanted if each in found}
+
+    def _peeled(self, digits: str, name: str) -> str:
+        """Return the commit that an id names, also by annotated tags."""
+        for _ in range(_MOST_TAGS):
+            kind, content = self._objects([digits]).get(digits, ("", b""))
+            if kind == "commit":
+                return digits
+            if kind != "tag":
+                break
+            digits = _header(content, b"object")
+        if not kind:
+            raise DocumentError(
+                f"the commit of '{name}' is not in the repository",
+                f"It is {digits}.",
+                "In a shallow clone, such as on a server for tests, fetch it first.",
+            )
+        raise DocumentError(f"'{name}' is no commit", f"It is a {kind}.")
+
+    # ── objects ────────────────────────────────────────────────────────────────────────────
+
+    def tree(self, commit: str) -> str:
+        """Return the id of the top folder of a commit."""
+        return _header(self._objects([commit])[commit][1], b"tree")
+
+    def folders(self, ids: Iterable[str]) -> dict[str, dict[str, TreeEntry]]:
+        """Return the entries of folders by id and name.
+
+        Raises:
+            DocumentError: one is missing or malformed, or has a name that no file system has.
+        """
+        wanted = list(dict.fromkeys(ids))
+        found = self._all("tree", wanted)
+        return {each: _entries(data, len(each) // 2) for each, data in found.items()}
+
+    def contents(self, ids: Iterable[str]) -> dict[str, bytes]:
+        """Return the contents of files by id.
+
+        Raises:
+            DocumentError: one is missing, damaged, or larger than `_MOST_BYTES`.
+        """
+        return self._all("blob", list(dict.fromkeys(ids)))
+
+    def sizes(self, ids: Iterable[str]) -> dict[str, int]:
+        """Return the sizes of objects by id, in bytes; those that are missing are left out."""
+        return {each: size for each, (_, size) in self._described(ids).items()}
+
+    def _described(self, ids: Iterable[str]) -> dict[str, tuple[str, int]]:
+        """Return type and size of objects by id, as the repository says."""
+        asked = "".join(f"{each}\n" for each in ids).encode()
+        lines = self._git(["cat-file", "--batch-check"], stdin=asked).decode().splitlines()
+        found = (line.split() for line in lines)
+        return {words[0]: (words[1], int(words[2])) for words in found if len(words) == 3}
+
+    def find(self, commit: str, path: str) -> TreeEntry | None:
+        """Return what is at a path of a commit, "" for its top; None if nothing is.
+
+        Raises:
+            DocumentError: the path leads through something that is no folder, such as a link.
+        """
+        entry = _top(self, commit)
+        gone: list[str] = []
+        for part in path.split("/") if path else ():
+            if entry.mode != FOLDER:
+                raise DocumentError(f"'{'/'.join(gone)}' is no folder of the revision")
+            found = _folder(self, entry.id).get(part)
+            if found is None:
+                return None
+            entry = found
+            gone.append(part)
+        return entry
+
+    def _all(self, kind: str, ids: Sequence[str]) -> dict[str, bytes]:
+        found = self._objects(ids)
+        for each in ids:
+            if each not in found:
+                raise DocumentError(
+                    f"git cannot read it: the object {each} is not in the repository",
+                    "",
+                    "Fetch all of the commit: no partial clone (`git fetch --refetch`).",
+                )
+            if found[each][0] != kind:
+                raise DocumentError(f"the object {each} is no {kind}, but a {found[each][0]}")
+        return {each: found[each][1] for each in ids}
+
+    def _objects(self, ids: Sequence[str]) -> dict[str, tuple[str, bytes]]:
+        """Return type and content of objects, verified; what is missing is left out.
+
+        Raises:
+            DocumentError: one is damaged, or larger than `_MOST_BYTES`.
+        """
+        for each, size in self.sizes(ids).items():
+            if size > _MOST_BYTES:
+                raise DocumentError(f"the object {each} is larger than {_MOST_BYTES} bytes")
+        asked = "".join(f"{each}\n" for each in ids).encode()
+        data = self._git(["cat-file", "--batch"], stdin=asked)
+        found: dict[str, tuple[str, bytes]] = {}
+        for each in ids:
+            line, _, data = data.partition(b"\n")
+            words = line.decode(errors="replace").split()
+            if words[-1:] == ["missing"]:
+                continue
+            if len(words) != 3 or not words[2].isdecimal():
+                raise DocumentError(f"git cannot read it: {line[:200].decode(errors='replace')}")
+            content, data = data[: int(words[2])], data[int(words[2]) + 1 :]
+            if _digest(words[1], content, len(each)) != each:
+                raise DocumentError(
+                    f"the object {each} of the repository is damaged",
+                    "Its content does not have this hash.",
+                    "Clone the repository again.",
+                )
+            found[each] = words[1], content
+        return found
+
+    # ── fetching ───────────────────────────────────────────────────────────────────────────
+
+    def fetch_missing(self, digits: str, remote: str) -> None:
+        """Fetch a commit without its history, unless it is there, by the settings of a remote.
+
+        Raises:
+            UsageError: ``digits`` is no full id, or ``remote`` no remote of the repository.
+            DocumentError: it cannot be fetched.
+        """
+        if not _HASH.match(digits):
+            raise UsageError(f"'{digits}' is not the full id of a commit")
+        if remote not in self._ask("remote").split():
+            raise UsageError(f"'{remote}' is no remote of the repository", "", "See `git remote`.")
+        if self.sizes([digits]):
+            return
+        options = (
+            *("--quiet", "--depth=1", "--no-tags", "--no-prune", "--no-recurse-submodules"),
+            *("--no-auto-maintenance", "--no-write-fetch-head", "--refmap="),
+            *("--upload-pack=git-upload-pack", "--", remote, digits),
+        )
+        self._git(["fetch", *options], environment=_FETCHING, wait=_WAIT_FOR_SERVER)
+
+    # ── git ────────────────────────────────────────────────────────────────────────────────
+
+    def top(self) -> Path | None:
+        """Return the top folder of the work tree; None without one."""
+        bare = self._ask("rev-parse", "--is-inside-work-tree") != "true"
+        shown = b"" if bare else self._git(["rev-parse", "--show-toplevel"]).removesuffix(b"\n")
+        return Path(os.fsdecode(shown)) if shown else None
+
+    def prefix(self) -> str:
+        """Return the path of the folder from the top of the work tree, with "/" at its end."""
+        return os.fsdecode(self._git(["rev-parse", "--show-prefix"]).removesuffix(b"\n"))
+
+    def _ask(self, *words: str) -> str:
+        """Return the answer of git, or "" if it has none."""
+        return self._git(words, quiet=True).decode(errors="replace").strip()
+
+    def _git(
+        self,
+        words: Sequence[str],
+        *,
+        stdin: bytes = b"",
+        quiet: bool = False,
+        environment: dict[str, str] | None = None,
+        wait: int = _WAIT,
+    ) -> bytes:
+        """Return what git prints.
+
+        Raises:
+            DocumentError: git fails; if ``quiet``, only if it says why.
+            UnavailableError: git is not installed.
+        """
+        own = {name: text for name, text in os.environ.items() if name not in _ELSEWHERE}
+        try:
+            done = subprocess.run(
+                [_program(own.get("PATH", os.defpath)), *_SAFE, *words],
+                cwd=self.folder,
+                env={**own, **_ALWAYS, **(environment or _READING)},
+                input=stdin,
+                capture_output=True,
+                timeout=wait,
+                check=False,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise DocumentError(f"git does not answer within {wait} seconds") from error
+        said = done.stderr[:500].decode(errors="replace").strip()
+        if done.returncode and (said or not quiet):
+            why = said.removeprefix("fatal: ") or f"it ended with status {done.returncode}"
+            raise DocumentError(f"git cannot read it: {why}")
+        if said and not done.returncode and environment is None:
+            raise DocumentError(f"git warns: {said}", "What it read is not certain.")
+        return done.stdout
+
+
+@lru_cache(maxsize=64)
+def _top(repository: Repository, commit: str) -> TreeEntry:
+    return TreeEntry(FOLDER, repository.tree(commit))
+
+
+@lru_cache(maxsize=1024)  # what has an id never changes
+def _folder(repository: Repository, digits: str) -> dict[str, TreeEntry]:
+    return repository.folders([digits])[digits]
+
+
+def walk(
+    repository: Repository, tree: str, *, most: int, other: str = ""
+) -> Iterator[tuple[str, TreeEntry]]:
+    """Yield path and entry of all that is below a folder and is no folder, folders level by level.
+
+    With ``other``, only what this folder does not have with the same content at the same path.
+
+    Raises:
+        DocumentError: there are more than ``most`` entries; a few objects can stand for millions.
+    """
+    level = [("", tree, other)]
+    count = 0
+    while level:
+        ids = [each for _, *pair in level for each in pair if each]
+        found = repository.folders(ids)
+        below = []
+        for path, here, there in level:
+            before = found[there] if there else {}
+            for name, entry in found[here].items():
+                count += 1
+                if count > most:
+                    raise DocumentError(f"there are more than {most} files in the commit")
+                old = before.get(name)
+                if old == entry:
+                    continue
+                if entry.mode == FOLDER:
+                    matching = old.id if old and old.mode == FOLDER else ""
+                    below.append((f"{path}{name}/", entry.id, matching))
+                else:
+                    yield path + name, entry
+        level = below
+
+
+@lru_cache(maxsize=8)
+def _program(path: str) -> str:
+    """Return the path of git; folders of ``path`` that depend on the working directory are skipped.
+
+    Raises:
+        UnavailableError: git is not installed.
+    """
+    folders = [each for each in path.split(os.pathsep) if each.startswith("/")]
+    found = shutil.which("git", path=os.pathsep.join(folders)) if folders else None
+    if not found:
+        raise UnavailableError("git is not installed", "", "Install git.")
+    return found
+
+
+def _unknown(name: str) -> DocumentError:
+    return DocumentError(
+        f"git finds no revision '{name}'",
+        "",
+        "`git log --oneline` and `git branch` show what there is. In a shallow clone, such as "
+        "on a server for tests, fetch it first.",
+    )
+
+
+def _either(candidates: Iterable[str]) -> str:
+    return " and ".join(f"'{each}'" for each in candidates)
+
+
+def _parted(line: str) -> tuple[str, str, str]:
+    return line.partition(" ")
+
+
+def _digest(kind: str, content: bytes, digits: int) -> str:
+    whole = b"%s %d\0%s" % (kind.encode(), len(content), content)
+    if digits == 40:
+        return hashlib.sha1(whole, usedforsecurity=False).hexdigest()
+    return hashlib.sha256(whole).hexdigest()
+
+
+def _header(content: bytes, key: bytes) -> str:
+    """Return the id in the first line of a commit or a tag."""
+    first, _, digits = content.partition(b"\n")[0].partition(b" ")
+    found = digits.decode(errors="replace")
+    if first != key or not _HASH.match(found):
+        raise DocumentError("an object of the repository is malformed")
+    return found
+
+
+def _entries(data: bytes, length: int) -> dict[str, TreeEntry]:
+    """Return the entries of a folder, by name; ids have ``length`` bytes.
+
+    Raises:
+        DocumentError: the object is malformed, or has a name twice, or one that leads elsewhere.
+    """
+    found: dict[str, TreeEntry] = {}
+    while data:
+        head, _, rest = data.partition(b"\0")
+        mode, _, raw = head.partition(b" ")
+        name, data = os.fsdecode(raw), rest[length:]
+        if name in found or name in ("", ".", "..") or "/" in name or name.lower() == ".git":
+            raise DocumentError(
+                f"a folder of the commit has the name '{name}' twice or in vain",
+                "No file system can have this, and programs take different ones.",
+            )
+        found[name] = TreeEntry(mode.decode(errors="replace").lstrip("0"), rest[:length].hex())
+    return found

@@ -1,0 +1,594 @@
+"""The review of a change: what HEAD has, and what it adds to BASE, both read from commits.
+
+Nobody whose change is reviewed steers the review: both sides are what two commits have, not what
+lies in a checkout (`sros_tool.proof.repository`, `sros_tool.proof.commit_files`), and what was not
+compared is in the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, tzinfo
+from functools import partial
+from pathlib import Path
+
+from sros_tool.checks.kind import WARNING, Finding
+from sros_tool.checks.registry import ChosenFindings, FindingFilter
+from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
+from sros_tool.errors import DocumentError, PolicyError, SrosError
+from sros_tool.faults import Fault
+from sros_tool.fleet.document import read_fleet
+from sros_tool.fleet.expansion import read_policy_for
+from sros_tool.fleet.model import Fleet
+from sros_tool.folders import Folder
+from sros_tool.keystore.expiry import Lifetime, Threshold, UnreadableEnclave, due_enclaves
+from sros_tool.keystore.layout import KEY_FILE, SETTINGS
+from sros_tool.keystore.reader import load_settings
+from sros_tool.keystore.rights import RightsSource, load_rights
+from sros_tool.policy.model import Policy, Source
+from sros_tool.proof.commit_files import CommitFiles
+from sros_tool.proof.findings import requirement_findings
+from sros_tool.proof.growth import Growth, compare_access
+from sros_tool.proof.repository import FILES, SUBMODULE, Repository, TreeEntry, walk
+from sros_tool.proof.requirements import Requirement, read_requirements
+from sros_tool.proof.sources import AccessSource, load_policies, load_side
+from sros_tool.proof.system import System, policy_system
+
+_HEAD, _BASE = "HEAD", "BASE"
+_FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
+_MOST_ENTRIES = 200_000
+_MOST_CHANGED = 20_000
+_MOST_OUTSIDE = 8 * 1024 * 1024
+"""Bytes of the largest changed file of which it is looked whether it is a policy."""
+_OF_POLICIES = ((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns="))
+"""What an XML file that is a policy, or a part of one, has, and what follows in it."""
+_OK, _FOUND, _UNDECIDED = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class ReviewRequest:
+    """What is reviewed: paths are from the top of the repository.
+
+    ``base`` is the commit with the access of before, or "" to compare with nothing; ``head`` the
+    one that is reviewed.  With ``allow_new_access``, more access is shown, and does not fail.
+    ``renew_within`` is the time before the expiry of an enclave from which on the review fails.
+    ``left_out`` are folders whose policies are not reviewed.
+    """
+
+    repository: Repository
+    base: str
+    head: str
+    policies: tuple[str, ...]
+    requirements: tuple[str, ...]
+    fleet: str
+    keystores: tuple[str, ...]
+    allow_new_access: bool
+    renew_within: Threshold
+    left_out: tuple[str, ...]
+    at: datetime
+    zone: tzinfo = UTC
+
+
+@dataclass(frozen=True, slots=True)
+class AccessChange:
+    """What HEAD gives that BASE does not."""
+
+    before: AccessSource
+    after: AccessSource
+    growth: Growth
+
+
+@dataclass(frozen=True, slots=True)
+class RightsChange:
+    """The rights of a policy in BASE and in HEAD."""
+
+    before: RightsSource
+    after: RightsSource
+
+
+@dataclass(frozen=True, slots=True)
+class DroppedRequirements:
+    """Requirements of BASE that HEAD does not have, and those that do not hold in HEAD."""
+
+    dropped: tuple[Requirement, ...]
+    chosen: ChosenFindings
+
+
+@dataclass(frozen=True, slots=True)
+class ExpiryCheck:
+    """Enclaves of a keystore that need to be renewed, and those that could not be read."""
+
+    due: tuple[Lifetime, ...]
+    unreadable: tuple[UnreadableEnclave, ...]
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Facts that are lines of text; the first of each pair is a sentence, the second a name."""
+
+    lines: tuple[tuple[str, str], ...]
+
+
+Content = (
+    ChosenFindings
+    | AccessChange
+    | RightsChange
+    | DroppedRequirements
+    | ExpiryCheck
+    | Facts
+    | SrosError
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ReviewStep:
+    """One step of a review, its exit status, and what it found.
+
+    ``kind`` is "files", "policy", "requirements", "requirements-before", "new-access", "rights",
+    "keystore" or "expiry"; ``subject`` is the path that it is about.  An error says why it could
+    not be decided.
+    """
+
+    kind: str
+    subject: str
+    status: int
+    content: Content
+
+
+@dataclass(frozen=True, slots=True)
+class Review:
+    """All steps of a review, and what it left out, as clauses.
+
+    ``base`` and ``head`` are full ids of commits; ``base`` is "" if nothing was compared.
+    ``head_folder`` and ``base_folder`` are where the files were read, which nobody has to see.
+    """
+
+    base: str
+    head: str
+    steps: tuple[ReviewStep, ...]
+    left_out: tuple[str, ...]
+    head_folder: Path
+    base_folder: Path
+
+    @property
+    def status(self) -> int:
+        """The worst status of all steps."""
+        return max((each.status for each in self.steps), default=_OK)
+
+    def shown(self, text: str) -> str:
+        """Return a text with the paths of files as the repository has them."""
+        base = f"git:{self.base[:12]}:"
+        return text.replace(f"{self.head_folder}/", "").replace(f"{self.base_folder}/", base)
+
+    def shown_finding(self, finding: Finding) -> Finding:
+        """Return a finding with the paths of files as the repository has them."""
+        related = tuple(
+            replace(each, text=self.shown(each.text), file=self.shown(each.file))
+            for each in finding.related
+        )
+        return replace(
+            finding,
+            subject=self.shown(finding.subject),
+            text=self.shown(finding.text),
+            file=self.shown(finding.file),
+            own_remedy=self.shown(finding.own_remedy),
+            related=related,
+        )
+
+
+def review(request: ReviewRequest, folder: Path) -> Review:
+    """Return the review of a change; the files of both commits are written below ``folder``.
+
+    Args:
+        request: what is reviewed.
+        folder: a new folder, outside of the repository, that nobody else can open.
+
+    Raises:
+        SrosError: a commit cannot be read.
+    """
+    repository = request.repository
+    head = CommitFiles(repository, _HEAD, request.head, folder / _HEAD)
+    base = CommitFiles(repository, _BASE, request.base, folder / _BASE) if request.base else None
+    with Folder(folder) as private:
+        for name in (_HEAD, _BASE):
+            private.mkdir(name, 0o700)
+    steps = _Review(request, head, base)
+    found = tuple(steps.all())
+    return Review(
+        request.base,
+        request.head,
+        found,
+        tuple(dict.fromkeys(steps.left_out())),
+        folder / _HEAD,
+        folder / _BASE,
+    )
+
+
+@dataclass(slots=True)
+class _Review:
+    request: ReviewRequest
+    head: CommitFiles
+    base: CommitFiles | None
+
+    @property
+    def _new_access(self) -> int:
+        """The status of what gives more access."""
+        return _OK if self.request.allow_new_access else _FOUND
+
+    def all(self) -> Iterator[ReviewStep]:
+        asked = self.request
+        head_fleet = yield from self._fleet(self.head)
+        base_fleet = yield from self._fleet(self.base)
+        of_head = yield from self._policies(self.head, head_fleet)
+        of_base: list[Path] = []
+        if self.base:
+            with suppress(SrosError):  # said by the comparison
+                of_base = [
+                    file
+                    for path in asked.policies
+                    for file in self.base.policies(path, placeholders=base_fleet is not None)
+                ]
+        for each in of_head:
+            yield from self._checked("policy", str(each), partial(self._findings, each, head_fleet))
+        yield from self._requirements(of_head, head_fleet)
+        if self.base:
+            yield from self._checked(
+                "new-access",
+                " ".join(asked.policies),
+                lambda: self._access(of_base, base_fleet, of_head, head_fleet),
+                if_any=bool(asked.policies),
+            )
+            for each in of_head:
+                path = str(each.relative_to(self.head.folder))
+                before = self.base.folder / path
+                if before in of_base:
+                    yield from self._checked(
+                        "rights",
+                        path,
+                        partial(self._rights, (before, base_fleet), (each, head_fleet)),
+                    )
+        keystores = yield from self._keystores(self.head)
+        for path, keystore in keystores.items():
+            yield from self._keystore(path, keystore)
+        if self.base:
+            yield from self._checked("files", "", self._others)
+        for error in self.head.refused + (self.base.refused if self.base else []):
+            yield ReviewStep("files", "", _UNDECIDED, error)
+
+    @staticmethod
+    def _checked(
+        kind: str,
+        subject: str,
+        decide: Callable[[], tuple[int, Content] | None],
+        *,
+        if_any: bool = True,
+    ) -> Iterator[ReviewStep]:
+        """Yield a step with what a function decides, or with the reason why it could not."""
+        if not if_any:
+            return
+        try:
+            decided = decide()
+        except SrosError as error:
+            decided = _UNDECIDED, error
+        except OSError as error:  # such as a name that is too long for this system
+            decided = _UNDECIDED, DocumentError(f"'{error.filename}': {error.strerror}")
+        if decided:
+            yield ReviewStep(kind, subject, *decided)
+
+    # ── files ──────────────────────────────────────────────────────────────────────────────
+
+    def _fleet(self, side: CommitFiles | None) -> Generator[ReviewStep, None, Fleet | None]:
+        """Return the fleet of a side; None without one."""
+        path = self.request.fleet
+        if not path or not side:
+            return None
+        try:
+            file = side.file(path)
+            if file:
+                return read_fleet(file)
+            if side is self.head:
+                raise self._missing(path)
+        except SrosError as error:
+            yield ReviewStep("files", path, _UNDECIDED, error)
+        return None
+
+    def _policies(
+        self, side: CommitFiles, fleet: Fleet | None
+    ) -> Generator[ReviewStep, None, list[Path]]:
+        """Return the files of the policies of a side."""
+        found: list[Path] = []
+        for path in self.request.policies:
+            try:
+                files = side.policies(path, placeholders=fleet is not None)
+                if not files:
+                    raise self._missing(path)
+                found += [each for each in files if each not in found]
+            except (SrosError, OSError) as error:
+                known = error if isinstance(error, SrosError) else DocumentError(str(error))
+                yield ReviewStep("policy", path, _UNDECIDED, known)
+        return found
+
+    def _keystores(self, side: CommitFiles) -> Generator[ReviewStep, None, dict[str, Path]]:
+        """Return the folders of the keystores of a side, by their paths."""
+        found: dict[str, Path] = {}
+        for path in self.request.keystores:
+            try:
+                folder = side.tree(path)
+                if not folder:
+                    raise self._missing(path)
+                found[path] = folder
+            except (SrosError, OSError) as error:
+                known = error if isinstance(error, SrosError) else DocumentError(str(error))
+                yield ReviewStep("keystore", path, _UNDECIDED, known)
+        return found
+
+    def _missing(self, path: str) -> DocumentError:
+        """Return the error that HEAD does not have a file, and what became of it."""
+        entry = self.base.entry(path) if self.base else None
+        became = ""
+        if entry:
+            became = "The change deletes it."
+            for name, each in self._changed(self.head, self.base):
+                if each.id == entry.id:
+                    became = f"The change renames it to '{name}'."
+        return DocumentError(
+            f"'{path}' is not in the commit", became, "Review the files that the robot uses."
+        )
+
+    @staticmethod
+    def _changed(side: CommitFiles, other: CommitFiles | None) -> Iterator[tuple[str, TreeEntry]]:
+        """Yield what one side has that the other does not have with the same content."""
+        tree = side.repository.tree(side.commit)
+        before = other.repository.tree(other.commit) if other else ""
+        return walk(side.repository, tree, most=_MOST_ENTRIES, other=before)
+
+    def _others(self) -> tuple[int, Content] | None:
+        """Return the policies that change and are not reviewed, and what became of others."""
+        assert self.base
+        lines: list[tuple[str, str]] = []
+        status = _OK
+        changed = list(self._changed(self.head, self.base))
+        if len(changed) > _MOST_CHANGED:
+            raise DocumentError(f"the change has more than {_MOST_CHANGED} files")
+        names = {entry.id: name for name, entry in changed}
+        for path in self._policies_among(changed, self.head):
+            lines.append(("changes and is not reviewed, as no policy that is uses it", path))
+            status = self._new_access
+        gone = [
+            (path, entry)
+            for path, entry in self._changed(self.base, self.head)
+            if not self._has(self.head, path)
+        ]
+        for path in self._policies_among(gone, self.base, known=False):
+            new = names.get(dict(gone)[path].id)
+            lines.append((f"is renamed to '{new}'" if new else "is deleted", path))
+        for path, entry in changed:
+            if entry.mode == SUBMODULE:
+                lines.append(("is a submodule that changes, whose files are not reviewed", path))
+        return (status, Facts(tuple(lines))) if lines else None
+
+    @staticmethod
+    def _has(side: CommitFiles, path: str) -> bool:
+        try:
+            return side.entry(path) is not None
+        except DocumentError:
+            return False
+
+    def _policies_among(
+        self, entries: Iterable[tuple[str, TreeEntry]], side: CommitFiles, *, known: bool = True
+    ) -> list[str]:
+        """Return the paths of entries that are, or could be, parts of policies."""
+        wanted = {
+            path: entry
+            for path, entry in entries
+            if entry.mode in FILES
+            and not (known and path in side.files)
+            and not any(f"{path}/".startswith(f"{each}/") for each in self.request.left_out)
+        }
+        sizes = side.repository.sizes(dict.fromkeys(each.id for each in wanted.values()))
+        large = [path for path, each in wanted.items() if sizes.get(each.id, 0) > _MOST_OUTSIDE]
+        found = [path for path in large if path.lower().endswith(".xml")]
+        for path, entry in wanted.items():
+            if path not in large:
+                content = side.repository.contents([entry.id])[entry.id]
+                if _may_be_policy(content):
+                    found.append(path)
+        return sorted(found)
+
+    def left_out(self) -> Iterator[str]:
+        """Yield what the review does not say, as clauses."""
+        asked = self.request
+        if not asked.policies:
+            yield "no policy is named"
+        if not asked.requirements:
+            yield "no requirements are named"
+        if not self.base:
+            yield "nothing is compared with an earlier commit, as asked"
+        if asked.allow_new_access:
+            yield "new access does not fail the review, as asked"
+        for path in asked.left_out:
+            yield f"policies below '{path}' are not looked at, as asked"
+        if asked.keystores and asked.requirements:
+            yield "requirements are decided of the policies, not of the keystores"
+        if asked.keystores:
+            yield "private keys of keystores are not looked at"
+        for side in (self.head, self.base):
+            for path in dict.fromkeys(side.fell_back if side else ()):
+                assert side
+                yield f"'{path}' is not in {side.name}, so that a fallback counts in its place"
+        top = asked.repository.top()
+        if not top:
+            return
+        if asked.repository.commit(_HEAD) != asked.head:
+            yield "the commit that is checked out is another one than the one that is reviewed"
+        elif differing := self.head.differing(top):
+            more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+            files = ", ".join(f"'{each}'" for each in differing[:3])
+            yield f"the checkout has other content than the commit that is reviewed: {files}{more}"
+
+    # ── policies ───────────────────────────────────────────────────────────────────────────
+
+    def _circumstances(self, fleet: Fleet | None = None) -> Circumstances:
+        return Circumstances(self.request.at, self.request.zone, fleet=fleet)
+
+    def _findings(self, policy: Path, fleet: Fleet | None) -> tuple[int, Content]:
+        chosen = FindingFilter().choose(policy_findings(policy, self._circumstances(fleet)))
+        return _status(chosen), chosen
+
+    def _access(
+        self,
+        of_base: Sequence[Path],
+        base_fleet: Fleet | None,
+        of_head: Sequence[Path],
+        head_fleet: Fleet | None,
+    ) -> tuple[int, Content]:
+        after = load_policies(of_head, _HEAD, head_fleet)
+        if not of_base:
+            assert self.base
+            for path in self.request.policies:  # raises the reason why it was not read
+                self.base.policies(path, placeholders=base_fleet is not None)
+            new = (("is new, so that all of its access is new", " ".join(self.request.policies)),)
+            return self._new_access, Facts(new)
+        return self._compared(load_policies(of_base, _BASE, base_fleet), after)
+
+    def _compared(self, before: AccessSource, after: AccessSource) -> tuple[int, Content]:
+        growth = compare_access(before, after)
+        return (self._new_access if growth else _OK), AccessChange(before, after, growth)
+
+    def _rights(
+        self, before: tuple[Path, Fleet | None], after: tuple[Path, Fleet | None]
+    ) -> tuple[int, Content] | None:
+        first, second = load_rights(*before), load_rights(*after)
+        return None if first.rights == second.rights else (_OK, RightsChange(first, second))
+
+    # ── requirements ───────────────────────────────────────────────────────────────────────
+
+    def _read_requirements(
+        self, side: CommitFiles
+    ) -> Generator[ReviewStep, None, list[Requirement]]:
+        """Return the requirements of a side."""
+        found: list[Requirement] = []
+        for path in self.request.requirements:
+            try:
+                file = side.file(path)
+                if file:
+                    found += read_requirements(file)
+                elif side is self.head:
+                    raise self._missing(path)
+            except SrosError as error:
+                yield ReviewStep("requirements", path, _UNDECIDED, error)
+        return found
+
+    def _requirements(self, policies: Sequence[Path], fleet: Fleet | None) -> Iterator[ReviewStep]:
+        if not self.request.requirements:
+            return
+        wanted = yield from self._read_requirements(self.head)
+        earlier: list[Requirement] = []
+        if self.base:
+            earlier = yield from self._read_requirements(self.base)
+        kept = {_demanded(each) for each in wanted}
+        dropped = [each for each in earlier if _demanded(each) not in kept]
+        subject = " ".join(self.request.policies)
+        try:
+            system = policy_system(_together(policies, fleet), at=self.request.at)
+        except SrosError as error:
+            yield ReviewStep("requirements", subject, _UNDECIDED, error)
+            return
+        yield from self._checked("requirements", subject, partial(_decided, wanted, system))
+        if dropped:
+            decide = partial(self._dropped, dropped, system)
+            yield from self._checked("requirements-before", subject, decide)
+
+    def _dropped(self, dropped: Sequence[Requirement], system: System) -> tuple[int, Content]:
+        status, chosen = _decided(dropped, system)
+        return min(status, self._new_access), DroppedRequirements(tuple(dropped), chosen)
+
+    # ── keystores ──────────────────────────────────────────────────────────────────────────
+
+    def _keystore(self, path: str, folder: Path) -> Iterator[ReviewStep]:
+        before = None
+        if self.base:
+            try:
+                before = self.base.tree(path)
+            except SrosError as error:
+                yield ReviewStep("new-access", path, _UNDECIDED, error)
+        settings = f"{path}/{SETTINGS}"
+        same = before is not None and _same(self.base, self.head, settings)
+
+        def findings() -> tuple[int, Content]:
+            found = (
+                each
+                for each in path_findings(folder, self._circumstances())
+                if each.id != _FILE_MISSING or Path(each.file).name != KEY_FILE
+            )
+            chosen = FindingFilter(strict=bool(self.base) and not same).choose(found)
+            return _status(chosen), chosen
+
+        def access() -> tuple[int, Content]:
+            if before:
+                return self._compared(load_side(before), load_side(folder))
+            new = (("is new, so that all of its access is new", path),)
+            return self._new_access, Facts(new)
+
+        yield from self._checked("keystore", path, findings)
+        if self.base:
+            yield from self._checked("new-access", path, access)
+        yield from self._checked("expiry", path, lambda: self._expiry(before or folder, folder))
+
+    def _expiry(self, settings_of: Path, folder: Path) -> tuple[int, Content]:
+        settings = load_settings(settings_of)
+        due, unreadable, count = due_enclaves(
+            folder, self.request.renew_within, self.request.at, settings
+        )
+        status = _UNDECIDED if unreadable else _FOUND if due else _OK
+        return status, ExpiryCheck(due, unreadable, count)
+
+
+def _may_be_policy(content: bytes) -> bool:
+    """Return whether a file could be a policy, or a part of one, whatever its name is."""
+    text = b" ".join(content.replace(b"\0", b"").split())  # UTF-16 has a zero in each letter
+    if not text.lstrip(b"\xef\xbb\xbf\xfe\xff").startswith(b"<"):
+        return False
+    return any(second in text.partition(first)[2] for first, second in _OF_POLICIES)
+
+
+def _same(base: CommitFiles | None, head: CommitFiles, path: str) -> bool:
+    return base is not None and base.files.get(path) == head.files.get(path)
+
+
+def _status(chosen: ChosenFindings) -> int:
+    return _FOUND if chosen.fails(WARNING) else _OK
+
+
+def _decided(requirements: Sequence[Requirement], system: System) -> tuple[int, ChosenFindings]:
+    chosen = FindingFilter().choose(requirement_findings(requirements, system))
+    return _status(chosen), chosen
+
+
+def _demanded(requirement: Requirement) -> Requirement:
+    """Return a requirement without what only people read."""
+    return replace(requirement, source=Source("", 0), name="", why="")
+
+
+def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
+    """Return the policies of one robot, or one fleet, as one.
+
+    Raises:
+        PolicyError: there is none, or two have the same enclave.
+    """
+    if not files:
+        raise PolicyError("requirements are decided of policies, and there is none to read")
+    first, *others = (read_policy_for(each, fleet) for each in files)
+    enclaves = {each.path: each for each in first.enclaves}
+    for each in (enclave for policy in others for enclave in policy.enclaves):
+        if each.path in enclaves:
+            raise PolicyError(
+                f"{each.source}: enclave {each.path} is in another policy, too",
+                f"The other one is at {enclaves[each.path].source}.",
+                "Review the policies of each robot in a review of its own.",
+            )
+        enclaves[each.path] = each
+    return replace(first, enclaves=tuple(enclaves.values()))
