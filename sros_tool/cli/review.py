@@ -334,9 +334,9 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             return access_summary(growth)
         case RightsChange():
             return "the rights that are written differ"
-        case DroppedRequirements(dropped=dropped, chosen=chosen):
-            count = "1 requirement" if len(dropped) == 1 else f"{len(dropped)} requirements"
-            return f"{count} dropped or changed, decided as before: {findings_summary(chosen)}"
+        case DroppedRequirements(count=count, chosen=chosen):
+            dropped = "1 requirement" if count == 1 else f"{count} requirements"
+            return f"{dropped} dropped or changed, decided as before: {findings_summary(chosen)}"
         case ExpiryCheck(due=due, unreadable=unreadable, count=count):
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
             return f"{len(due)} of {count} enclaves need to be renewed{unread}"
@@ -429,10 +429,9 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             return access_markdown(before, after, growth)
         case RightsChange(before=before, after=after):
             return rights_markdown(before, after)
-        case DroppedRequirements(dropped=dropped, chosen=chosen):
-            listed = bounded((code(str(each)) for each in dropped), 6000, rest)
+        case DroppedRequirements(chosen=chosen):
             title = "### The requirements change: these are decided as they were before"
-            return f"{title}\n\n{listed}\n\n{findings(chosen)}"
+            return f"{title}\n\n{findings(chosen)}"
         case ExpiryCheck(due=due, unreadable=unreadable):
             lines = [describe_lifetime(each, request.at) for each in due]
             lines += [f"{each.name}  unknown: {each.error}" for each in unreadable]

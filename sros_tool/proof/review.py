@@ -16,6 +16,7 @@ from pathlib import Path
 
 from sros_tool.checks.kind import WARNING, Finding
 from sros_tool.checks.registry import ChosenFindings, FindingFilter
+from sros_tool.checks.requirements import VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
 from sros_tool.errors import DocumentError, PolicyError, SrosError
 from sros_tool.faults import Fault
@@ -27,8 +28,9 @@ from sros_tool.keystore.expiry import Lifetime, Threshold, UnreadableEnclave, du
 from sros_tool.keystore.layout import KEY_FILE, SETTINGS
 from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.rights import RightsSource, load_rights
-from sros_tool.policy.model import Policy, Source
+from sros_tool.policy.model import Policy
 from sros_tool.proof.commit_files import CommitFiles
+from sros_tool.proof.dropped import dropped_findings, dropped_requirements
 from sros_tool.proof.findings import requirement_findings
 from sros_tool.proof.growth import Growth, compare_access
 from sros_tool.proof.repository import FILES, SUBMODULE, Repository, TreeEntry, walk
@@ -90,9 +92,12 @@ class RightsChange:
 
 @dataclass(frozen=True, slots=True)
 class DroppedRequirements:
-    """Requirements of BASE that HEAD does not have, and those that do not hold in HEAD."""
+    """Findings on requirements of BASE that HEAD does not demand in full, and how many there are.
 
-    dropped: tuple[Requirement, ...]
+    There is a finding for each of them, and one for each that does not hold in HEAD.
+    """
+
+    count: int
     chosen: ChosenFindings
 
 
@@ -489,8 +494,7 @@ class _Review:
         earlier: list[Requirement] = []
         if self.base:
             earlier = yield from self._read_requirements(self.base)
-        kept = {_demanded(each) for each in wanted}
-        dropped = [each for each in earlier if _demanded(each) not in kept]
+        dropped = dropped_requirements(earlier, wanted)
         subject = " ".join(self.request.policies)
         try:
             system = policy_system(_together(policies, fleet), at=self.request.at)
@@ -499,12 +503,17 @@ class _Review:
             return
         yield from self._checked("requirements", subject, partial(_decided, wanted, system))
         if dropped:
-            decide = partial(self._dropped, dropped, system)
+            decide = partial(self._dropped, earlier, wanted, system)
             yield from self._checked("requirements-before", subject, decide)
 
-    def _dropped(self, dropped: Sequence[Requirement], system: System) -> tuple[int, Content]:
-        status, chosen = _decided(dropped, system)
-        return min(status, self._new_access), DroppedRequirements(tuple(dropped), chosen)
+    def _dropped(
+        self, earlier: Sequence[Requirement], wanted: Sequence[Requirement], system: System
+    ) -> tuple[int, Content]:
+        dropped = [each.requirement for each in dropped_requirements(earlier, wanted)]
+        found = dropped_findings(earlier, wanted, " ".join(self.request.requirements))
+        broken = requirement_findings(dropped, system)
+        chosen = FindingFilter(exclude=(VACUOUS.id,)).choose([*found, *broken])
+        return self._new_access, DroppedRequirements(len(dropped), chosen)
 
     # ── keystores ──────────────────────────────────────────────────────────────────────────
 
@@ -566,11 +575,6 @@ def _status(chosen: ChosenFindings) -> int:
 def _decided(requirements: Sequence[Requirement], system: System) -> tuple[int, ChosenFindings]:
     chosen = FindingFilter().choose(requirement_findings(requirements, system))
     return _status(chosen), chosen
-
-
-def _demanded(requirement: Requirement) -> Requirement:
-    """Return a requirement without what only people read."""
-    return replace(requirement, source=Source("", 0), name="", why="")
 
 
 def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
