@@ -22,8 +22,8 @@ from sros_tool.cli.common import (
     print_json,
 )
 from sros_tool.cli.progress import progress
-from sros_tool.terminal import echo
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
+from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
