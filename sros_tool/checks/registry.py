@@ -7,7 +7,16 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from types import ModuleType
 
-from sros_tool.checks import policies, requirements, runtime, zenoh, zenoh_environment
+from sros_tool.checks import (
+    environment,
+    policies,
+    process_files,
+    processes,
+    requirements,
+    runtime,
+    zenoh,
+    zenoh_environment,
+)
 from sros_tool.checks.keystores import (
     authorities,
     documents,
@@ -21,7 +30,7 @@ from sros_tool.errors import UsageError
 
 _MODULES = (
     *(policies, requirements, files, authorities, enclaves, documents, issued),
-    *(zenoh_files, zenoh, zenoh_environment, runtime),
+    *(zenoh_files, zenoh, zenoh_environment, environment, runtime, processes, process_files),
 )
 
 

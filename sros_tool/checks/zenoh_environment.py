@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -113,20 +114,29 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
 
 
 def enforces_nothing(environment: Mapping[str, str], variable: str) -> str:
-    """Return why a process has no access control, or "" if it has, or did not start.
+    """Return why a process has no access control, or "" if it has, or does not start.
 
     ``variable`` is the one that names its configuration.
     """
     text = environment.get(variable, "")
     if not text:
         return f"{variable} is not set"
-    try:
+    with suppress(SrosError):  # a finding says what is wrong with the file
         data = read_bytes(Path(text), "Zenoh configuration")
-        overrides = override_pairs(environment.get(OVERRIDE, ""))
-        document = parse_configuration(data, text, overrides, lines=False)
-    except SrosError:
-        return ""
-    return "" if document.access.enabled else f"access_control is off in '{text}' with {OVERRIDE}"
+        return open_because(data, text, environment.get(OVERRIDE, ""))
+    return ""
+
+
+def open_because(data: bytes, name: str, override: str) -> str:
+    """Return why a configuration has no access control, as a clause, or "" if it has.
+
+    ``name`` is the name of the file; ``override`` is the value of ZENOH_CONFIG_OVERRIDE.
+
+    Raises:
+        SrosError: sros cannot read the configuration.
+    """
+    document = parse_configuration(data, name, override_pairs(override), lines=False)
+    return "" if document.access.enabled else f"access_control is off in '{name}' with {OVERRIDE}"
 
 
 def _overridden(

@@ -78,7 +78,8 @@ Example:
 Findings that the keystore's template accepts count as notes and share one line; with --strict,
 for example in CI, they count like all others. Where security is not enabled at all, `check runtime`
 shows a note, which counts with --fail-on note. Exit status: 1 if a finding of the --fail-on
-severity or higher is shown, else 0.""",
+severity or higher is shown, 2 if the only ones are about processes that could not be looked at,
+else 0.""",
 )
 @click.argument("targets", metavar="[policy|keystore|runtime] [PATH]...", nargs=-1, type=PATH)
 @click.option("--list", "as_list", is_flag=True, help="List all kinds of findings.")
@@ -272,7 +273,20 @@ def check(
         _print_text(chosen, _with_enclaves(at.fleet, paths))
     else:
         _SHOW[form](chosen, selection)
-    return 1 if fail_on != "never" and chosen.fails(Severity[fail_on.upper()]) else 0
+    return _status(chosen, fail_on)
+
+
+def _status(chosen: ChosenFindings, fail_on: str) -> int:
+    """Return the exit status: 1 for findings, and `NOT_DONE` if some processes were not seen."""
+    from sros_tool.checks.kind import Severity
+    from sros_tool.checks.process_files import PROCESS_NOT_SEEN
+
+    if fail_on == "never":
+        return 0
+    failing = [each for each in chosen.shown if each.severity >= Severity[fail_on.upper()]]
+    if failing and all(each.kind is PROCESS_NOT_SEEN for each in failing):
+        return NOT_DONE
+    return 1 if failing else 0
 
 
 def _is_named(parameter: str) -> bool:
@@ -420,14 +434,15 @@ def _findings_here(
 
     ``insecure_rmws`` maps RMWs that were found not to enforce security to the evidence.
     """
-    from sros_tool.checks.runtime import RuntimeState, running_processes, runtime_findings
+    from sros_tool.checks.runtime import RuntimeState, runtime_findings
     from sros_tool.cli.common import local_zone
+    from sros_tool.runtime.processes import ProcessTable
     from sros_tool.runtime.rmw import rmw_implementations
 
     zone = local_zone(environment)
     clock = now()
-    rmws, processes = rmw_implementations(environment), tuple(running_processes(clock))
-    state = RuntimeState(environment, moment, zone, processes, rmws, insecure_rmws, clock)
+    rmws, running = rmw_implementations(environment), ProcessTable().look(clock)
+    state = RuntimeState(environment, moment, zone, running, rmws, insecure_rmws, clock)
     return runtime_findings(state)
 
 

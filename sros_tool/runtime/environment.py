@@ -148,7 +148,7 @@ _UNREADABLE: dict[str, Callable[[str], bool]] = {
 
 # ── the command line of a node ─────────────────────────────────────────────────────────────
 
-_ROS_ARGS = "--ros-args"
+ROS_ARGS = "--ros-args"
 _ENCLAVE_OPTION = re.compile(r"(?:-e|--enclave)\Z")
 _ZENOH_ROUTER = "rmw_zenohd"
 _PYTHON = re.compile(r"python[\d.]*\Z")
@@ -164,13 +164,13 @@ def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
     command = tuple(command)
     if Path(command[0]).name == "ros2" and not _is_ros2_run(command):
         return command
-    ros_args = command[command.index(_ROS_ARGS) :] if _ROS_ARGS in command else ()
+    ros_args = command[command.index(ROS_ARGS) :] if ROS_ARGS in command else ()
     if any(_ENCLAVE_OPTION.match(word) for word in ros_args):
         return command
     if any(Path(word).name == _ZENOH_ROUTER for word in command):
         return command
     if ros_args or _is_ros2_run(command) or _is_of_package(command):
-        return (*command, _ROS_ARGS, "--enclave", enclave)
+        return (*command, ROS_ARGS, "--enclave", enclave)
     return command
 
 
@@ -180,10 +180,20 @@ def enclave_argument(command: Sequence[str]) -> str:
 
 
 def named_enclave(command: Sequence[str]) -> str:
-    """Return the enclave that ``--ros-args --enclave`` names in a command, or ""."""
-    words = list(command[command.index(_ROS_ARGS) :]) if _ROS_ARGS in command else []
-    named = [value for word, value in pairwise(words) if _ENCLAVE_OPTION.match(word)]
-    return named[-1] if named else ""
+    """Return the enclave that ``--ros-args --enclave`` names in a command, or "".
+
+    The last one counts.  ``--`` ends the arguments for ROS until the next ``--ros-args``
+    (rcl/src/rcl/arguments.c).
+    """
+    found, of_ros = "", False
+    for before, word in pairwise(("", *command)):
+        if of_ros and _ENCLAVE_OPTION.match(before):
+            found = word
+        elif word == ROS_ARGS:
+            of_ros = True
+        elif word == "--":
+            of_ros = False
+    return found
 
 
 _REMAP_OPTIONS = ("-r", "--remap")
@@ -200,7 +210,7 @@ def node_argument(command: Sequence[str]) -> tuple[str, str] | None:
     found: dict[str, str] = {}
     of_ros = False
     for before, word in pairwise(("", *command)):
-        if word == _ROS_ARGS:
+        if word == ROS_ARGS:
             of_ros = True
         elif word == "--":
             of_ros = False

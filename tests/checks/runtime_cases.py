@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import timedelta
+from pathlib import Path
+from typing import Any
 
-from sros_tool.checks.runtime import Process, RuntimeState
+from sros_tool.checks.runtime import RuntimeState
+from sros_tool.dds.permissions import parse_permissions
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import pem
+from sros_tool.runtime.process_files import FileReader, ProcessRoot
+from sros_tool.runtime.processes import Process, RunningProcesses, UnseenProcess, with_files
+from sros_tool.validity import parse_iso
 from tests.checks import zenoh_cases
-from tests.checks.bench import Bench
+from tests.checks.bench import DAY, Bench
 
 Change = Callable[[RuntimeState, Bench], RuntimeState]
 
@@ -51,7 +60,23 @@ def sound_state(bench: Bench) -> RuntimeState:
     node = Process(7, ("/usr/bin/talker", "--ros-args"), environment, started)
     daemon = Process(8, ("python3", "-c", "from ros2cli.daemon import main"), environment, started)
     rmws = ("rmw_fastrtps_cpp", "rmw_cyclonedds_cpp", "rmw_zenoh_cpp")
-    return RuntimeState(environment, started, processes=(node, daemon), rmws=rmws)
+    return with_processes(RuntimeState(environment, started, rmws=rmws), node, daemon)
+
+
+def with_processes(state: RuntimeState, *processes: Process) -> RuntimeState:
+    """The state with other processes."""
+    return replace(state, running=replace(state.running, processes=processes))
+
+
+def seen(state: RuntimeState) -> RuntimeState:
+    """The state with the files that its processes name, as they are now."""
+    handle = os.open("/", os.O_PATH)
+    root = ProcessRoot(handle, FileReader())
+    try:
+        filled = [with_files(each, root, "") for each in state.running.processes]
+    finally:
+        os.close(handle)
+    return with_processes(state, *filled)
 
 
 def having(**variables: str | None) -> Change:
@@ -68,12 +93,22 @@ def running(index: int, **variables: str | None) -> Change:
     """The same for one of the processes."""
 
     def change(state: RuntimeState, bench: Bench) -> RuntimeState:
-        process = state.processes[index]
+        process = state.running.processes[index]
         alone = replace(state, environment=process.environment)
-        changed = replace(process, environment=having(**variables)(alone, bench).environment)
-        processes = list(state.processes)
-        processes[index] = changed
-        return replace(state, processes=tuple(processes))
+        return changed(index, environment=having(**variables)(alone, bench).environment)(
+            state, bench
+        )
+
+    return change
+
+
+def changed(index: int, **fields: Any) -> Change:
+    """One of the processes with other values."""
+
+    def change(state: RuntimeState, _: Bench) -> RuntimeState:
+        processes = list(state.running.processes)
+        processes[index] = replace(processes[index], **fields)
+        return with_processes(state, *processes)
 
     return change
 
@@ -85,9 +120,43 @@ def _written_in_the_future(state: RuntimeState, bench: Bench) -> RuntimeState:
 
 
 def _written_since(state: RuntimeState, bench: Bench) -> RuntimeState:
-    moment = (state.now + timedelta(minutes=1)).timestamp()
-    os.utime(bench.path("enclaves/base/permissions.p7s"), (moment, moment))
+    return changed(0, started=state.now - timedelta(days=2))(state, bench)
+
+
+def _at_the_end(state: RuntimeState, bench: Bench, **variables: str | None) -> RuntimeState:
+    """An hour before the permissions expire."""
+    grant = parse_permissions(smime.parse(_of(state, "permissions.p7s").read_bytes()).document)
+    moment = parse_iso(grant.grants[0].not_after) - timedelta(hours=1)
+    return replace(running(0, **variables)(state, bench), now=moment)
+
+
+def _of(state: RuntimeState, file: str) -> Path:
+    """A file of the enclave of the first process."""
+    environment = state.running.processes[0].environment
+    return Path(f"{environment[KEYSTORE]}/enclaves{environment[ENCLAVE]}", file)
+
+
+def _revoked(state: RuntimeState, bench: Bench) -> RuntimeState:
+    bench.revoke(bench.certificate().serial_number)
+    shutil.copy(bench.path("public/identity_ca.crl.pem"), _of(state, "crl.pem"))
     return state
+
+
+def _others_can_write(state: RuntimeState, _: Bench) -> RuntimeState:
+    _of(state, "..").resolve().chmod(0o777)
+    return state
+
+
+def _among_strangers(state: RuntimeState, bench: Bench) -> RuntimeState:
+    other = bench.root.parent / "of others"
+    shutil.copytree(state.environment[KEYSTORE], other)
+    (other / "enclaves/base/identity_ca.cert.pem").write_bytes(pem(bench.new_authority()[0]))
+    return running(0, **{KEYSTORE: str(other)})(state, bench)
+
+
+def _unseen(state: RuntimeState, _: Bench) -> RuntimeState:
+    unseen = UnseenProcess(9, ("/sbin/init",), "Permission denied", speaks=False)
+    return replace(state, running=RunningProcesses(unseen=(unseen,)))
 
 
 def _without_ca_keys(state: RuntimeState, bench: Bench) -> RuntimeState:
@@ -109,7 +178,7 @@ def on_zenoh(text: str | None = None, **variables: str | None) -> Change:
         }
         old = (state.now - timedelta(days=1)).timestamp()
         os.utime(file, (old, old))
-        for index in range(len(state.processes)):
+        for index in range(len(state.running.processes)):
             state = running(index, **stated)(state, bench)
         return having(**stated)(state, bench)
 
@@ -117,10 +186,7 @@ def on_zenoh(text: str | None = None, **variables: str | None) -> Change:
 
 
 def session_written_since(state: RuntimeState, bench: Bench) -> RuntimeState:
-    state = on_zenoh()(state, bench)
-    moment = (state.now + timedelta(minutes=1)).timestamp()
-    os.utime(state.environment[SESSION], (moment, moment))
-    return state
+    return _written_since(on_zenoh()(state, bench), bench)
 
 
 CASES: dict[str, Change] = {
@@ -149,6 +215,16 @@ CASES: dict[str, Change] = {
     "runtime.process-unsecured": running(0, **{ENABLE: None}),
     "runtime.process-runs-unsecured": running(0, **{STRATEGY: "Permissive", ENCLAVE: "/gone"}),
     "runtime.process-outdated": _written_since,
+    "runtime.process-revoked": _revoked,
+    "runtime.process-without-files": running(0, **{ENCLAVE: "/gone"}),
+    "runtime.process-expired": lambda state, _: replace(state, now=state.now + 9000 * DAY),
+    "runtime.process-permissive": running(0, **{STRATEGY: "Permissive"}),
+    "runtime.process-other-keystore": _among_strangers,
+    "runtime.process-local-time": lambda state, bench: _at_the_end(state, bench, TZ="Asia/Tokyo"),
+    "runtime.process-files-replaceable": _others_can_write,
+    "runtime.process-elsewhere": changed(0, network="net:[1]"),
+    "runtime.process-not-seen": _unseen,
+    "runtime.zenoh-process-unread": on_zenoh("mode: client\n"),
     "runtime.zenoh-open": on_zenoh(**{SESSION: None}),
     "runtime.zenoh-file-not-found": on_zenoh(**{SESSION: "/nowhere/session.json5"}),
     "runtime.zenoh-overridden": on_zenoh(

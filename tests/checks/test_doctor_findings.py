@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from sros_tool.checks import runtime
 from sros_tool.demo import doctor
 from sros_tool.demo.doctor import Diagnosis
+from sros_tool.runtime.processes import ProcessTable, RunningProcesses
 from sros_tool.runtime.stacks import Stack
 from tests.checks.bench import Bench
 from tests.support.harness import sros
@@ -75,7 +75,7 @@ def test_the_status_is_about_the_nodes_of_ros(
 ) -> None:
     monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis(stacks))
     # Other tests run secured processes on this machine, and doctor looks at those, too.
-    monkeypatch.setattr(runtime, "running_processes", lambda _: iter(()))
+    monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses())
     ended = sros("doctor", env={})
     assert ended.status == status
     assert said in ended.out.rpartition("\n\n")[2]

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from sros_tool.checks import runtime
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Severity
 from sros_tool.checks.registry import KINDS, FindingFilter
 from sros_tool.checks.sarif import sarif
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UsageError
+from sros_tool.runtime.processes import ProcessTable, RunningProcesses
 from tests.checks import (
     keystore_cases,
     policy_cases,
@@ -202,7 +202,7 @@ def test_it_finds_out_what_a_path_is(bench: Bench, tmp_path: Path) -> None:
 def test_the_runtime_and_the_keystore_it_names(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runtime, "running_processes", lambda _: iter(()))
+    monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses())
     env = {"ROS_SECURITY_ENABLE": "True", "ROS_SECURITY_KEYSTORE": str(bench.root)}
     ended = sros("check", env=env)
     assert ended.status == 1

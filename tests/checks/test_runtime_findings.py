@@ -13,9 +13,11 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from sros_tool.checks.kind import ERROR, NOTE, WARNING
+from sros_tool.checks import runtime
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding
 from sros_tool.checks.registry import FindingFilter
-from sros_tool.checks.runtime import Process, RuntimeState, running_processes, runtime_findings
+from sros_tool.checks.runtime import RuntimeState
+from sros_tool.runtime.processes import Process, ProcessTable
 from tests.checks.bench import DAY, Bench
 from tests.checks.runtime_cases import (
     CASES,
@@ -27,11 +29,14 @@ from tests.checks.runtime_cases import (
     SESSION,
     SOUND,
     STRATEGY,
+    changed,
     having,
     on_zenoh,
     running,
+    seen,
     session_written_since,
     sound_state,
+    with_processes,
 )
 from tests.support.children import wait_for
 
@@ -43,6 +48,10 @@ SPELLING = {
 }
 
 
+def runtime_findings(state: RuntimeState) -> list[Finding]:
+    return runtime.runtime_findings(seen(state))
+
+
 def ids(state: RuntimeState) -> set[str]:
     return {each.id for each in runtime_findings(state)}
 
@@ -51,8 +60,9 @@ def ids(state: RuntimeState) -> set[str]:
 def sound_one(bench: Bench) -> RuntimeState:
     """A host whose keystore is an export, without keys of CAs."""
     state = SOUND(sound_state(bench), bench)
-    processes = [replace(each, environment=state.environment) for each in state.processes]
-    return replace(state, processes=tuple(processes))
+    for index in range(len(state.running.processes)):
+        state = changed(index, environment=state.environment)(state, bench)
+    return state
 
 
 def test_nothing_in_a_sound_setting(sound_one: RuntimeState) -> None:
@@ -68,15 +78,13 @@ def test_nothing_but_that_nothing_is_secured(variables: dict[str, str]) -> None:
 
 
 def test_without_security_each_open_node_is_named(sound_one: RuntimeState, bench: Bench) -> None:
-    node = replace(sound_one.processes[0], environment={DOMAIN: "3"})
+    node = replace(sound_one.running.processes[0], environment={DOMAIN: "3"})
     nodes = tuple(replace(node, pid=pid) for pid in range(100, 130))
-    other = replace(node, command=("/usr/bin/editor",))
-    state = replace(sound_one, environment={}, processes=(*nodes, other))
+    state = with_processes(replace(sound_one, environment={}), *nodes)
     (found,) = runtime_findings(state)
     assert found.text.startswith(
         "ROS_SECURITY_ENABLE is not set; running without it: process 100 (talker) in domain 3, "
     )
-    assert "editor" not in found.text
     assert found.text.endswith("process 119 (talker) in domain 3 and 10 more")
     for severity, shown in ((NOTE, True), (WARNING, True), (ERROR, False)):
         chosen = FindingFilter(severity=severity).choose([found])
@@ -86,8 +94,8 @@ def test_without_security_each_open_node_is_named(sound_one: RuntimeState, bench
 
 def test_the_name_of_a_process_cannot_be_taken_for_another_one(sound_one: RuntimeState) -> None:
     name = f"x) in domain 0, process 1 (y\x1b[2J{'z' * 500}"
-    node = Process(7, (name,), {DOMAIN: "4, all"}, sound_one.now, has_loaded=True)
-    (found,) = runtime_findings(replace(sound_one, environment={}, processes=(node,)))
+    node = Process(7, (name,), {DOMAIN: "4, all"}, sound_one.now, libraries=frozenset({"librcl"}))
+    (found,) = runtime_findings(with_processes(replace(sound_one, environment={}), node))
     text = found.text.partition("without it: ")[2]
     assert text == f"process 7 (x? in domain 0? process 1 ?y??2J{'z' * 8}) in domain 4? all"
 
@@ -96,8 +104,8 @@ def test_a_session_file_of_zenoh_is_security_without_ros_variables(
     sound_one: RuntimeState, bench: Bench
 ) -> None:
     unset = dict.fromkeys((ENABLE, STRATEGY, KEYSTORE, ENCLAVE))
-    assert ids(replace(on_zenoh(**unset)(sound_one, bench), processes=())) == set()
-    without_file = replace(on_zenoh(**unset, **{SESSION: None})(sound_one, bench), processes=())
+    assert ids(with_processes(on_zenoh(**unset)(sound_one, bench))) == set()
+    without_file = with_processes(on_zenoh(**unset, **{SESSION: None})(sound_one, bench))
     assert ids(without_file) == {"runtime.not-secured"}
 
 
@@ -158,9 +166,10 @@ def test_what_an_override_makes_of_a_session_file(
 def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: RuntimeState) -> None:
     root = Path(sound_one.environment[KEYSTORE])
     (root / "enclaves/base/permissions.p7s").unlink()
-    (found,) = runtime_findings(sound_one)
-    assert found.id == "enclave.file-missing"
-    assert "permissions.p7s" in found.text
+    missing, outdated = runtime_findings(sound_one)
+    assert (missing.id, outdated.id) == ("enclave.file-missing", "runtime.process-outdated")
+    assert "permissions.p7s" in missing.text
+    assert "permissions.p7s (removed)" in outdated.text
 
 
 def test_the_daemon_of_another_domain_is_not_asked(sound_one: RuntimeState, bench: Bench) -> None:
@@ -206,19 +215,15 @@ def test_variables_of_old_and_in_small_letters(
 def test_an_open_node_is_found_next_to_a_secured_one_from_a_shell_without_security(
     sound_one: RuntimeState,
 ) -> None:
-    secured = sound_one.processes[0]
+    secured = sound_one.running.processes[0]
     open_node = replace(secured, pid=9, environment={"ROS_DOMAIN_ID": "0"})
     shell = replace(sound_one, environment={"PATH": "/usr/bin"})
     both = {"runtime.process-unsecured", "runtime.not-secured"}
-    assert ids(replace(shell, processes=(secured, open_node))) == both
-    quiet = replace(open_node, command=("python3", "talker.py"))
+    assert ids(with_processes(shell, secured, open_node)) == both
     alone = {"runtime.not-secured"}
-    assert ids(replace(shell, processes=(secured, quiet))) == alone
-    loaded = replace(quiet, has_loaded=True)
-    assert ids(replace(shell, processes=(secured, loaded))) == both
     elsewhere = replace(open_node, environment={"ROS_DOMAIN_ID": "1"})
-    assert ids(replace(shell, processes=(secured, elsewhere))) == alone
-    assert ids(replace(shell, processes=(open_node,))) == alone
+    assert ids(with_processes(shell, secured, elsewhere)) == alone
+    assert ids(with_processes(shell, open_node)) == alone
 
 
 def test_real_processes_are_read(tmp_path: Path) -> None:
@@ -233,17 +238,23 @@ def test_real_processes_are_read(tmp_path: Path) -> None:
     child = subprocess.Popen(command, env=environment, cwd=tmp_path)
     try:
 
-        def seen() -> Any:
-            mine = (each for each in running_processes(datetime.now(UTC)) if each.pid == child.pid)
-            return next((e for e in mine if e.environment.get(ENCLAVE) and e.has_loaded), None)
+        def mine() -> Any:
+            listed = (
+                each
+                for each in ProcessTable().look(datetime.now(UTC)).processes
+                if each.pid == child.pid
+            )
+            return next((e for e in listed if e.environment.get(ENCLAVE)), None)
 
-        found = wait_for(seen, "the process with its environment")
+        found = wait_for(mine, "the process with its environment")
         assert found is not None
         assert found.environment[ENCLAVE] == "/sros_test_of_processes"
         assert found.command[1] == "-c"
         assert before < found.started < datetime.now(UTC) + timedelta(seconds=0.1)
-        assert found.is_node
-        assert os.getpid() not in {each.pid for each in running_processes(datetime.now(UTC))}
+        assert found.libraries == {"librcl"}
+        assert os.getpid() not in {
+            each.pid for each in ProcessTable().look(datetime.now(UTC)).processes
+        }
     finally:
         child.kill()
         child.wait()
@@ -285,7 +296,7 @@ def test_spelling(variables: dict[str, str], told: set[str]) -> None:
 def test_a_node_that_asks_for_security_and_runs_without(
     variables: dict[str, str], arguments: list[str], unsecured: bool, sound_one: RuntimeState
 ) -> None:
-    node = sound_one.processes[0]
+    node = sound_one.running.processes[0]
     name = node.environment[ENCLAVE]
     changed = replace(
         node,
@@ -295,7 +306,7 @@ def test_a_node_that_asks_for_security_and_runs_without(
         },
         command=(*node.command, *(each.format(name=name) for each in arguments)),
     )
-    state = replace(sound_one, processes=(changed,))
+    state = with_processes(sound_one, changed)
     assert ("runtime.process-runs-unsecured" in ids(state)) is unsecured
 
 

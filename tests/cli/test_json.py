@@ -14,13 +14,13 @@ import pytest
 from jsonschema import Draft202012Validator
 from referencing import Registry, Resource
 
-from sros_tool.checks import runtime
 from sros_tool.demo import doctor
 from sros_tool.demo import program as demo
 from sros_tool.demo.casting import CastMember
 from sros_tool.demo.doctor import Diagnosis
 from sros_tool.demo.result import KeystoreSummary
 from sros_tool.runtime import ros2cli
+from sros_tool.runtime.processes import ProcessTable, RunningProcesses
 from sros_tool.runtime.ros2cli import SecurityProvider
 from tests.checks.test_doctor_findings import CYCLONE, RMW
 from tests.cli.json_cases import (
@@ -252,7 +252,7 @@ def test_what_a_verb_prints_beside_a_graph(
 
 
 def test_what_doctor_prints(made_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime, "running_processes", lambda _: iter(()))
+    monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses())
     seen = Seen()
     for stacks, status in (((RMW, CYCLONE), 1), ((RMW,), 1), ((CYCLONE,), 0)):
         monkeypatch.setattr(doctor, "examine", lambda *_, found=stacks: Diagnosis(found))

@@ -1,0 +1,286 @@
+"""Checks of the environment variables that choose security, and of the enclave that they name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping
+from datetime import datetime, tzinfo
+from pathlib import Path
+
+from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import parse_governance
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore.layout import (
+    GOVERNANCE_P7S,
+    IDENTITY,
+    PERMISSIONS,
+    ca_key,
+    enclave_path,
+    is_keystore,
+    refuse_earlier,
+    search_enclaves,
+)
+from sros_tool.pki import smime
+from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
+from sros_tool.xml import read_bytes
+
+_RCL = "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy."
+_NAME_IT = (
+    "Start each process with `sros run ROOT NAME -- COMMAND...`, or set its enclave in the launch "
+    "file."
+)
+_ENV = '`eval "$(sros env ROOT NAME)"` sets all variables.'
+
+ENABLE_MISSPELT = FindingKind(
+    "runtime.enable-misspelt",
+    ERROR,
+    "ROS_SECURITY_ENABLE is neither true nor false",
+    "Only the exact value `true` enables security. With any other value every node runs "
+    "unsecured, and does not report it.",
+    _RCL,
+    f"Write ROS_SECURITY_ENABLE=true. {_ENV}",
+)
+NOT_ENABLED = FindingKind(
+    "runtime.not-enabled",
+    WARNING,
+    "security is configured but not enabled",
+    "Without ROS_SECURITY_ENABLE=true every node runs unsecured, whatever the other variables are.",
+    _RCL,
+    f"Write ROS_SECURITY_ENABLE=true, or unset the other variables. {_ENV}",
+)
+MISSPELT = FindingKind(
+    "runtime.variable-misspelt",
+    ERROR,
+    "a misspelt or obsolete variable, which ROS 2 ignores",
+    "The name looks like a typo, or an old name, of a variable that rcl reads. rcl ignores it "
+    "without a message.",
+    _RCL,
+    "Correct the name.",
+)
+STRATEGY_MISSPELT = FindingKind(
+    "runtime.strategy-misspelt",
+    ERROR,
+    "ROS_SECURITY_STRATEGY is neither Enforce nor Permissive",
+    "Only the exact value `Enforce` enforces security. With any other value a node whose enclave "
+    "is missing runs unsecured.",
+    _RCL,
+    f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
+)
+NOT_ENFORCED = FindingKind(
+    "runtime.not-enforced",
+    WARNING,
+    "security is enabled but not enforced",
+    "A node runs unsecured if its enclave or one of its files is missing, even if it logs that it "
+    "found a security directory.",
+    _RCL,
+    f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
+)
+KEYSTORE_UNSET = FindingKind(
+    "runtime.keystore-unset",
+    ERROR,
+    "security is enabled, but ROS_SECURITY_KEYSTORE is not set",
+    'With Enforce no node starts (rcl says "error not set"); without Enforce every node runs '
+    "unsecured.",
+    _RCL,
+    f"Set ROS_SECURITY_KEYSTORE. {_ENV}",
+)
+KEYSTORE_NOT_FOUND = FindingKind(
+    "runtime.keystore-not-found",
+    ERROR,
+    "ROS_SECURITY_KEYSTORE is not a keystore",
+    "With Enforce no node starts; without Enforce every node runs unsecured.",
+    _RCL,
+    f"Correct the path. {_ENV}",
+)
+KEYSTORE_RELATIVE = FindingKind(
+    "runtime.keystore-relative",
+    WARNING,
+    "ROS_SECURITY_KEYSTORE is a relative path",
+    "Each process resolves the path in its working directory, so a service, for instance, looks "
+    "in another folder.",
+    _RCL,
+    f"Write the absolute path. {_ENV}",
+)
+ENCLAVE_NOT_FOUND = FindingKind(
+    "runtime.enclave-not-found",
+    ERROR,
+    "the enclave is not in the keystore",
+    "With Enforce the node does not start; without Enforce it runs unsecured. Names are "
+    "case-sensitive.",
+    _RCL,
+    "Correct the name, or create the enclave with `sros create_enclave`.",
+)
+NO_ENCLAVE = FindingKind(
+    "runtime.enclave-unset",
+    WARNING,
+    "ROS_SECURITY_ENCLAVE_OVERRIDE is not set",
+    "A process without `--ros-args --enclave NAME` uses the enclave /, which the keystore does "
+    "not have, and does not start.",
+    _RCL,
+    _NAME_IT,
+)
+UNSECURED_WITHOUT_ENCLAVE = FindingKind(
+    "runtime.unsecured-without-enclave",
+    ERROR,
+    "ROS_SECURITY_ENCLAVE_OVERRIDE is not set, and nodes run unsecured",
+    "A process without `--ros-args --enclave NAME` uses the enclave /, which the keystore does "
+    "not have. It runs UNSECURED, because ROS_SECURITY_STRATEGY is not exactly `Enforce`.",
+    _RCL,
+    f"Write ROS_SECURITY_STRATEGY=Enforce. {_NAME_IT}",
+)
+DOMAIN_MALFORMED = FindingKind(
+    "runtime.domain-malformed",
+    ERROR,
+    "ROS_DOMAIN_ID is not a valid domain id",
+    "Nodes do not start; if the value has a leading zero, they read it as octal and join another "
+    "domain.",
+    "rcl 9 (rcl/src/rcl/domain_id.c: strtoul with base 0); Cyclone DDS refuses domains above 230.",
+    "Write one whole number from 0 to 230, without leading zeros.",
+)
+DOMAIN_NOT_GOVERNED = FindingKind(
+    "runtime.domain-not-governed",
+    ERROR,
+    "the keystore does not cover this domain",
+    'No node starts: Fast DDS says "Not found topic access rule for topic ros_discovery_info", '
+    'Cyclone DDS "Could not find domain in governance".',
+    "DDS-Security 1.1, 9.4.1.2; measured.",
+    "Set ROS_DOMAIN_ID to a domain of the keystore, or make a keystore for this domain with `sros "
+    "create_keystore --domain`.",
+)
+CA_KEY_HERE = FindingKind(
+    "runtime.ca-key-present",
+    NOTE,
+    "nodes use the keystore that holds the CA keys",
+    "An attacker who takes over a node can create any enclave, with any rights.",
+    "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6.",
+    "Run nodes with an export (`sros distribute_key`), and keep this keystore elsewhere.",
+)
+
+_READ = (
+    ENABLE, STRATEGY, KEYSTORE, ENCLAVE, DOMAIN, "RMW_IMPLEMENTATION", "ROS_SECURITY_LOG_FILE",
+    "ROS_SECURITY_LOG_VERBOSITY", "ROS_SECURITY_LOG_PUBLISH",
+)  # fmt: skip
+_OLD = {
+    "ROS_SECURITY_ROOT_DIRECTORY": KEYSTORE,
+    "ROS_SECURITY_NODE_DIRECTORY": ENCLAVE,
+    "ROS_SECURITY_LOOKUP_TYPE": ENCLAVE,
+}
+_CLOSE = 0.88
+
+
+def variable_findings(
+    environment: Mapping[str, str], *, now: datetime, zone: tzinfo
+) -> Iterator[Finding]:
+    """Yield findings about the environment variables and the enclave that they name."""
+    yield from _spelling(environment)
+    if environment.get(ENABLE) != "true":
+        return
+    if environment.get(STRATEGY) != "Enforce" and environment.get(STRATEGY) in (
+        None, "", "Permissive",
+    ):  # fmt: skip
+        yield NOT_ENFORCED.found(STRATEGY, value_text(environment, STRATEGY))
+    domain: int | None = None
+    try:
+        domain = domain_from(environment) or 0
+    except SrosError as error:
+        yield DOMAIN_MALFORMED.found(DOMAIN, error.what, remedy=error.remedy)
+    text = environment.get(KEYSTORE, "")
+    if not text:
+        yield KEYSTORE_UNSET.found(KEYSTORE, value_text(environment, KEYSTORE))
+        return
+    root = Path(text)
+    if not root.is_absolute():
+        yield KEYSTORE_RELATIVE.found(KEYSTORE, value_text(environment, KEYSTORE))
+    if not is_keystore(root):
+        missing = "does not exist" if not root.exists() else "has no enclaves folder with content"
+        remedy = ""
+        try:
+            refuse_earlier(root)
+        except KeystoreError as error:
+            missing, remedy = f"is not read. {error.why}".rstrip("."), error.remedy
+        yield KEYSTORE_NOT_FOUND.found(KEYSTORE, f"'{root}' {missing}", remedy=remedy)
+        return
+    yield from _enclave(environment, root, domain, now=now, zone=zone)
+
+
+def asks_in_vain(environment: Mapping[str, str]) -> list[str]:
+    """Return the variables that configure security, where nothing says whether to enable it."""
+    if ENABLE in environment:
+        return []
+    return [name for name in (STRATEGY, KEYSTORE, ENCLAVE) if environment.get(name)]
+
+
+def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
+    enable, strategy = environment.get(ENABLE), environment.get(STRATEGY)
+    if enable not in (None, "", "true", "false"):
+        yield ENABLE_MISSPELT.found(ENABLE, value_text(environment, ENABLE))
+    elif named := asks_in_vain(environment):
+        yield NOT_ENABLED.found(
+            ENABLE,
+            f"{' and '.join(named)} {'is' if len(named) == 1 else 'are'} set, and {ENABLE} is not",
+        )
+    if strategy not in (None, "", "Enforce", "Permissive"):
+        yield STRATEGY_MISSPELT.found(STRATEGY, value_text(environment, STRATEGY))
+    for name in sorted(environment):
+        if name in _READ or not name.upper().startswith(("ROS", "RMW")):
+            continue
+        close = difflib.get_close_matches(name.upper(), _READ, n=1, cutoff=_CLOSE)
+        meant = _OLD.get(name) or (close[0] if close else "")
+        if meant:
+            yield MISSPELT.found(name, f"{name} is set; ROS 2 reads {meant}")
+
+
+def _enclave(
+    environment: Mapping[str, str],
+    root: Path,
+    domain: int | None,
+    *,
+    now: datetime,
+    zone: tzinfo,
+) -> Iterator[Finding]:
+    names, wanted = set(search_enclaves(root)[0]), environment.get(ENCLAVE, "")
+    governed = _governed(root)
+    if governed and domain is not None and domain not in governed:
+        text = f"the governance of '{root}' is for domain {governed}, not for {domain}"
+        yield DOMAIN_NOT_GOVERNED.found(DOMAIN, text)
+        domain = None  # so that it is not reported again for the enclave
+    for role in (IDENTITY, PERMISSIONS):
+        if (root / ca_key(role)).exists():
+            yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key(role)}' exists")
+            break
+    if not wanted and "/" not in names:
+        enforced = environment.get(STRATEGY) == "Enforce"
+        kind = NO_ENCLAVE if enforced else UNSECURED_WITHOUT_ENCLAVE
+        yield kind.found(ENCLAVE, f"'{root}' has no enclave /")
+        return
+    name = wanted or "/"
+    if name not in names and not enclave_path(root, name).is_dir():
+        close = difflib.get_close_matches(name, names, n=1)
+        hint = f"; it has {close[0]}" if close else ""
+        enforced = environment.get(STRATEGY) == "Enforce"
+        effect = "" if enforced else f"; nodes RUN UNSECURED, as {STRATEGY} is not 'Enforce'"
+        yield ENCLAVE_NOT_FOUND.found(ENCLAVE, f"'{root}' has no enclave {name}{hint}{effect}")
+        return
+    found = keystore_findings(root, now=now, zone=zone, domain=domain, only=(name,))
+    for each in found:
+        if each.id == "enclave.governance-domain":
+            yield DOMAIN_NOT_GOVERNED.found(DOMAIN, each.text, each.file)
+        else:
+            yield each
+
+
+def _governed(root: Path) -> DomainSet | None:
+    """Return the domains of a keystore's governance, or None if it cannot be read."""
+    try:
+        signed = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document"))
+        return parse_governance(signed.document).domains().closed()
+    except SrosError:  # reported for the enclave, which has its own copy in an export
+        return None
+
+
+def value_text(environment: Mapping[str, str], name: str) -> str:
+    """Return a variable and its value as a clause."""
+    value = environment.get(name)
+    return f"{name} is not set" if value is None else f"{name} is {value!r}"

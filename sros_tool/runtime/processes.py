@@ -1,0 +1,427 @@
+"""The running processes that speak ROS 2, DDS or Zenoh, as /proc shows them.
+
+A process is known by the libraries that it has mapped, by ``--ros-args``, or by its program.  What
+it says in /proc (command, environment, mapped files) is chosen by the process itself, also after
+its start: every text is bounded, and read through a handle of its folder, which never becomes that
+of another process.  A process that links its DDS statically and has no arguments of ROS is not
+recognised; one that cannot be looked at is reported.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import NamedTuple
+
+from sros_tool.runtime.environment import ROS_ARGS
+from sros_tool.runtime.process_files import (
+    FileReader,
+    LoadedEnclave,
+    LoadedFile,
+    ProcessRoot,
+    loaded_enclave,
+)
+from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
+from sros_tool.runtime.variables import DOMAIN, ENABLE
+from sros_tool.runtime.zenoh_environment import NO_CONFIGURATION, RMW_ZENOH, ROUTER_URI, SESSION_URI
+
+_LIBRARIES = re.compile(
+    rb"/(lib(?:rcl|rmw_[a-z_]+?|ddsc|dds_security_auth|fastrtps|fastdds|nddsc|nddscore|zenohc"
+    rb"|zenohpico)|zenoh)(?:-[0-9a-f]{6,40})?(?:\.abi3|\.cpython-[\w-]+)?\.so"
+)
+_DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
+_ROUTERS = ("rmw_zenohd", "zenohd")
+_BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
+_INTERPRETER = re.compile(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
+_SCRIPTS_OF_SROS = ("sros", "sros_tool")
+
+_LOADING = timedelta(milliseconds=20)
+"""No process loads its enclave sooner after its start, which is known in steps of 10 ms."""
+_MOST_BYTES = 4 * 1024 * 1024
+_MOST_MAPS = 32 * 1024 * 1024
+_MOST_TRIES = 3
+_KERNEL_THREAD = 0x00200000
+_LONGEST = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """A running process that speaks ROS 2, DDS or Zenoh.
+
+    ``started`` is the earliest moment at which it can have loaded its files.  ``libraries`` are the
+    names of those of ROS 2, DDS and Zenoh that it has mapped, such as "libddsc".  ``network`` names
+    its network namespace; "" is that of this process.  ``enclave`` is the one that it names, if it
+    asks for security, and ``configuration`` the file that it names for Zenoh.
+    """
+
+    pid: int
+    command: tuple[str, ...]
+    environment: Mapping[str, str]
+    started: datetime
+    libraries: frozenset[str] = frozenset()
+    user: int = 0
+    network: str = ""
+    enclave: LoadedEnclave | None = None
+    configuration: LoadedFile | None = None
+
+    @property
+    def label(self) -> str:
+        """Its name in messages, such as "process 4711 (talker)"."""
+        return f"process {self.pid} ({_program(self.command)})"
+
+    @property
+    def asks_for_security(self) -> bool:
+        """Whether it runs with ROS_SECURITY_ENABLE=true."""
+        return self.environment.get(ENABLE) == "true"
+
+    @property
+    def domain(self) -> str:
+        """The domain that it names, as text that can be shown."""
+        return plain(self.environment.get(DOMAIN) or "0")
+
+    @property
+    def rmw(self) -> str:
+        """The RMW of the middleware that it has mapped, or else that it names."""
+        named = self.environment.get(RMW, "")
+        mapped = {rmw for library, rmw in _RMW_OF.items() if library in self.libraries}
+        if len(mapped) == 1 and not any(named.startswith(each) for each in mapped):
+            return f"{mapped.pop()}_cpp"
+        return named or DEFAULT_RMW
+
+    @property
+    def is_zenoh(self) -> bool:
+        """Whether it speaks Zenoh, by rmw_zenoh or without an RMW."""
+        return self.rmw.startswith(RMW_ZENOH) or self.is_router
+
+    @property
+    def is_router(self) -> bool:
+        """Whether it is the router of Zenoh."""
+        return any(Path(word).name in _ROUTERS for word in self.command[:3])
+
+    @property
+    def is_daemon(self) -> bool:
+        """Whether it is the ros2 daemon."""
+        return any(mark in word for word in self.command for mark in _DAEMON)
+
+
+_RMW_OF = {
+    "libddsc": "rmw_cyclonedds",
+    "libfastrtps": "rmw_fastrtps",
+    "libfastdds": "rmw_fastrtps",
+    "libnddsc": "rmw_connextdds",
+    "libzenohc": "rmw_zenoh",
+    "zenoh": "rmw_zenoh",
+    "libzenohpico": "rmw_zenoh",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class UnseenProcess:
+    """A process that could not be looked at, and ``why``, as a clause.
+
+    ``speaks`` is whether its command shows that it speaks ROS 2; of others that is not known.
+    """
+
+    pid: int
+    command: tuple[str, ...]
+    why: str
+    speaks: bool
+
+    @property
+    def label(self) -> str:
+        """Its name in messages, such as "process 4711 (talker)"."""
+        return f"process {self.pid} ({_program(self.command)})"
+
+
+@dataclass(frozen=True, slots=True)
+class RunningProcesses:
+    """The processes that speak ROS 2, without those that only wait for one; and the unseen ones.
+
+    ``hidden`` says which processes /proc does not show, as a clause, or "".  ``container`` is
+    whether only the processes of a container can be seen.
+    """
+
+    processes: tuple[Process, ...] = ()
+    unseen: tuple[UnseenProcess, ...] = ()
+    hidden: str = ""
+    container: bool = False
+
+
+def plain(text: str, longest: int = _LONGEST) -> str:
+    """Return a text that a process chose, so that it can be taken for nothing else in a message."""
+    return re.sub(r"[^\w.+/ -]", "?", text[:longest])
+
+
+def _program(command: tuple[str, ...]) -> str:
+    """Return the name of a program, or of the script or module that an interpreter runs."""
+    name = Path(command[0]).name if command else ""
+    if len(command) > 1 and _INTERPRETER.match(name):
+        if command[1] == "-m" and len(command) > 2:
+            name = command[2]
+        elif not command[1].startswith("-"):
+            name = Path(command[1]).name
+    return plain(name or "?")
+
+
+class _Stat(NamedTuple):
+    """What /proc/PID/stat says: ``identity`` changes when the process starts another program."""
+
+    parent: int
+    ticks: int
+    identity: tuple[str, ...]
+    size: str
+    is_idle: bool
+
+
+class _Looked(NamedTuple):
+    """What was read of a process, as long as ``stat`` is the same."""
+
+    stat: _Stat
+    process: Process | None
+    unseen: UnseenProcess | None
+
+
+class ProcessTable:
+    """The processes of /proc, to be looked at again and again; only what changes is read again."""
+
+    def __init__(self, proc: Path = Path("/proc")) -> None:
+        self._proc = proc
+        self._looked: dict[int, _Looked] = {}
+        self._reader = FileReader()
+        self._ticks = os.sysconf("SC_CLK_TCK")
+
+    def look(self, now: datetime) -> RunningProcesses:
+        """Return the processes that run, except this one.
+
+        ``now`` is the time on the clock of this machine.
+        """
+        begin = now - timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME)) + _LOADING
+        self._reader.begin()
+        before, self._looked = self._looked, {}
+        found: list[Process] = []
+        closed: list[UnseenProcess] = []
+        pids = [int(each) for each in os.listdir(self._proc) if each.isdigit()]
+        for pid in sorted(pids):
+            if pid == os.getpid():
+                continue
+            try:
+                with self._opened(pid) as folder:
+                    looked = self._look(pid, folder, before.get(pid))
+                    if looked is None:
+                        continue
+                    self._looked[pid] = looked
+                    if looked.process:
+                        started = begin + timedelta(seconds=looked.stat.ticks / self._ticks)
+                        process = replace(looked.process, started=started)
+                        found.append(self._with_files(process, folder))
+            except PermissionError:
+                closed.append(UnseenProcess(pid, (), "/proc hides it", speaks=False))
+            except OSError:  # it has ended
+                continue
+        waiting = self._waiting(found)
+        return RunningProcesses(
+            tuple(each for each in found if each.pid not in waiting),
+            (*(each.unseen for each in self._looked.values() if each.unseen), *closed),
+            "" if (self._proc / "1").exists() else "those of other users, which /proc hides",
+            _namespace(self._proc / "self/ns/pid") not in ("", _FIRST_PID_NAMESPACE),
+        )
+
+    @contextmanager
+    def _opened(self, pid: int) -> Iterator[int]:
+        handle = os.open(self._proc / str(pid), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            yield handle
+        finally:
+            os.close(handle)
+
+    def _look(self, pid: int, folder: int, before: _Looked | None) -> _Looked | None:
+        """Return what is known of a process, or None if it has ended or runs no program."""
+        for _ in range(_MOST_TRIES):
+            stat = _stat(folder)
+            if stat.is_idle:
+                return None
+            if before and before.stat == stat:
+                return before
+            command: tuple[str, ...] = ()
+            try:
+                command = tuple(_words(folder, "cmdline"))
+                process = _examine(pid, folder, command)
+                unseen = None
+            except (PermissionError, _TooLongError) as error:
+                why = error.strerror or "the operating system refuses it"
+                unseen = UnseenProcess(pid, command, why, _may_speak(command))
+                process = None
+            if _stat(folder).identity == stat.identity:
+                return _Looked(stat, process, unseen)
+        why = "it starts one program after the other"
+        return _Looked(stat, None, UnseenProcess(pid, command, why, _may_speak(command)))
+
+    def _with_files(self, process: Process, folder: int) -> Process:
+        """Return a process with the files that it names, as it sees them."""
+        try:
+            own = os.readlink("cwd", dir_fd=folder)
+            root = os.open("root", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
+        except OSError as error:
+            problem = f"its root directory cannot be looked at ({error.strerror})"
+            enclave = LoadedEnclave("", "", problem=problem) if process.asks_for_security else None
+            return replace(process, enclave=enclave, configuration=_configuration_of(process))
+        try:
+            return with_files(process, ProcessRoot(root, self._reader), own)
+        finally:
+            os.close(root)
+
+    def _waiting(self, found: list[Process]) -> set[int]:
+        """Return the processes that speak nothing themselves: they wait for one that does.
+
+        Such as ``timeout 60 sros run ROOT NAME -- talker --ros-args``: without a library of ROS 2
+        or DDS, and with a process below it that speaks.
+        """
+        parents = {pid: each.stat.parent for pid, each in self._looked.items()}
+        above: set[int] = set()
+        for each in found:
+            pid = parents.get(each.pid, 0)
+            while pid in parents and pid not in above:
+                above.add(pid)
+                pid = parents[pid]
+        return {
+            each.pid
+            for each in found
+            if not each.libraries and (each.pid in above or _is_sros_run(each.command))
+        }
+
+
+def with_files(process: Process, root: ProcessRoot, folder: str) -> Process:
+    """Return a process with the files that it names; ``folder`` is its working directory."""
+    zenoh = _configuration_of(process)
+    if zenoh and not zenoh.problem:
+        path = zenoh.name if zenoh.name.startswith("/") else f"{folder}/{zenoh.name}"
+        zenoh = root.load(zenoh.name, path)
+    enclave = loaded_enclave(
+        process.environment, process.command, root, user=process.user, folder=folder
+    )
+    return replace(process, enclave=enclave, configuration=zenoh)
+
+
+class _TooLongError(OSError):
+    """A text of /proc that is longer than sros reads."""
+
+
+def _examine(pid: int, folder: int, command: tuple[str, ...]) -> Process | None:
+    """Return a process if it speaks ROS 2, DDS or Zenoh.
+
+    Raises:
+        OSError: It cannot be looked at, or has ended.
+    """
+    environment: dict[str, str] = {}
+    for word in _words(folder, "environ"):
+        name, mark, value = word.partition("=")
+        if mark:
+            environment.setdefault(name, value)  # getenv(3) takes the first one
+    maps = _read(folder, "maps", _MOST_MAPS)
+    libraries = frozenset(each.decode() for each in _LIBRARIES.findall(maps))
+    if not libraries and not _may_speak(command):
+        return None
+    network = os.readlink("ns/net", dir_fd=folder)
+    return Process(
+        pid,
+        command,
+        environment,
+        _NO_MOMENT,
+        libraries,
+        _user(folder),
+        "" if network == _namespace(Path("/proc/thread-self/ns/net")) else network,
+    )
+
+
+_NO_MOMENT = datetime.fromtimestamp(0)
+_FIRST_PID_NAMESPACE = "pid:[4026531836]"
+"""The name of the namespace of all processes (PROC_PID_INIT_INO of <linux/proc_ns.h>)."""
+
+
+def _may_speak(command: tuple[str, ...]) -> bool:
+    """Return whether a command shows that it speaks ROS 2 or Zenoh."""
+    return ROS_ARGS in command or any(
+        Path(word).name in (*_ROUTERS, *_BRIDGES) or any(mark in word for mark in _DAEMON)
+        for word in command[:3]
+    )
+
+
+def _is_sros_run(command: tuple[str, ...]) -> bool:
+    """Return whether a command is ``sros run``, before it becomes the command of the node."""
+    names = [Path(word).name for word in command[:4]]
+    return "run" in names and any(each in names for each in _SCRIPTS_OF_SROS)
+
+
+def _configuration_of(process: Process) -> LoadedFile | None:
+    """Return the name of the file with which a process of Zenoh is configured, not read yet.
+
+    Its problem says why that is not known.
+    """
+    if not process.is_zenoh:
+        return None
+    by_rmw = RMW in process.environment or "librmw_zenoh_cpp" in process.libraries
+    is_rmw_router = process.is_router and "zenohd" not in {Path(e).name for e in process.command}
+    if not (by_rmw or is_rmw_router):
+        return LoadedFile("", problem="its program or its arguments choose it")
+    path = process.environment.get(ROUTER_URI if process.is_router else SESSION_URI, "")
+    return LoadedFile(path) if path and path != NO_CONFIGURATION else None
+
+
+def _stat(folder: int) -> _Stat:
+    """Return the numbers of a process.
+
+    Raises:
+        OSError: It has ended.
+    """
+    text = _read(folder, "stat", _MOST_BYTES).decode("utf-8", "surrogateescape")
+    # The name may hold spaces and parentheses; numbers follow the last parenthesis.
+    name, _, rest = text.rpartition(")")
+    numbers = rest.split()
+    if len(numbers) < 24:
+        raise ProcessLookupError
+    is_idle = numbers[0] in "ZX" or bool(int(numbers[6]) & _KERNEL_THREAD)
+    identity = (name, numbers[19], numbers[23])
+    return _Stat(int(numbers[1]), int(numbers[19]), identity, numbers[20], is_idle)
+
+
+def _user(folder: int) -> int:
+    """Return the effective user id of a process."""
+    found = re.search(rb"^Uid:\s+\d+\s+(\d+)", _read(folder, "status", _MOST_BYTES), re.MULTILINE)
+    return int(found[1]) if found else 0
+
+
+def _words(folder: int, name: str) -> list[str]:
+    text = _read(folder, name, _MOST_BYTES).rstrip(b"\0")
+    return [os.fsdecode(word) for word in text.split(b"\0")] if text else []
+
+
+def _read(folder: int, name: str, most: int) -> bytes:
+    """Return a file of /proc/PID.
+
+    Raises:
+        OSError: It cannot be read, or is longer than ``most``.
+    """
+    handle = os.open(name, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
+    try:
+        parts, length = [], 0
+        while part := os.read(handle, 1024 * 1024):
+            parts.append(part)
+            length += len(part)
+            if length > most:
+                raise _TooLongError(0, f"its {name} is longer than {most // 1024**2} MiB")
+        return b"".join(parts)
+    finally:
+        os.close(handle)
+
+
+def _namespace(path: Path) -> str:
+    try:
+        return str(path.readlink())
+    except OSError:
+        return ""

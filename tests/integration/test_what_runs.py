@@ -1,0 +1,48 @@
+"""Each state in which a process can run is named by `sros check runtime`, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from sros_tool.runtime.netns import try_isolation
+from tests.integration import what_runs
+from tests.support.children import python
+
+pytestmark = pytest.mark.dds
+
+EXPECTED = {
+    **{name: {"process-outdated"} for name in (*what_runs.FILES, "named")},
+    "expired": {"process-expired"},
+    "removed": {"process-without-files"},
+    "revoked": {"process-revoked"},
+    "permissive": {"process-permissive"},
+    "unsecured": {"process-runs-unsecured"},
+    "open": {"process-unsecured"},
+    "stranger": {"process-other-keystore"},
+    "elsewhere": {"process-elsewhere"},
+}
+"""The ids of the findings about each process; `fine` and `wrapped` have none."""
+
+
+@pytest.fixture(scope="module")
+def said() -> Any:
+    if not try_isolation().isolated:
+        pytest.skip("needs a network of its own")
+    return json.loads(python("-m", "tests.integration.what_runs").stdout)
+
+
+def test_each_state_is_named_and_nothing_else(said: Any) -> None:
+    found = {
+        name: {each.removeprefix("runtime.") for each in of} for name, of in said["found"].items()
+    }
+    assert set(said["running"]) == {*EXPECTED, "fine", "wrapped"}
+    assert found == EXPECTED
+
+
+def test_the_file_that_changed_is_named(said: Any) -> None:
+    for name, file in what_runs.FILES.items():
+        text = said["found"][name]["runtime.process-outdated"]
+        assert f"; {file} of /{name} changed later" in text
