@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -11,7 +10,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.checks.zenoh import configuration_findings
-from sros_tool.errors import DocumentError, SrosError
+from sros_tool.errors import DocumentError
 from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.layout import (
     KEY_URI_FILE,
@@ -22,8 +21,9 @@ from sros_tool.keystore.layout import (
     locate_enclave,
     refuse_earlier,
 )
+from sros_tool.policy.folder import policy_files
 from sros_tool.policy.model import Policy
-from sros_tool.xml import parse, read_bytes
+from sros_tool.xml import read_bytes
 
 _ENCLAVE_FILES = (*REQUIRED_FILES, KEY_URI_FILE, "permissions.xml", "crl.pem", "request.pem")
 
@@ -66,12 +66,12 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
 def policy_findings(path: Path, at: Circumstances) -> list[Finding]:
     """Return the findings at a policy, or in a folder of policies.
 
-    Raises `DocumentError` if there is no file to read.
+    Raises `DocumentError` if there is no file to read, or one in the folder is perhaps a policy.
     """
     if not path.is_dir():
         read_bytes(path, "file")
         return list(policy_file_findings(path, at.distribution, at.fleet))
-    policies = list(_policies_below(path))
+    policies = list(policy_files(path))
     if policies:
         return [
             finding
@@ -84,20 +84,6 @@ def policy_findings(path: Path, at: Circumstances) -> list[Finding]:
         "It has no enclaves folder with content, no cert.pem, and no XML file that begins "
         "with <policy>.",
     )
-
-
-def _policies_below(folder: Path) -> Iterator[Path]:
-    """Yield the policy files in a folder and below it, sorted, without fragments for includes.
-
-    A file that cannot be read is one of them if its name says so: ``*.policy.xml``.
-    """
-    for path in sorted(folder.rglob("*.xml")):
-        try:
-            if parse(read_bytes(path, "file"), str(path)).tag == "policy":
-                yield path
-        except SrosError:
-            if f".{path.name.lower()}".endswith(".policy.xml"):
-                yield path
 
 
 def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:

@@ -51,6 +51,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import embedded_lists, load_crl, names_issuers, refusal_of, signed_by
 from sros_tool.pki.requests import key_digest
 from sros_tool.policy.document import PolicyFiles, read_policy
+from sros_tool.policy.folder import policy_files
 from sros_tool.policy.model import Enclave, Policy, Source
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.policy.stated import StatedProtection, stated_protections
@@ -154,7 +155,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
     if str(path).startswith(PREFIX):
         return _of_revision(find_revision(str(path)), fleet)
     if path.is_dir() and not is_keystore(path) and not (path / PERMISSIONS_FILE).exists():
-        files = [each for each in sorted(path.glob("*.xml")) if _is_policy(each)]
+        files = list(policy_files(path))
         if files:
             return _of_policies(str(path), [_read(each, fleet) for each in files])
     source = load_rights(path, fleet, hidden=True)
@@ -362,10 +363,6 @@ def _without_dates(permissions: Permissions) -> Permissions:
     return Permissions(
         tuple(replace(each, not_before=begin, not_after=end) for each in permissions.grants)
     )
-
-
-def _is_policy(file: Path) -> bool:
-    return parse(read_bytes(file, "policy file"), f"'{file}'", instructions=True).tag == "policy"
 
 
 def _of_revision(revision: Revision, fleet: Fleet | None) -> AccessSource:
