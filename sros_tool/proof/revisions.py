@@ -8,11 +8,13 @@ from pathlib import Path
 
 from sros_tool.errors import DocumentError, UsageError
 from sros_tool.policy.document import MissingFileError
+from sros_tool.policy.folder import is_policy
 from sros_tool.policy.model import Source
 from sros_tool.proof.repository import FILES, FOLDER, Repository, walk
 
 PREFIX = "git:"
 _MOST_FILES = 300  # of a folder
+_MOST_BYTES = 64 * 1024 * 1024  # of its files
 _MOST_ENTRIES = 100_000
 _NOWHERE = Path("/dev/null/git")
 """No file can be there, so that no link or file of the disk is taken for one of a revision."""
@@ -38,21 +40,38 @@ class Revision:
         """A path for the policy reader, which exists nowhere."""
         return _NOWHERE / self.path
 
-    def files(self) -> tuple[Revision, ...]:
-        """Return the files below this folder whose names end with ``.xml``, or this file."""
+    def policies(self) -> tuple[Revision, ...]:
+        """Return the policies in this folder and below it, or this file.
+
+        Raises:
+            DocumentError: what is there is perhaps a policy (`sros_tool.policy.folder`), a link, or
+                a submodule: where these lead to is not followed.
+        """
         entry = self.repository.find(self.commit, self.path)
         if entry is None or entry.mode != FOLDER:
             return (self,)
-        found = walk(self.repository, entry.id, most=_MOST_ENTRIES)
-        names = sorted(name for name, _ in found if name.lower().endswith(".xml"))
-        if len(names) > _MOST_FILES:
-            raise DocumentError(
-                f"'{self}' has more than {_MOST_FILES} files", "", "Name one of them."
-            )
         below = f"{self.path}/" if self.path else ""
-        return tuple(
-            Revision(self.repository, self.name, self.commit, below + each) for each in names
-        )
+        found = [
+            (Revision(self.repository, self.name, self.commit, below + name), each)
+            for name, each in walk(self.repository, entry.id, most=_MOST_ENTRIES)
+        ]
+        for file, each in found:
+            if each.mode not in FILES:
+                raise DocumentError(f"'{file}' is {each.kind}", "", "Name a policy in the folder.")
+        ids = [each.id for _, each in found]
+        if sum(self.repository.sizes(ids).values()) > _MOST_BYTES:
+            raise DocumentError(
+                f"'{self}' has more than {_MOST_BYTES} bytes", "", "Name a policy in it."
+            )
+        contents = self.repository.contents(ids)
+        policies = [
+            file for file, each in found if is_policy(file.path, contents[each.id], f"'{file}'")
+        ]
+        if len(policies) > _MOST_FILES:
+            raise DocumentError(
+                f"'{self}' has more than {_MOST_FILES} policies", "", "Name one of them."
+            )
+        return tuple(sorted(policies, key=lambda each: each.path))
 
     def read(self, file: Path) -> bytes:
         """Return the content of a file that has a `place` in this revision.

@@ -59,7 +59,7 @@ from sros_tool.proof.revisions import PREFIX, Revision, find_revision
 from sros_tool.proof.zenoh_settings import LONE, SIGNED, SignedConfiguration
 from sros_tool.translate import permissions_for
 from sros_tool.validity import iso, window
-from sros_tool.xml import parse, read_bytes
+from sros_tool.xml import read_bytes
 from sros_tool.zenoh.document import ConfigurationDocument
 from sros_tool.zenoh.enforcement import Enforcement
 
@@ -367,13 +367,7 @@ def _without_dates(permissions: Permissions) -> Permissions:
 
 def _of_revision(revision: Revision, fleet: Fleet | None) -> AccessSource:
     try:
-        policies = []
-        files = revision.files()
-        for each in files:
-            content = each.read(each.place)
-            tag = parse(content, f"'{each}'", instructions=True).tag
-            if len(files) == 1 or tag == "policy":
-                policies.append(_read(each.place, fleet, each.read))
+        policies = [_read(each.place, fleet, each.read) for each in revision.policies()]
         side = _of_policies(str(revision), policies)
     except SrosError as error:
         texts = (revision.shown(each) for each in (error.what, error.why, error.remedy))

@@ -26,7 +26,7 @@ from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource, load_side
 from sros_tool.topics import SERVICE_ENDS, dds_names
 from sros_tool.translate import governance_for
 from tests.support.children import LONG
-from tests.support.harness import sros
+from tests.support.harness import policy_text, publish, sros
 
 PAIRS = 5000 if LONG else 12
 VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
@@ -452,15 +452,33 @@ def test_a_path_of_a_revision_is_from_its_top(repository: Path) -> None:
     assert "'git:main:robot.xml' does not exist. A path is from the top of the" in ended.err
 
 
+@pytest.mark.parametrize("name", ["robots/evil.xml", "evil.XML", "robots/evil.inc", "robots/link"])
+def test_a_folder_of_a_revision_is_read_whole(name: str, repository: Path) -> None:
+    """Policies below the folder, and under another ending, were left out without a word."""
+    words = ("diff_policy", "--no-new-access", "git:main~1:policies", "git:main:policies")
+    evil = repository / "policies" / name
+    evil.parent.mkdir(exist_ok=True)
+    if evil.name == "link":
+        evil.symlink_to("../../elsewhere")
+    else:
+        evil.write_text(policy_text({"/evil": publish("/cmd_vel")}))
+    git(repository, "add", "-A")
+    git(repository, "commit", "-q", "-m", "more")
+    ended = sros(*words, cwd=repository)
+    known = evil.suffix.lower() == ".xml"
+    assert ended.status == (1 if known else 2)
+    assert ("/evil" if known else f"git:main:policies/{name}' ") in ended.out + ended.err
+
+
 def test_a_folder_of_too_many_policies_is_refused(repository: Path) -> None:
-    for each in range(300):
+    for each in range(301):
         (repository / "policies" / f"more{each}.xml").write_text("<policy version='0.2.0'/>")
     git(repository, "add", "-A")
     git(repository, "commit", "-q", "-m", "many")
     words = ("diff_policy", "--no-new-access")
     ended = sros(*words, "git:main~1:policies", "git:main:policies", cwd=repository)
     assert ended.status == 2
-    assert "'git:main:policies' has more than 300 files" in ended.err
+    assert "'git:main:policies' has more than 300 policies" in ended.err
 
 
 def test_a_git_that_fails_without_a_word_is_no_missing_file(
