@@ -195,7 +195,15 @@ class Folder:
         """Make the symbolic link ``path`` with the text ``target``."""
         parent, name = self._at(path)
         with self._naming(path):
-            os.symlink(target, name, dir_fd=parent)  # its owner grants nothing, so it stays
+            os.symlink(target, name, dir_fd=parent)
+            if self._hand_over:
+                # By a handle: meanwhile, the owner of the folder could put another file there.
+                handle = os.open(name, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=parent)
+                try:
+                    if stat.S_ISLNK(os.fstat(handle).st_mode):
+                        os.chown(f"/proc/self/fd/{handle}", *self._owner)
+                finally:
+                    os.close(handle)
 
     def close_to_others(self, path: str) -> None:
         """Take the rights of the group and of others away from a file or folder.

@@ -6,7 +6,7 @@ import os
 import pwd
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +29,7 @@ from sros_tool.cli.progress import progress
 from sros_tool.cli.running import ACCEPT_KEY, COMMAND, DOMAIN, RMW, WithCommand
 from sros_tool.cli.written import notes_json
 from sros_tool.errors import UsageError
+from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.runtime.units import Job
 from sros_tool.terminal import echo
 
@@ -233,6 +234,7 @@ def _changes(folder: Path, files: Mapping[str, str], *, force: bool) -> dict[str
     """
     from sros_tool.xml import read_bytes
 
+    _refuse_folders_of_others(folder, files)
     found = {}
     for path, text in files.items():
         if not os.path.lexists(folder / path):
@@ -247,6 +249,22 @@ def _changes(folder: Path, files: Mapping[str, str], *, force: bool) -> dict[str
             "Add --force to replace these files, or choose another folder.",
         )
     return found
+
+
+def _refuse_folders_of_others(folder: Path, files: Iterable[str]) -> None:
+    """Raise `UsageError` if another user could change the units, which systemd would run."""
+    trusted = frozenset({0, os.geteuid()})
+    for place in dict.fromkeys((folder, *((folder / path).parent for path in files))):
+        others = [*replaceable_on_the_way(place, trusted)]
+        if os.path.lexists(place):
+            others.append((place, other_writers(place.lstat(), trusted)))
+        for each, why in others:
+            if why:
+                raise UsageError(
+                    f"the units would be in '{each}', which others can change: {why}",
+                    "systemd would run what they write there.",
+                    "Choose a folder that only you can change, such as /etc/systemd/system.",
+                )
 
 
 def _write(folder: Path, files: Mapping[str, str], changes: Mapping[str, str]) -> None:

@@ -92,10 +92,12 @@ class TokenKey(ec.EllipticCurvePrivateKey):
     @property
     def never_left(self) -> bool:
         """Whether the token says that the key was made on it, and that it never gives it out."""
+        if self._private is None:
+            return True  # one that is only planned, perhaps without the package for tokens
         from pkcs11 import Attribute, PKCS11Error
 
         try:
-            return self._private is None or bool(
+            return bool(
                 self._private[Attribute.NEVER_EXTRACTABLE]
                 and self._private[Attribute.ALWAYS_SENSITIVE]
             )

@@ -231,7 +231,7 @@ class Includer:
         try:
             target = self.load(file)
         except DocumentError as error:
-            remedy = error.remedy or (_missing_remedy(file) if not file.exists() else "")
+            remedy = error.remedy or ("" if _is_there(file) else _missing_remedy(file))
             raise PolicyError(f"{where}: {error.what}", error.why, remedy) from error
         linked = bool(href) and Path(os.path.normpath(place.file.parent / unquote(href))) != file
         inner = IncludedFile(file, (*place.trail, step), linked)
@@ -240,7 +240,7 @@ class Includer:
 
     def _exists(self, file: Path) -> bool:
         if self.read is None:
-            return file.exists()
+            return _is_there(file)
         try:
             self.load(file)
         except MissingFileError:
@@ -277,6 +277,11 @@ class Includer:
 
 COMMON = "common"
 """Name of the folder of the parts that policies include."""
+
+
+def _is_there(file: Path) -> bool:
+    """Return whether a file exists; it does not if its name is too long for the system."""
+    return os.path.exists(file)  # noqa: PTH110 - Path.exists raises for such a name
 
 
 def _missing_remedy(file: Path) -> str:

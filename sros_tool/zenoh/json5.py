@@ -18,6 +18,9 @@ _MOST_DEPTH = 100
 _MOST_DIGITS = 400
 _MOST_TOKENS = 2_000_000
 """The router of a thousand enclaves has less than half of it; more would take many seconds."""
+_MOST_WITHOUT_LINES = 200_000
+"""Files of processes and of whole keystores, one after another, that are not plain JSON; the
+default configuration of Zenoh has a fiftieth of it."""
 
 
 class Json5Error(ValueError):
@@ -66,11 +69,12 @@ class _Token(NamedTuple):
 def parse_json5(text: str, *, lines: bool = True) -> Any:
     """Return the value of a JSON5 text; each object is a `Json5Object`.
 
-    Without ``lines``, which are then 1 everywhere, JSON is read some twenty times as fast.
+    Without ``lines``, which are then 1 everywhere, JSON is read some twenty times as fast, and only
+    a small text that is no JSON.
 
     Raises:
-        Json5Error: the text is not JSON5, has more than 100 levels, or an object that names a
-            member twice.
+        Json5Error: the text is not JSON5, is too large, has more than 100 levels, or an object that
+            names a member twice.
     """
     # JSON may state half a character by an escape.
     if not lines and "\\u" not in text:
@@ -78,7 +82,7 @@ def parse_json5(text: str, *, lines: bool = True) -> Any:
             value = json.loads(text, object_pairs_hook=_without_lines)
             if not _is_deep(value):
                 return value
-    return _Reader(text).whole()
+    return _Reader(text, _MOST_TOKENS if lines else _MOST_WITHOUT_LINES).whole()
 
 
 def _without_lines(members: list[tuple[str, Any]]) -> Json5Object:
@@ -100,12 +104,12 @@ def _is_deep(value: Any) -> bool:
     return any(isinstance(each, dict | list) for each in level)
 
 
-def _tokens(text: str) -> Iterator[_Token]:
+def _tokens(text: str, most: int) -> Iterator[_Token]:
     at, line, count = 0, 1, 0
     while at < len(text):
         count += 1
-        if count > 2 * _MOST_TOKENS:  # every other one may be space
-            raise Json5Error(f"more than {_MOST_TOKENS} tokens", line)
+        if count > 2 * most:  # every other one may be space
+            raise Json5Error(f"more than {most} tokens", line)
         found = _TOKEN.match(text, at)
         if found is None:
             raise Json5Error(f"unexpected {text[at : at + 10]!r}", line)
@@ -122,8 +126,8 @@ def _tokens(text: str) -> Iterator[_Token]:
 class _Reader:
     """Reads values one after another; ``_now`` is the token that comes next."""
 
-    def __init__(self, text: str) -> None:
-        self._tokens = _tokens(text)
+    def __init__(self, text: str, most: int) -> None:
+        self._tokens = _tokens(text, most)
         self._now = next(self._tokens)
 
     def whole(self) -> Any:

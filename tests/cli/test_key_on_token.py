@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -236,3 +237,13 @@ def test_a_folder_with_only_the_place_of_a_key_is_an_enclave(root: Path) -> None
         if path.name != "key.p11":
             path.unlink()
     assert list_enclaves(root) == ("/arm", "/file")
+
+
+def test_a_key_on_a_token_is_planned_without_the_package_for_tokens(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pkcs11", None)
+    words = ("create_enclave", root, "/new", "--key", "pkcs11:token=robot;object=new")
+    planned = sros(*words, "--dry-run").ok()
+    assert "enclaves/new/key.p11" in planned.out
+    assert "pip install" in sros(*words).err

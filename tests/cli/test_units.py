@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -123,3 +124,19 @@ def test_no_link_is_followed_out_of_the_folder(made: Path, tmp_path: Path) -> No
     assert refused.status == 2
     assert not any((tmp_path / "elsewhere").iterdir())
     assert [each.name for each in (tmp_path / "units").iterdir()] == ["sros@leg.service.d"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as several users")
+@pytest.mark.parametrize("theirs", ["units", "units/sros@leg.service.d", "."])
+def test_no_unit_is_written_where_others_can_change_it(
+    made: Path, tmp_path: Path, theirs: str
+) -> None:
+    folder = tmp_path / "units"
+    (folder / "sros@leg.service.d").mkdir(parents=True)
+    os.chown(tmp_path / theirs, 65532, 65532)
+    before = snapshot(tmp_path)
+    ended = sros("units", made, "/leg", folder)
+    assert ended.status == 2 and "which others can change" in ended.err, ended
+    assert snapshot(tmp_path) == before
+    os.chown(tmp_path / theirs, 0, 0)
+    sros("units", made, "/leg", folder).ok()

@@ -131,3 +131,15 @@ def test_texts_are_read_as_zenoh_reads_them() -> None:
     different = [text for text in texts if theirs(text) != ours(text)]
     assert different == []
     assert 0.3 < sum(ours(each) != "refused" for each in texts) / len(texts) < 0.95
+
+
+def test_a_large_text_that_is_no_json_is_read_only_where_it_was_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whoever runs a process chooses its file, and JSON5 takes seconds for a megabyte."""
+    monkeypatch.setattr("sros_tool.zenoh.json5._MOST_WITHOUT_LINES", 100)
+    large = "[" + "1," * 100 + "]"
+    assert len(parse_json5(large)) == 100
+    with pytest.raises(Json5Error, match="more than 100 tokens"):
+        parse_json5(large, lines=False)
+    assert len(parse_json5(large.replace(",]", "]"), lines=False)) == 100
