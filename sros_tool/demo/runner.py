@@ -347,7 +347,10 @@ class _Runner:
         enough_at = None
         while True:
             now = time.monotonic()
-            if enough_at is None and all(self._is_met(claim, processes) for claim in positive):
+            if enough_at is None and all(
+                _is_hopeless(claim, row, processes) or self._is_met(claim, processes)
+                for claim in positive
+            ):
                 enough_at = now
             if enough_at is not None:
                 if not silence and now >= start + _SHORTEST_BRIEF:
@@ -371,6 +374,12 @@ class _Runner:
             topic = processes[claim.talker].topic
             return any(event.publishers.get(topic) for event in events)
         return True
+
+
+def _is_hopeless(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
+    """Return whether a claim can no longer be met: an intruder of it was refused, or has ended."""
+    names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
+    return not all(processes[name].running for name in names)
 
 
 def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:

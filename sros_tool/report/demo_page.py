@@ -44,8 +44,8 @@ def _sentence(text: str) -> str:
 
 def _head(result: Json) -> str:
     rows = result["rows"]
-    good = sum(bool(row["as_expected"]) for row in rows)
-    skipped = sum(row["observed"] == _SKIPPED for row in rows)
+    good, skipped = _good(rows), sum(row["observed"] == _SKIPPED for row in rows)
+    not_tried = sum(len(_not_tried(scenario)) for scenario in result["scenarios"])
     opened = sum(bool(row.get("open_because")) and not row.get("open_here") for row in rows)
     here = sum(bool(row.get("open_here")) for row in rows)
     where = (
@@ -60,11 +60,17 @@ def _head(result: Json) -> str:
         where,
     ]
     tiles = [
-        ("good" if good == len(rows) else "error", f"{good} of {len(rows)}", "rows as expected"),
+        (
+            ("good" if good == len(rows) else "") if result["as_expected"] else "error",
+            f"{good} of {len(rows)}",
+            "rows as expected",
+        ),
         ("", str(sum(bool(row.get("defence_removed")) for row in rows)), "with a defence removed"),
         ("warning" if opened else "", str(opened), "known to be open"),
         ("error", str(here), "open in this keystore"),
         ("", str(skipped), "skipped"),
+        ("", str(result.get("left_out", 0)), "left out"),
+        ("error", str(not_tried), "not tried, and needed for a proof"),
     ]
     shown = "".join(
         f'<li class="tile {kind}"><b>{number}</b> {text}</li>'
@@ -78,17 +84,38 @@ def _head(result: Json) -> str:
     )
 
 
+def _good(rows: Sequence[Json]) -> int:
+    """Return the number of rows that were tried and are as expected."""
+    return sum(bool(row["as_expected"]) and row["observed"] != _SKIPPED for row in rows)
+
+
+def _not_tried(scenario: Json) -> Sequence[str]:
+    """Return what would have to be tried to prove a user's keystore sound, and was not."""
+    keystore = scenario.get("keystore")
+    return keystore["not_tried"] if keystore else ()
+
+
 def _scenario(scenario: Json) -> str:
     rows = scenario["rows"]
-    good = sum(bool(row["as_expected"]) for row in rows)
+    good = _good(rows)
     parts = [f"<section><h2>{escape(scenario['title'])}</h2>"]
     if scenario.get("cast"):
         members = (
             f"<b>{escape(each['part'])}</b> {escape(each['enclave'])}"
             + (f" as node {escape(', '.join(each['nodes']))}" if each["nodes"] else "")
+            + (f" ({escape(each['why'])})" if each.get("why") else "")
             for each in scenario["cast"]
         )
         parts.append(f'<p class="soft">Cast: {"; ".join(members)}.</p>')
+    if keystore := scenario.get("keystore"):
+        used = len({each["enclave"] for each in scenario["cast"]})
+        played = f"Parts are played by {used} of {keystore['enclaves']} enclaves"
+        elsewhere = keystore["elsewhere"]
+        played += f"; the keys of {elsewhere} are elsewhere" if elsewhere else ""
+        parts.append(f'<p class="soft">{played}.</p>')
+    if not_tried := _not_tried(scenario):
+        names = escape("; ".join(not_tried))
+        parts.append(f"<p>Not tried, and needed for a proof: {names}.</p>")
     if rows:
         count = f"{escape(scenario['name'])}: {good} of {len(rows)} rows as expected"
         parts += [f'<p class="soft">{count}</p>', _table(rows)]

@@ -45,6 +45,7 @@ _BARE_TOPIC = {
     "data_protection_kind": _NONE,
 }
 _FREE_TOPIC = {"enable_read_access_control": False, "enable_write_access_control": False}
+_OPEN_TOPIC = _BARE_TOPIC | _FREE_TOPIC
 
 OTHERS = "joins the other enclaves"
 GIVEN = (
@@ -173,7 +174,29 @@ class WeakRobot:
 
 
 _ELSEWHERE = "permissions for another domain"
+_LOOKS = "an enclave of another domain lists topics"
 _REVOKED = ("revoked identity", "old permissions put back after revocation")
+_OPEN = (
+    *GIVEN,
+    *WIDEST,
+    *OWN_PART,
+    *_REVOKED,
+    "payload read on the wire",
+    "packets of a secured talker changed",
+    "an unsecured node listens",
+    "an unsecured node lists topics",
+    "an unsecured node injects",
+    "variables spelt right",
+)
+_UNCHECKED = (
+    _ELSEWHERE,
+    _LOOKS,
+    "packets of a secured talker sent again",
+    "certificate with the key of another enclave",
+    "the attacker's own permissions CA",
+    "permissions and governance signed by the enclave",
+)
+"""What whom peers refuse can do as if it were unsecured: on Cyclone DDS, not on Fast DDS."""
 WEAK: Mapping[str, WeakRobot] = {
     "one enclave that may do everything": WeakRobot(_one_wild, WIDEST),
     "enclaves that may all do everything": WeakRobot(_all_wild, (*GIVEN, *WIDEST, *OWN_PART)),
@@ -181,12 +204,20 @@ WEAK: Mapping[str, WeakRobot] = {
         partial(_governed, _BARE, _BARE_TOPIC),
         ("payload read on the wire", "packets of a secured talker changed"),
     ),
+    "unauthenticated participants admitted": WeakRobot(
+        partial(_governed, _BARE | {"allow_unauthenticated_participants": True}, _OPEN_TOPIC),
+        (*_OPEN, *_UNCHECKED),
+        on_fast=_OPEN,
+    ),
     "joining not controlled": WeakRobot(
         partial(_governed, {"enable_join_access_control": False}, {}),
-        (_ELSEWHERE,),
+        (_ELSEWHERE, _LOOKS),
+        on_fast=(_LOOKS,),
     ),
     "topics not controlled": WeakRobot(
-        partial(_governed, {}, _FREE_TOPIC), (*GIVEN, *WIDEST, *OWN_PART, _ELSEWHERE)
+        partial(_governed, {}, _FREE_TOPIC),
+        (*GIVEN, *WIDEST, *OWN_PART, _ELSEWHERE, _LOOKS),
+        on_fast=(*GIVEN, *WIDEST, *OWN_PART),
     ),
     "a certificate of another CA": WeakRobot(_certificate_of_another_ca, (), joins=True),
     "an enclave of another keystore": WeakRobot(_enclave_of_another_keystore, (), joins=True),

@@ -54,6 +54,23 @@ def result(*rows: dict[str, Any], cost: dict[str, Any] | None = None) -> dict[st
     }
 
 
+def test_what_was_not_tried_is_said_and_nothing_of_it_is_green() -> None:
+    skipped = row("a", observed="skipped", detail="no key")
+    shown = result(row("b"), skipped) | {"left_out": 3, "as_expected": False}
+    keystore = {"enclaves": 7, "elsewhere": 1, "not_tried": ["a", HOSTILE[0]]}
+    cast = [{"part": "guest", "enclave": "/a", "nodes": [], "why": f"why {HOSTILE[0]}"}]
+    shown["scenarios"] = [{**shown["scenarios"][0], "keystore": keystore, "cast": cast}]
+    page = html.fromstring(render_demo_page(shown))
+    tiles = {each.text_content(): each.get("class", "") for each in page.cssselect("li.tile")}
+    assert "good" not in tiles["1 of 2 rows as expected"]
+    assert {"1 skipped", "3 left out", "2 not tried, and needed for a proof"} <= set(tiles)
+    text = page.text_content()
+    assert f"Not tried, and needed for a proof: a; {HOSTILE[0]}." in text
+    assert f"guest /a (why {HOSTILE[0]})" in text
+    assert "Parts are played by 1 of 7 enclaves; the keys of 1 are elsewhere." in text
+    assert not page.cssselect("script")
+
+
 COST = {
     "kinds": list(KINDS),
     "payloads": [64, 1024, 1048576],
@@ -99,7 +116,7 @@ def test_every_row_is_told_with_what_came_of_it() -> None:
     assert "known to be open Names are in clear. None." in told[2]
     assert told[3].startswith("differs something else not heard heard")
     assert told[4].startswith("skipped")
-    assert "4 of 5" in page and "heard 0 of 50; control" in page
+    assert "3 of 5" in page and "heard 0 of 50; control" in page
     attacks = html.fromstring(page).xpath("//tr[@class='attack']")
     assert [each.text_content() for each in attacks] == ["joining", "looking"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sros_tool.demo import forger
 from sros_tool.demo.forger import Undefended
-from sros_tool.demo.scenarios.attacks.kinds import injection, succeeds
+from sros_tool.demo.scenarios.attacks.kinds import discovering, injection, succeeds
 from sros_tool.demo.scenarios.model import UNSECURED, Condition, Identity, Row, RowStatus, Variant
 
 _ITSELF = "permissions signed by the enclave itself"
@@ -238,6 +238,31 @@ ROWS: tuple[Row, ...] = (
                 (Condition.FAST,),
                 RowStatus.NOT_HEARD,
                 mechanism="Fast DDS lets it start; its peers find no rule for the domain",
+            ),
+        ),
+    ),
+    discovering(
+        "an enclave of another domain lists topics",
+        Identity(forger.permissions_for_another_domain, "guest"),
+        RowStatus.NOT_LET_IN,
+        "the permissions have no rule for this domain",
+        attack="permissions for another domain",
+        variants=(
+            Variant(
+                (Condition.OPEN_JOIN,),
+                RowStatus.VISIBLE,
+                "the template does not control who joins the domain",
+                "keep join_access_control on",
+            ),
+            Variant(
+                (Condition.FAST,),
+                RowStatus.NOT_VISIBLE,
+                mechanism="Fast DDS lets it start; its peers find no rule for the domain",
+            ),
+            Variant(
+                (Condition.UNCONTROLLED,),
+                RowStatus.NOT_VISIBLE,
+                mechanism="its DDS controls no topic; its peers find no rule for the domain",
             ),
         ),
     ),

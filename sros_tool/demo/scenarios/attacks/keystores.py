@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from sros_tool.demo.scenarios.attacks.kinds import calling, injection, listening, posing_as_server
-from sros_tool.demo.scenarios.model import (
-    OWN,
-    Claim,
-    Identity,
-    Party,
-    Relation,
-    Role,
-    Row,
-    RowStatus,
+from sros_tool.demo.scenarios.attacks.kinds import (
+    calling,
+    discovering,
+    injection,
+    listening,
+    posing_as_server,
 )
+from sros_tool.demo.scenarios.model import OWN, Identity, Row, RowStatus
 
 WIDEST_PUBLISHER, WIDEST_SUBSCRIBER = "widest publisher", "widest subscriber"
 WIDEST_CLIENT, WIDEST_SERVER = "widest client", "widest server"
@@ -66,20 +63,8 @@ def revoked_joining(enclave: str, own: bool) -> Row:
 
 
 def _joining(name: str, enclave: str, expected: RowStatus, mechanism: str) -> Row:
-    """Return a row in which an enclave looks for the talker, as the listener does.
+    """Return a row in which an enclave looks for the talker.
 
     Endpoints are announced to whom the talker's DDS has authenticated, and to nobody else.
     """
-    return Row(
-        name,
-        expected,
-        mechanism,
-        (
-            Party("joining enclave", Role.OBSERVER, Identity(OWN, enclave), intruder=True),
-            Party("talker", Role.TALKER, Identity(OWN, "talker")),
-            Party("looking listener", Role.OBSERVER, Identity(OWN, "listener")),
-        ),
-        (Claim(Relation.SEES, "joining enclave", "talker").expecting(expected),),
-        (Claim(Relation.SEES, "looking listener", "talker"),),
-        brief=True,
-    )
+    return discovering(name, Identity(OWN, enclave), expected, mechanism, attack="")

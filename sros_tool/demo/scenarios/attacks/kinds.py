@@ -144,9 +144,19 @@ def discovering(
     open_because: str = "",
     remedy: str = "",
 ) -> Row:
-    """Return a row that shows whether the attacker discovers a publisher of the topic."""
-    open_talker = Party("unsecured talker", Role.TALKER, other_topic=True)
-    unsecured = attacker.keystore is None
+    """Return a row that shows whether the attacker discovers a publisher of the topic.
+
+    The control is that an unsecured attacker discovers another publisher, or if a secured one has
+    to fail, that an enclave which may listen discovers this one.
+    """
+    others: tuple[Party, ...] = ()
+    controls: tuple[Claim, ...] = ()
+    if attacker.keystore is None:
+        others = (Party("unsecured talker", Role.TALKER, other_topic=True),)
+        controls = (Claim(Relation.SEES, _ATTACKER, "unsecured talker"),)
+    elif expected is not RowStatus.VISIBLE:
+        others = (Party("looking listener", Role.OBSERVER, Identity(OWN, "listener")),)
+        controls = (Claim(Relation.SEES, "looking listener", "talker"),)
     return Row(
         name,
         expected,
@@ -154,10 +164,10 @@ def discovering(
         (
             Party(_ATTACKER, Role.OBSERVER, attacker, intruder=True),
             Party("talker", Role.TALKER, Identity(victims, "talker")),
-            *((open_talker,) if unsecured else ()),
+            *others,
         ),
         (Claim(Relation.SEES, _ATTACKER, "talker").expecting(expected),),
-        (Claim(Relation.SEES, _ATTACKER, "unsecured talker"),) if unsecured else (),
+        controls,
         brief=True,
         variants=variants,
         attack=attack,
