@@ -170,8 +170,7 @@ class ProcessRoot:
                         continue
                     raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
                 above, within = folders[-1] if folders else ("", self._handle)
-                flags = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
-                handle = _open_part(part, flags, within)
+                handle = _open_part(part, within)
                 folders.append((f"{above}/{part}", handle))
                 state = os.fstat(handle)
                 way.append((f"{above}/{part}", state))
@@ -194,9 +193,9 @@ class ProcessRoot:
                 os.close(handle)
 
 
-def _open_part(name: str, flags: int, folder: int) -> int:
+def _open_part(name: str, folder: int) -> int:
     try:
-        return os.open(name, flags, dir_fd=folder)
+        return os.open(name, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
     except ValueError as error:  # a NUL in the name
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)) from error
 
