@@ -31,7 +31,7 @@ from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificates, subject_text, validity_of
 from sros_tool.pki.crl import SUPERSEDED, load_crl
-from sros_tool.runtime.process_files import LoadedEnclave
+from sros_tool.runtime.process_files import ProcessEnclave
 from sros_tool.runtime.processes import Process, plain
 from sros_tool.runtime.rmw import vendor_of
 from sros_tool.runtime.variables import KEYSTORE, STRATEGY
@@ -142,11 +142,11 @@ def file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator[
     yield from _unread_files(process, enclave)
 
 
-def _required(enclave: LoadedEnclave) -> Sequence[str]:
+def _required(enclave: ProcessEnclave) -> Sequence[str]:
     return [each.name for each in enclave.files if each.name not in (CRL_FILE, KEY_URI_FILE)]
 
 
-def _newer(process: Process, enclave: LoadedEnclave) -> Iterator[str]:
+def _newer(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
     """Yield the names of the files that changed, or were removed, since a process started."""
     files = enclave.files
     if process.is_zenoh:
@@ -161,7 +161,7 @@ def _newer(process: Process, enclave: LoadedEnclave) -> Iterator[str]:
         yield from (f"'{plain_path(each)}' (moved, or its mode)" for each in moved[:1])
 
 
-def _unread_files(process: Process, enclave: LoadedEnclave) -> Iterator[Finding]:
+def _unread_files(process: Process, enclave: ProcessEnclave) -> Iterator[Finding]:
     unread = [f"{each.name} ({each.problem})" for each in enclave.files if each.problem]
     if unread:
         text = f"its files cannot be looked at: {', '.join(unread)}"
@@ -183,7 +183,7 @@ class _Loaded:
     unknown: str = ""
 
 
-def _loaded(enclave: LoadedEnclave, newer: Sequence[str], started: datetime) -> _Loaded:
+def _loaded(enclave: ProcessEnclave, newer: Sequence[str], started: datetime) -> _Loaded:
     """Return what a process loaded: what unchanged files say, and what the ledger has of others."""
     windows: dict[str, Window] = {}
     changed = {each.split()[0] for each in newer}
@@ -229,7 +229,7 @@ def _recorded_window(what: str, entry: Entry) -> Mapping[str, Window]:
     return {}
 
 
-def _revoked(enclave: LoadedEnclave, entries: Sequence[Entry], serial: int) -> str:
+def _revoked(enclave: ProcessEnclave, entries: Sequence[Entry], serial: int) -> str:
     """Return when and why a certificate was revoked, by the ledger or the list, as a clause."""
     for each in entries:
         if each.what == "revocation" and each.serial and int(each.serial, 16) == serial:
@@ -246,7 +246,7 @@ def _revoked(enclave: LoadedEnclave, entries: Sequence[Entry], serial: int) -> s
     return ""
 
 
-def _entries(enclave: LoadedEnclave) -> tuple[Sequence[Entry], str]:
+def _entries(enclave: ProcessEnclave) -> tuple[Sequence[Entry], str]:
     """Return what the ledger records of an enclave, and why it cannot be asked, as a clause."""
     if enclave.here is None:
         return (), "its keystore is not at this path here"
@@ -264,7 +264,7 @@ def _entries(enclave: LoadedEnclave) -> tuple[Sequence[Entry], str]:
     return [each for each in entries if each.enclave == enclave.name], ""
 
 
-def certificates_in(enclave: LoadedEnclave, file: str) -> tuple[x509.Certificate, ...]:
+def certificates_in(enclave: ProcessEnclave, file: str) -> tuple[x509.Certificate, ...]:
     """Return the certificates of a file, or none if it is not there or cannot be read."""
     data = enclave.file(file).data
     with suppress(SrosError):
@@ -275,7 +275,7 @@ def certificates_in(enclave: LoadedEnclave, file: str) -> tuple[x509.Certificate
     return ()
 
 
-def _grant(enclave: LoadedEnclave, subject: str) -> Grant | None:
+def _grant(enclave: ProcessEnclave, subject: str) -> Grant | None:
     data = enclave.file(PERMISSIONS_FILE).data
     with suppress(SrosError):
         return parse_permissions(smime.parse(data).document).grant_of(subject) if data else None

@@ -141,7 +141,7 @@ NOT_SECURED = FindingKind(
 _MOST_NODES = 20
 
 
-class Security(StrEnum):
+class _Security(StrEnum):
     """The security with which a process runs, as far as it can be seen."""
 
     SECURED = "secured"
@@ -149,20 +149,20 @@ class Security(StrEnum):
     UNKNOWN = "unknown"
 
 
-def security_of(process: Process) -> Security:
+def _security_of(process: Process) -> _Security:
     """Return the security with which a process runs."""
     if process.is_zenoh:
         if process.configuration and process.configuration.problem:
-            return Security.UNKNOWN
+            return _Security.UNKNOWN
         try:
-            return Security.OPEN if _zenoh_opening(process) else Security.SECURED
+            return _Security.OPEN if _zenoh_opening(process) else _Security.SECURED
         except SrosError:
-            return Security.UNKNOWN
+            return _Security.UNKNOWN
     if not process.asks_for_security:
-        return Security.OPEN
+        return _Security.OPEN
     if process.enclave and process.enclave.problem:
-        return Security.UNKNOWN
-    return Security.OPEN if unsecured_because(process) else Security.SECURED
+        return _Security.UNKNOWN
+    return _Security.OPEN if unsecured_because(process) else _Security.SECURED
 
 
 def process_findings(
@@ -175,8 +175,8 @@ def process_findings(
     is_secured_here = environment.get(ENABLE) == "true"
     here = ("", environment.get(DOMAIN) or "0")
     nodes = [each for each in running.processes if not each.is_daemon]
-    security = {each.pid: security_of(each) for each in nodes}
-    secured = [each for each in nodes if security[each.pid] is Security.SECURED]
+    security = {each.pid: _security_of(each) for each in nodes}
+    secured = [each for each in nodes if security[each.pid] is _Security.SECURED]
     closed = {_place(each) for each in nodes if each.asks_for_security}
     closed |= {here} if is_secured_here else set()
     open_nodes: list[str] = []
@@ -190,7 +190,7 @@ def process_findings(
         if process.asks_for_security:
             yield from file_findings(process, now=now, zone=zone)
             yield from _unsecured(process)
-        elif security[process.pid] is Security.OPEN:
+        elif security[process.pid] is _Security.OPEN:
             if _place(process) in closed:
                 text = f"{_where(process)}, with {ENABLE} not 'true'"
                 yield PROCESS_UNSECURED.found(process.label, text)
@@ -414,7 +414,7 @@ def _keys(certificates: Iterable[x509.Certificate]) -> _Keys:
 _FORM = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
 
 
-def _elsewhere(nodes: Sequence[Process], security: Mapping[int, Security]) -> Iterator[Finding]:
+def _elsewhere(nodes: Sequence[Process], security: Mapping[int, _Security]) -> Iterator[Finding]:
     others = [each for each in nodes if each.network]
     if others:
         networks = len({each.network for each in others})

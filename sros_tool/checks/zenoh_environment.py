@@ -81,7 +81,7 @@ def is_zenoh(environment: Mapping[str, str]) -> bool:
     return environment.get(RMW, "").startswith(RMW_ZENOH)
 
 
-def named_files(environment: Mapping[str, str]) -> Iterator[tuple[str, Path]]:
+def _named_files(environment: Mapping[str, str]) -> Iterator[tuple[str, Path]]:
     """Yield the variables that name a configuration of Zenoh, and its path."""
     for name in (SESSION_URI, ROUTER_URI):
         text = environment.get(name, "")
@@ -96,7 +96,7 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
     if environment.get(ENABLE) == "true" and not environment.get(SESSION_URI):
         yield NO_SESSION_FILE.found(SESSION_URI, f"{SESSION_URI} is not set")
     overrides = tuple(override_pairs(environment.get(OVERRIDE, "")))
-    for name, path in named_files(environment):
+    for name, path in _named_files(environment):
         try:
             data = read_bytes(path, "Zenoh configuration")
         except SrosError as error:

@@ -25,7 +25,7 @@ from sros_tool.runtime.cyclone import ENCLAVE_FILES
 from sros_tool.runtime.environment import enclave_argument
 from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE
 
-CRL = "crl.pem"
+_CRL = "crl.pem"
 _KEY, _KEY_ON_TOKEN = "key.pem", "key.p11"
 _UNREAD = (_KEY, _KEY_ON_TOKEN, "governance.p7s")
 """Files whose content says nothing about a process; private keys are never read."""
@@ -51,7 +51,7 @@ class LoadedFile:
 
 
 @dataclass(frozen=True, slots=True)
-class LoadedEnclave:
+class ProcessEnclave:
     """The enclave that a process names, and its files as they are now.
 
     ``keystore`` is the path that the process names.  ``moved`` maps the folders of the keystore in
@@ -207,7 +207,7 @@ def loaded_enclave(
     *,
     user: int,
     folder: str = "",
-) -> LoadedEnclave | None:
+) -> ProcessEnclave | None:
     """Return the enclave that rcl loads for a process, or None if the process asks for none.
 
     ``user`` is the user id of the process, and ``folder`` its working directory, or "" if that is
@@ -218,24 +218,24 @@ def loaded_enclave(
         return None
     name = environment.get(ENCLAVE) or enclave_argument(command)
     if not keystore.startswith("/") and not folder:
-        return LoadedEnclave(keystore, name, problem=f"{KEYSTORE} is a relative path")
+        return ProcessEnclave(keystore, name, problem=f"{KEYSTORE} is a relative path")
     top = keystore if keystore.startswith("/") else f"{folder}/{keystore}"
     place = f"{top}/enclaves/{name.strip('/')}"
     try:
         above = root.folders(top)
     except OSError as error:
-        return LoadedEnclave(keystore, name, problem=_reason(error))
+        return ProcessEnclave(keystore, name, problem=_reason(error))
     try:
         folders = root.folders(place)
     except OSError as error:
-        return LoadedEnclave(keystore, name, problem=_reason(error), here=_same_here(top, above))
+        return ProcessEnclave(keystore, name, problem=_reason(error), here=_same_here(top, above))
     own = list(folders.items())[len(above) - 1 :]
-    return LoadedEnclave(
+    return ProcessEnclave(
         keystore,
         name,
         tuple(
             root.load(each, f"{place}/{each}", read=each not in _UNREAD)
-            for each in (*ENCLAVE_FILES, _KEY_ON_TOKEN, CRL)
+            for each in (*ENCLAVE_FILES, _KEY_ON_TOKEN, _CRL)
         ),
         is_there=True,
         moved={

@@ -22,8 +22,8 @@ from typing import NamedTuple
 from sros_tool.runtime.environment import ROS_ARGS
 from sros_tool.runtime.process_files import (
     FileReader,
-    LoadedEnclave,
     LoadedFile,
+    ProcessEnclave,
     ProcessRoot,
     loaded_enclave,
 )
@@ -67,7 +67,7 @@ class Process:
     libraries: frozenset[str] = frozenset()
     user: int = 0
     network: str = ""
-    enclave: LoadedEnclave | None = None
+    enclave: ProcessEnclave | None = None
     configuration: LoadedFile | None = None
 
     @property
@@ -269,7 +269,7 @@ class ProcessTable:
             root = os.open("root", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
         except OSError as error:
             problem = f"its root directory cannot be looked at ({error.strerror})"
-            enclave = LoadedEnclave("", "", problem=problem) if process.asks_for_security else None
+            enclave = ProcessEnclave("", "", problem=problem) if process.asks_for_security else None
             return replace(process, enclave=enclave, configuration=_configuration_of(process))
         try:
             return with_files(process, ProcessRoot(root, self._reader), own)
