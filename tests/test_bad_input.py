@@ -249,7 +249,10 @@ POLICIES: dict[str, tuple[str, str]] = {
     "include of a folder": (_include('href="."'), "not a regular file"),
     "include of a FIFO": (_include('href="fifo"'), "not a regular file"),
     "include of links in a circle": (_include('href="circle"'), "does not exist"),
-    "include of a long name": (_include(f'href="{"x" * 300}"'), "' cannot be read. File name too long"),
+    "include of a long name": (
+        _include(f'href="{"x" * 300}"'),
+        "' cannot be read. File name too long",
+    ),
     "include of text": (_include('href="part.xml" parse="text"'), "plain text"),
     "include of itself": (
         _include('xpointer="xpointer(/policy/enclaves/enclave/profiles/profile/*)"'),
