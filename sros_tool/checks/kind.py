@@ -127,13 +127,15 @@ class Cause:
     """The common cause of several findings of one severity, and the remedy that ends all of them.
 
     ``title`` is a clause, ``text`` and ``remedy`` are sentences.  ``number`` counts the findings:
-    where only some of them are selected, they are shown one by one.
+    where only some of them are selected, they are shown one by one.  ``place`` is shown in place of
+    that of the first one, unless it is empty.
     """
 
     title: str
     text: str
     remedy: str
     number: int
+    place: str = ""
 
 
 @dataclass(frozen=True, slots=True)

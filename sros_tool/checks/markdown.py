@@ -27,9 +27,9 @@ def _cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
     """Yield the lines of findings of one cause."""
     first = findings[0]
     assert first.cause, "findings that are shown together have a cause"
-    word = first.severity.word
+    word, place = first.severity.word, first.cause.place or first.place
     ids = code(", ".join(dict.fromkeys(each.id for each in findings)))
-    yield f"{_SIGNS[word]} **{word}** {code(first.place)} {plain(first.cause.title)} ({ids})"
+    yield f"{_SIGNS[word]} **{word}** {code(place)} {plain(first.cause.title)} ({ids})"
     yield code(first.cause.text)
     yield code(first.cause.remedy)
 

@@ -41,7 +41,8 @@ def as_note(findings: tuple[Finding, ...]) -> Note:
     """Return one finding, or findings of one cause, as a note."""
     first = findings[0]
     if first.cause and len(findings) > 1:
-        text = f"{first.place}: {first.cause.title}. {first.cause.text} {first.cause.remedy}"
+        cause, place = first.cause, first.cause.place or first.place
+        text = f"{place}: {cause.title}. {cause.text} {cause.remedy}"
     else:
         text = f"{first.place}: {first.kind.title}: {first.text}. {first.remedy}"
     return Note(first.id, text)

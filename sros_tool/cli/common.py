@@ -334,7 +334,15 @@ def print_plan(root: Path, changes: Sequence[Change]) -> None:
 
 
 def print_closed(root: Path, changes: Sequence[Change]) -> None:
-    """Say on stderr which keys of a keystore were closed to other users, and what that means."""
+    """Say on stderr what a first write did: keys closed to others, what was taken over on trust."""
+    if any(each.action == "adopt" for each in changes):
+        echo(
+            f"took over '{root}', which ros2/sros2 made: it has settings and a ledger from now on. "
+            "The certificates and permissions that were there, signed by its CA, are taken on "
+            "trust: nothing shows whether one of them was replaced or taken back before, and put "
+            "in again.",
+            err=True,
+        )
     closed = [str(root / each.path) for each in changes if each.action == "close"]
     if closed:
         more = f" and {len(closed) - 3} more" if len(closed) > 3 else ""

@@ -19,9 +19,10 @@ def echo_findings(findings: Sequence[Finding], *, err: bool = False) -> None:
     """Print one finding, or findings of one cause; the severity is in colour on a terminal."""
     first = findings[0]
     if first.cause and len(findings) > 1:
+        place = first.cause.place or first.place
         ids = ", ".join(dict.fromkeys(each.id for each in findings))
-        lines = _wrapped(f"{first.place}: {first.severity.word}: {first.cause.title} [{ids}]")
-        for text in (first.cause.text, first.cause.remedy):
+        lines = [f"{place}: {first.severity.word}: {first.cause.title}"]
+        for text in (f"[{ids}]", first.cause.text, first.cause.remedy):
             lines += _wrapped(text, "    ")
     else:
         lines = _finding_lines(first)
@@ -41,14 +42,14 @@ def _finding_lines(finding: Finding) -> list[str]:
     return [head, f"    {subject}{finding.text}{by}", *related, f"    {finding.remedy}"]
 
 
-def _wrapped(text: str, indent: str = "") -> list[str]:
+def _wrapped(text: str, indent: str) -> list[str]:
     """Return lines of at most 80 characters; what is to be copied stays on one, however long."""
     whole = re.sub(r"`[^`]+`|<\w[^>]*/>", lambda m: m[0].replace(" ", "\0"), visible_line(text))
     lines = wrap(
         whole,
         80,
         initial_indent=indent,
-        subsequent_indent="    ",
+        subsequent_indent=indent,
         break_long_words=False,
         break_on_hyphens=False,
     )

@@ -570,9 +570,13 @@ def append(
     """Stage the ledger with ``entries`` added at its end, and its head, signed by ``authority``.
 
     What is wrong with the present ledger is recorded first, so that the new head hides nothing.
+    Before the first entry in a keystore of ros2/sros2 stands what is there already.
     """
+    from sros_tool.keystore.of_ros2 import take_over  # only writing needs it
+
     if not entries:
         return
+    entries = take_over(transaction, now, entries)
     root, follow = transaction.root, transaction.dry_run
     present = _read(root, follow_link=follow, having=_NONE)
     gaps = (Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded)

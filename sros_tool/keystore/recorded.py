@@ -11,6 +11,7 @@ from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.layout import SETTINGS
 from sros_tool.keystore.ledger import Entry, Ledger, read_ledger
+from sros_tool.keystore.of_ros2 import is_of_ros2
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class RecordedRights:
         chained = ledger.entries[ledger.unchained :]
         self._chained = {each.enclave for each in chained if each.what == "permissions"}
         # A keystore of ros2/sros2 has enclaves that no ledger records.
-        self._complete = (root / SETTINGS).exists()
+        self._complete = (root / SETTINGS).exists() or not (is_of_ros2(root) or ledger.lines)
         self._last = {each.enclave: each for each in ledger.entries if each.what == "permissions"}
         self._certain = {each.enclave for each in ledger.certain if each.what == "permissions"}
 

@@ -33,6 +33,7 @@ from sros_tool.checks.keystores.issued import (
     summary_of,
     wanted_rights,
 )
+from sros_tool.checks.keystores.of_ros2 import with_cause_of_ros2
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
 from sros_tool.checks.keystores.zenoh_files import check_network, check_own_zenoh
 from sros_tool.checks.kind import Finding
@@ -121,7 +122,8 @@ def keystore_findings(
         found += findings_in(replace(policy, enclaves=chosen), distribution)
     real_root = os.path.realpath(root)
     located = (_at_real_file(each, root, real_root) for each in found)
-    return with_causes(joined([_with_names(each, root) for each in located]))
+    found = with_causes(joined([_with_names(each, root) for each in located]))
+    return with_cause_of_ros2(found, root) if keystore.is_home else found
 
 
 def _enclave_findings(

@@ -43,6 +43,7 @@ class Move(NamedTuple):
 
 
 CLOSE = "close"
+ADOPT = "adopt"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,8 @@ class Change:
     """One file or link that a transaction changes.
 
     ``action`` is "create", "replace" or "remove", or `CLOSE` for a private key or a folder of keys
-    that other users cannot open any more; ``path`` is relative to the keystore.
+    that other users cannot open any more, or `ADOPT` for a keystore of ros2/sros2 that gets its
+    settings and ledger; ``path`` is relative to the keystore.
     """
 
     action: str

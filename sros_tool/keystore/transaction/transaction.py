@@ -39,6 +39,7 @@ from sros_tool.keystore.transaction.lock import KeystoreLock, lock_new
 from sros_tool.keystore.transaction.recovery import complete, recover
 from sros_tool.keystore.transaction.stage import (
     ADDED,
+    ADOPT,
     AFTER,
     BEFORE,
     CLOSE,
@@ -349,6 +350,10 @@ class Transaction:
                 self.changes.extend(staged.changes)
                 self._moves += staged.moves
         return [(part, result) for part, (result, _) in slices]
+
+    def adopt(self) -> None:
+        """Note among the changes that the keystore gets its first settings and ledger."""
+        self.changes.add(ADOPT, "")
 
     # ── commit ─────────────────────────────────────────────────────────────────────────────
 

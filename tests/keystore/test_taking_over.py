@@ -1,0 +1,116 @@
+"""A keystore of ros2/sros2 is one finding, is taken over by the first write, and stays sros's."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.reader import load_settings
+from tests.support.harness import policy_text, publish, sros
+from tests.support.made_by_ros2 import RELEASES, make
+
+NOW = datetime.now(UTC).replace(microsecond=0)
+SERVICES = ("--exclude", "keystore.allow-everything")
+
+
+def made_by_ros2(root: Path, release: str = "jazzy and rolling") -> Path:
+    make(root, "/a", "/b/c", now=NOW, release=RELEASES[release])
+    for path in root.rglob("*"):
+        if not path.is_symlink():
+            path.chmod(0o755 if path.is_dir() else 0o644)
+    return root
+
+
+def command_in(said: str) -> list[str]:
+    """The words of the first command that a paragraph names."""
+    found = re.search("`(sros .+?)`", " ".join(said.split()))
+    assert found, said
+    return shlex.split(found[1])[1:]
+
+
+def paragraphs(said: str) -> int:
+    """The number of findings that are shown, each with its severity."""
+    return len(re.findall(r":\s(?:error|warning):\s", said))
+
+
+@pytest.mark.parametrize("release", RELEASES)
+def test_it_is_one_finding_with_one_command(release: str, tmp_path: Path) -> None:
+    root = made_by_ros2(tmp_path / "ks", release)
+    ended = sros("check", root, *SERVICES)
+    assert ended.status == 1
+    assert paragraphs(ended.out) == 1, ended.out
+    assert f"{root}: error: a keystore that ros2/sros2 made" in " ".join(ended.out.split())
+    assert "time-format" in ended.out and "key-readable" in ended.out
+    sros(*command_in(ended.out)).ok()
+    ended = sros("check", root, *SERVICES).ok()
+    for name in ("/a", "/b/c"):
+        sros("renew", root, name).ok()
+
+
+FIRST = (
+    ("create_enclave", "{}", "/new"),
+    ("renew", "{}", "/a"),
+    ("revoke", "{}", "/a"),
+    ("rotate_ca", "{}", "--next"),
+    ("create_permission", "{}", "/a", "{policy}"),
+)
+
+
+@pytest.mark.parametrize("words", FIRST, ids=lambda words: words[0])
+def test_the_first_write_takes_it_over_and_says_so(words: tuple[str, ...], tmp_path: Path) -> None:
+    root = made_by_ros2(tmp_path / "ks")
+    policy = tmp_path / "policy.xml"
+    policy.write_text(policy_text({"/a": publish("x")}))
+    words = tuple(each.format(root, policy=policy) for each in words)
+    assert "adopt" in str(json.loads(sros(*words, "--dry-run", "--json").ok().out)["changes"])
+    ended = sros(*words).ok()
+    assert "which ros2/sros2 made" in ended.err and "taken on trust" in ended.err
+    assert load_settings(root).name == "sros2"
+    found = {each["id"] for each in json.loads(sros("check", root, "--json").out)["findings"]}
+    assert not found & {"keystore.settings-missing", "keystore.not-in-ledger"}
+    assert not read_ledger(root).gaps
+    assert "taken on trust" not in sros("renew", root, "/b/c").ok().err
+
+
+def test_an_enclave_that_ros2_adds_later_is_one_finding(tmp_path: Path) -> None:
+    root = made_by_ros2(tmp_path / "ks")
+    shutil.copytree(root, tmp_path / "with", symlinks=True)
+    shutil.rmtree(root / "enclaves/b")
+    sros("update_keystore", root, "--template", "sros2").ok()
+    shutil.copytree(tmp_path / "with/enclaves/b", root / "enclaves/b", symlinks=True)
+    ended = sros("check", root, "--severity", "warning")
+    assert paragraphs(ended.out) == 2, ended.out
+    assert "an enclave that the keystore never issued" in " ".join(ended.out.split())
+    assert "backup" not in ended.out and "Find out where" not in ended.out
+    policy = tmp_path / "POLICY_FILE"
+    policy.write_text(policy_text({"/b/c": publish("x")}))
+    said = ended.out[ended.out.index("enclave that the keystore") :]
+    sros(*command_in(said), cwd=tmp_path).ok()
+    sros("renew", root, "/b/c").ok()
+    found = {each["id"] for each in json.loads(sros("check", root, "--json").out)["findings"]}
+    assert "keystore.not-in-ledger" not in found
+
+
+def test_a_keystore_of_sros_without_its_records_is_not_one_of_ros2(tmp_path: Path) -> None:
+    """Whoever removes settings and ledger would have older permissions signed again."""
+    root, policy = tmp_path / "ks", tmp_path / "policy.xml"
+    sros("create_keystore", root, "--template", "sros2").ok()
+    for names in (("x", "wide"), ("x",)):
+        policy.write_text(policy_text({"/a": publish(*names)}))
+        sros("generate_artifacts", "-k", root, "-p", policy).ok()
+        if "wide" in names:
+            older = (root / "enclaves/a/permissions.p7s").read_bytes()
+    (root / "enclaves/a/permissions.p7s").write_bytes(older)
+    for file in ("sros.toml", "ledger.jsonl", "ledger.p7s"):
+        (root / file).unlink()
+    ended = sros("renew", root, "/a")
+    assert ended.status == 2
+    assert "not certain that the permissions" in ended.err
+    assert "ros2/sros2 made" not in sros("check", root).out
