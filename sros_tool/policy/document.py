@@ -105,6 +105,8 @@ class Includer:
     root: Path
     read: PolicyFiles | None = None
     """Where files are read from; None stands for the file system."""
+    fallbacks: list[tuple[Source, str]] = field(default_factory=list)
+    """The includes whose fallback was used, with the file that is absent."""
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
     _sizes: dict[Path, int] = field(default_factory=dict)
     _includes: int = 0
@@ -223,6 +225,7 @@ class Includer:
         href, pointer = element.get("href", ""), element.get("xpointer", "")
         file = self.target(element, place)
         if inside and not self._exists(file):
+            self.fallbacks.append((Source(str(place.file), element.sourceline or 0), str(file)))
             yield from self.children(inside[0], place)
             return
         step = (file, pointer)
@@ -368,6 +371,16 @@ def read_policy(
     return _Reader(path, content, placeholders=placeholders, read=read).policy()
 
 
+def refuse_fallbacks(policy: Policy) -> None:
+    """Raise `PolicyError` if a policy has rights only because a file is absent."""
+    for source, file in policy.fallbacks:
+        raise PolicyError(
+            f"{source}: the fallback of the include is used, because '{file}' is absent",
+            "What is decided of this policy would hold only where that file is absent, too.",
+            "Add the file, or put the rights of the fallback in the place of the include.",
+        )
+
+
 class _Reader:
     _other_roots: tuple[str, ...] = ()
     """The root elements that are read besides <policy>."""
@@ -457,7 +470,7 @@ class _Reader:
             raise PolicyError(f"'{self._shown}': the policy has no enclave")
         digest = self._includer.digest()
         read = tuple(replace(enclave, digest=digest) for enclave in enclaves.values())
-        return Policy(read, version, str(self._shown))
+        return Policy(read, version, str(self._shown), tuple(self._includer.fallbacks))
 
     def _enclave(self, element: etree._Element, place: IncludedFile) -> Enclave:
         self._attributes(element, place, required=("path",))

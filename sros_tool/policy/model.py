@@ -109,11 +109,15 @@ class Enclave:
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """A policy with its includes resolved; each enclave path occurs once."""
+    """A policy with its includes resolved; each enclave path occurs once.
+
+    ``fallbacks`` are the includes whose fallback was used, with the file that is absent.
+    """
 
     enclaves: tuple[Enclave, ...]
     version: str = VERSION
     file: str = field(default="", compare=False)
+    fallbacks: tuple[tuple[Source, str], ...] = field(default=(), compare=False)
 
     def enclave(self, path: str) -> Enclave | None:
         """Return the enclave with this path, or None."""

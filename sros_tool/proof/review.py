@@ -585,7 +585,8 @@ def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
     """
     if not files:
         raise PolicyError("requirements are decided of policies, and there is none to read")
-    first, *others = (read_policy_for(each, fleet) for each in files)
+    policies = [read_policy_for(each, fleet) for each in files]
+    first, *others = policies
     enclaves = {each.path: each for each in first.enclaves}
     for each in (enclave for policy in others for enclave in policy.enclaves):
         if each.path in enclaves:
@@ -595,4 +596,5 @@ def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
                 "Review the policies of each robot in a review of its own.",
             )
         enclaves[each.path] = each
-    return replace(first, enclaves=tuple(enclaves.values()))
+    fallbacks = tuple(each for policy in policies for each in policy.fallbacks)
+    return replace(first, enclaves=tuple(enclaves.values()), fallbacks=fallbacks)

@@ -50,7 +50,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import embedded_lists, load_crl, names_issuers, refusal_of, signed_by
 from sros_tool.pki.requests import key_digest
-from sros_tool.policy.document import PolicyFiles, read_policy
+from sros_tool.policy.document import PolicyFiles, read_policy, refuse_fallbacks
 from sros_tool.policy.folder import policy_files
 from sros_tool.policy.model import Enclave, Policy, Source
 from sros_tool.policy.rights import Right, policy_rights
@@ -388,6 +388,8 @@ def _read(path: Path, fleet: Fleet | None, read: PolicyFiles | None = None) -> _
 
 def _of_policies(shown: str, policies: list[_Read]) -> AccessSource:
     enclaves: dict[str, Enclave] = {}
+    for policy, _ in policies:
+        refuse_fallbacks(policy)
     for each in (enclave for policy, _ in policies for enclave in policy.enclaves):
         if each.path in enclaves:
             raise DocumentError(

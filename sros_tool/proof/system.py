@@ -32,6 +32,7 @@ from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
+from sros_tool.policy.document import refuse_fallbacks
 from sros_tool.policy.model import ALLOW, Policy, Source
 from sros_tool.policy.protection import PROTECT, Level
 from sros_tool.policy.rights import Right, policy_rights
@@ -129,8 +130,10 @@ def policy_system(
     default template is assumed.
 
     Raises:
-        PolicyError: only Zenoh is wanted, and it cannot carry out the policy.
+        PolicyError: a fallback of an include is used, or only Zenoh is wanted, and it cannot carry
+            out the policy.
     """
+    refuse_fallbacks(policy)
     domains = DomainSet.of((domain, domain))
     rights = frozenset(each for each in policy_rights(policy) if each.qualifier is ALLOW)
     stated = _stated([each.path for each in policy.enclaves], rights)

@@ -293,3 +293,27 @@ def test_a_wildcard_namespace_counts_in_every_world(tmp_path: Path) -> None:
     assert "/a" in ended.out
     assert "/n/x" in sros("explain", policy, "--reach", "/a").out
     sros("view", policy, "--focus", "/a", "-o", tmp_path / "focus.svg").ok()
+
+
+def test_nothing_is_decided_that_depends_on_a_file_that_is_absent(tmp_path: Path) -> None:
+    """The robot has the file: what it adds was in no comparison, and broke no requirement."""
+    policy, before = tmp_path / "robot.xml", tmp_path / "before.xml"
+    required = tmp_path / "required.toml"
+    before.write_text(policy_text({"/a": publish("/x")}))
+    include = (
+        '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="site.xml" '
+        'xpointer="xpointer(/profile/*)">\n<xi:fallback/></xi:include>'
+    )
+    policy.write_text(policy_text({"/a": publish("/x") + include}))
+    required.write_text('[[nobody]]\npublish = ["/cmd_vel"]\n')
+    compared = ("diff_policy", "--no-new-access", before, policy)
+    decided = ("check", policy, "--requirements", required, "--include", "requirement.violated")
+    for asked in (compared, decided):
+        ended = sros(*asked)
+        assert ended.status == 2
+        line = policy.read_text().split("<xi:include")[0].count("\n") + 1
+        assert f"{policy}:{line}: the fallback of the include is used, because" in ended.err
+        assert "would hold only where that file is absent" in ended.err
+    assert sros("diff_policy", "--no-new-access", policy, before).status == 2
+    (tmp_path / "site.xml").write_text(f"<profile ns='/' node='n'>{publish('/cmd_vel')}</profile>")
+    assert [sros(*asked).status for asked in (compared, decided)] == [1, 1]
