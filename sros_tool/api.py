@@ -224,7 +224,7 @@ def generate(
         enclaves=names,
         policies=_fleet_policies(policies, fleet) if fleet else [_policy(e) for e in policies],
         now=_moment(now),
-        domain=domain,
+        domain=_domain(domain),
         keyring=_keyring(secrets),
         dry_run=dry_run,
     )
@@ -335,7 +335,8 @@ def explain_access(
         enclave: The name of the enclave, such as "/talker".
         action: "publish", "subscribe", "call", "serve", "execute" or "join".
         name: The absolute ROS name of the topic, service or action; "" for "join".
-        kind: The kind of ``name``; without it, "call" means a service.
+        kind: The kind of ``name``; without it, "call" and "serve" mean an action if the rights of
+            the enclave, the policy or the keystore have an action and no service of that name.
         vendor: "fastdds" (2.14), "fastdds-2.9", "cyclonedds", "standard", "opendds" or "connext".
         policy: The policy of the enclave, or its file, in which to find the ``policy_lines``.
         domain: The ROS domain id; by default 0, or the first domain of the governance.
@@ -353,13 +354,16 @@ def explain_access(
         (True, 'rule 1 allows publish rt/chatter by rt/chatter')
     """
     from sros_tool.dds.decision.vendors import Vendor
-    from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
+    from sros_tool.explain.evaluator import Evaluator, JoinContext, action_meant, load_enclave
     from sros_tool.explain.question import ask
     from sros_tool.keystore.layout import check_keystore, enclave_path, has_enclave, list_enclaves
     from sros_tool.keystore.missing import no_such_enclave
+    from sros_tool.keystore.rights import load_rights
+    from sros_tool.policy.rights import policy_rights
     from sros_tool.runtime.environment import choose_domain
 
     question = ask(action, name, kind)
+    domain = _domain(domain)
     vendors = [each.value for each in Vendor]
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
@@ -368,13 +372,19 @@ def explain_access(
     if not has_enclave(root, enclave):
         raise no_such_enclave(root, enclave, list_enclaves(root))
     at = _moment(now)
-    own = _policy(policy).enclave(enclave) if policy is not None else None
+    stated = _policy(policy) if policy is not None else None
+    own = stated.enclave(enclave) if stated else None
     loaded = replace(
         load_enclave(enclave, enclave_path(root, enclave), at=at), root=root, policy=own
     )
     if domain is None:
         domain = choose_domain(loaded.joined_domains, None, root) if loaded.joined_domains else 0
-    answer = Evaluator(Vendor(vendor), loaded, JoinContext(domain, at, zone)).explain(question)
+    evaluator = Evaluator(Vendor(vendor), loaded, JoinContext(domain, at, zone))
+    if kind is None:
+        rights = [lambda: policy_rights(stated)] if stated else []
+        others = [*rights, lambda: load_rights(root).rights]
+        question = action_meant(evaluator, question, others) or question
+    answer = evaluator.explain(question)
     decision = answer.decision
     _, colon, reason = decision.text.partition(": ")
     return AccessAnswer(
@@ -415,7 +425,7 @@ def check(
 
     Raises:
         DocumentError: A path is neither a policy, nor a keystore, nor an enclave.
-        UsageError: No path is given, or the severity is unknown.
+        UsageError: No path is given, the severity is unknown, or ``domain`` is not a domain id.
 
     Example:
         >>> for finding in sros_tool.check("ks"):
@@ -431,7 +441,7 @@ def check(
     if severity not in levels:
         raise UsageError(f"unknown severity {severity!r}", "", f"Choose {', '.join(levels)}.")
     read = tuple(_policy(each) for each in _several("policies", policies))
-    at = Circumstances(_moment(now), zone, domain, read)
+    at = Circumstances(_moment(now), zone, _domain(domain), read)
     found = dict.fromkeys(each for path in paths for each in path_findings(Path(path), at))
     return FindingFilter(severity=levels[severity], strict=strict).choose(found).shown
 
@@ -470,7 +480,7 @@ def check_requirements(
     Raises:
         DocumentError: A file cannot be read, or a requirement cannot be decided with so many
             wildcards.
-        UsageError: There is no such vendor.
+        UsageError: There is no such vendor, or ``domain`` is not a domain id.
 
     Example:
         >>> for finding in sros_tool.check_requirements("robot.xml", "robot.requirements.toml"):
@@ -485,13 +495,14 @@ def check_requirements(
 
     if vendor and vendor not in WORLDS:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(WORLDS)}.")
+    of = _domain(domain)
     files = [requirements] if isinstance(requirements, str | PathLike) else requirements
     read = read_all_requirements(map(Path, files))
     system = load_system(
         Path(path),
         at=_moment(now),
         zone=zone,
-        domain=domain,
+        domain=of,
         fleet=read_fleet(Path(fleet)) if fleet else None,
         world=vendor,
         template=load_template(template) if template else None,
@@ -543,6 +554,13 @@ def _moment(now: datetime | None) -> datetime:
             f"the time {now.isoformat()} has no time zone", "", "Add one, such as tzinfo=UTC."
         )
     return now
+
+
+def _domain(given: int | None) -> int | None:
+    """Return the ROS domain id; raise `UsageError` for a number that is none."""
+    from sros_tool.dds.domains import DomainSet
+
+    return None if given is None else DomainSet.parse(str(given), "domain").only()
 
 
 def _policy(given: AnyPath | Policy) -> Policy:

@@ -125,6 +125,22 @@ def test_an_answer_says_by_which_line_and_until_when(keystore: sros_tool.Keystor
     assert later.remedy
 
 
+def test_an_action_is_found_out_as_on_the_command_line(tmp_path: Path) -> None:
+    file = tmp_path / "robot.xml"
+    actions = "".join(
+        f'<enclave path="/{name}"><profiles><profile ns="/" node="{name}">'
+        f'<actions {right}="ALLOW"><action>/pick</action></actions></profile></profiles></enclave>'
+        for name, right in (("arm", "execute"), ("planner", "call"))
+    )
+    file.write_text(f'<policy version="0.2.0"><enclaves>{actions}</enclaves></policy>')
+    made = sros_tool.create_keystore(tmp_path / "ks", template="production")
+    sros_tool.generate(made, file)
+    assert sros_tool.explain_access(made, "/planner", "call", "/pick")
+    assert sros_tool.explain_access(made, "/arm", "serve", "/pick", policy=file)
+    assert not sros_tool.explain_access(made, "/arm", "call", "/pick")
+    assert not sros_tool.explain_access(made, "/planner", "call", "/pick", kind="service")
+
+
 def test_a_fleet_has_one_policy_and_one_status(tmp_path: Path) -> None:
     policy, fleet = tmp_path / "robot.xml", tmp_path / "fleet.toml"
     policy.write_text(policy_text({"/{robot}/a": publish("/{robot}/x")}))
@@ -219,6 +235,15 @@ def test_a_short_passphrase_needs_insisting(tmp_path: Path) -> None:
             lambda ks: sros_tool.explain_access(ks, "/taker", "join"),
             KeystoreError,
             TALKER,
+        ),
+        *(
+            (call, UsageError, "0 to 230")
+            for call in (
+                lambda ks: sros_tool.explain_access(ks, TALKER, "join", domain=-1),
+                lambda ks: sros_tool.check(ks, domain=231),
+                lambda ks: sros_tool.generate(ks, POLICY, domain=-1),
+                lambda ks: sros_tool.check_requirements(ks, ks, domain=-1),
+            )
         ),
         (
             lambda ks: sros_tool.explain_access(ks, TALKER, "join", vendor="rti"),

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from datetime import tzinfo
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     from sros_tool.fleet.model import Fleet
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.model import Enclave, Source
+    from sros_tool.policy.rights import Right
     from sros_tool.reach import HopPath, Reach
 
 _WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
@@ -423,6 +424,7 @@ def _show_answer(
         *taken,
         *_provenance_notes(answer, policy),
         *_other_type(evaluator, answer, kind),
+        *_no_topic(answer, _other_rights(enclave, policy, options)),
         *_other_name(answer, enclave),
     ]
     if not all_vendors:
@@ -598,28 +600,27 @@ def _provenance_notes(answer: Answer, policy: Path | None) -> list[Note]:
 def _action_meant(
     evaluator: Evaluator, question: Question, policy: Path | None, options: _ContextOptions
 ) -> Question | None:
-    """Return the question about an action, if that is what the rights show the name to be.
+    """Return the question about an action, if that is what the rights show the name to be."""
+    from sros_tool.explain.evaluator import action_meant
 
-    The rights of the enclave come first; those of the policy and of the keystore are read only if
-    the service is denied.
-    """
-    if question.word not in ("call", "serve"):
-        return None
-    from sros_tool.explain.question import about_action
+    return action_meant(evaluator, question, _other_rights(evaluator.enclave, policy, options))
+
+
+def _other_rights(
+    enclave: LoadedEnclave, policy: Path | None, options: _ContextOptions
+) -> list[Callable[[], frozenset[Right]]]:
+    """Return functions that read the rights of the policy and of the keystore."""
     from sros_tool.keystore.layout import is_keystore
-    from sros_tool.keystore.rights import load_rights
-    from sros_tool.translate import grant_rights
 
-    answer = evaluator.answer(question)
-    name = evaluator.enclave.name
-    found = set(grant_rights(name, answer.grant)) if answer.grant else set()
-    if not answer.allowed:
-        root = evaluator.enclave.root
-        for path in (policy, root if root and is_keystore(root) else None):
-            if path:
-                with suppress(SrosError, OSError):
-                    found |= load_rights(path, options.fleet(root) if policy else None).rights
-    return about_action(question, found)
+    root = enclave.root
+    paths = [each for each in (policy, root if root and is_keystore(root) else None) if each]
+
+    def read(path: Path) -> frozenset[Right]:
+        from sros_tool.keystore.rights import load_rights
+
+        return load_rights(path, options.fleet(root) if policy else None).rights
+
+    return [partial(read, each) for each in paths]
 
 
 def _taken_for_action(question: Question, action: Question) -> list[Note]:
@@ -655,6 +656,23 @@ def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> list[
         return []
     text = f"it may {action}: add --type action if {question.name} is an action."
     return [Note("explain.an-action", text)]
+
+
+def _no_topic(answer: Answer, others: Iterable[Callable[[], frozenset[Right]]]) -> list[Note]:
+    """Return a note if a denied topic has the name of a service or an action."""
+    question = answer.question
+    if question.type != "topic" or answer.allowed or answer.problems:
+        return []
+    rights: set[Right] = set()
+    for read in others:
+        with suppress(SrosError, OSError):
+            rights |= read()
+    kinds = {each.kind for each in rights if each.name == question.name}
+    if "topics" in kinds or not kinds & {"services", "actions"}:
+        return []
+    what, word = ("an action", "execute") if "actions" in kinds else ("a service", "serve")
+    text = f"{question.name} is {what} in the rights here, and no topic: ask about call or {word}."
+    return [Note("explain.no-topic", text)]
 
 
 # ── Zenoh ──────────────────────────────────────────────────────────────────────────────────

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
@@ -31,7 +31,7 @@ from sros_tool.explain.answer import (
     deciding_lines,
     recorded_policy,
 )
-from sros_tool.explain.question import OWN_PARTS, Part, Question
+from sros_tool.explain.question import OWN_PARTS, Part, Question, about_action
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import KEY_FILE, LEDGER
 from sros_tool.keystore.loading import vendor_problems
@@ -39,6 +39,7 @@ from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.policy.model import Enclave
+from sros_tool.policy.rights import Right
 from sros_tool.xml import read_bytes
 
 _LOG = logging.getLogger(__name__)
@@ -378,3 +379,24 @@ class Evaluator:
         reason, root = answer.decision.reason, str(self.enclave.root or "")
         faulty = (each.file for each in answer.problems if each.fault.id == reason)
         return remedy(reason, root, self.enclave.name, next(faulty, ""))
+
+
+def action_meant(
+    evaluator: Evaluator, question: Question, others: Iterable[Callable[[], Iterable[Right]]]
+) -> Question | None:
+    """Return the question about an action, if that is what the rights show the name to be.
+
+    The rights of the enclave come first; ``others``, such as those of its policy and of its
+    keystore, are read only if the service is denied.
+    """
+    if question.word not in ("call", "serve"):
+        return None
+    from sros_tool.translate import grant_rights  # most questions need no translation back
+
+    answer = evaluator.answer(question)
+    found = set(grant_rights(evaluator.enclave.name, answer.grant)) if answer.grant else set()
+    if not answer.allowed:
+        for read in others:
+            with suppress(SrosError, OSError):
+                found |= set(read())
+    return about_action(question, found)

@@ -438,6 +438,17 @@ def test_a_name_that_is_an_action_is_asked_about_as_one_of_everybody(fibonacci: 
     assert "an-action" not in explain(fibonacci, CLIENT, "call", "/nothing").err
 
 
+def test_a_topic_that_is_an_action_is_noted(fibonacci: Path) -> None:
+    for word in ("publish", "subscribe"):
+        found = explain(fibonacci, CLIENT, word, "/fibonacci")
+        assert found.status == 1
+        assert "note [explain.no-topic]" in found.err
+        assert (
+            "/fibonacci is an action in the rights here, and no topic: ask about call" in found.err
+        )
+    assert "no-topic" not in explain(fibonacci, CLIENT, "publish", "/nothing").err
+
+
 def test_an_action_is_one_where_wildcards_allow_services(tmp_path: Path) -> None:
     root = tmp_path / "ks"
     sros("create_keystore", root).ok()
