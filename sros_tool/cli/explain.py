@@ -1493,9 +1493,12 @@ _LOG_NOTES = (
 
 
 def _finding_lines(finding: LogFinding) -> Iterator[str]:
+    from sros_tool.runtime.vendor_log import UNKNOWN, plain_refusal
+
     times = f"  ({finding.count} times)" if finding.count > 1 else ""
     by = f" of {finding.process}" if finding.process else ""
-    yield f"line {finding.line}{by}: {finding.text[:160]}{times}"
+    text = finding.text if finding.id == UNKNOWN.id else plain_refusal(finding.text)
+    yield f"line {finding.line}{by}: {text[:160]}{times}"
     of = f" [{finding.enclave}]" if finding.enclave else ""
     source = finding.vendor.title.split()[0] + " DDS" if finding.vendor else "ROS 2"
     source = ZENOH_TITLE if finding.zenoh else source

@@ -756,6 +756,13 @@ def test_a_denied_topic_is_compared_with_what_is_signed(keystore: Path, tmp_path
     assert f"sros explain {keystore} {ENCLAVE} publish /other" in found.out
 
 
+def test_a_known_line_is_shown_without_time_and_source() -> None:
+    log = LOGS / f"{FAST_14}.node_of_another_enclave.log"
+    shown = sros("explain", "--log", log).out.splitlines()[0]
+    topic = "rq/listener/describe_parametersRequest topic not found in allow rule."
+    assert shown == f"line 2: {topic}  (2 times)"
+
+
 def test_halves_of_services_are_told_as_services() -> None:
     texts = {
         "rq/addRequest topic not found in allow rule. -> check_create_datawriter": "call /add",
