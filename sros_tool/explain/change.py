@@ -173,7 +173,8 @@ def likely_names(answer: Answer, enclave: LoadedEnclave) -> tuple[str, ...]:
     """Return at most three names of the same right that the denied name of a question may mean.
 
     For a standard service of a node, these are the services of the enclave's nodes; for any other
-    name, those that are spelled almost alike.
+    name, those with the same last part, as a forgotten remapping leaves it, and else those that are
+    spelled almost alike.
     """
     question = answer.question
     names = {
@@ -182,9 +183,9 @@ def likely_names(answer: Answer, enclave: LoadedEnclave) -> tuple[str, ...]:
         if (each.right, each.qualifier) == (question.right, ALLOW) and not is_expression(each.name)
     } - {question.name}
     last = question.name.rpartition("/")[2]
-    if question.type == "service" and last in NODE_SERVICES:
-        own = sorted(each for each in names if each.rpartition("/")[2] == last)
-        return tuple(own) if len(own) <= _SHOWN else ()
+    same = sorted(each for each in names if each.rpartition("/")[2] == last)
+    if (question.type == "service" and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
+        return tuple(same) if len(same) <= _SHOWN else ()
     return tuple(get_close_matches(question.name, sorted(names), n=_SHOWN, cutoff=_ALIKE))
 
 

@@ -19,6 +19,7 @@ from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer
+from sros_tool.explain.change import likely_names
 from sros_tool.explain.denials import Denial, nodes_served, read_denials, serving_node
 from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave
 from sros_tool.explain.question import Part, Question, ask
@@ -501,6 +502,8 @@ class _Examiner:
             remedy = "Restart the process: it loaded earlier permissions."
         else:
             other, better = self._other_node(denial, answer)
+            if not other:
+                other, better = self._other_name(denial, name, enclave, finding.remedy)
             found = [answer.decision.text, *other]
             remedy = better or finding.remedy
         remedy = remedy.replace("ENCLAVE", enclave.name)
@@ -528,6 +531,22 @@ class _Examiner:
                 "LOG`."
             )
         return [], ""
+
+    def _other_name(
+        self, denial: Denial, name: str, enclave: LoadedEnclave, remedy: str
+    ) -> tuple[list[str], str]:
+        """Return causes and a remedy if the enclave may use names that may be meant."""
+        words = _words_to_ask(denial, name)
+        if len(words) != 1 or denial.by_rule:
+            return [], ""
+        asked = self._answer(enclave, denial.vendor, ask(words[0], name))
+        names = likely_names(asked, enclave)
+        if not names:
+            return [], ""
+        return [f"the enclave may {words[0]} {' and '.join(names)}: perhaps that is meant"], (
+            f"If a remapping was forgotten, add `--ros-args -r {quote(name)}:={quote(names[0])}`; "
+            f"otherwise {remedy}"
+        )
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show what a policy lacks for a topic, here called ``name``."""

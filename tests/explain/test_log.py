@@ -756,6 +756,18 @@ def test_a_denied_topic_is_compared_with_what_is_signed(keystore: Path, tmp_path
     assert f"sros explain {keystore} {ENCLAVE} publish /other" in found.out
 
 
+def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
+    log = tmp_path / "robot.log"
+    for topic, meant in (("front/chatter", True), ("chater", True), ("odom", False)):
+        log.write_text(
+            f"[SECURITY Error] rt/{topic} topic not found in allow rule. check_create_datawriter\n"
+        )
+        found = sros("explain", keystore, ENCLAVE, "--log", log).out
+        assert ("the enclave may publish /chatter: perhaps that is meant" in found) is meant
+        assert (f"`--ros-args -r /{topic}:=/chatter`" in found) is meant
+        assert f"`sros explain {keystore} {ENCLAVE} publish /{topic}`" in found
+
+
 def test_a_known_line_is_shown_without_time_and_source() -> None:
     log = LOGS / f"{FAST_14}.node_of_another_enclave.log"
     shown = sros("explain", "--log", log).out.splitlines()[0]
