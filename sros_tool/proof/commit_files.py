@@ -72,7 +72,7 @@ class CommitFiles:
             return None
         if entry.mode not in FILES:
             raise self._no_file(path, entry)
-        return self._write(path, entry, self.repository.contents([entry.id])[entry.id])
+        return self._write(path, entry, self.repository.content(entry.id))
 
     def policies(self, path: str, *, placeholders: bool) -> list[Path]:
         """Return the policies at a path, a file or a folder, written to their places.

@@ -258,6 +258,10 @@ class Repository:
             gone.append(part)
         return entry
 
+    def content(self, digits: str) -> bytes:
+        """Return the content of a file, as `contents`; many policies include the same ones."""
+        return _content(self, digits)
+
     def _all(self, kind: str, ids: Sequence[str]) -> dict[str, bytes]:
         found = self._objects(ids)
         for each in ids:
@@ -383,6 +387,11 @@ def _top(repository: Repository, commit: str) -> TreeEntry:
 @lru_cache(maxsize=1024)  # what has an id never changes
 def _folder(repository: Repository, digits: str) -> dict[str, TreeEntry]:
     return repository.folders([digits])[digits]
+
+
+@lru_cache(maxsize=256)
+def _content(repository: Repository, digits: str) -> bytes:
+    return repository.contents([digits])[digits]
 
 
 def walk(

@@ -89,7 +89,7 @@ class Revision:
             raise DocumentError(
                 f"'{shown}' is {entry.kind}", "", "Name a file of the revision itself."
             )
-        return self.repository.contents([entry.id])[entry.id]
+        return self.repository.content(entry.id)
 
     def shown(self, text: str) -> str:
         """Return a text with the places of this revision as a user would name them."""

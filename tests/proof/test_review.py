@@ -1,0 +1,274 @@
+"""What a review compares and says, and which names of commits it takes."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from sros_tool.errors import DocumentError, SrosError, UsageError
+from sros_tool.proof.repository import Repository
+from tests.support.code_host import PROJECT
+from tests.support.code_host import policy as policy_text
+from tests.support.harness import Ended, publish, sros
+
+ROBOT = {"/a": publish("/x"), "/b": publish("/y")}
+WIDER = {"/a": publish("/x"), "/b": publish("/y", "/x")}
+ONLY = '[[only]]\npublish = ["/x"]\nenclaves = ["/a"]\n'
+PERSON = {
+    f"GIT_{who}_{what}": "a@example.org"
+    for who in ("AUTHOR", "COMMITTER")
+    for what in ("NAME", "EMAIL")
+}
+
+
+class Change:
+    """A repository whose first commit is the base of a change."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.git("init", "--quiet", "--initial-branch", "main")
+        self.base = ""
+
+    def git(self, *words: str) -> str:
+        nobody = {"GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_NOSYSTEM": "1"}
+        done = subprocess.run(
+            ["git", "-C", str(self.folder), *words],
+            env={"PATH": "/usr/bin:/bin", **PERSON, **nobody},
+            capture_output=True,
+            check=True,
+        )
+        return done.stdout.decode().strip()
+
+    def commit(self, files: dict[str, str | bytes | None]) -> str:
+        for name, text in files.items():
+            place = self.folder / name
+            place.parent.mkdir(parents=True, exist_ok=True)
+            if text is None:
+                place.unlink()
+            else:
+                place.write_bytes(text.encode() if isinstance(text, str) else text)
+        self.git("add", "--all", "--force")
+        self.git("commit", "--quiet", "--allow-empty", "--message", "x")
+        commit = self.git("rev-parse", "HEAD")
+        self.base = self.base or commit
+        return commit
+
+    def review(self, *words: str) -> Ended:
+        return sros("review", "--base", self.base, *words, cwd=self.folder)
+
+
+@pytest.fixture
+def change(tmp_path: Path) -> Change:
+    made = Change(tmp_path)
+    shutil.copytree(PROJECT / "policies/common", tmp_path / "common")
+    made.commit({"robot.xml": policy_text(ROBOT), "robot.toml": ONLY})
+    return made
+
+
+# ── what is compared ───────────────────────────────────────────────────────────────────────
+
+
+def test_rights_that_move_to_a_second_policy_are_seen(change: Change) -> None:
+    """Requirements and access are decided of all policies together."""
+    change.commit({"second.xml": policy_text({"/evil": publish("/x")})})
+    both = change.review("--policy", "robot.xml\nsecond.xml", "--requirements", "robot.toml")
+    assert both.status == 1
+    assert "requirements robot.xml second.xml: 1 error" in both.out
+    assert "rights are new" in both.out
+    one = change.review("--policy", "robot.xml")
+    assert one.status == 1
+    assert "'second.xml' changes and is not reviewed" in one.out
+    assert change.review("--policy", "robot.xml", "--new-access", "allow").status == 0
+    change.commit({"second.xml": None, "tests/second.xml": policy_text(WIDER)})
+    left = change.review("--policy", "robot.xml", "--leave-out", "tests")
+    assert left.status == 0
+    assert "policies below 'tests' are not looked at, as asked" in left.out
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("evil.XML", policy_text(WIDER).encode()),
+        ("robots/deep/evil.txt", policy_text(WIDER).encode()),
+        ("evil.xml", b"\xff\xfe" + policy_text(WIDER).encode("utf-16-le")),
+        ("part.xml", b'<profile ns="/" node="n"/>'),
+    ],
+)
+def test_a_policy_that_is_not_named_is_said(change: Change, name: str, content: bytes) -> None:
+    change.commit({name: content})
+    ended = change.review("--policy", "robot.xml")
+    assert ended.status == 1
+    assert f"'{name}' changes and is not reviewed" in ended.out
+    change.base = change.git("rev-parse", "HEAD")
+    change.commit({name: None})
+    assert f"'{name}' is deleted" in change.review("--policy", "robot.xml").out
+
+
+def test_only_commits_count(change: Change) -> None:
+    change.commit({"robot.xml": policy_text(WIDER)})
+    (change.folder / "robot.xml").write_text(policy_text(ROBOT))
+    ended = change.review("--policy", "robot.xml")
+    assert ended.status == 1
+    assert "the checkout has other content than the commit that is reviewed: 'robot.xml'" in (
+        ended.out
+    )
+    earlier = change.review("--policy", "robot.xml", "--head", change.base)
+    assert earlier.status == 0
+    assert "the commit that is checked out is another one than the one that is" in earlier.out
+
+
+def test_a_fleet_counts_as_each_commit_has_it(change: Change) -> None:
+    fleet = 'enclaves = ["/{robot}"]\n[robots.r1]\n'
+    policy = policy_text({"/{robot}": publish("/{robot}/x")})
+    change.base = change.commit({"fleet.xml": policy, "fleet.toml": fleet})
+    words = ("--policy", "fleet.xml", "--fleet", "fleet.toml")
+    assert change.review(*words).status == 0
+    change.commit({"fleet.toml": f"{fleet}[robots.r2]\n"})
+    ended = change.review(*words)
+    assert ended.status == 1, ended
+    assert "new-access fleet.xml: " in ended.out
+
+
+@pytest.mark.parametrize("case", ["rights", "ca", "governance", "default"])
+def test_the_access_of_a_keystore_is_compared(
+    change: Change, made_keystores: Path, case: str
+) -> None:
+    public = change.folder / "ks"
+    shutil.copytree(made_keystores / "before", public, symlinks=True)
+    change.base = change.commit({})
+    words = ("--policy", "robot.xml", "--keystore", "ks")
+    same = change.review(*words)
+    assert "new-access ks: nobody gets more access" in same.out, same
+    shutil.rmtree(public)
+    shutil.copytree(made_keystores / case, public, symlinks=True)
+    change.commit({})
+    ended = change.review(*words)
+    assert ended.status > 0
+    (line,) = (each for each in ended.out.splitlines() if each.startswith("new-access ks"))
+    assert "nobody gets more" not in line
+
+
+@pytest.fixture(scope="module")
+def made_keystores(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the public part of a keystore, and what a change makes of it."""
+    folder = tmp_path_factory.mktemp("keystores")
+    shutil.copytree(PROJECT / "policies/common", folder / "common")
+    for name, enclaves in (("robot", ROBOT), ("wider", WIDER)):
+        (folder / f"{name}.xml").write_text(policy_text(enclaves))
+    sros("create_keystore", "before", "--template", "production", cwd=folder).ok()
+    sros("generate_artifacts", "-k", "before", "-p", "robot.xml", cwd=folder).ok()
+    for case in ("rights", "ca", "governance", "default"):
+        shutil.copytree(folder / "before", folder / case, symlinks=True)
+    sros("generate_artifacts", "-k", "rights", "-p", "wider.xml", cwd=folder).ok()
+    sros("rotate_ca", "ca", "--next", cwd=folder).ok()
+    weaker = ("--set", "protection.rtps=NONE", "--allow-looser")
+    for change_of in (weaker, weaker[:2]):
+        if sros("update_keystore", "governance", *change_of, cwd=folder).status == 0:
+            break
+    settings = folder / "default" / "sros.toml"
+    settings.write_text(settings.read_text().replace('"node_basics"', '"everything"'))
+    for key in [*folder.glob("**/key.pem"), *folder.glob("**/*.key.pem")]:
+        key.unlink()
+    return folder
+
+
+# ── names of commits ───────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def named(change: Change) -> Change:
+    """Return a repository with a remote, whose branch main has the wider policy since a tag."""
+    change.git("remote", "add", "origin", ".")
+    change.git("update-ref", "refs/remotes/origin/main", change.base)
+    change.commit({"robot.xml": policy_text(WIDER)})
+    return change
+
+
+@pytest.mark.parametrize(
+    ("reference", "name", "said"),
+    [
+        ("refs/tags/origin/main", "origin/main", "'refs/remotes/origin/main'"),
+        ("refs/heads/origin/main", "origin/main", "'refs/heads/origin/main'"),
+        ("refs/tags/main", "main", "'refs/tags/main' and 'refs/heads/main'"),
+        ("refs/tags/{short}", "{short}", "ambiguous"),
+        ("refs/main", "main", "'refs/main' and"),
+    ],
+)
+def test_an_ambiguous_name_is_refused(named: Change, reference: str, name: str, said: str) -> None:
+    """A tag that has the name of the base would be taken in its place."""
+    short = named.base[:7]
+    name, reference = name.format(short=short), reference.format(short=short)
+    words = ("diff_policy", "--no-new-access", f"git:{name}:robot.xml", "robot.xml")
+    before = sros(*words, cwd=named.folder)
+    assert before.status == (0 if name == "main" else 1), before
+    named.git("update-ref", reference, "HEAD")
+    after = sros(*words, cwd=named.folder)
+    assert after.status == 2, after
+    assert f"the name '{name}' is ambiguous" in after.err
+    assert said in after.err
+    with pytest.raises(UsageError, match="neither the full id"):
+        Repository(named.folder).exact_commit(name)
+
+
+def test_a_tag_that_only_looks_like_a_branch_of_the_remote_is_refused(named: Change) -> None:
+    named.git("tag", "origin/stable")
+    with pytest.raises(DocumentError, match="no branch of the remote 'origin'"):
+        Repository(named.folder).commit("origin/stable")
+    assert Repository(named.folder).exact_commit("refs/tags/origin/stable")
+
+
+@pytest.mark.parametrize("place", ["refs/tags/refs/heads/gone", "refs/heads/refs/heads/gone"])
+def test_a_full_reference_is_taken_exactly(named: Change, place: str) -> None:
+    """Git itself would find a tag that is named like a full reference which does not exist."""
+    named.git("update-ref", place, "HEAD")
+    assert named.git("rev-parse", "--verify", "refs/heads/gone")
+    for ask in (Repository(named.folder).exact_commit, Repository(named.folder).commit):
+        with pytest.raises(SrosError, match="git finds no"):
+            ask("refs/heads/gone")
+
+
+@pytest.mark.parametrize(
+    "name", ["main", "main~1", "HEAD", "@", "HEAD^", "v1", "v1^{}", "HEAD@{0}"]
+)
+def test_names_that_are_clear_are_taken(named: Change, name: str) -> None:
+    named.git("tag", "-a", "-m", "x", "v1")
+    assert Repository(named.folder).commit(name) == named.git("rev-parse", f"{name}^{{commit}}")
+
+
+def _replace(change: Change, wider: str) -> None:
+    change.git("replace", wider, change.git("rev-parse", f"{change.base}:robot.xml"))
+
+
+def _graft(change: Change, _: str) -> None:
+    head = change.git("rev-parse", "HEAD")
+    change.git("replace", head, change.base)
+
+
+def _damage(change: Change, wider: str) -> None:
+    objects = change.folder / ".git" / "objects"
+    earlier = change.git("rev-parse", f"{change.base}:robot.xml")
+    places = [objects / each[:2] / each[2:] for each in (wider, earlier)]
+    places[0].chmod(0o600)
+    places[0].write_bytes(places[1].read_bytes())
+
+
+@pytest.mark.parametrize(
+    ("trick", "status"),
+    [(_replace, 1), (_graft, 1), (_damage, 2)],
+    ids=["replace", "graft", "loose"],
+)
+def test_objects_are_what_their_hashes_say(
+    named: Change, trick: Callable[[Change, str], None], status: int
+) -> None:
+    """A naive `git show` gives the policy of before."""
+    trick(named, named.git("rev-parse", "HEAD:robot.xml"))
+    try:
+        naive = named.git("show", "HEAD:robot.xml")
+    except subprocess.CalledProcessError as error:
+        naive = error.stdout.decode()
+    assert "/x" not in naive.rpartition("/y")[2]
+    assert named.review("--policy", "robot.xml").status == status
