@@ -141,7 +141,7 @@ class Lie:
 
     name: str
     said: str
-    plant: Callable[[Origin, Path], None]
+    plant: Callable[[Origin, Path], object]
 
 
 def _text(text: str, path: str = "") -> Callable[[Origin, Path], None]:
