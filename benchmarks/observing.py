@@ -129,16 +129,18 @@ def _look() -> float:
     """Return the seconds of one look at the whole graph with rclpy in this process."""
     import rclpy
 
-    from sros_tool.graph.observer import NODE_NAME, _sight
+    from sros_tool.graph.observer import _NODE_NAME, _Observer
 
     rclpy.init(args=[])
-    node = rclpy.create_node(NODE_NAME, enable_rosout=False, start_parameter_services=False)
+    node = rclpy.create_node(_NODE_NAME, enable_rosout=False, start_parameter_services=False)
+    observer = _Observer(node)
+    observer = _Observer(node)
     deadline = time.monotonic() + _PATIENCE
     found: Any = None
     while time.monotonic() < deadline and (found is None or len(found[1]) < ENDPOINTS):
         time.sleep(0.1)
-        found = _sight(node)
-    taken = _median(lambda _: _sight(node))
+        found = observer.sight()
+    taken = _median(lambda _: observer.sight())
     node.destroy_node()
     rclpy.shutdown()
     return taken

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from sros_tool.cli.common import now
 from sros_tool.errors import KeystoreError, Note, UsageError
+from sros_tool.keystore.unchanged import of_one_state
 from sros_tool.owners import other_writers
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class EnclaveEnvironment:
     needs_pin: bool = False
 
 
+@of_one_state
 def loadable_environment(
     root: Path,
     name: str,

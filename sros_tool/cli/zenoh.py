@@ -115,6 +115,7 @@ def zenoh(
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
     from sros_tool.keystore.lifecycle.zenoh import set_zenoh
     from sros_tool.keystore.reader import load_settings
+    from sros_tool.keystore.unchanged import of_one_state
 
     if existing:
         _refuse_with_from(root, router, *endpoints, *listen, mode, domain, off, only_check)
@@ -136,9 +137,8 @@ def zenoh(
         raise UsageError("--off takes no other choice of the network", "", "Leave one of them out.")
     network = None if off else _network(settings, given)
     with progress("writing the files of Zenoh"):
-        result = set_zenoh(
-            root, network, now=now(), keyring=keyring(), dry_run=dry_run or only_check
-        )
+        work = of_one_state(set_zenoh) if only_check else set_zenoh
+        result = work(root, network, now=now(), keyring=keyring(), dry_run=dry_run or only_check)
     # A document and the signed one next to it are written together.
     actions = {
         each.path: each.action for each in result.changes if Path(each.path).name in ZENOH_FILES

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.keystore.reader import OpenedEnclave
+from sros_tool.keystore.zenoh import opened
 from sros_tool.pki import smime
 from sros_tool.runtime.environment import REFUSING, render_refusal
 from sros_tool.runtime.zenoh_environment import NO_CONFIGURATION
@@ -266,3 +268,22 @@ def test_completion_of_rmw(keystore: Path) -> None:
     env = {"_SROS_COMPLETE": "bash_complete", "COMP_WORDS": f"sros env {keystore} --rmw rmw_z"}
     completed = sros(env={**env, "COMP_CWORD": "4"})
     assert completed.out.split(",")[-1].split() == ["rmw_zenoh_cpp"], completed
+
+
+def test_who_reads_while_another_writes_sees_one_state(
+    keystore: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the permissions and the file of Zenoh, somebody changes both."""
+    words = ("env", keystore, "/a", *ZENOH)
+    before = sros(*words)
+    real, waiting = opened.open_zenoh, ["more.xml"]
+
+    def change_meanwhile(folder: Path, name: str, state: OpenedEnclave) -> object:
+        if waiting:
+            sros("create_permission", keystore, "/a", keystore.parent / waiting.pop()).ok()
+        return real(folder, name, state)
+
+    monkeypatch.setattr(opened, "open_zenoh", change_meanwhile)
+    ended = sros(*words)
+    assert not waiting
+    assert (ended.status, ended.out) == (before.status, before.out), ended

@@ -42,6 +42,7 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_P7S, enclave_path
 from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.unchanged import of_one_state
 from sros_tool.parallel import map_slices, tick
 from sros_tool.pki import smime
 from sros_tool.policy.model import Policy
@@ -52,6 +53,7 @@ _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
 """Ids of the kinds that follow from a choice of the keystore, and so affect all enclaves."""
 
 
+@of_one_state
 def keystore_findings(
     root: Path,
     *,
