@@ -144,17 +144,15 @@ class UserKeystore:
 
     def rightful(self, row: Row) -> str:
         """Return the enclave of a row whose attacker is the very enclave that it competes with."""
-        own = [each for each in row.parties if each.identity.keystore is OWN]
-        for attacker in (each for each in own if each.intruder):
-            enclave = self.cast.get(attacker.identity.enclave, "")
-            for other in own:
-                same = (other.role, self.cast.get(other.identity.enclave)) == (
-                    attacker.role,
-                    enclave,
-                )
-                if same and not other.intruder and enclave:
-                    return enclave
-        return ""
+        attackers, others = (
+            {
+                (each.role, self.cast.get(each.identity.enclave, ""))
+                for each in row.parties
+                if each.identity.keystore is OWN and each.intruder is intruder
+            }
+            for intruder in (True, False)
+        )
+        return next((enclave for _, enclave in attackers & others), "")
 
     def opened(self, row: Row, topic: str) -> Row:
         """Return a row that expects the attack to succeed if the attacker's permissions allow it.

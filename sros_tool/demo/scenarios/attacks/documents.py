@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sros_tool.demo import forger
 from sros_tool.demo.forger import Undefended
-from sros_tool.demo.scenarios.attacks.kinds import discovering, injection, succeeds
+from sros_tool.demo.scenarios.attacks.kinds import discovering, injection, open_to, succeeds
 from sros_tool.demo.scenarios.model import UNSECURED, Condition, Identity, Row, RowStatus, Variant
 
 _ITSELF = "permissions signed by the enclave itself"
@@ -223,21 +223,22 @@ ROWS: tuple[Row, ...] = (
                 "keep join_access_control and the access control of topics on",
             ),
             Variant(
+                (Condition.FAST,),
+                RowStatus.NOT_HEARD,
+                mechanism="Fast DDS lets it start; its peers find no rule for the domain",
+            ),
+            Variant(
                 (Condition.OPEN_JOIN,),
                 RowStatus.REFUSED,
                 "the template does not control who joins the domain",
                 "keep join_access_control on",
                 mechanism="its DDS joins, and then finds no rule for the topic in this domain",
             ),
+            *open_to(RowStatus.HEARD, RowStatus.NOT_HEARD),
             Variant(
                 (Condition.UNCONTROLLED,),
                 RowStatus.NOT_HEARD,
                 mechanism="its DDS controls no topic; its peers find no rule for the domain",
-            ),
-            Variant(
-                (Condition.FAST,),
-                RowStatus.NOT_HEARD,
-                mechanism="Fast DDS lets it start; its peers find no rule for the domain",
             ),
         ),
     ),
@@ -258,6 +259,12 @@ ROWS: tuple[Row, ...] = (
                 (Condition.FAST,),
                 RowStatus.NOT_VISIBLE,
                 mechanism="Fast DDS lets it start; its peers find no rule for the domain",
+            ),
+            Variant(
+                (Condition.UNAUTHENTICATED, Condition.UNAUTHENTICATED_SEE),
+                RowStatus.VISIBLE,
+                "the template admits unauthenticated participants, and does not protect the topic",
+                "remove allow_unauthenticated_participants from the template",
             ),
             Variant(
                 (Condition.UNCONTROLLED,),
