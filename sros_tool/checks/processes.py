@@ -31,7 +31,7 @@ from sros_tool.checks.zenoh_environment import (
     open_because,
 )
 from sros_tool.errors import SrosError
-from sros_tool.keystore.layout import IDENTITY_CA_FILE, enclave_path
+from sros_tool.keystore.layout import IDENTITY_CA_FILE, enclave_path, search_enclaves
 from sros_tool.pki.certificates import load_certificates
 from sros_tool.runtime.processes import Process, RunningProcesses, plain
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
@@ -141,7 +141,7 @@ NOT_SECURED = FindingKind(
 _MOST_NODES = 20
 
 
-class _Security(StrEnum):
+class Security(StrEnum):
     """The security with which a process runs, as far as it can be seen."""
 
     SECURED = "secured"
@@ -149,20 +149,20 @@ class _Security(StrEnum):
     UNKNOWN = "unknown"
 
 
-def _security_of(process: Process) -> _Security:
+def security_of(process: Process) -> Security:
     """Return the security with which a process runs."""
     if process.is_zenoh:
         if process.configuration and process.configuration.problem:
-            return _Security.UNKNOWN
+            return Security.UNKNOWN
         try:
-            return _Security.OPEN if _zenoh_opening(process) else _Security.SECURED
+            return Security.OPEN if _zenoh_opening(process) else Security.SECURED
         except SrosError:
-            return _Security.UNKNOWN
+            return Security.UNKNOWN
     if not process.asks_for_security:
-        return _Security.OPEN
+        return Security.OPEN
     if process.enclave and process.enclave.problem:
-        return _Security.UNKNOWN
-    return _Security.OPEN if unsecured_because(process) else _Security.SECURED
+        return Security.UNKNOWN
+    return Security.OPEN if unsecured_because(process) else Security.SECURED
 
 
 def process_findings(
@@ -175,8 +175,8 @@ def process_findings(
     is_secured_here = environment.get(ENABLE) == "true"
     here = ("", environment.get(DOMAIN) or "0")
     nodes = [each for each in running.processes if not each.is_daemon]
-    security = {each.pid: _security_of(each) for each in nodes}
-    secured = [each for each in nodes if security[each.pid] is _Security.SECURED]
+    security = {each.pid: security_of(each) for each in nodes}
+    secured = [each for each in nodes if security[each.pid] is Security.SECURED]
     closed = {_place(each) for each in nodes if each.asks_for_security}
     closed |= {here} if is_secured_here else set()
     open_nodes: list[str] = []
@@ -190,14 +190,15 @@ def process_findings(
         if process.asks_for_security:
             yield from file_findings(process, now=now, zone=zone)
             yield from _unsecured(process)
-        elif security[process.pid] is _Security.OPEN:
+        elif security[process.pid] is Security.OPEN:
             if _place(process) in closed:
                 text = f"{_where(process)}, with {ENABLE} not 'true'"
                 yield PROCESS_UNSECURED.found(process.label, text)
             else:
                 open_nodes.append(f"{process.label} {_where(process)}")
     yield from _not_secured(environment, open_nodes)
-    yield from _mixed_vendors(secured, environment if is_secured_here else None)
+    starts_nodes = is_secured_here and bool(environment.get(ENCLAVE))
+    yield from _mixed_vendors(secured, environment if starts_nodes else None)
     yield from _other_keystores(secured, environment if is_secured_here else None)
     yield from _elsewhere(nodes, security)
     yield from _not_seen(running)
@@ -395,8 +396,10 @@ def _by_authorities(processes: Iterable[Process]) -> list[tuple[_Keys, list[Proc
 
 
 def _authorities_here(environment: Mapping[str, str]) -> _Keys:
-    """Return the identity CAs of the enclave that an environment names, as far as it has one."""
-    folder = enclave_path(Path(environment.get(KEYSTORE, "")), environment.get(ENCLAVE) or "/")
+    """Return the identity CAs of the enclave that an environment names, or else of the first."""
+    root = Path(environment.get(KEYSTORE, ""))
+    name = environment.get(ENCLAVE) or next(iter(search_enclaves(root)[0]), "/")
+    folder = enclave_path(root, name)
     with suppress(SrosError):  # other findings say what is wrong there
         file = folder / IDENTITY_CA_FILE
         return _keys(load_certificates(read_bytes(file, "CA certificate"), str(file)))
@@ -414,7 +417,7 @@ def _keys(certificates: Iterable[x509.Certificate]) -> _Keys:
 _FORM = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
 
 
-def _elsewhere(nodes: Sequence[Process], security: Mapping[int, _Security]) -> Iterator[Finding]:
+def _elsewhere(nodes: Sequence[Process], security: Mapping[int, Security]) -> Iterator[Finding]:
     others = [each for each in nodes if each.network]
     if others:
         networks = len({each.network for each in others})

@@ -7,7 +7,7 @@
 - processes: `running` (with `enclave_environment` and `containers`), `demo`
 - policies: `policy` (with `new_access`), `review`, `view`
 - robots that run: `generate_policy` and `audit` (with `observing`)
-- answers: `explain` (with `explain_zenoh`), `check`
+- answers: `explain` (with `explain_zenoh`), `check` (with `watching`)
 
 All share `common`, `findings` and `progress`.  `ros2` has the same verbs as ``ros2 security``.
 """

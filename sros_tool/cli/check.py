@@ -177,6 +177,11 @@ else 0.""",
     show_default=True,
     help="Output for people, programs, code hosts, or a comment on a pull request.",
 )
+@click.option(
+    "--watch",
+    is_flag=True,
+    help="With `runtime`: go on, and report each change among the processes once.",
+)
 @json_option
 @click.option("--sarif", "as_sarif", is_flag=True, help="The same as --format sarif.")
 @click.option(
@@ -203,6 +208,7 @@ def check(
     distribution: str | None,
     moment: str | None,
     form: str,
+    watch: bool,
     as_json: bool,
     as_sarif: bool,
     needs_renewal: str | None,
@@ -245,6 +251,17 @@ def check(
             "",
             f"`sros audit {policies[0]}` reports what a policy would deny to the running robot.",
         )
+    if watch:
+        if family != "runtime" or form not in ("text", "json") or moment:
+            raise UsageError(
+                "--watch is for `sros check runtime`, as text or with --json, and for now",
+                "",
+                "Write `sros check runtime --watch`.",
+            )
+        from sros_tool.cli.watching import watch_processes
+
+        watch_processes(_environment(domain_of(domain)), selection, as_json=form == "json")
+        return 0
     at = _circumstances(domain, moment, policies, fleet_file)
     at = replace(at, distribution=_distribution(distribution))
     if suggest:
@@ -421,10 +438,12 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
 
 
 def _runtime(at: Circumstances) -> list[Finding]:
-    environment = dict(os.environ)
-    if at.domain is not None:
-        environment["ROS_DOMAIN_ID"] = str(at.domain)
-    return _findings_here(environment, at.now, {})
+    return _findings_here(_environment(at.domain), at.now, {})
+
+
+def _environment(domain: int | None) -> dict[str, str]:
+    """Return the variables of this process, with the domain of --domain."""
+    return {**os.environ, **({} if domain is None else {"ROS_DOMAIN_ID": str(domain)})}
 
 
 def _findings_here(

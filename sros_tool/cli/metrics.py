@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -26,6 +28,9 @@ from sros_tool.cli.written import file_change
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo, echo_document
 from sros_tool.values import as_plain
+
+if TYPE_CHECKING:
+    from sros_tool.prometheus import Metric
 
 _SUFFIX = ".prom"
 """The only suffix of files that the textfile collector of node_exporter reads."""
@@ -56,6 +61,9 @@ The exit status is 0 whatever is found. If the keystore cannot be examined it is
     help="Also count where the keystore differs from this policy.  Can be repeated.",
 )
 @fleet_option("The robots that the placeholders of the policies stand for.")
+@click.option(
+    "--runtime", is_flag=True, help="Also count the running processes, by what they run with."
+)
 @dry_run_option
 @json_option
 def metrics(
@@ -64,6 +72,7 @@ def metrics(
     earliest: bool,
     policies: tuple[Path, ...],
     fleet_file: Path | None,
+    runtime: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -86,6 +95,7 @@ def metrics(
     with progress("examining"):
         findings = keystore_findings(root, now=moment, zone=local_zone(os.environ), policies=wanted)
         found = keystore_metrics(root, findings, now=moment, each_enclave=not earliest)
+        found += _of_processes(moment) if runtime else ()
     text = render_metrics(found)
     changes = file_change(output, existed=output.exists()) if output else []
     saved = save(output, text.encode()) if output and not dry_run else ""
@@ -98,6 +108,14 @@ def metrics(
         echo(saved, err=True)
     else:
         echo_document(text)
+
+
+def _of_processes(moment: datetime) -> tuple[Metric, ...]:
+    from sros_tool.checks.runtime_metrics import runtime_metrics
+    from sros_tool.runtime.processes import ProcessTable
+
+    running = ProcessTable().look(moment)
+    return runtime_metrics(os.environ, running, now=moment, zone=local_zone(os.environ))
 
 
 def check_suffix(output: Path) -> None:

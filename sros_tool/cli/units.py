@@ -16,6 +16,7 @@ from sros_tool.cli.common import (
     PATH,
     chosen_enclaves,
     complete_keystore_and_enclave,
+    domain_of,
     dry_run_option,
     json_option,
     print_json,
@@ -70,8 +71,8 @@ Examples:
     multiple=True,
     type=click.Choice([each.value for each in Job]),
     help="A timer that renews what expires within 30 days, checks the keystore each day, or "
-    "writes metrics every 15 minutes: of the keystore, or of `sros fleet status` (fleet).  Can be "
-    "repeated.",
+    "writes metrics every 15 minutes: of the keystore, or of `sros fleet status` (fleet); guard is "
+    "no timer, and watches all ROS processes of the machine, as root.  Can be repeated.",
 )
 @click.option(
     "--target",
@@ -146,6 +147,12 @@ def units(
     folder = PATH.convert(rest[-1], None, None)
     if passphrase is not None and Job.RENEW not in jobs:
         raise UsageError("--passphrase-file is for --job renew only")
+    if user is not None and Job.GUARD in jobs:
+        raise UsageError(
+            "--user is not for --job guard",
+            "Only root can look at the processes of all users.",
+            "Write the guard by a command of its own, without --user.",
+        )
     if jobs and (rest[1:] or several) and there is None:
         raise UsageError(
             f"the nodes run where the keystore is in {INSTALLED}, and the jobs are for '{root}'",
@@ -183,6 +190,7 @@ def units(
             user=user or _owner(root),
             sros=program or _this_program(),
             passphrase=passphrase or "",
+            domain=domain_of(domain) or 0,
         )
     changes = _changes(folder, files, force=force)
     if not dry_run:

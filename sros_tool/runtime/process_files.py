@@ -88,6 +88,7 @@ class FileReader:
     def __init__(self) -> None:
         self._left = _MOST_BYTES_OF_ALL
         self._read: dict[tuple[int, ...], bytes] = {}
+        self._before: dict[tuple[int, ...], bytes] = {}
 
     def read(self, handle: int, state: os.stat_result) -> bytes:
         """Return the content of a regular file that is open with O_PATH.
@@ -96,6 +97,9 @@ class FileReader:
             OSError: The file cannot be read, is no regular file, or is too large.
         """
         key = (state.st_dev, state.st_ino, state.st_ctime_ns, state.st_size)
+        if key not in self._read and key in self._before:
+            self._read[key] = self._before[key]
+            self._left -= state.st_size
         if key not in self._read:
             if not stat.S_ISREG(state.st_mode):
                 raise OSError(errno.EINVAL, "it is not a regular file")
@@ -109,9 +113,9 @@ class FileReader:
         return self._read[key]
 
     def begin(self) -> None:
-        """Forget the files that were read before."""
+        """Forget the files that were not asked for since the last time."""
         self._left = _MOST_BYTES_OF_ALL
-        self._read.clear()
+        self._before, self._read = self._read, {}
 
 
 class ProcessRoot:

@@ -212,14 +212,12 @@ class ProcessTable:
                 continue
             try:
                 with self._opened(pid) as folder:
-                    looked = self._look(pid, folder, before.get(pid))
+                    looked = self._look(pid, folder, before.get(pid), begin)
                     if looked is None:
                         continue
                     self._looked[pid] = looked
                     if looked.process:
-                        started = begin + timedelta(seconds=looked.stat.ticks / self._ticks)
-                        process = replace(looked.process, started=started)
-                        found.append(self._with_files(process, folder))
+                        found.append(self._with_files(looked.process, folder))
             except PermissionError:
                 closed.append(UnseenProcess(pid, (), "/proc hides it", speaks=False))
             except OSError:  # it has ended
@@ -240,8 +238,13 @@ class ProcessTable:
         finally:
             os.close(handle)
 
-    def _look(self, pid: int, folder: int, before: _Looked | None) -> _Looked | None:
-        """Return what is known of a process, or None if it has ended or runs no program."""
+    def _look(
+        self, pid: int, folder: int, before: _Looked | None, begin: datetime
+    ) -> _Looked | None:
+        """Return what is known of a process, or None if it has ended or runs no program.
+
+        ``begin`` is the moment from which the starts of processes count.
+        """
         for _ in range(_MOST_TRIES):
             stat = _stat(folder)
             if stat.is_idle:
@@ -251,7 +254,10 @@ class ProcessTable:
             command: tuple[str, ...] = ()
             try:
                 command = tuple(_words(folder, "cmdline"))
-                process = _examine(pid, folder, command)
+                started = begin + timedelta(seconds=stat.ticks / self._ticks)
+                if before and before.process and before.stat.identity == stat.identity:
+                    started = before.process.started  # the same, whatever the clock is set to
+                process = _examine(pid, folder, command, started)
                 unseen = None
             except (PermissionError, _TooLongError) as error:
                 why = error.strerror or "the operating system refuses it"
@@ -312,7 +318,7 @@ class _TooLongError(OSError):
     """A text of /proc that is longer than sros reads."""
 
 
-def _examine(pid: int, folder: int, command: tuple[str, ...]) -> Process | None:
+def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime) -> Process | None:
     """Return a process if it speaks ROS 2, DDS or Zenoh.
 
     Raises:
@@ -332,14 +338,13 @@ def _examine(pid: int, folder: int, command: tuple[str, ...]) -> Process | None:
         pid,
         command,
         environment,
-        _NO_MOMENT,
+        started,
         libraries,
         _user(folder),
         "" if network == _namespace(Path("/proc/thread-self/ns/net")) else network,
     )
 
 
-_NO_MOMENT = datetime.fromtimestamp(0)
 _FIRST_PID_NAMESPACE = "pid:[4026531836]"
 """The name of the namespace of all processes (PROC_PID_INIT_INO of <linux/proc_ns.h>)."""
 

@@ -14,6 +14,7 @@ from enum import StrEnum
 
 from sros_tool.errors import UsageError
 from sros_tool.runtime.environment import render_environment
+from sros_tool.runtime.variables import DOMAIN, ENABLE, KEYSTORE, STRATEGY
 
 TEMPLATE = "sros@.service"
 """The unit of all nodes; its instance name is the enclave, as `unit_instance` writes it."""
@@ -57,6 +58,7 @@ class Job(StrEnum):
     CHECK = "check"
     METRICS = "metrics"
     FLEET = "fleet"
+    GUARD = "guard"
 
 
 _OFTEN = "*:0/15"
@@ -181,9 +183,9 @@ def node_settings(
 
 
 def job_units(
-    job: Job, keystore: str, *, user: str, sros: str, passphrase: str = ""
+    job: Job, keystore: str, *, user: str, sros: str, passphrase: str = "", domain: int = 0
 ) -> dict[str, str]:
-    """Return the service and the timer of a job by their names.
+    """Return the service and the timer of a job by their names; the guard has no timer.
 
     Args:
         job: the job.
@@ -191,10 +193,13 @@ def job_units(
         user: its owner.
         sros: the path of the program sros.
         passphrase: the path of the file with the passphrase of the CA keys, or "".
+        domain: the ROS domain in which the guard takes open nodes for mistakes.
 
     Raises:
         UsageError: a path cannot be written in a unit.
     """
+    if job is Job.GUARD:
+        return {f"sros-{job}.service": _guard(keystore, sros, domain)}
     name = f"sros-{job}"
     root, program = _check_path(keystore, "the keystore"), _check_path(sros, "the program")
     what, words, own = {
@@ -261,6 +266,33 @@ Persistent=yes
 WantedBy=timers.target
 """
     return {f"{name}.service": service, f"{name}.timer": timer}
+
+
+def _guard(keystore: str, sros: str, domain: int) -> str:
+    """Return the service that watches the processes of a machine as long as it runs."""
+    root = _check_path(keystore, "the keystore")
+    variables = {KEYSTORE: root, ENABLE: "true", STRATEGY: "Enforce", DOMAIN: str(domain)}
+    # Without rights of root that it does not need; only these let it look at all processes.
+    rights = "CapabilityBoundingSet=CAP_SYS_PTRACE CAP_DAC_READ_SEARCH"
+    return f"""\
+{_MADE}
+[Unit]
+Description=Watch the ROS processes of this machine, which the keystore {root} secures
+
+[Service]
+Type=exec
+User=root
+Restart=always
+RestartSec=5
+ExecStart={" ".join((_check_path(sros, "the program"), "check", "runtime", "--watch"))}
+{_lines(render_environment(variables, "systemd").splitlines())}
+{_CLOSED.replace("CapabilityBoundingSet=", rights)}
+PrivateDevices=yes
+RestrictAddressFamilies=AF_UNIX
+
+[Install]
+WantedBy=multi-user.target
+"""
 
 
 def _lines(lines: Iterable[str]) -> str:

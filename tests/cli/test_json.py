@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -225,7 +226,7 @@ WITH_A_GRAPH = {
 }
 
 
-@pytest.mark.parametrize("verb", sorted({*CASES} - {"demo", "doctor", *WITH_A_GRAPH}))
+@pytest.mark.parametrize("verb", sorted({*CASES} - {"check", "demo", "doctor", *WITH_A_GRAPH}))
 def test_what_a_verb_prints(verb: str, made_folder: Path, tmp_path: Path) -> None:
     seen = Seen()
     for case in CASES[verb]:
@@ -249,6 +250,20 @@ def test_what_a_verb_prints_beside_a_graph(
         assert ended.status == status, ended
         seen.check(verb, ended)
     assert seen.unseen(verb) == []
+
+
+def test_what_check_prints(
+    made_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = Seen()
+    for case in CASES["check"]:
+        seen.check("check", both_ways("check", case, made_folder, tmp_path))
+    monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses())
+    monkeypatch.setattr(signal, "sigtimedwait", lambda *_: True)
+    watched = sros("check", "runtime", "--watch", "--json", env={"ROS_SECURITY_ENABLE": None}).ok()
+    assert watched.out.count("\n") == 1
+    seen.check("check", watched)
+    assert seen.unseen("check") == []
 
 
 def test_what_doctor_prints(made_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from sros_tool.pki.certificates import validity_of
+from sros_tool.runtime.processes import (
+    Process,
+    ProcessTable,
+    RunningProcesses,
+    UnseenProcess,
+)
 from tests.support.harness import certificate, policy_text, publish, sros
 
 KINDS = {"certificate", "permissions", "governance", "identity_ca", "permissions_ca"}
@@ -53,6 +60,20 @@ def test_the_expiry_of_every_file_and_the_findings(keystore: Path) -> None:
     shown = {word: float(counts[word]) for word in ("error", "warning", "note")}
     assert {word: number for (word,), number in found["sros_findings"].items()} == shown
     assert sum(found.get("sros_findings_of_kind", {}).values()) == sum(shown.values())
+
+
+def test_the_running_processes_are_counted(
+    keystore: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = Process(7, ("talker",), {}, datetime.now(UTC), network="net:[1]")
+    unseen = UnseenProcess(8, ("init",), "Permission denied", speaks=False)
+    running = RunningProcesses((process,), (unseen,))
+    monkeypatch.setattr(ProcessTable, "look", lambda *_: running)
+    found = read(sros("metrics", keystore, "--runtime").ok().out)
+    assert found["sros_processes"] == {("secured",): 0, ("open",): 1, ("unknown",): 0}
+    assert found["sros_processes_not_seen"][()] == 1
+    assert found["sros_process_findings"]["note", "runtime.process-elsewhere"] == 1
+    assert "sros_processes" not in read(sros("metrics", keystore).ok().out)
 
 
 def test_damage_is_counted_and_makes_no_error(keystore: Path) -> None:

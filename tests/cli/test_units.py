@@ -89,6 +89,18 @@ def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> 
     assert "\nSuccessExitStatus=1\n" in fleet
 
 
+def test_the_guard_watches_with_the_keystore_and_its_domain(made: Path, tmp_path: Path) -> None:
+    words = ("--job", "guard", "--sros", "/usr/bin/sros", "--domain", "3", "--target", "/srv/k")
+    sros("units", made, *words, tmp_path / "units").ok()
+    (unit,) = (tmp_path / "units").iterdir()
+    lines = unit.read_text().splitlines()
+    assert unit.name == "sros-guard.service"
+    assert "ExecStart=/usr/bin/sros check runtime --watch" in lines
+    assert 'Environment="ROS_SECURITY_KEYSTORE=/srv/k"' in lines
+    assert 'Environment="ROS_DOMAIN_ID=3"' in lines
+    assert "CapabilityBoundingSet=CAP_SYS_PTRACE CAP_DAC_READ_SEARCH" in lines
+
+
 @pytest.mark.parametrize(
     ("words", "why"),
     [
@@ -104,6 +116,7 @@ def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> 
         (("/leg", "F", "--", "true"), "cannot be written in a unit"),
         (("/leg", "F", "--", "/bin/true", "a\nUser=root"), "cannot be written in a unit"),
         (("--job", "renew", "F", "--sros", "sros"), "cannot be written in a unit"),
+        (("--job", "guard", "F", "--user", "ros"), "Only root"),
     ],
 )
 def test_what_is_refused_writes_nothing(

@@ -173,6 +173,35 @@ def by_process(
     return dict(found)
 
 
+class Watching:
+    """`sros check runtime --watch --json`, and what it has said so far."""
+
+    def __init__(self, folder: Path) -> None:
+        self._out, self._err = folder / "watch.jsonl", folder / "watch.err"
+        words = ("-m", "sros_tool", "check", "runtime", "--watch", "--json")
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self._process = subprocess.Popen(
+                [sys.executable, *words],
+                env=importing(),
+                stdout=out,
+                stderr=err,
+                preexec_fn=end_with_parent,
+            )
+
+    def changes(self, names: Mapping[int, str]) -> list[tuple[str, str, str]]:
+        """What became of which process with which finding."""
+        found = []
+        for line in self._out.read_text().split("\n")[:-1]:
+            change = json.loads(line)
+            for name in by_process([change["finding"]], names):
+                found.append((change["change"], name, change["finding"]["id"]))
+        return found
+
+    def end(self) -> tuple[int, str]:
+        self._process.terminate()
+        return self._process.wait(), self._err.read_text()
+
+
 def main() -> None:
     enter_isolation()
     with tempfile.TemporaryDirectory() as place:
@@ -181,13 +210,26 @@ def main() -> None:
         started = Started(folder)
         try:
             start_all(started, home, robot, strange)
+            watching = Watching(folder)
+            wait_for(lambda: watching.changes(started.pids()), "the first changes")
             change_files(home, robot)
             said = sros("check", "runtime", "--at", "2d", "--json", "--severity", "note")
             assert said.status in (1, 2), said
             findings = json.loads(said.out)["findings"]
             running = [name for name, child in started.children.items() if child.poll() is None]
-            found = by_process(findings, started.pids())
-            json.dump({"found": found, "running": running}, sys.stdout)
+            names = started.pids()
+            found = by_process(findings, names)
+            wanted = {(name, each) for name, of in found.items() for each in of}
+            wanted.discard(("expired", "runtime.process-expired"))  # it has not expired today
+            wait_for(
+                lambda: {each[1:] for each in watching.changes(names)} >= wanted, "each change"
+            )
+            started.children["open"].kill()
+            over = ("over", "open", "runtime.process-unsecured")
+            wait_for(lambda: over in watching.changes(names), "the end of a process")
+            watched = [list(each) for each in watching.changes(names)]
+            told = {"found": found, "running": running, "watched": watched, "end": watching.end()}
+            json.dump(told, sys.stdout)
         finally:
             started.end()
 

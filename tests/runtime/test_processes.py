@@ -1,0 +1,204 @@
+"""What /proc says is chosen by processes: it is bounded, and taken for nothing else."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from sros_tool.runtime import processes
+from sros_tool.runtime.environment import enclave_argument
+from sros_tool.runtime.process_files import FileReader, LoadedFile, ProcessRoot
+from sros_tool.runtime.processes import ProcessTable, RunningProcesses, _Stat
+
+NOW = datetime(2026, 11, 23, tzinfo=UTC)
+ROS = ("talker", "--ros-args")
+
+
+@dataclass
+class Proc:
+    """A folder such as /proc."""
+
+    path: Path
+
+    def add(
+        self,
+        pid: int,
+        *command: str,
+        environment: bytes = b"",
+        maps: str = "",
+        parent: int = 1,
+        flags: int = 0,
+        start: str = "100",
+    ) -> Path:
+        folder = self.path / str(pid)
+        (folder / "ns").mkdir(parents=True, exist_ok=True)
+        numbers = ["S", str(parent), *"0000", str(flags), *"000000000000", start, "4096", *"00000"]
+        (folder / "stat").write_text(f"{pid} (a) b) {' '.join(numbers)}\n")
+        (folder / "cmdline").write_bytes("\0".join((*command, "")).encode())
+        (folder / "environ").write_bytes(environment)
+        (folder / "maps").write_text(f"7f00-7f01 r-xp 0 08:01 7 {maps}\n" if maps else "")
+        (folder / "status").write_text("Name:\ta\nUid:\t7\t8\t9\t9\n")
+        for link, target in (("ns/net", "net:[1]"), ("cwd", "/"), ("root", str(self.path))):
+            (folder / link).unlink(missing_ok=True)
+            (folder / link).symlink_to(target)
+        return folder
+
+    def look(self, table: ProcessTable | None = None) -> RunningProcesses:
+        return (table or ProcessTable(self.path)).look(NOW)
+
+    def labels(self) -> list[str]:
+        return [each.label for each in self.look().processes]
+
+
+@pytest.fixture
+def proc(tmp_path: Path) -> Proc:
+    (tmp_path / "1").mkdir()
+    return Proc(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("command", "maps", "found"),
+    [
+        (ROS, "", True),
+        (("editor",), "", False),
+        (("editor",), "/usr/lib/librcl.so", True),
+        (("a",), "/opt/ros/jazzy/lib/librmw_zenoh_cpp.so", True),
+        (("a",), "/usr/lib/x86_64-linux-gnu/libddsc.so.0debian.10.2 (deleted)", True),
+        (("a",), "/v/cyclonedds.libs/libddsc-4d7a8b3c.so.11", True),
+        (("a",), "/v/site-packages/zenoh/zenoh.abi3.so", True),
+        (("a",), "/usr/lib/libfastrtps.so.2.14", True),
+        (("a",), "/home/u/notes about librcl.txt", False),
+        (("/usr/bin/zenohd",), "", True),
+        (("python3", "-c", "from ros2cli.daemon import main"), "", True),
+        (("python3", "/opt/_ros2_daemon"), "", True),
+    ],
+)
+def test_who_speaks(command: tuple[str, ...], maps: str, found: bool, proc: Proc) -> None:
+    proc.add(7, *command, maps=maps)
+    assert bool(proc.labels()) is found
+
+
+def test_kernel_threads_and_processes_that_wait_for_a_node_are_none(proc: Proc) -> None:
+    proc.add(5, *ROS, flags=0x00200000)
+    proc.add(7, "timeout", "60", "sros", "run", "ks", "/a", "--", *ROS)
+    assert proc.labels() == []  # sros is about to become the node
+    proc.add(7, "nice", *ROS)
+    proc.add(8, "sh", "-c", "x", parent=7)
+    assert proc.labels() == ["process 7 (nice)"]
+    proc.add(9, *ROS, parent=8)
+    assert proc.labels() == ["process 9 (talker)"]
+    proc.add(7, "nice", *ROS, maps="/lib/librcl.so")
+    assert proc.labels() == ["process 7 (nice)", "process 9 (talker)"]
+
+
+def test_the_first_of_two_variables_counts_as_for_getenv(proc: Proc) -> None:
+    proc.add(7, *ROS, environment=b"ROS_DOMAIN_ID=3\0ROS_DOMAIN_ID=4\0x\0=y\0Z=\xff")
+    (process,) = proc.look().processes
+    assert process.domain == "3"
+    assert process.environment["Z"] == "\udcff"
+    assert (process.user, process.network) == (8, "net:[1]")
+
+
+def test_endless_texts_are_not_looked_at_and_named(proc: Proc) -> None:
+    folder = proc.add(7, *ROS)
+    with (folder / "environ").open("wb") as file:
+        file.truncate(5 * 1024**2)
+    (unseen,) = proc.look().unseen
+    assert unseen.speaks
+    assert unseen.why == "its environ is longer than 4 MiB"
+
+
+def test_a_process_that_always_starts_another_program_is_named(
+    proc: Proc, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    proc.add(7, *ROS)
+    (proc.path / "1").rmdir()
+    programs = (_Stat(1, 1, (str(number),), "1", is_idle=False) for number in range(9))
+    monkeypatch.setattr(processes, "_stat", lambda _: next(programs))
+    (unseen,) = proc.look().unseen
+    assert unseen.why == "it starts one program after the other"
+
+
+def test_what_proc_hides_is_said(proc: Proc) -> None:
+    assert proc.look().hidden == ""
+    (proc.path / "1").rmdir()
+    assert proc.look().hidden
+
+
+def test_only_what_changed_is_read_again_and_another_process_is_another(proc: Proc) -> None:
+    table = ProcessTable(proc.path)
+    folder = proc.add(7, *ROS)
+    first = proc.look(table)
+    assert table.look(NOW + timedelta(seconds=9)) == first
+    (folder / "environ").write_bytes(b"ROS_DOMAIN_ID=5")
+    assert proc.look(table) == first
+    proc.add(7, *ROS, start="900", environment=b"ROS_DOMAIN_ID=5")
+    (process,) = proc.look(table).processes
+    assert process.domain == "5"
+    assert process.started > first.processes[0].started
+
+
+@pytest.mark.parametrize(
+    ("words", "enclave"),
+    [
+        ("--ros-args --enclave /a", "/a"),
+        ("--ros-args -e /a -e /b", "/b"),
+        ("--ros-args -r x:=y -- --enclave /a", "/"),
+        ("--ros-args -- x --ros-args -e /a", "/a"),
+        ("--enclave /a --ros-args", "/"),
+    ],
+)
+def test_the_enclave_of_a_command(words: str, enclave: str) -> None:
+    assert enclave_argument(("talker", *words.split())) == enclave
+
+
+# ── files ──────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Iterator[ProcessRoot]:
+    """The root directory of a process in a container."""
+    (tmp_path / "root/etc").mkdir(parents=True)
+    (tmp_path / "secret").write_text("outside")
+    handle = os.open(tmp_path / "root", os.O_PATH)
+    yield ProcessRoot(handle, FileReader())
+    os.close(handle)
+
+
+def test_no_path_of_a_container_leads_out_of_it(root: ProcessRoot, tmp_path: Path) -> None:
+    inside = tmp_path / "root"
+    (inside / "etc/secret").write_text("inside")
+    (inside / "up").symlink_to("../../../../etc")
+    (inside / "out").symlink_to(f"{tmp_path}/secret")
+    (inside / "circle").symlink_to("/circle")
+    for path in ("/etc/secret", "/up/secret", "/../../etc/secret", "/etc/../../etc/./secret"):
+        assert root.load("x", path).data == b"inside"
+    for path in ("/out", "/secret", "/../secret", f"{tmp_path}/secret", "/etc/\0"):
+        assert root.load("x", path) == LoadedFile("x")
+    assert root.load("x", "/circle").problem
+    assert root.load("x", "/a" * 5000).problem == ""
+
+
+def test_what_is_no_file_is_not_opened(root: ProcessRoot, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "root/pipe")
+    with (tmp_path / "root/endless").open("wb") as file:
+        file.truncate(17 * 1024**2)
+    for path in ("/pipe", "/etc", "/endless"):
+        assert root.load("x", path).problem
+
+
+def test_a_replaced_link_is_a_change(root: ProcessRoot, tmp_path: Path) -> None:
+    (tmp_path / "root/old").mkdir()
+    (tmp_path / "root/old/f").write_text("1")
+    before = root.load("x", "/old/f").changed
+    assert before is not None
+    while datetime.now(UTC) - before < timedelta(milliseconds=20):  # the clock of the kernel ticks
+        (tmp_path / "tick").touch()
+    (tmp_path / "root/live").symlink_to("old")
+    after = root.load("x", "/live/f").changed
+    assert after is not None and after > before
