@@ -151,8 +151,9 @@ def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
     may = not isinstance(requirement, Must)
     if not may and any(each.enclave in world.idle for each in witness.uses):
         return
+    confirm = world.confirm if may else world.confirm_own
     for use in witness.uses:
-        if world.confirm(use.enclave, use.writes, use.topic) is not may:
+        if confirm(use.enclave, use.writes, use.topic) is not may:
             raise AssertionError(f"{world.title} decides otherwise on {use}, for {requirement}")
 
 
@@ -251,7 +252,7 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
             for part in _parts_of(right):
                 own = NameSet()
                 if enclave not in world.idle:
-                    own = world.side(part.writes).of.get(enclave, own)
+                    own = _own(world, enclave, part.writes)
                 topics = part.topics(name)
                 # Of a wildcard, only names that a node can have are asked for.
                 topic = (topics.valid() - own).example(limit, longest=world.longest)
@@ -260,9 +261,17 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
     if lacking:
         return Witness((min(lacking, key=_better),))
     for writes, topic in world.needed:
-        if topic not in world.side(writes).of[enclave]:
+        if topic not in _own(world, enclave, writes):
             return Witness((Use(enclave, "", topic, topic, writes),))
     return None
+
+
+def _own(world: World, enclave: str, writes: bool) -> NameSet:
+    """Return what an enclave may write, or read, by its own permissions."""
+    access = world.own.get(enclave)
+    if access is None:
+        return NameSet()
+    return access.writes if writes else access.reads
 
 
 def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
@@ -23,15 +23,20 @@ from sros_tool.proof.requirements import (
     demand,
 )
 from sros_tool.proof.system import System
+from sros_tool.proof.worlds import World
 from sros_tool.topics import service_of
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One use of a witness, and the right that states it; None if nothing does."""
+    """One use of a witness, and the right that states it; None if nothing does.
+
+    ``lender`` is the enclave that has this right, if the use is by its permissions, or "".
+    """
 
     use: Use
     place: Place | None
+    lender: str = ""
 
     @property
     def source(self) -> Source | None:
@@ -42,7 +47,9 @@ class Step:
         """Return text such as ``publish /cmd_vel``, with the wildcard that allows it."""
         right, kind, name, by = self.drawn()
         shown = f"action {name}" if kind == "actions" else name
-        return f"{right or ('write' if self.use.writes else 'read')} {shown}" + (by and f" by {by}")
+        text = f"{right or ('write' if self.use.writes else 'read')} {shown}"
+        text += f" by {by}" if by else ""
+        return f"{text} with the permissions of {self.lender}" if self.lender else text
 
     def drawn(self) -> tuple[str, str, str, str]:
         """Return right, kind and name as a policy states them, and the wildcard that allows it.
@@ -109,8 +116,8 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
         verdicts = list(worlds.decide(requirement, limit))
         broken = [(world, each.witness) for world, each in verdicts if each.witness]
         if broken:
-            witness = min((each for _, each in broken), key=lambda each: len(each.uses))
-            steps = tuple(Step(use, system.places.find(use)) for use in witness.uses)
+            world, witness = min(broken, key=lambda each: len(each[1].uses))
+            steps = tuple(_step(use, world, system) for use in witness.uses)
             titles = tuple(world.title for world, _ in broken)
             titles = () if len(broken) == len(system.worlds) else titles
             known = {each for world in system.worlds for each in world.enclaves}
@@ -121,6 +128,13 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
         if not broken and (names := [each.assumed for _, each in verdicts if each.assumed]):
             assumed.append((requirement, names[0]))
     return Decided(tuple(violations), tuple(vacuous), tuple(assumed))
+
+
+def _step(use: Use, world: World, system: System) -> Step:
+    """Return a use with the right that states it, perhaps that of another enclave."""
+    lender = world.lender(use.enclave, use.writes, use.topic)
+    stating = replace(use, enclave=lender) if lender else use
+    return Step(use, system.places.find(stating), lender)
 
 
 def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:

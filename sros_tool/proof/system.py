@@ -13,6 +13,7 @@ from shlex import quote
 from sros_tool.automata import NameSet
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.subjects import also_fitting
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
@@ -141,10 +142,12 @@ def policy_system(
     protection = (template or load_template(DEFAULT_TEMPLATE)).protection
     governance = governance_for(with_stated(protection, protections), domains)
     demanded = None if template else _demanded(protections)
+    subjects = {each.path: f"CN={each.path}" for each in policy.enclaves}
+    unique = template is not None and template.unique_subject
     signed = {
         each.path: permissions_for(
             each,
-            subject=f"CN={each.path}",
+            subject=subjects[each.path],
             validity=window(at, _PLANNED),
             domains=domains,
         )
@@ -154,10 +157,12 @@ def policy_system(
     for vendor in MEASURED:
         if world in ("", vendor.value):
             access = {
-                name: (Access(vendor, governance, each, f"CN={name}", domain=domain, at=at),)
+                name: (Access(vendor, governance, each, subjects[name], domain=domain, at=at),)
                 for name, each in signed.items()
             }
-            worlds.append(_dds_world(vendor, access, stated, demanded=demanded))
+            granted = {} if unique else {name: (each,) for name, each in subjects.items()}
+            lenders = also_fitting(vendor.traits, subjects, granted)
+            worlds.append(_dds_world(vendor, access, stated, demanded=demanded, lenders=lenders))
     left_out = None
     if world in ("", _ZENOH):
         try:
@@ -196,6 +201,7 @@ def _dds_world(
     title: str = "",
     idle: Collection[str] = (),
     demanded: Mapping[Level, NameSet] | None = None,
+    lenders: Mapping[str, Sequence[str]] | None = None,
 ) -> World:
     """Return the world of a vendor; an enclave may do what one of its accesses gives.
 
@@ -225,6 +231,7 @@ def _dds_world(
         demanded=None if demanded is None else NameSet.union(demanded.values()),
         needed=_OF_EVERY_NODE,
         idle=idle,
+        lenders=lenders or {},
         longest=vendor.traits.longest_topic_name or LONGEST,
     )
 
@@ -329,6 +336,8 @@ def _keystore_system(
             "",
             "Name one with --domain.",
         )
+    subjects = {name: each.subject for name, each in loaded.items() if each.subject}
+    granting = {name: [each.subject for each in some] for name, some in grants.items()}
     moments = {name: (at, *_later(name, grants.get(name, ()), at)) for name in names}
     worlds = []
     for vendor, number in product(MEASURED, domains):
@@ -351,7 +360,8 @@ def _keystore_system(
                 for each, moment in product(possible, moments[name])
             )
             access[name] = tuple(each for each in found if each is not None)
-        worlds.append(_dds_world(vendor, access, stated, title=title, idle=idle))
+        lenders = also_fitting(vendor.traits, subjects, granting)
+        worlds.append(_dds_world(vendor, access, stated, title=title, idle=idle, lenders=lenders))
     if world == _ZENOH or (not world and has_zenoh_files(root)):
         worlds += _zenoh_worlds(root, domain, stated)
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}

@@ -235,9 +235,10 @@ class World:
         demanded: NameSet | None = None,
         needed: Sequence[tuple[bool, str]] = (),
         idle: Collection[str] = (),
+        lenders: Mapping[str, Sequence[str]] = MappingProxyType({}),
         longest: int = LONGEST,
     ) -> None:
-        """Take the access of each enclave.
+        """Take the access that each enclave has by its own permissions.
 
         ``confirm`` decides on one topic without these sets, and ``stated`` has the topics that the
         rights of an enclave name without wildcards.
@@ -247,14 +248,17 @@ class World:
         it, while that of all others is assumed; None if nothing is.  ``needed`` are topics that
         every node has to write (True) and read (False).  ``idle`` are enclaves in which no process
         starts with their files as they are: they may do what their rights give, and are able to do
-        nothing.
+        nothing.  ``lenders`` are the enclaves whose permissions an enclave can use as well, so that
+        it may do what they may do; what it must be able to do, it has to be by its own.
         """
         self.title = title
-        self.confirm = confirm
-        self.stated = stated
+        self.confirm_own = confirm
+        self.lenders = lenders
+        self.own = access
+        self.stated = {name: self._with_lent(name, stated) for name in stated}
         self.longest = longest
         self.enclaves = tuple(sorted(access))
-        self._access = access
+        self._access = {name: self._with_lent(name, access) for name in access}
         self.needed = tuple(needed)
         self.idle = frozenset(idle)
         self._weak = weak
@@ -262,13 +266,33 @@ class World:
         self._readers_of: dict[str, list[str]] = {}
         self._shared: dict[tuple[str, str], str | None] = {}
 
+    def _with_lent(self, name: str, access: Mapping[str, TopicAccess]) -> TopicAccess:
+        every = [access[each] for each in (name, *self.lenders.get(name, ())) if each in access]
+        if len(every) == 1:
+            return every[0]
+        writes, reads = ([e.writes for e in every], [e.reads for e in every])
+        return TopicAccess(NameSet.union(writes), NameSet.union(reads))
+
+    def confirm(self, enclave: str, writes: bool, topic: str) -> bool:
+        """Return whether an enclave may write (or else read) a topic, as the engine decides."""
+        able = (enclave, *self.lenders.get(enclave, ()))
+        return any(self.confirm_own(each, writes, topic) for each in able)
+
+    def lender(self, enclave: str, writes: bool, topic: str) -> str:
+        """Return the enclave without whose permissions another one may not use a topic, or ""."""
+        if enclave not in self.lenders or self.confirm_own(enclave, writes, topic):
+            return ""
+        others = self.lenders[enclave]
+        return next((each for each in others if self.confirm_own(each, writes, topic)), "")
+
     def gives_as(self, other: World) -> bool:
         """Return whether all decisions are those of ``other``: both have equal sets."""
         return (
             (self.longest, self.needed, self.idle) == (other.longest, other.needed, other.idle)
             and self.stated == other.stated
             and (self._weak, self.demanded) == (other._weak, other.demanded)
-            and self._access == other._access
+            and self.own == other.own
+            and self.lenders == other.lenders
         )
 
     @cached_property

@@ -74,6 +74,24 @@ class Finite:
     stated: Mapping[tuple[str, bool], frozenset[str]]
     level: Callable[[str], int]
     """How well the messages of a topic are protected: 0, 1 (signed), or 2 (encrypted)."""
+    own: Finite | None = None
+    """What each enclave may do by its own permissions, if it can use those of others, too."""
+
+    def lending(self) -> Finite:
+        """The world of a vendor that takes the permissions of ``/a/b`` for those of ``/a``, too."""
+
+        def lent(enclave: str, of: Callable[[str], frozenset[str]]) -> frozenset[str]:
+            parts = set(enclave.split("/"))
+            lenders = (each for each in self.writes if parts <= set(each.split("/")))
+            return frozenset().union(*map(of, lenders))
+
+        return Finite(
+            {each: lent(each, self.writes.__getitem__) for each in self.writes},
+            {each: lent(each, self.reads.__getitem__) for each in self.writes},
+            {(e, side): lent(e, lambda of: self.stated[of, side]) for e, side in self.stated},  # noqa: B023
+            self.level,
+            self,
+        )
 
     def may(self, enclave: str, writes: bool, topic: str) -> bool:
         """Whether an enclave may write or read a topic."""
@@ -98,6 +116,7 @@ def breaches(requirement: Requirement, world: Finite) -> Iterator[tuple[str, ...
                         if world.may(enclave, writes, topic):
                             yield (name,)
         case Must(enclave=enclave):
+            world = world.own or world
             for right, patterns in requirement.rights:
                 for name in WITH_PARTS:
                     needed = dds_names(right, name)

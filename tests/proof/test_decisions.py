@@ -13,11 +13,12 @@ from sros_tool.policy.document import read_policy
 from sros_tool.proof.findings import Decided, decide_all, requirement_findings
 from sros_tool.proof.requirements import Only, Protected, parse_requirements
 from sros_tool.proof.suggest import suggest
-from sros_tool.proof.system import System, policy_system
+from sros_tool.proof.system import System, load_system, policy_system
 from sros_tool.resources import templates_dir
-from tests.support.harness import policy_text
+from tests.support.harness import policy_text, sros
 
 NOW = datetime(2027, 1, 1, tzinfo=UTC)
+NOW_SIGNED = datetime.now(UTC)
 
 
 def may(right: str, *names: str) -> str:
@@ -174,3 +175,38 @@ def test_protection_is_that_of_the_policy_and_of_a_chosen_template(
     system = policy_system(policy, at=NOW, template=template)
     found = decide_all(parse_requirements(required.encode(), "r.toml"), system)
     assert (not found.violations, bool(found.assumed)) == PROTECTION[case]
+
+
+SHARED = {"/mux": may("subscribe", "/x"), "/robot/mux": may("publish", "/cmd*")}
+ONLY_MUX = '[[only]]\npublish = ["/cmd_vel"]\nenclaves = ["/robot/mux"]\n'
+
+
+def test_permissions_that_a_vendor_takes_for_ones_own_count() -> None:
+    """Cyclone DDS takes the permissions of ``/robot/mux`` for those of ``/mux``, too."""
+    assert texts(SHARED, ONLY_MUX) == [
+        "/mux: may publish /cmd_vel by /cmd* with the permissions of /robot/mux, but only "
+        "/robot/mux may publish /cmd_vel; with Cyclone DDS 0.10.2 only"
+    ]
+    # Able to do something it has to be by its own permissions.
+    must = '[[must]]\nenclave = "/mux"\npublish = ["/cmd_vel"]\n'
+    assert texts(SHARED, must) == [
+        "/mux: may not publish /cmd_vel, but /mux has to be able to publish /cmd_vel"
+    ]
+    apart = '[[apart]]\nfrom = ["/mux"]\nto = ["/base"]\n'
+    (chain,) = texts(SHARED | {"/base": may("subscribe", "/cmd_vel")}, apart)
+    assert "/mux -publish /cmd_vel by /cmd* with the permissions of /robot/mux-> /base" in chain
+    others = {"/mux2": SHARED["/mux"], "/robot/mux": SHARED["/robot/mux"]}
+    assert texts(others, ONLY_MUX) == []
+
+
+def test_unique_subjects_fit_no_other_permissions(tmp_path: Path) -> None:
+    policy = read_policy(Path("r.xml"), policy_text(SHARED).encode())
+    requirements = parse_requirements(ONLY_MUX.encode(), "r.toml")
+    for template, holds in (("production", True), ("sros2", False)):
+        system = policy_system(policy, at=NOW, template=load_template(template))
+        assert (decide_all(requirements, system).violations == ()) is holds
+        (tmp_path / "r.xml").write_text(policy_text(SHARED))
+        ks = tmp_path / template
+        sros("create_keystore", ks, "--template", template).ok()
+        sros("generate_artifacts", "-k", ks, "-p", tmp_path / "r.xml").ok()
+        assert (decide_all(requirements, load_system(ks, at=NOW_SIGNED)).violations == ()) is holds

@@ -7,10 +7,10 @@ A certificate's subject is the RFC 2253 text that OpenSSL and
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from itertools import takewhile
 
-from sros_tool.dds.decision.vendors import Subjects
+from sros_tool.dds.decision.vendors import Subjects, VendorTraits
 
 _MOST_PARTS = 20  # Cyclone DDS 0.10 refuses a grant's subject of more
 
@@ -18,6 +18,34 @@ _MOST_PARTS = 20  # Cyclone DDS 0.10 refuses a grant's subject of more
 def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
     """Return whether a grant for ``granted`` applies to the certificate subject ``certified``."""
     return _COMPARE[rule](granted, certified)
+
+
+def also_fitting(
+    traits: VendorTraits, certified: Mapping[str, str], granted: Mapping[str, Collection[str]]
+) -> dict[str, tuple[str, ...]]:
+    """Map each enclave to the others whose permissions fit its certificate as well, if any do.
+
+    ``certified`` are the subjects of certificates, ``granted`` those of the grants.
+    """
+    if traits.subjects is not Subjects.SUBSET:  # all others compare the whole subject
+        return {}
+    having: dict[str, set[str]] = {}
+    for name, subjects in granted.items():
+        for part in {each for subject in subjects for each in _SEPARATORS.split(subject.strip())}:
+            having.setdefault(part, set()).add(name)
+    found = {}
+    for name, subject in certified.items():
+        own = escaped(subject) if traits.escapes_subjects else subject
+        several = [having.get(part, set()) for part in _SEPARATORS.split(own) if part]
+        fitting = set.intersection(*sorted(several, key=len)) if several else set()
+        others = tuple(
+            each
+            for each in sorted(fitting - {name})
+            if any(same_subject(traits.subjects, one.strip(), own) for one in granted[each])
+        )
+        if others:
+            found[name] = others
+    return found
 
 
 def escaped(certified: str) -> str:
@@ -110,15 +138,18 @@ def _plain(text: str) -> str:
     return text.strip(" ").replace("\\", "").replace('"', "")
 
 
+_SEPARATORS = re.compile(r"[,/|]")
+
+
 def _subset(granted: str, certified: str) -> bool:
-    parts = [part for part in re.split(r"[,/|]", granted) if part]
+    parts = [part for part in _SEPARATORS.split(granted) if part]
     if len(parts) > _MOST_PARTS:
         return False
     values: dict[str, str] = {}
     for part in parts:
         kind, _, value = part.partition("=")
         values.setdefault(kind, value)
-    wanted = re.split(r"[,/|]", certified)
+    wanted = _SEPARATORS.split(certified)
     if wanted and not wanted[-1]:  # no empty part after a last separator
         wanted.pop()
     for part in wanted:
