@@ -768,6 +768,11 @@ Example:
 @click.option(
     "--discard-edits", is_flag=True, help="Write sros.toml and governance.xml as they were."
 )
+@click.option(
+    "--trust-records",
+    is_flag=True,
+    help="Take the rights on trust that a ledger of version 0.1 has without a chain.",
+)
 @click.option("--next", "next_stage", is_flag=True, help="Do only the next stage.")
 @click.option(
     "--allow-looser", is_flag=True, help="Allow that something becomes possible that was not."
@@ -784,6 +789,7 @@ def update_keystore(
     domain: str | None,
     take_edits: bool,
     discard_edits: bool,
+    trust_records: bool,
     next_stage: bool,
     allow_looser: bool,
     revoke_old: bool,
@@ -816,6 +822,14 @@ def update_keystore(
     ):
         raise UsageError("give only one of --template, --take-edits and --discard-edits")
     chosen = (template_name, values, rules, dropped, domain, take_edits, discard_edits)
+    if trust_records:
+        from sros_tool.keystore.lifecycle.records import trust_records as trust
+
+        if next_stage or any(each not in (None, (), False) for each in chosen):
+            raise UsageError("--trust-records changes nothing else", "", "Give it alone.")
+        update = trust(root, now=now(), keyring=keyring(), dry_run=dry_run)
+        _show_update(update, (), "", dry_run=dry_run, as_json=as_json)
+        return 0
     if not any(each not in (None, (), False) for each in chosen):
         again = f"sros update_keystore {quote(str(root))} --template production --next"
         raise UsageError(
@@ -961,7 +975,7 @@ def _show_update(
             }
         )
         return
-    if not update.done:
+    if not (update.done or update.changes):
         echo("nothing is left to do", err=True)
         print_remarks(update.remarks)
         return

@@ -62,6 +62,12 @@ class RecordedRights:
             return self._last.get(name)
         return None
 
+    def unproven(self) -> dict[str, Entry]:
+        """Return the last entries of enclaves that only lines from before the chain vouch for."""
+        if not self._unchained:
+            return {}
+        return {name: each for name, each in self._last.items() if name not in self._chained}
+
     def policy(self, name: str, digest: str) -> str:
         """Return the SHA-256 of the policy of an enclave's permissions, or "".
 
@@ -72,7 +78,7 @@ class RecordedRights:
         Raises:
             KeystoreError: it is not the last document that the ledger has for the enclave.
         """
-        last = self._last.get(name)
+        last, trust = self._last.get(name), ""
         if last and last.sha256 != digest:
             why = (
                 f"The ledger has others, signed at {last.time}. Perhaps older ones were put back, "
@@ -85,6 +91,10 @@ class RecordedRights:
                 f"Nothing shows whether a line was removed from the first {self._unchained} of the "
                 "ledger, so later ones may be missing."
             )
+            trust = (
+                " If you know that nobody else could change the ledger since version 0.1 of sros "
+                f"wrote it, run `sros update_keystore {quote(str(self._root))} --trust-records`."
+            )
         elif not last and self._complete:
             why = "The ledger has none for this enclave."
         else:
@@ -94,5 +104,5 @@ class RecordedRights:
             why,
             f"State its rights with `sros create_permission {quote(str(self._root))} {name} "
             "POLICY_FILE`, and "
-            "try again.",
+            f"try again.{trust}",
         )

@@ -411,7 +411,7 @@ def _(bench: Bench) -> None:
     own.write_bytes(data)
 
 
-@case("keystore.ledger-unchained")
+@case("keystore.ledger-unchained", "keystore.ledger-unproven")
 def _(bench: Bench) -> None:
     bench.unlink("ledger.p7s")
     ledger = bench.path("ledger.jsonl")

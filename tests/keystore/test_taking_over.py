@@ -114,3 +114,53 @@ def test_a_keystore_of_sros_without_its_records_is_not_one_of_ros2(tmp_path: Pat
     assert ended.status == 2
     assert "not certain that the permissions" in ended.err
     assert "ros2/sros2 made" not in sros("check", root).out
+
+
+# ── version 0.1 of sros ────────────────────────────────────────────────────────────────────
+
+
+def made_by_0_1(root: Path) -> Path:
+    """A keystore whose ledger has neither a chain nor a head, and so nothing to prove itself."""
+    policy = root.parent / "policy.xml"
+    policy.write_text(policy_text({"/a": publish("x"), "/b": publish("y")}))
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("generate_artifacts", "-k", root, "-p", policy).ok()
+    lines = [json.loads(line) for line in (root / "ledger.jsonl").read_text().splitlines()]
+    for line in lines:
+        line.pop("previous", "")
+    (root / "ledger.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (root / "ledger.p7s").unlink()
+    return root
+
+
+def test_a_keystore_of_version_0_1_is_one_finding_with_one_command(tmp_path: Path) -> None:
+    root = made_by_0_1(tmp_path / "ks")
+    refused = sros("renew", root, "/a")
+    assert refused.status == 2 and "--trust-records" in refused.err
+    known = ("--exclude", "enclave.node-cannot-start")
+    ended = sros("check", root, *known)
+    assert paragraphs(ended.out) == 1 and "[keystore.ledger-unproven]" in ended.out
+    trusted = command_in(ended.out[ended.out.index("If you know") :])
+    assert "taken on trust" in sros(*trusted, "--dry-run").ok().err
+    assert sros("renew", root, "/a").status == 2
+    assert "taken on trust" in sros(*trusted).ok().err
+    sros("check", root, *known).ok()
+    sros("renew", root, "/a").ok()
+    assert "left-out" not in sros("zenoh", root).ok().err
+    assert "no enclave" in sros(*trusted).err
+
+
+def test_older_permissions_that_were_put_back_are_not_taken_on_trust(tmp_path: Path) -> None:
+    root = made_by_0_1(tmp_path / "ks")
+    shutil.copy(root / "enclaves/b/permissions.p7s", root / "enclaves/a/permissions.p7s")
+    ended = sros("update_keystore", root, "--trust-records")
+    assert ended.status == 2
+    assert "the permissions of /a are not the last ones in the ledger" in ended.err
+
+
+def test_a_damaged_ledger_is_not_taken_on_trust(tmp_path: Path) -> None:
+    root = made_by_0_1(tmp_path / "ks")
+    with (root / "ledger.jsonl").open("a") as ledger:
+        ledger.write("nothing\n")
+    ended = sros("update_keystore", root, "--trust-records")
+    assert ended.status == 2 and "is damaged" in ended.err

@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.checks.keystores.files import UNREADABLE, key_mode_findings
 from sros_tool.checks.keystores.opened import CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.fleet.enclaves import left_robot_of
@@ -34,6 +34,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.keystore.reader import authority_files
+from sros_tool.keystore.recorded import RecordedRights
 from sros_tool.keystore.settings import edit_remedy
 from sros_tool.pki.certificates import (
     authority_text,
@@ -305,6 +306,19 @@ LEDGER_UNCHAINED = FindingKind(
     "New lines are chained. Once the CAs are replaced (`sros rotate_ca ROOT --next`), the earlier "
     "lines no longer matter.",
 )
+LEDGER_UNPROVEN = FindingKind(
+    "keystore.ledger-unproven",
+    WARNING,
+    "enclaves whose rights only lines of the ledger without a chain vouch for",
+    "Version 0.1 of sros wrote such lines. Whoever removes one of them can put back the "
+    "permissions from before, so `sros renew`, `sros zenoh` and `sros rotate_ca` leave these "
+    "enclaves out or refuse them.",
+    "sros: each line of ledger.jsonl has the digest of the line before, ledger.p7s that of the "
+    "last.",
+    "If you know that nobody else could change the keystore, run `sros update_keystore ROOT "
+    "--trust-records`. Otherwise state the rights again, with `sros generate_artifacts -k ROOT -p "
+    "POLICY_FILE` or `sros create_permission ROOT NAME POLICY_FILE`.",
+)
 CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",
     ERROR,
@@ -390,6 +404,9 @@ def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
         yield LEDGER_DAMAGED.found("ledger", gap, file)
     if count := keystore.ledger.unchained:
         yield LEDGER_UNCHAINED.found("ledger", f"{count} lines have no chain", file)
+        unproven = RecordedRights(keystore.root, keystore.ledger).unproven()
+        if names := [name for name in keystore.names if name in unproven]:
+            yield LEDGER_UNPROVEN.found("ledger", some_names(names), file)
 
 
 def _authority(

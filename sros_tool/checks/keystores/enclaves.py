@@ -29,12 +29,15 @@ from sros_tool.errors import SrosError
 from sros_tool.faults import VENDOR_FAULTS, Fault
 from sros_tool.keystore.issuing.tokens import pin_file_problem, pin_line_break
 from sros_tool.keystore.layout import (
+    IDENTITY,
     IDENTITY_CA_FILE,
     KEY_URI_FILE,
+    PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
     REQUEST,
     ZENOH_FILES,
+    ca_certificate,
     waits_for_answer,
 )
 from sros_tool.keystore.reader import weaknesses
@@ -78,6 +81,11 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
         file = enclave.file(problem.file)
         if enclave.keystore.is_home:
             remedy, root, path = problem.fault.remedy_in(problem.file), "ROOT", quote(file)
+            missing = _SHARED.get(problem.file, "")
+            if missing and not (enclave.keystore.root / missing).exists():
+                remedy = (
+                    f"Restore {missing} from a backup; every exported enclave has a copy of it."
+                )
         else:
             remedy, root = problem.fault.remedy_in_export(problem.file), "KEYSTORE"
             there = f"KEYSTORE/enclaves{quote(enclave.name)}/{problem.file}"
@@ -86,6 +94,12 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
         accepted = enclave.accepts_expiry if problem.fault in _EXPIRED else ""
         yield kind.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
 
+
+_SHARED = {
+    IDENTITY_CA_FILE: ca_certificate(IDENTITY),
+    PERMISSIONS_CA_FILE: ca_certificate(PERMISSIONS),
+}
+"""The files of a keystore to which the links of its enclaves lead, which no verb makes again."""
 
 EXPIRES_SOON = FindingKind(
     "enclave.ends-soon",

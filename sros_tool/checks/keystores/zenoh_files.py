@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterator
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import SrosError
+from sros_tool.faults import Fault
 from sros_tool.keystore.layout import PERMISSIONS, SETTINGS, enclave_path
 from sros_tool.keystore.reader import open_enclave, open_keystore
 from sros_tool.keystore.zenoh.opened import OpenedZenoh, ZenohFault, open_zenoh
@@ -66,8 +67,11 @@ LEFT_OUT = FindingKind(
     "an enclave that has no rights on Zenoh",
     "It gets no configuration, and all others deny it everything.",
     _SOURCE,
-    "Renew it with `sros renew ROOT NAME`, or revoke it if nobody needs it.",
+    "State its rights with `sros create_permission ROOT NAME POLICY_FILE`, or revoke it if nobody "
+    "needs it.",
 )
+_RENEW = "Renew it with `sros renew ROOT NAME`, or revoke it if nobody needs it."
+_EXPIRED = {Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED}
 CANNOT_BE_MADE = FindingKind(
     "zenoh.cannot-be-made",
     ERROR,
@@ -140,7 +144,10 @@ def check_network(
             yield from _of_drift(keystore, each)
     for name, why in left_out.items():
         if only is None or name in only:
-            yield LEFT_OUT.found(name, why.rstrip("."), str(enclave_path(keystore.root, name)))
+            folder = enclave_path(keystore.root, name)
+            faults = {e.fault for e in open_enclave(folder, now=keystore.now).problems_at_home}
+            remedy = _RENEW if faults and faults <= _EXPIRED else ""
+            yield LEFT_OUT.found(name, why.rstrip("."), str(folder), remedy=remedy)
 
 
 def _of_drift(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
