@@ -36,11 +36,13 @@ ALL = {"policy": POLICY, "requirements": REQUIRED}
 @pytest.fixture(scope="module")
 def origin(tmp_path_factory: pytest.TempPathFactory) -> Origin:
     made = Origin(tmp_path_factory.mktemp("origin"))
+    made.commit({"README": "A robot.\n"}, "same")
+    made.git("rm", "--quiet", "README")
     made.commit({POLICY: policy(WIDER)}, "wider")
     made.commit({POLICY: policy(BEFORE).replace("ALLOW", "PERMIT")}, "broken")
     looser = REQUIREMENTS.replace("/cmd_vel", "/status").replace("/mux", "/web")
     made.commit({POLICY: policy(WIDER), REQUIRED: looser}, "dropped")
-    made.git("checkout", "--quiet", "main")
+    made.git("checkout", "--quiet", "same")
     return made
 
 
@@ -65,7 +67,7 @@ def run_action(origin: Origin, clone: Path, **inputs: str) -> tuple[int, str, di
 
 
 def test_the_action_on_pull_requests(origin: Origin, tmp_path: Path) -> None:
-    status, said, _ = run_action(origin, origin.clone(tmp_path / "same", "main"), **ALL)
+    status, said, _ = run_action(origin, origin.clone(tmp_path / "same", "same"), **ALL)
     assert status == 0, said
     assert said.startswith("## Review: nothing found\n")
     assert "nobody gets more access" in said
@@ -168,6 +170,8 @@ def test_what_cannot_be_compared_fails_in_the_action(origin: Origin, tmp_path: P
         ({"summary": "review.md"}, "'review.md' is in the repository"),
         ({"sarif": "robot/../.git/x"}, "'robot/../.git/x' is in the repository"),
         ({"head": "main"}, "neither the full id of a commit nor a full reference"),
+        ({"base": "refs/heads/same"}, "both commits are the same"),
+        ({"keystore": "robot/common"}, "'robot/common' is no keystore"),
     ],
 )
 def test_what_cannot_be_decided(origin: Origin, inputs: dict[str, str], said: str) -> None:
@@ -241,7 +245,7 @@ def test_the_hooks(origin: Origin, tmp_path: Path) -> None:
         each["entry"] = f"{origin.python} -I -m sros_tool {verb}"
     everything = set(arguments)
     failing: dict[str, set[str]] = {
-        "main": set(),
+        "same": set(),
         "wider": everything - {"sros-policy"},
         "broken": everything,
     }

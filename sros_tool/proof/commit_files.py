@@ -8,7 +8,6 @@ or made, but those of a keystore that stay in the keystore.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -22,7 +21,6 @@ from sros_tool.xml import parse
 
 _MOST_ENTRIES = 200_000
 _MOST_BYTES = 512 * 1024 * 1024
-_AT_ONCE = 64 * 1024 * 1024
 
 
 def checked_path(text: str) -> str:
@@ -120,11 +118,13 @@ class CommitFiles:
             if each.mode not in (*FILES, LINK):
                 raise self._no_file(where, each)
             (links if each.mode == LINK else plain)[where] = each
-        for part in self._parts(list({**plain, **links}.items())):
-            contents = self.repository.contents(each.id for _, each in part)
-            for where, each in part:
-                if where in plain:
-                    self._write(where, each, contents[each.id])
+        places: dict[str, list[str]] = {}
+        for where, each in plain.items():
+            places.setdefault(each.id, []).append(where)
+        for part in self.repository.contents_in_parts(places, _MOST_BYTES):
+            for digits, content in part.items():
+                for where in places[digits]:
+                    self._write(where, plain[where], content)
         contents = self.repository.contents(each.id for each in links.values())
         top = self.folder / path
         with Folder(self.folder) as folder:
@@ -192,23 +192,6 @@ class CommitFiles:
                 folder.write(path, content, 0o600)
             self.files[path] = entry
         return self.folder / path
-
-    def _parts(self, entries: Sequence[tuple[str, TreeEntry]]) -> list[list[tuple[str, TreeEntry]]]:
-        """Return entries in parts, whose contents fit into memory."""
-        sizes = self.repository.sizes(dict.fromkeys(each.id for _, each in entries))
-        parts: list[list[tuple[str, TreeEntry]]] = []
-        total, room = 0, 0
-        for each in entries:
-            size = sizes.get(each[1].id, 0)
-            total += size
-            room -= size
-            if room < 0 or not parts:
-                parts.append([])
-                room = _AT_ONCE
-            parts[-1].append(each)
-        if total > _MOST_BYTES:
-            raise DocumentError(f"the commit has more than {_MOST_BYTES} bytes there")
-        return parts
 
     def _no_file(self, path: str, entry: TreeEntry) -> DocumentError:
         return DocumentError(

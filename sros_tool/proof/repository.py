@@ -26,6 +26,7 @@ FILES = ("100644", "100755", "100664")
 
 _MOST_BYTES = 32 * 1024 * 1024
 """Bytes of the largest object that is read."""
+_AT_ONCE = 64 * 1024 * 1024
 _MOST_TAGS = 10
 _WAIT = 60  # seconds
 _WAIT_FOR_SERVER = 600
@@ -35,7 +36,6 @@ _SAFE = (
     *("-c", "core.fsmonitor=false"),
     *("-c", "core.hooksPath=/dev/null"),
     *("-c", "core.alternateRefsCommand=:"),
-    *("-c", "safe.bareRepository=explicit"),
 )
 _READING = {"GIT_ALLOW_PROTOCOL": "", "GIT_NO_LAZY_FETCH": "1"}
 _FETCHING = {"GIT_ALLOW_PROTOCOL": "file:git:http:https:ssh"}
@@ -43,6 +43,7 @@ _ALWAYS = {
     "GIT_NO_REPLACE_OBJECTS": "1",
     "GIT_OPTIONAL_LOCKS": "0",
     "GIT_TERMINAL_PROMPT": "0",
+    **dict.fromkeys(("GIT_TRACE", "GIT_TRACE2", "GIT_TRACE2_EVENT", "GIT_TRACE2_PERF"), "0"),
     "LC_ALL": "C",
 }
 _ELSEWHERE = (
@@ -257,6 +258,26 @@ class Repository:
             entry = found
             gone.append(part)
         return entry
+
+    def contents_in_parts(self, ids: Iterable[str], most: int) -> Iterator[dict[str, bytes]]:
+        """Yield the contents of files by id, in parts that fit into memory.
+
+        Raises:
+            DocumentError: as of `contents`, or all of them have more than ``most`` bytes.
+        """
+        known = self.sizes(wanted := dict.fromkeys(ids))
+        sizes = {each: known.get(each, 0) for each in wanted}  # what is missing is an error below
+        if sum(sizes.values()) > most:
+            raise DocumentError(f"the commit has more than {most} bytes there")
+        part: list[str] = []
+        room = _AT_ONCE
+        for each, size in sizes.items():
+            if part and size > room:
+                yield self.contents(part)
+                part, room = [], _AT_ONCE
+            part.append(each)
+            room -= size
+        yield self.contents(part)
 
     def content(self, digits: str) -> bytes:
         """Return the content of a file, as `contents`; many policies include the same ones."""

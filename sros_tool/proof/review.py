@@ -25,7 +25,7 @@ from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.model import Fleet
 from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import Lifetime, Threshold, UnreadableEnclave, due_enclaves
-from sros_tool.keystore.layout import KEY_FILE, SETTINGS
+from sros_tool.keystore.layout import KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.policy.model import Policy
@@ -42,8 +42,12 @@ _HEAD, _BASE = "HEAD", "BASE"
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
 _MOST_ENTRIES = 200_000
 _MOST_CHANGED = 20_000
-_MOST_OUTSIDE = 8 * 1024 * 1024
-"""Bytes of the largest changed file of which it is looked whether it is a policy."""
+_MOST_BYTES = 1024 * 1024 * 1024
+_MOST_OUTSIDE = 32 * 1024 * 1024
+"""Bytes of the largest changed file of which it is looked whether it is a policy.
+
+No policy is larger.
+"""
 _OF_POLICIES = ((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns="))
 """What an XML file that is a policy, or a part of one, has, and what follows in it."""
 _OK, _FOUND, _UNDECIDED = 0, 1, 2
@@ -225,12 +229,20 @@ class _Review:
 
     def all(self) -> Iterator[ReviewStep]:
         asked = self.request
+        if asked.base == asked.head:
+            same = DocumentError(
+                "both commits are the same, so that nothing would be compared",
+                "",
+                "Check out the commit of the change (GitHub's pull_request_target does not), or "
+                "ask for no comparison: --base none.",
+            )
+            yield ReviewStep("files", "", _UNDECIDED, same)
         head_fleet = yield from self._fleet(self.head)
         base_fleet = yield from self._fleet(self.base)
         of_head = yield from self._policies(self.head, head_fleet)
         of_base: list[Path] = []
         if self.base:
-            with suppress(SrosError):  # said by the comparison
+            with suppress(SrosError, OSError):  # said by the comparison
                 of_base = [
                     file
                     for path in asked.policies
@@ -324,6 +336,8 @@ class _Review:
                 folder = side.tree(path)
                 if not folder:
                     raise self._missing(path)
+                if not is_keystore(folder):
+                    raise DocumentError(f"'{path}' is no keystore", "It has no enclaves in it.")
                 found[path] = folder
             except (SrosError, OSError) as error:
                 known = error if isinstance(error, SrosError) else DocumentError(str(error))
@@ -394,14 +408,14 @@ class _Review:
             and not any(f"{path}/".startswith(f"{each}/") for each in self.request.left_out)
         }
         sizes = side.repository.sizes(dict.fromkeys(each.id for each in wanted.values()))
-        large = [path for path, each in wanted.items() if sizes.get(each.id, 0) > _MOST_OUTSIDE]
-        found = [path for path in large if path.lower().endswith(".xml")]
-        for path, entry in wanted.items():
-            if path not in large:
-                content = side.repository.contents([entry.id])[entry.id]
-                if _may_be_policy(content):
-                    found.append(path)
-        return sorted(found)
+        small = {p: e.id for p, e in wanted.items() if sizes.get(e.id, 0) <= _MOST_OUTSIDE}
+        of_policies = {
+            digits
+            for part in side.repository.contents_in_parts(small.values(), _MOST_BYTES)
+            for digits, content in part.items()
+            if _may_be_policy(content)
+        }
+        return sorted(path for path, digits in small.items() if digits in of_policies)
 
     def left_out(self) -> Iterator[str]:
         """Yield what the review does not say, as clauses."""

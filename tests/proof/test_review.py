@@ -89,6 +89,15 @@ def test_rights_that_move_to_a_second_policy_are_seen(change: Change) -> None:
     assert "policies below 'tests' are not looked at, as asked" in left.out
 
 
+def test_what_a_partial_clone_lacks_is_not_passed_over(change: Change) -> None:
+    change.commit({"evil.xml": policy_text(WIDER)})
+    missing = change.git("rev-parse", "HEAD:evil.xml")
+    (change.folder / ".git" / "objects" / missing[:2] / missing[2:]).unlink()
+    ended = change.review("--policy", "robot.xml")
+    assert ended.status == 2
+    assert f"the object {missing} is not in the repository" in ended.out
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -116,8 +125,10 @@ def test_only_commits_count(change: Change) -> None:
     assert "the checkout has other content than the commit that is reviewed: 'robot.xml'" in (
         ended.out
     )
-    earlier = change.review("--policy", "robot.xml", "--head", change.base)
-    assert earlier.status == 0
+    change.git("update-ref", "refs/heads/other", change.git("rev-parse", "HEAD"))
+    change.commit({"README": "x"})
+    earlier = change.review("--policy", "robot.xml", "--head", "refs/heads/other")
+    assert earlier.status == 1
     assert "the commit that is checked out is another one than the one that is" in earlier.out
 
 
@@ -125,6 +136,7 @@ def test_a_fleet_counts_as_each_commit_has_it(change: Change) -> None:
     fleet = 'enclaves = ["/{robot}"]\n[robots.r1]\n'
     policy = policy_text({"/{robot}": publish("/{robot}/x")})
     change.base = change.commit({"fleet.xml": policy, "fleet.toml": fleet})
+    change.commit({"README": "x"})
     words = ("--policy", "fleet.xml", "--fleet", "fleet.toml")
     assert change.review(*words).status == 0
     change.commit({"fleet.toml": f"{fleet}[robots.r2]\n"})
