@@ -62,9 +62,7 @@ def test_the_expiry_of_every_file_and_the_findings(keystore: Path) -> None:
     assert sum(found.get("sros_findings_of_kind", {}).values()) == sum(shown.values())
 
 
-def test_the_running_processes_are_counted(
-    keystore: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_running_processes_are_counted(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     process = Process(7, ("talker",), {}, datetime.now(UTC), network="net:[1]")
     unseen = UnseenProcess(8, ("init",), "Permission denied", speaks=False)
     running = RunningProcesses((process,), (unseen,))
