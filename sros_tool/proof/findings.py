@@ -76,7 +76,8 @@ class Violation:
     """A requirement that does not hold, the steps of its witness, and the worlds where it does not.
 
     ``worlds`` is empty if it holds in none of those that were decided.  ``missing`` is an enclave
-    of the witness that does not exist, or "".
+    of the witness that does not exist, or "".  ``idle`` says that it is no process that could start
+    with the files of its enclave, whatever its rights are.
     """
 
     requirement: Requirement
@@ -84,6 +85,7 @@ class Violation:
     steps: tuple[Step, ...]
     worlds: tuple[str, ...]
     missing: str = ""
+    idle: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +124,8 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             titles = () if len(broken) == len(system.worlds) else titles
             known = {each for world in system.worlds for each in world.enclaves}
             missing = next((each for each in witness.enclaves if each and each not in known), "")
-            violations.append(Violation(requirement, witness, steps, titles, missing))
+            idle = isinstance(requirement, Must) and requirement.enclave in world.idle
+            violations.append(Violation(requirement, witness, steps, titles, missing, idle))
         if reasons := tuple(_never_fails([each for _, each in verdicts])):
             vacuous.append((requirement, reasons))
         if not broken and (names := [each.assumed for _, each in verdicts if each.assumed]):
@@ -220,7 +223,11 @@ def _fact(violation: Violation) -> str:
         case Apart():
             return f"influences {steps[-1].use.enclave}: {_chain(steps)}"
         case Must():
-            return "does not exist" if violation.missing else f"may not {steps[0].does()}"
+            if violation.missing:
+                return "does not exist"
+            if violation.idle:
+                return "cannot start with its files as they are, which `sros check` shows"
+            return f"may not {steps[0].does()}"
         case Protected():
             return "its messages are not"
         case AtMost():

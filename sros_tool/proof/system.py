@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -23,6 +24,8 @@ from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave, l
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.layout import (
+    KEY_FILE,
+    KEY_URI_FILE,
     PERMISSIONS_FILE,
     enclave_names,
     enclave_path,
@@ -285,6 +288,7 @@ def _stated(enclaves: Iterable[str], rights: Iterable[Right]) -> dict[str, Topic
 # ── a keystore ─────────────────────────────────────────────────────────────────────────────
 
 
+_KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 _MOST_DOMAINS = 20
 _MOST_GOVERNANCES = 4
 
@@ -302,7 +306,14 @@ def _keystore_system(
     source = load_rights(root)
     rights = frozenset(each for each in source.rights if each.qualifier is ALLOW)
     stated = _stated(names, rights)
-    loaded = {name: load_enclave(name, enclave_path(root, name), at=at) for name in names}
+    folders = {name: enclave_path(root, name) for name in names}
+    # Without any key this is the public part of a keystore, and the keys are where it came from.
+    public = not any(
+        os.path.lexists(folder / key) for folder in folders.values() for key in _KEY_FILES
+    )
+    loaded = {name: load_enclave(name, folder, at=at) for name, folder in folders.items()}
+    if public:
+        loaded = {name: replace(each, key_elsewhere=True) for name, each in loaded.items()}
     for name, each in loaded.items():
         if not each.permissions and (file := enclave_path(root, name) / PERMISSIONS_FILE).exists():
             raise KeystoreError(
