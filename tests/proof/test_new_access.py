@@ -437,7 +437,12 @@ def test_nothing_that_a_repository_configures_is_run(repository: Path) -> None:
         (repository / ".git" / "hooks" / each).chmod(0o755)
     sides = ("git:main:policies/robot.xml", "policies/robot.xml")
     assert sros("diff_policy", "--no-new-access", *sides, cwd=repository).status == 0
+    assert not (repository / "sprung").exists()
     # With an object that is missing, git would ask the remote for it.
+    write(repository / "policies", "robot.xml", "/x", "other", INCLUDE)
+    git(repository, "-c", "filter.x.smudge=", "-c", "filter.x.process=", "commit", "-q", "-a",
+        "--no-verify", "-m", "second")  # fmt: skip
+    (repository / "sprung").unlink(missing_ok=True)
     blob = git(repository, "rev-parse", "HEAD:policies/robot.xml").strip()
     missing = repository / ".git" / "objects" / blob[:2] / blob[2:]
     missing.rename(repository / "kept")
