@@ -258,8 +258,9 @@ def test_run_says_nothing_of_the_enclave_where_the_command_names_it(
     done = run([*PROGRAM, "run", keystore, "/a", *ZENOH, "--", node])
     assert done.stdout == "--ros-args --enclave /a\n"
     assert "enclave-argument" not in done.stderr
-    done = run([*PROGRAM, "run", keystore, "/a", *ZENOH, "--", node, "--ros-args", "-e", "/b"])
-    assert "note [zenoh.enclave-argument]" in done.stderr
+    named = ["--", node, "--ros-args", "-e", "/b"]
+    done = run([*PROGRAM, "run", keystore, "/a", *ZENOH, *named], status=2)
+    assert "the command names the enclave /b" in done.stderr
     done = run([*PROGRAM, "run", keystore, "/router", *ZENOH, "--", router])
     assert (done.stdout, done.stderr) == ("\n", "")
 
