@@ -6,15 +6,18 @@ import ast
 import json
 import os
 import re
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 
 from ansible_collections.sros.fleet.plugins.filter.due_units import due_units, without_unit
+from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
 from sros_tool import __version__
 from tests.integration.robots import CHECKOUT
 from tests.support.children import run
+from tests.support.harness import policy_text, publish, sros
 
 COLLECTION = CHECKOUT / "ansible_collections/sros/fleet"
 PLAYS = sorted(path.stem for path in (COLLECTION / "playbooks").glob("*.yml"))
@@ -104,3 +107,24 @@ def test_units_to_restart_are_in_order() -> None:
     changed = ["/r1/camera", "/r1/router"]
     assert due_units(units, changed, ["/r1/router"]) == ["router", "camera", "both", "all"]
     assert without_unit(["/r1/x", "/r1/base"], units[:2]) == ["/r1/x"]
+
+
+@needs_ansible
+def test_a_revoked_robot_is_left_out_and_no_failure(tmp_path: Path) -> None:
+    """Otherwise a robot that was revoked before would stop every delivery to the others."""
+    from ansible_collections.sros.fleet.plugins.action.enclaves import export
+    from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import LeftOutError
+
+    (tmp_path / "policy.xml").write_text(policy_text({"/{robot}/a": publish("a")}))
+    (tmp_path / "fleet.toml").write_text("[robots]\nr1 = {}\nr2 = {}\nr3 = {}\n")
+    words = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
+    sros("generate_artifacts", "-k", tmp_path / "ks", *words).ok()
+    sros("revoke", tmp_path / "ks", "--robot", "r1").ok()
+    shutil.rmtree(tmp_path / "ks/enclaves/r3")
+    arguments = {"keystore": tmp_path / "ks", "program": [sys.executable, "-m", "sros_tool"]}
+    assert export({**arguments, "robot": "r2"})
+    with pytest.raises(LeftOutError, match="All enclaves of r1 are revoked"):
+        export({**arguments, "robot": "r1"})
+    with pytest.raises(RefusedError, match="the robot r3 has no enclave") as refused:
+        export({**arguments, "robot": "r3"})
+    assert not isinstance(refused.value, LeftOutError)

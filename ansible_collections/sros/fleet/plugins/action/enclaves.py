@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import time
 from typing import Any
 
@@ -18,7 +19,10 @@ from ansible_collections.sros.fleet.plugins.plugin_utils.answers import (
     record,
     text,
 )
-from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import RobotAction
+from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import (
+    LeftOutError,
+    RobotAction,
+)
 
 
 class ActionModule(RobotAction):
@@ -57,6 +61,7 @@ def export(arguments: dict[str, Any]) -> bytes:
     """Return the export of a robot's enclaves (``.tar.gz``), which holds their keys.
 
     Raises:
+        LeftOutError: all enclaves of the robot are revoked.
         RefusedError: sros refuses; the text is what it says.
     """
     program = arguments.get("program") or ["sros"]
@@ -68,5 +73,17 @@ def export(arguments: dict[str, Any]) -> bytes:
         words += ["--robot", str(arguments["robot"])]
     done = ask([*program, *words, "-"])
     if done.returncode:
+        if not patterns and _is_revoked(program, arguments):
+            raise LeftOutError(f"All enclaves of {arguments['robot']} are revoked.")
         raise RefusedError(decoded(done.stderr))
     return bytes(done.stdout)
+
+
+def _is_revoked(program: list[str], arguments: dict[str, Any]) -> bool:
+    """Return whether the keystore has no enclave of a robot any more, because they are revoked."""
+    words = ["fleet", "status", str(arguments["keystore"]), "--robot", str(arguments["robot"])]
+    done = ask([*program, *words, "--json"])
+    if done.returncode not in (0, 1):
+        return False
+    (robot,) = json.loads(done.stdout)["robots"]
+    return not robot["enclaves"] and bool(robot["revoked"])

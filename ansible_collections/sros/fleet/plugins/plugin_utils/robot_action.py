@@ -18,6 +18,10 @@ _INTERPRETER = re.compile(r"(ansible_)?discovered_interpreter_\w+")
 _PROGRAM = re.compile(r"/[A-Za-z0-9_./+-]{1,200}")
 
 
+class LeftOutError(RefusedError):
+    """There is nothing to do on this robot, which is no failure."""
+
+
 class RobotAction(ActionBase):  # type: ignore[misc]
     """Run a module on a robot, and return of its answer only what is in ``readers``.
 
@@ -49,6 +53,8 @@ class RobotAction(ActionBase):  # type: ignore[misc]
             )
         except AnsibleConnectionFailure as error:
             lost = harmless(str(error))
+        except LeftOutError as error:
+            return {"skipped": True, "skip_reason": str(error)}
         except (AnsibleError, RefusedError) as error:
             return {"failed": True, "msg": harmless(str(error))}
         if lost:  # raised out of the handler, so that no cause is printed with it
