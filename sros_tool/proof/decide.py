@@ -16,16 +16,19 @@ from fnmatch import fnmatchcase
 from functools import lru_cache
 
 from sros_tool.automata import NameSet, SearchLimit
-from sros_tool.names import is_expression
+from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import RIGHTS
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.flow import TopicHop, shortest_chain
 from sros_tool.proof.requirements import (
+    EXCEPT,
     Apart,
     AtMost,
     Must,
     Nobody,
+    NotBoth,
+    NothingBut,
     Only,
     Protected,
     Requirement,
@@ -130,6 +133,10 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
             witness = _too_many(requirement, world, limit)
         case Widest():
             witness = _too_wide(requirement, world, limit)
+        case NothingBut():
+            witness = _more_than(requirement, world, limit)
+        case NotBoth():
+            witness = _both(requirement, world, limit)
         case Protected():
             witness = _unprotected(requirement, world, limit)
         case Apart():
@@ -207,8 +214,11 @@ def _each(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
                 yield right, part, part.topics(name)
 
 
-def _match(patterns: Iterable[str], enclave: str) -> bool:
-    return any(fnmatchcase(enclave, each) for each in patterns)
+def _match(patterns: Sequence[str], enclave: str) -> bool:
+    """Return whether a list of enclaves has an enclave: by a pattern, and excepted by none."""
+    return any(fnmatchcase(enclave, each) for each in patterns if each[0] != EXCEPT) and not any(
+        fnmatchcase(enclave, each[1:]) for each in patterns if each[0] == EXCEPT
+    )
 
 
 def _use(enclave: str, right: str, part: _Part, topics: Topics, topic: str) -> Use:
@@ -225,15 +235,22 @@ def _better(use: Use) -> tuple[int, str, str]:
 
 def _not_alone(requirement: Only | Nobody, world: World, limit: SearchLimit) -> Witness | None:
     allowed = requirement.enclaves if isinstance(requirement, Only) else ()
+    return _first_of(_first_uses(requirement.rights, world, limit, allowed).values())
+
+
+def _first_uses(
+    rights: RightNames, world: World, limit: SearchLimit, without: Sequence[str] = ()
+) -> dict[str, Use]:
+    """Map the enclaves that have one of some rights to the shortest use, except ``without``."""
     found: dict[str, Use] = {}
-    for right, part, topics in _each(requirement.rights):
+    for right, part, topics in _each(rights):
         for met in world.side(part.writes).meeting(topics, limit):
-            if _match(allowed, met.enclave):
+            if _match(without, met.enclave):
                 continue
             if topic := world.use(met, topics, limit):
                 use = _use(met.enclave, right, part, topics, topic)
                 found[met.enclave] = min(use, found.get(met.enclave, use), key=_better)
-    return _first_of(found.values())
+    return found
 
 
 def _first_of(uses: Collection[Use]) -> Witness | None:
@@ -374,6 +391,43 @@ def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness 
     return _first_of(found.values())
 
 
+_WRITTEN_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/rosout", "rt/parameter_events"))
+_READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
+
+
+def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Witness | None:
+    """Return the shortest name of which an enclave may do more than it should."""
+    enclaves = [each for each in world.enclaves if _match(requirement.enclaves, each)]
+    found: dict[str, Use] = {}
+    for writes, ordinary in ((True, _WRITTEN_BY_EVERY_NODE), (False, _READ_BY_EVERY_NODE)):
+        allowed = NameSet.union(
+            part.topics(name).every()
+            for right, names in requirement.rights
+            for part in _parts_of(right)
+            if part.writes is writes
+            for name in names
+        )
+        for enclave in enclaves:
+            more = world.side(writes).of[enclave] - allowed - ordinary
+            if topic := world.any_example(more, limit):
+                right, name = _in_ros_terms(topic, writes=writes)
+                use = Use(enclave, right, name, topic, writes)
+                found[enclave] = min(use, found.get(enclave, use), key=_better)
+    return _first_of(found.values())
+
+
+def _both(requirement: NotBoth, world: World, limit: SearchLimit) -> Witness | None:
+    """Return a use of each side by one enclave, the shortest ones."""
+    sides = [
+        _first_uses(rights, world, limit) for rights in (requirement.first, requirement.second)
+    ]
+    pairs = {each: (use, sides[1][each]) for each, use in sides[0].items() if each in sides[1]}
+    if not pairs:
+        return None
+    best = min(pairs, key=lambda each: [_better(use) for use in pairs[each]])
+    return Witness(pairs[best], tuple(sorted(pairs.keys() - {best})))
+
+
 def _unprotected(requirement: Protected, world: World, limit: SearchLimit) -> Witness | None:
     """Return the shortest name whose messages are not protected as demanded."""
     weak = world.weaker(requirement.level)
@@ -460,16 +514,21 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
     match requirement:
         case Only():
             patterns = requirement.enclaves
-        case Widest():
+        case Widest() | NothingBut():
             patterns = requirement.enclaves
         case Apart():
             patterns = (*requirement.sources, *requirement.targets, *requirement.through)
     for each in dict.fromkeys(patterns):
-        if not any(fnmatchcase(enclave, each) for enclave in world.enclaves):
+        if not any(fnmatchcase(enclave, each.removeprefix(EXCEPT)) for enclave in world.enclaves):
             yield f"enclave {each}"
     match requirement:
-        case Only() | AtMost():
-            for right, names in requirement.rights:
+        case Only() | AtMost() | NotBoth():
+            sides = (
+                (*requirement.first, *requirement.second)
+                if isinstance(requirement, NotBoth)
+                else requirement.rights
+            )
+            for right, names in sides:
                 for name in names:
                     if not _anybody(world, _doing(right), name, limit):
                         yield _named(right, name)

@@ -14,14 +14,18 @@ from sros_tool.checks.requirements import DROPPED
 from sros_tool.policy.patterns import covers, overlap
 from sros_tool.policy.protection import Level
 from sros_tool.proof.requirements import (
+    EXCEPT,
     Apart,
     AtMost,
     Must,
     Nobody,
+    NotBoth,
+    NothingBut,
     OfRights,
     Only,
     Protected,
     Requirement,
+    RightNames,
     Widest,
     demand,
 )
@@ -123,8 +127,15 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
     match requirement:
         case Widest(rights=rights, enclaves=enclaves):
             for each in rights:
-                for enclave in enclaves:
-                    yield replace(requirement, rights=(each,), enclaves=(enclave,))
+                for some in _one_by_one(enclaves):
+                    yield replace(requirement, rights=(each,), enclaves=some)
+        case NothingBut(enclaves=enclaves):
+            for some in _one_by_one(enclaves):
+                yield replace(requirement, enclaves=some)
+        case NotBoth(first=first, second=second):
+            for one in _single_rights(first):
+                for other in _single_rights(second):
+                    yield replace(requirement, first=(one,), second=(other,))
         case (
             Only(rights=rights)
             | Nobody(rights=rights)
@@ -138,11 +149,22 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
             for pair in pairs:
                 yield replace(requirement, names=(pair,))
         case Apart(sources=sources, targets=targets):
-            for source in sources:
-                for target in targets:
-                    yield replace(requirement, sources=(source,), targets=(target,))
+            for source in _one_by_one(sources):
+                for target in _one_by_one(targets):
+                    yield replace(requirement, sources=source, targets=target)
         case _:
             raise AssertionError(requirement)
+
+
+def _one_by_one(enclaves: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """Yield lists of one enclave or pattern each, with what the whole list excepts."""
+    excepted = tuple(each for each in enclaves if each.startswith(EXCEPT))
+    yield from ((each, *excepted) for each in enclaves if not each.startswith(EXCEPT))
+
+
+def _single_rights(rights: RightNames) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield rights to one name each."""
+    yield from ((right, (name,)) for right, names in rights for name in names)
 
 
 def _implies(new: Requirement, old: Requirement) -> bool:
@@ -151,7 +173,7 @@ def _implies(new: Requirement, old: Requirement) -> bool:
         case Nobody(), Only() | AtMost() | Nobody():
             return _right_within(old, new)
         case Only(), Only():
-            return _right_within(old, new) and _all_within(new.enclaves, old.enclaves)
+            return _right_within(old, new) and _enclaves_within(new.enclaves, old.enclaves)
         case Must(), Must():
             return new.enclave == old.enclave and _right_within(old, new)
         case AtMost(), AtMost():
@@ -161,7 +183,18 @@ def _implies(new: Requirement, old: Requirement) -> bool:
             return (
                 right == old_right
                 and _all_within(names, old_names)
-                and _all_within(old.enclaves, new.enclaves)
+                and _enclaves_within(old.enclaves, new.enclaves)
+            )
+        case NothingBut(), NothingBut():
+            return _enclaves_within(old.enclaves, new.enclaves) and all(
+                any(right == one and _all_within(names, some) for one, some in old.rights)
+                for right, names in new.rights
+                if names
+            )
+        case NotBoth(), NotBoth():
+            return all(
+                one[0] == other[0] and covers(one[1][0], other[1][0])
+                for one, other in ((new.first[0], old.first[0]), (new.second[0], old.second[0]))
             )
         case Protected(), Protected():
             ((kind, name),), ((old_kind, old_name),) = new.names, old.names
@@ -169,9 +202,9 @@ def _implies(new: Requirement, old: Requirement) -> bool:
             return kind == old_kind and strong and covers(name, old_name)
         case Apart(), Apart():
             return (
-                _all_within(old.sources, new.sources)
-                and _all_within(old.targets, new.targets)
-                and _all_within(new.through, old.through)
+                _enclaves_within(old.sources, new.sources)
+                and _enclaves_within(old.targets, new.targets)
+                and _enclaves_within(new.through, old.through)
             )
         case _:
             return False
@@ -188,13 +221,30 @@ def _all_within(narrow: Iterable[str], wide: Sequence[str]) -> bool:
     return all(any(covers(one, each) for one in wide) for each in narrow)
 
 
+def _enclaves_within(narrow: Sequence[str], wide: Sequence[str]) -> bool:
+    """Return whether a list of enclaves has no enclave that another list does not have."""
+    ours, others = ([each[1:] for each in of if each.startswith(EXCEPT)] for of in (narrow, wide))
+    some = [each for each in narrow if not each.startswith(EXCEPT)]
+    more = [each for each in wide if not each.startswith(EXCEPT)]
+    free = (e for e in others if any(overlap(e, each) for each in some))
+    return _all_within(some, more) and _all_within(free, ours)
+
+
 def _is_alike(new: Requirement, old: Requirement) -> bool:
     """Return whether two parts are about some of the same names, or enclaves, in the same way."""
     if type(new) is not type(old):
         return False
     match new, old:
         case Widest(), Widest():
-            return new.rights[0][0] == old.rights[0][0] and overlap(*new.enclaves, *old.enclaves)
+            same = new.rights[0][0] == old.rights[0][0]
+            return same and overlap(new.enclaves[0], old.enclaves[0])
+        case NothingBut(), NothingBut():
+            return overlap(new.enclaves[0], old.enclaves[0])
+        case NotBoth(), NotBoth():
+            return all(
+                one[0] == other[0] and overlap(one[1][0], other[1][0])
+                for one, other in ((new.first[0], old.first[0]), (new.second[0], old.second[0]))
+            )
         case Must(), Must() if new.enclave != old.enclave:
             return False
         case OfRights(), OfRights():
@@ -204,6 +254,7 @@ def _is_alike(new: Requirement, old: Requirement) -> bool:
             ((kind, name),), ((old_kind, old_name),) = new.names, old.names
             return kind == old_kind and overlap(name, old_name)
         case Apart(), Apart():
-            return overlap(*new.sources, *old.sources) and overlap(*new.targets, *old.targets)
+            same = overlap(new.sources[0], old.sources[0])
+            return same and overlap(new.targets[0], old.targets[0])
         case _:
             raise AssertionError(old)

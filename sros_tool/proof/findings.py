@@ -18,6 +18,7 @@ from sros_tool.proof.requirements import (
     Apart,
     AtMost,
     Must,
+    NotBoth,
     Protected,
     Requirement,
     demand,
@@ -232,6 +233,8 @@ def _fact(violation: Violation) -> str:
             return "its messages are not"
         case AtMost():
             return f"{_together(steps)}{_others(violation)}"
+        case NotBoth():
+            return f"may {steps[0].does()} and {steps[1].does()}{_others(violation)}"
         case _:
             return f"may {steps[0].does()}{_others(violation)}"
 

@@ -8,7 +8,8 @@ A requirement is a table of the file, such as::
     why = "Commands meet in one place."
 
 Names are absolute ROS names, with the wildcards of policies; enclaves are names or patterns, as for
-``--match``.  What each kind demands is said by its class.
+``--match``, and those that a list excepts have ``!`` before them.  What each kind demands is said
+by its class.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from sros_tool.xml import read_bytes
 _MOST_REQUIREMENTS = 1000
 _MOST_TEXTS = 1000  # of one key
 _LONGEST_TEXT = 500  # characters of a name or a reason
+EXCEPT = "!"
+"""What stands before the enclaves that a list of enclaves excepts."""
 _LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
 
 
@@ -107,6 +110,25 @@ class Widest(OfRights):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class NothingBut(OfRights):
+    """The enclaves have no rights but these, and what every node needs to start."""
+
+    KIND = "nothing_but"
+
+    enclaves: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NotBoth(Requirement):
+    """No enclave has one of the rights ``first`` and one of the rights ``second``."""
+
+    KIND = "not_both"
+
+    first: RightNames
+    second: RightNames
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Protected(Requirement):
     """The messages of all ``names`` (pairs of kind and name) are signed, or encrypted."""
 
@@ -131,7 +153,7 @@ def demand(requirement: Requirement) -> str:
     """Return what a requirement demands, as a clause such as ``nobody may publish /x``."""
     match requirement:
         case Only(rights=rights, enclaves=enclaves):
-            return f"only {_listed(enclaves)} may {_said(rights)}"
+            return f"only {_those(enclaves)} may {_said(rights)}"
         case Nobody(rights=rights):
             return f"nobody may {_said(rights)}"
         case Must(rights=rights, enclave=enclave):
@@ -139,13 +161,17 @@ def demand(requirement: Requirement) -> str:
         case AtMost(rights=rights, most=most):
             return f"at most {most} enclave{'' if most == 1 else 's'} may {_said(rights)}"
         case Widest(rights=rights, enclaves=enclaves):
-            return f"wildcards may let {_listed(enclaves)} only {_said(rights)}"
+            return f"wildcards may let {_those(enclaves)} only {_said(rights)}"
+        case NothingBut(rights=rights, enclaves=enclaves):
+            return f"{_those(enclaves)} may do nothing but {_said(rights)}"
+        case NotBoth(first=first, second=second):
+            return f"nobody may both {_said(first)} and {_said(second)}"
         case Protected(names=names, level=level):
             shown = _listed([f"{kind.removesuffix('s')} {name}" for kind, name in names])
             return f"{shown} has to be {'encrypted' if level is Level.ENCRYPT else 'signed'}"
         case Apart(sources=sources, targets=targets, through=through):
-            past = f" except through {_listed(through)}" if through else ""
-            return f"{_listed(sources)} must not influence {_listed(targets)}{past}"
+            past = f" except through {_those(through)}" if through else ""
+            return f"{_those(sources)} must not influence {_those(targets)}{past}"
         case _:
             raise AssertionError(requirement)
 
@@ -157,6 +183,14 @@ def _said(rights: RightNames, link: str = "or") -> str:
         for right, names in rights
     )
     return f" {link} ".join(texts)
+
+
+def _those(enclaves: Iterable[str]) -> str:
+    """Return a list of enclaves as text, with those that it excepts."""
+    every = list(enclaves)
+    excepted = [each[len(EXCEPT) :] for each in every if each.startswith(EXCEPT)]
+    text = _listed(each for each in every if not each.startswith(EXCEPT))
+    return f"{text} (but not {_listed(excepted)})" if excepted else text
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -316,14 +350,17 @@ class _Table:
         return found
 
     def enclaves(self, key: str) -> tuple[str, ...]:
-        """Return names and patterns of enclaves."""
+        """Return names and patterns of enclaves, those that are excepted with ``!`` before them."""
         found = self.texts(key)
         for each in found:
-            problem = "" if each == "/" else expression_problem(each)
-            if not problem and each[0] not in "/*?[":
+            name = each.removeprefix(EXCEPT)
+            problem = "" if name == "/" else expression_problem(name)
+            if not problem and name[0] not in "/*?[":
                 problem = "An enclave begins with '/'."
             if problem:
                 raise self.error(key, f"{_short(each)} is no enclave in {key}", problem)
+        if all(each.startswith(EXCEPT) for each in found):
+            raise self.error(key, f"{key} only excepts enclaves", 'Write "*" before them for all.')
         return found
 
     def rights(self, *, least: int = 1) -> RightNames:
@@ -383,6 +420,28 @@ def _widest(table: _Table) -> Widest:
     return Widest(**own, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
 
 
+def _nothing_but(table: _Table) -> NothingBut:
+    own = table.known(*KIND_OF, "enclaves")
+    return NothingBut(**own, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
+
+
+def _not_both(table: _Table) -> NotBoth:
+    rights: list[RightNames] = []
+    own = table.known("first", "second")
+    for key in ("first", "second"):
+        value = table.values.get(key)
+        if not isinstance(value, dict) or not value or set(value) - set(KIND_OF):
+            raise table.error(
+                key,
+                f"{key} has {_short(value)}, and not rights",
+                'Write for example first = { publish = ["/cmd_vel"] }.',
+            )
+        line = table.lines.get(key, table.source.line)
+        inner = _Table(f"not_both.{key}", value, Source(table.source.file, line), {})
+        rights.append(inner.rights())
+    return NotBoth(**own, first=rights[0], second=rights[1])
+
+
 def _protected(table: _Table) -> Protected:
     own = table.known(*RIGHTS, "level")
     level = table.values.get("level")
@@ -412,6 +471,8 @@ _READERS: Mapping[str, Callable[[_Table], Requirement]] = {
     Apart.KIND: _apart,
     AtMost.KIND: _at_most,
     Widest.KIND: _widest,
+    NothingBut.KIND: _nothing_but,
+    NotBoth.KIND: _not_both,
 }
 
 

@@ -332,6 +332,13 @@ class World:
             or found
         )
 
+    def any_example(self, names: NameSet, limit: SearchLimit) -> str | None:
+        """Return a topic of a set, if possible one that is stated, or that nodes can have."""
+        sets = (names, *(names & each for each in _VALID))
+        stated = (next(each.stated(), None) for each in sets)
+        found = (each.example(limit, longest=self.longest) for each in (*sets[1:], names))
+        return next(filter(None, (*stated, *found)), None)
+
     def use(self, met: Meeting, topics: Topics, limit: SearchLimit) -> str | None:
         """Return the best example of the topics that an enclave may use."""
         if met.wild:

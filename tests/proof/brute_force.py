@@ -21,6 +21,8 @@ from sros_tool.proof.requirements import (
     AtMost,
     Must,
     Nobody,
+    NotBoth,
+    NothingBut,
     Only,
     Protected,
     Requirement,
@@ -111,7 +113,7 @@ def breaches(requirement: Requirement, world: Finite) -> Iterator[tuple[str, ...
         case Only() | Nobody():
             allowed = requirement.enclaves if isinstance(requirement, Only) else ()
             for enclave in world.writes:
-                if not any(fnmatchcase(enclave, each) for each in allowed):
+                if not listed(allowed, enclave):
                     for name, topic, writes in doings(requirement.rights):
                         if world.may(enclave, writes, topic):
                             yield (name,)
@@ -138,7 +140,7 @@ def breaches(requirement: Requirement, world: Finite) -> Iterator[tuple[str, ...
                     yield (name,)
         case Widest():
             for enclave in world.writes:
-                if any(fnmatchcase(enclave, each) for each in requirement.enclaves):
+                if listed(requirement.enclaves, enclave):
                     for right, patterns in requirement.rights:
                         for name, topic, writes in doings(((right, ("*",)),)):
                             if any(matches(each, name) for each in patterns):
@@ -147,6 +149,26 @@ def breaches(requirement: Requirement, world: Finite) -> Iterator[tuple[str, ...
                                 enclave, writes, topic
                             ):
                                 yield (name,)
+        case NothingBut(rights=rights, enclaves=enclaves):
+            sides = [
+                {t for r, ns in rights for n in ns for t in dds_names(r, n)[i]} for i in (0, 1)
+            ]
+            for enclave in (each for each in world.writes if listed(enclaves, each)):
+                for allowed, may in zip(sides, (world.writes, world.reads), strict=True):
+                    for topic in may[enclave]:
+                        if not any(matches(each, topic) for each in allowed):
+                            yield (topic[2:].removesuffix("Request").removesuffix("Reply"),)
+        case NotBoth(first=first, second=second):
+            for enclave in world.writes:
+                names, others = (
+                    [
+                        name
+                        for name, topic, writes in doings(of)
+                        if world.may(enclave, writes, topic)
+                    ]
+                    for of in (first, second)
+                )
+                yield from ((name,) for name in names if others)
         case Protected(names=pairs, level=level):
             for kind, pattern in pairs:
                 for name in (each for each in WITH_PARTS if matches(pattern, each)):
@@ -156,6 +178,12 @@ def breaches(requirement: Requirement, world: Finite) -> Iterator[tuple[str, ...
             yield from chains(requirement, world)
         case _:
             raise AssertionError(requirement)
+
+
+def listed(patterns: Collection[str], enclave: str) -> bool:
+    """Whether a list of enclaves, of which some are excepted, has an enclave."""
+    fits = {each[0] == "!" for each in patterns if fnmatchcase(enclave, each.lstrip("!"))}
+    return fits == {False}
 
 
 def doings(rights: Collection[tuple[str, tuple[str, ...]]]) -> Iterator[tuple[str, str, bool]]:
@@ -182,7 +210,7 @@ def chains(requirement: Apart, world: Finite) -> Iterator[tuple[str, ...]]:
     """Yield a shortest chain of enclaves for each source and target."""
 
     def among(patterns: Collection[str]) -> list[str]:
-        return [each for each in world.writes if any(fnmatchcase(each, one) for one in patterns)]
+        return [each for each in world.writes if listed(patterns, each)]
 
     through = set(among(requirement.through))
     for source in among(requirement.sources):

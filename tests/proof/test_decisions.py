@@ -210,3 +210,46 @@ def test_unique_subjects_fit_no_other_permissions(tmp_path: Path) -> None:
         sros("create_keystore", ks, "--template", template).ok()
         sros("generate_artifacts", "-k", ks, "-p", tmp_path / "r.xml").ok()
         assert (decide_all(requirements, load_system(ks, at=NOW_SIGNED)).violations == ()) is holds
+
+
+CAMERA = {
+    "/camera": may("publish", "/image", "/rosout", "/parameter_events")
+    + may("subscribe", "/parameter_events", "/trigger")
+    + may("reply", "/camera/set_*"),
+    "/base": may("subscribe", "/image") + may("publish", "/trigger"),
+}
+NOTHING_BUT = '[[nothing_but]]\nenclaves = ["/camera"]\npublish = ["/image"]\n'
+BOTH = '[[not_both]]\nfirst = { publish = ["/image"] }\nsecond = { %s }\n'
+EXPRESSIBLE = {
+    NOTHING_BUT + 'subscribe = ["/trigger"]\nreply = ["/camera/*"]\n': "",
+    NOTHING_BUT + 'reply = ["/camera/*"]\n': (
+        "/camera: may subscribe /trigger, but /camera may do nothing but publish /image or reply "
+        "/camera/*"
+    ),
+    NOTHING_BUT + 'subscribe = ["/trigger"]\nreply = ["/camera/set_?"]\n': (
+        "/camera: may reply /camera/set_ by /camera/set_*, but /camera may do nothing but publish "
+        "/image or subscribe /trigger or reply /camera/set_?"
+    ),
+    '[[nothing_but]]\nenclaves = ["*", "!/camera"]\nsubscribe = ["/image"]\n': (
+        "/base: may publish /trigger, but * (but not /camera) may do nothing but subscribe /image"
+    ),
+    BOTH % 'reply = ["*/set_x"]': (
+        "/camera: may publish /image and reply /camera/set_x by /camera/set_*, but nobody may "
+        "both publish /image and reply */set_x"
+    ),
+    BOTH % 'publish = ["/trigger"]': "",
+    '[[only]]\npublish = ["/image"]\nenclaves = ["*", "!/camera"]\n': (
+        "/camera: may publish /image, but only * (but not /camera) may publish /image"
+    ),
+    '[[only]]\npublish = ["/image"]\nenclaves = ["*", "!/base"]\n': "",
+    '[[apart]]\nfrom = ["*", "!/camera"]\nto = ["/base"]\n': (
+        "r.toml: no two enclaves are left that it keeps apart: * (but not /camera) must not "
+        "influence /base"
+    ),
+}
+
+
+@pytest.mark.parametrize("required", EXPRESSIBLE)
+def test_what_else_can_be_demanded(required: str) -> None:
+    text = EXPRESSIBLE[required]
+    assert texts(CAMERA, required) == ([text] if text else [])

@@ -20,6 +20,8 @@ WIDEST = '[[widest]]\npublish = ["/a*"]\nsubscribe = []\nenclaves = ["/x"]\n'
 AT_MOST = '[[at_most]]\ncall = ["/go"]\nenclaves = 2\n'
 PROTECTED = '[[protected]]\ntopics = ["/a"]\nlevel = "encrypt"\n'
 MUST = '[[must]]\nenclave = "/x"\npublish = ["/a", "/b"]\n'
+NOTHING_BUT = '[[nothing_but]]\nenclaves = ["/x", "/y"]\npublish = ["/a", "/b*"]\n'
+NOT_BOTH = '[[not_both]]\nfirst = { publish = ["/a"] }\nsecond = { request = ["/b"] }\n'
 
 KEPT = {
     "the same": (ONLY + MUST + PROTECTED, ONLY + MUST + PROTECTED),
@@ -36,6 +38,12 @@ KEPT = {
     "fewer wildcards": (WIDEST, WIDEST.replace("/a*", "/ab*").replace('"/x"', '"*"')),
     "a lower number": (AT_MOST, AT_MOST.replace("2", "1")),
     "stronger": (PROTECTED.replace("encrypt", "sign"), PROTECTED.replace('"/a"', '"/*"')),
+    "less rights of more enclaves": (
+        NOTHING_BUT,
+        NOTHING_BUT.replace('"/y"', '"*"').replace('"/a", ', ""),
+    ),
+    "more that nobody may both": (NOT_BOTH, NOT_BOTH.replace("/a", "/*")),
+    "an exception more": (ONLY, ONLY.replace('"/y"', '"/y", "!/y/z"')),
 }
 WEAKENED = {
     "another enclave": (ONLY, ONLY.replace('"/y"', '"/y", "/z"')),
@@ -51,6 +59,11 @@ WEAKENED = {
     "a higher number": (AT_MOST, AT_MOST.replace("2", "3")),
     "weaker": (PROTECTED, PROTECTED.replace("encrypt", "sign")),
     "less that must work": (MUST, MUST.replace(', "/b"', "")),
+    "an exception less": (ONLY.replace('"/y"', '"/*", "!/z"'), ONLY.replace('"/y"', '"/*"')),
+    "more rights": (NOTHING_BUT, NOTHING_BUT.replace("/b*", "/*")),
+    "fewer enclaves do nothing but": (NOTHING_BUT, NOTHING_BUT.replace(', "/y"', "")),
+    "less that nobody may both": (NOT_BOTH.replace("/a", "/*"), NOT_BOTH),
+    "somebody is not kept apart": (APART, APART.replace('"/web/*"', '"/web/*", "!/web/x"')),
 }
 DROPPED = {
     "another kind": (ONLY, MUST),

@@ -18,6 +18,8 @@ from sros_tool.proof.requirements import (
     AtMost,
     Must,
     Nobody,
+    NotBoth,
+    NothingBut,
     Only,
     Protected,
     Widest,
@@ -59,6 +61,12 @@ through = ["/robot/mux"]
 [[protected]]
 services = ["/x"]
 level = "sign"
+[[nothing_but]]
+enclaves = ["/arm/*", "!/arm/base"]
+subscribe = ["/a"]
+[[not_both]]
+first = { publish = ["/x"] }
+second = { request = ["/y"], call = ["/z"] }
 """
 
 
@@ -91,6 +99,16 @@ def test_every_kind_is_read_with_its_line() -> None:
         ),
         Apart(source=at(24), sources=("/web/*",), targets=("/",), through=("/robot/mux",)),
         Protected(source=at(28), names=(("services", "/x"),), level=Level.SIGN),
+        NothingBut(
+            source=at(31),
+            rights=(("subscribe", ("/a",)),),
+            enclaves=("/arm/*", "!/arm/base"),
+        ),
+        NotBoth(
+            source=at(34),
+            first=(("publish", ("/x",)),),
+            second=(("request", ("/y",)), ("call", ("/z",))),
+        ),
     )
 
 
@@ -104,6 +122,8 @@ def test_each_says_what_it_demands() -> None:
         "topic /camera/*, action /go has to be encrypted",
         "/web/* must not influence / except through /robot/mux",
         "service /x has to be signed",
+        "/arm/* (but not /arm/base) may do nothing but subscribe /a",
+        "nobody may both publish /x and request /y or call action /z",
     ]
 
 
@@ -140,6 +160,12 @@ WRONG = {
     '[[protected]]\ntopics = ["/x"]': "r.toml:1: level has None",
     '[[protected]]\ntopics = ["/x"]\nlevel = "SIGN"': "r.toml:3: level has 'SIGN'",
     '[[protected]]\ntopics = ["/x"]\nlevel = []': "r.toml:3: level has []",
+    '[[only]]\npublish = ["/x"]\nenclaves = ["!/x"]': "r.toml:3: enclaves only excepts enclaves",
+    '[[only]]\npublish = ["/x"]\nenclaves = ["!x"]': "r.toml:3: '!x' is no enclave",
+    "[[not_both]]\nfirst = 1": "r.toml:2: first has 1, and not rights",
+    '[[not_both]]\nfirst = { publish = ["/x"] }': "r.toml:1: second has None",
+    '[[not_both]]\nfirst = { fly = ["/x"] }': "r.toml:2: first has {'fly': ['/x']}",
+    "[[not_both]]\nfirst = { publish = [] }": "r.toml:2: publish is not a list of names",
     '[[protected]]\nlevel = "sign"': "r.toml:1: [[protected]] names nothing",
     '[[apart]]\nfrom = ["/x"]': "r.toml:1: to is missing in [[apart]]",
     f"{NOBODY * 1001}": "more than 1000 requirements",
