@@ -119,8 +119,8 @@ ZENOH_UNREAD = FindingKind(
 PROCESS_ELSEWHERE = FindingKind(
     "runtime.process-elsewhere",
     NOTE,
-    "nodes in other network namespaces",
-    "They are not next to the nodes of this network, and are compared only among themselves.",
+    "a node in another network namespace",
+    "It is not next to the nodes of this network, and is compared only with those next to it.",
     "network_namespaces(7).",
     "Run `sros check runtime` in that network, too, or look whether they are meant to be there.",
     prominent=True,
@@ -166,11 +166,17 @@ def security_of(process: Process) -> Security:
 
 
 def process_findings(
-    environment: Mapping[str, str], running: RunningProcesses, *, now: datetime, zone: tzinfo
+    environment: Mapping[str, str],
+    running: RunningProcesses,
+    *,
+    now: datetime,
+    zone: tzinfo,
+    one_by_one: bool = False,
 ) -> Iterator[Finding]:
     """Yield the findings about running processes, from the place of an environment.
 
-    ``now`` is the time on the clock of this machine, and ``zone`` its time zone.
+    ``now`` is the time on the clock of this machine, and ``zone`` its time zone.  If
+    ``one_by_one``, each open node is a finding where security is not enabled, and else one of all.
     """
     is_secured_here = environment.get(ENABLE) == "true"
     here = ("", environment.get(DOMAIN) or "0")
@@ -179,7 +185,7 @@ def process_findings(
     secured = [each for each in nodes if security[each.pid] is Security.SECURED]
     closed = {_place(each) for each in nodes if each.asks_for_security}
     closed |= {here} if is_secured_here else set()
-    open_nodes: list[str] = []
+    open_nodes: list[Process] = []
     for process in running.processes:
         if process.is_daemon:
             # Each domain has its own daemon; commands ask the daemon of their domain.
@@ -195,8 +201,8 @@ def process_findings(
                 text = f"{_where(process)}, with {ENABLE} not 'true'"
                 yield PROCESS_UNSECURED.found(process.label, text)
             else:
-                open_nodes.append(f"{process.label} {_where(process)}")
-    yield from _not_secured(environment, open_nodes)
+                open_nodes.append(process)
+    yield from _not_secured(environment, open_nodes, one_by_one=one_by_one)
     starts_nodes = is_secured_here and bool(environment.get(ENCLAVE))
     yield from _mixed_vendors(secured, environment if starts_nodes else None)
     yield from _other_keystores(secured, environment if is_secured_here else None)
@@ -301,18 +307,24 @@ def _is_open(environment: Mapping[str, str]) -> bool:
     return not is_zenoh(environment) or bool(enforces_nothing(environment, SESSION_URI))
 
 
-def _not_secured(environment: Mapping[str, str], nodes: list[str]) -> Iterator[Finding]:
+def _not_secured(
+    environment: Mapping[str, str], nodes: Sequence[Process], *, one_by_one: bool
+) -> Iterator[Finding]:
     """Yield a finding, with the open nodes that run, unless the variables ask for security."""
     asks = environment.get(ENABLE) not in (None, "", "false") or asks_in_vain(environment)
     if asks or not _is_open(environment):
+        return
+    if one_by_one:
+        for each in nodes:
+            yield NOT_SECURED.found(each.label, f"it runs open {_where(each)}")
         return
     running = f"; running without it: {_some(nodes)}" if nodes else ""
     yield NOT_SECURED.found(ENABLE, value_text(environment, ENABLE) + running)
 
 
-def _some(labels: Sequence[str]) -> str:
-    more = f" and {len(labels) - _MOST_NODES} more" if len(labels) > _MOST_NODES else ""
-    return f"{', '.join(labels[:_MOST_NODES])}{more}"
+def _some(nodes: Sequence[Process]) -> str:
+    more = f" and {len(nodes) - _MOST_NODES} more" if len(nodes) > _MOST_NODES else ""
+    return ", ".join(f"{each.label} {_where(each)}" for each in nodes[:_MOST_NODES]) + more
 
 
 # ── next to each other ─────────────────────────────────────────────────────────────────────
@@ -418,13 +430,10 @@ _FORM = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
 
 
 def _elsewhere(nodes: Sequence[Process], security: Mapping[int, Security]) -> Iterator[Finding]:
-    others = [each for each in nodes if each.network]
-    if others:
-        networks = len({each.network for each in others})
-        shown = [f"{e.label}, {security[e.pid]}, in domain {e.domain}" for e in others]
-        many = "namespaces" if networks > 1 else "namespace"
-        text = f"{len(others)} in {networks} other {many}: {_some(shown)}"
-        yield PROCESS_ELSEWHERE.found("processes", text)
+    for each in nodes:
+        if each.network:
+            text = f"{security[each.pid]}, in domain {each.domain} of {each.network}"
+            yield PROCESS_ELSEWHERE.found(each.label, text)
 
 
 def _not_seen(running: RunningProcesses) -> Iterator[Finding]:

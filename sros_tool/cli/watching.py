@@ -13,7 +13,6 @@ from sros_tool.terminal import echo, echo_lines, visible_json
 from sros_tool.values import versioned
 
 if TYPE_CHECKING:
-    from sros_tool.checks.kind import Finding
     from sros_tool.checks.registry import FindingFilter
     from sros_tool.runtime.processes import RunningProcesses
 
@@ -43,11 +42,10 @@ def watch_processes(
             running = table.look(moment)
             if judged is None or judged[0] != running or moment - judged[1] >= _AGAIN:
                 judged = running, moment
-                found = process_findings(environment, running, now=moment, zone=zone)
-                shown: list[Finding] = [
-                    each for each in selection.choose(found).shown if each.subject
-                ]
-                for change in news.changes(shown, moment):
+                found = process_findings(
+                    environment, running, now=moment, zone=zone, one_by_one=True
+                )
+                for change in news.changes(selection.choose(found).shown, moment):
                     if as_json:
                         line = json.dumps(versioned(change.as_json()), ensure_ascii=False)
                         echo_lines(visible_json(line))

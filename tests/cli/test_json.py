@@ -8,6 +8,7 @@ import shutil
 import signal
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from sros_tool.demo.casting import CastMember
 from sros_tool.demo.doctor import Diagnosis
 from sros_tool.demo.result import KeystoreSummary
 from sros_tool.runtime import ros2cli
-from sros_tool.runtime.processes import ProcessTable, RunningProcesses
+from sros_tool.runtime.processes import Process, ProcessTable, RunningProcesses
 from sros_tool.runtime.ros2cli import SecurityProvider
 from tests.checks.test_doctor_findings import CYCLONE, RMW
 from tests.cli.json_cases import (
@@ -258,11 +259,13 @@ def test_what_check_prints(
     seen = Seen()
     for case in CASES["check"]:
         seen.check("check", both_ways("check", case, made_folder, tmp_path))
-    monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses())
+    elsewhere = Process(7, ("talker",), {}, datetime.now(UTC), network="net:[1]")
+    monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses((elsewhere,)))
     monkeypatch.setattr(signal, "sigtimedwait", lambda *_: True)
     watched = sros("check", "runtime", "--watch", "--json", env={"ROS_SECURITY_ENABLE": None}).ok()
-    assert watched.out.count("\n") == 1
-    seen.check("check", watched)
+    for line in watched.out.splitlines():
+        seen.check("check", replace(watched, out=line))
+    assert watched.out.count("\n") == 2
     assert seen.unseen("check") == []
 
 

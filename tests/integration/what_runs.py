@@ -65,9 +65,9 @@ class Started:
     ) -> None:
         report = self.folder / f"{name}.jsonl"
         report.touch()
-        command = [*(self.command if dds or LONG else QUIET), *arguments]
-        if command[0] != QUIET[0]:
-            command += ["--report", str(report)]
+        command = [*QUIET, *arguments]
+        if dds or LONG:
+            command = [*self.command, "--report", str(report), *arguments]
 
         def begin() -> None:
             end_with_parent()
@@ -165,9 +165,7 @@ def by_process(
     """Map the processes' names to the ids and texts of the findings about each."""
     found: dict[str, dict[str, str]] = defaultdict(dict)
     for each in findings:
-        place = "subject" if each["id"] != "runtime.process-elsewhere" else "text"
-        subjects = re.findall(r"process (\d+) ", each[place])
-        for pid in subjects:
+        for pid in re.findall(r"process (\d+) ", each["subject"]):
             if int(pid) in names:
                 found[names[int(pid)]][each["id"]] = each["text"]
     return dict(found)
