@@ -150,25 +150,19 @@ def breaches(requirement: Requirement, world: Finite) -> Iterator[tuple[str, ...
                             ):
                                 yield (name,)
         case NothingBut(rights=rights, enclaves=enclaves):
-            sides = [
-                {t for r, ns in rights for n in ns for t in dds_names(r, n)[i]} for i in (0, 1)
-            ]
+            every = [dds_names(right, name) for right, names in rights for name in names]
             for enclave in (each for each in world.writes if listed(enclaves, each)):
-                for allowed, may in zip(sides, (world.writes, world.reads), strict=True):
-                    for topic in may[enclave]:
-                        if not any(matches(each, topic) for each in allowed):
+                for side, given in enumerate((world.writes, world.reads)):
+                    for topic in given[enclave]:
+                        if not any(matches(each, topic) for pair in every for each in pair[side]):
                             yield (topic[2:].removesuffix("Request").removesuffix("Reply"),)
         case NotBoth(first=first, second=second):
             for enclave in world.writes:
-                names, others = (
-                    [
-                        name
-                        for name, topic, writes in doings(of)
-                        if world.may(enclave, writes, topic)
-                    ]
+                one, other = (
+                    [n for n, topic, writes in doings(of) if world.may(enclave, writes, topic)]
                     for of in (first, second)
                 )
-                yield from ((name,) for name in names if others)
+                yield from ((name,) for name in one if other)
         case Protected(names=pairs, level=level):
             for kind, pattern in pairs:
                 for name in (each for each in WITH_PARTS if matches(pattern, each)):
