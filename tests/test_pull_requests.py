@@ -246,7 +246,6 @@ def test_the_hooks(origin: Origin, tmp_path: Path) -> None:
     everything = set(arguments)
     failing: dict[str, set[str]] = {
         "same": set(),
-        "wider": everything - {"sros-policy"},
         "broken": everything,
     }
     for branch, expected in failing.items():

@@ -36,15 +36,16 @@ _MOST = 60_000
 _SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
 _WORDS = {0: "nothing found", 1: "found", 2: "could not be decided"}
 _TITLES = {
-    "files": "Files",
-    "policy": "Policy",
+    "new-access": "New access",
     "requirements": "Requirements",
     "requirements-before": "Requirements of before",
-    "new-access": "New access",
-    "rights": "Rights",
+    "files": "Files",
     "keystore": "Keystore",
     "expiry": "Expiry",
+    "policy": "Policy",
+    "rights": "Rights",
 }
+"""Kinds of steps, what matters most first: what does not fit into a comment is at its end."""
 
 
 class _Lines(click.ParamType[tuple[str, ...]]):
@@ -378,7 +379,7 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
         f"{_SIGNS[each.status]} {_TITLES[each.kind]}"
         f"{' ' + code(result.shown(each.subject)) if each.subject else ''}: "
         f"{code(_sentence(result, each))}"
-        for each in result.steps
+        for each in _by_weight(result)
     )
     count = len(result.left_out)
     out = f", but {count} thing{'s were' if count > 1 else ' was'} left out:" if count else ""
@@ -389,7 +390,7 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     parts += [bounded(map(code, result.left_out), 6000, printed)] if count else []
     parts += [sides, bounded(lines, 12_000, printed)]
     room = _MOST - sum(map(len, parts))
-    for step in sorted(result.steps, key=lambda each: -each.status):
+    for step in _by_weight(result):
         detail = result.shown(_detail(result, step, request))
         if detail and len(detail) > room:
             detail = f"### {_TITLES[step.kind]}: too long for a comment"
@@ -397,6 +398,12 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
             parts.append(detail)
             room -= len(detail) + 2
     return "\n\n".join(each.rstrip("\n") for each in parts) + "\n"
+
+
+def _by_weight(result: Review) -> list[ReviewStep]:
+    """Return the steps, those that fail first, and of them what matters most."""
+    kinds = list(_TITLES)
+    return sorted(result.steps, key=lambda each: (not each.status, kinds.index(each.kind)))
 
 
 def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:

@@ -508,8 +508,8 @@ def _entries(data: bytes, length: int) -> dict[str, TreeEntry]:
         name, data = os.fsdecode(raw), rest[length:]
         if name in found or name in ("", ".", "..") or "/" in name or name.lower() == ".git":
             raise DocumentError(
-                f"a folder of the commit has the name '{name}' twice or in vain",
-                "No file system can have this, and programs take different ones.",
+                f"a folder of the commit has '{name}' twice, or no file can have this name",
+                "Programs differ in what they take for it.",
             )
         found[name] = TreeEntry(mode.decode(errors="replace").lstrip("0"), rest[:length].hex())
     return found

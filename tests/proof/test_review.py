@@ -6,6 +6,7 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -186,6 +187,21 @@ def made_keystores(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for key in [*folder.glob("**/key.pem"), *folder.glob("**/*.key.pem")]:
         key.unlink()
     return folder
+
+
+def test_new_access_is_never_pushed_out_of_a_comment(change: Change, tmp_path: Path) -> None:
+    """Two hundred policies that are broken, with long names, do not."""
+    broken = {f"many/{n:03}{'x' * 150}.policy.xml": "<policy version='0'/>" for n in range(200)}
+    change.base = change.commit({"many/robot.xml": policy_text(ROBOT)})
+    shutil.copytree(change.folder / "common", change.folder / "many" / "common")
+    change.commit({**broken, "robot.xml": policy_text(WIDER)})
+    with TemporaryDirectory() as outside:
+        summary = Path(outside, "review.md")
+        ended = change.review("--policy", "robot.xml\nmany", "--summary", str(summary))
+        text = summary.read_text()
+    assert ended.status == 2
+    assert len(text) < 65_536
+    assert "New access `robot.xml many`" in text.partition("###")[0]
 
 
 # ── names of commits ───────────────────────────────────────────────────────────────────────
