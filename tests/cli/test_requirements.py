@@ -228,14 +228,14 @@ def test_a_keystore_is_decided_as_it_is_signed(keystore: Path, tmp_path: Path) -
     copied = tmp_path / "public"
     shutil.copytree(keystore, copied, symlinks=True)
     (copied / "enclaves" / "mux" / "key.pem").unlink()
-    asked = ("check", copied, *ONLY[2:], "--requirements", tmp_path / "must.toml")
-    ended = sros(*asked)
+    again = ("check", copied, *ONLY[2:], "--requirements", tmp_path / "must.toml")
+    ended = sros(*again)
     assert (ended.status, "/mux: cannot start with its files" in ended.out) == (1, True)
     for key in copied.glob("enclaves/*/key.pem"):
         key.unlink()
-    sros(*asked).ok()
+    sros(*again).ok()
     (tmp_path / "must.toml").write_text('[[must]]\nenclave = "/mux"\npublish = ["/scan"]\n')
-    assert "/mux: may not publish /scan, but" in sros(*asked).out
+    assert "/mux: may not publish /scan, but" in sros(*again).out
 
 
 def test_a_keystore_gives_proposals_that_hold(keystore: Path, tmp_path: Path) -> None:
