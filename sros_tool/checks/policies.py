@@ -631,6 +631,12 @@ def within_root(rights: Collection[Right]) -> str:
     return f"/ has all rights of {some}" if names else ""
 
 
+def only_basic(rights: Collection[Right]) -> bool:
+    """Return whether all rights of an enclave are rights that every node needs."""
+    basics = _basic_rights()
+    return all(basics.cover(each._replace(enclave="/")) for each in rights)
+
+
 @cache
 def _basic_rights() -> Rules:
     """Return the rights that every node needs, as those of the enclave /."""

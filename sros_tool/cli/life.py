@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -312,7 +312,7 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     if as_json:
         print_json(_lists_json(root, lists, result, expires_soon=soon, dry_run=dry_run))
     elif lists:
-        for line in _list_lines(lists):
+        for line in _list_lines(lists, _names(root)):
             echo(line)
     else:
         echo("nothing was ever revoked", err=True)
@@ -327,14 +327,22 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     return 1 if soon else 0
 
 
-def _list_lines(lists: Sequence[RevocationList]) -> Iterator[str]:
+def _names(root: Path) -> dict[str, str]:
+    """Map the serial numbers of certificates to their enclaves, as the ledger has them."""
+    from sros_tool.keystore.ledger import read_ledger
+
+    return {each.serial: each.enclave for each in read_ledger(root).entries if each.serial}
+
+
+def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> Iterator[str]:
     from sros_tool.pki.certificates import subject_text
     from sros_tool.validity import iso
 
     found, *others = lists
     yield f"revocation list {found.number}, until {iso(found.next_update)}"
     for each in found.revoked:
-        yield f"  {each.serial:x}  {iso(each.date)}  {each.reason}"
+        serial = f"{each.serial:x}"
+        yield f"  {serial}  {iso(each.date)}  {each.reason}  {names.get(serial, '')}".rstrip()
     for other in others:  # of the other CA during a rotation
         yield (
             f"next to it, list {other.number} of the other CA, "
@@ -355,7 +363,7 @@ def _lists_json(
     from sros_tool.pki.certificates import subject_text
     from sros_tool.validity import iso
 
-    found = lists[0] if lists else None
+    found, names = lists[0] if lists else None, _names(root)
     return {
         "keystore": str(root),
         "dry_run": dry_run,
@@ -364,7 +372,12 @@ def _lists_json(
         "next_update": iso(found.next_update) if found else None,
         "expires_soon": expires_soon,
         "revoked": [
-            {"serial": f"{each.serial:x}", "date": iso(each.date), "reason": each.reason}
+            {
+                "serial": f"{each.serial:x}",
+                "enclave": names.get(f"{each.serial:x}") or None,
+                "date": iso(each.date),
+                "reason": each.reason,
+            }
             for each in (found.revoked if found else ())
         ],
         "other_lists": [

@@ -103,9 +103,9 @@ def recorded_fleet(root: Path) -> Fleet:
     if fleet is None:
         raise KeystoreError(
             f"keystore '{root}' has no fleet",
-            "Nobody has named the robots whose enclaves it has.",
-            f"Name them with `sros generate_artifacts -k {quote(str(root))} -p POLICY_FILE --fleet "
-            "FLEET_FILE`.",
+            "",
+            f"Name its robots with `sros generate_artifacts -k {quote(str(root))} -p POLICY_FILE "
+            "--fleet FLEET_FILE`.",
         )
     return fleet
 

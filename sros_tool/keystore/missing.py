@@ -20,8 +20,13 @@ _WHOLE_ALIKE = 0.9
 """The lowest similarity of a typo in a whole name: names of one namespace begin alike."""
 
 
-def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
-    """Return the error for the missing enclave ``name``; ``there`` are the existing enclaves."""
+def no_such_enclave(
+    root: Path, name: str, there: Collection[str], *, may_create: bool = True
+) -> SrosError:
+    """Return the error for the missing enclave ``name``; ``there`` are the existing enclaves.
+
+    Without ``may_create`` it does not advise to create the enclave.
+    """
     if revocation := _revocation(root, name):
         return _was_revoked(root, revocation)
     what = f"enclave {name} does not exist in keystore '{root}'"
@@ -45,6 +50,8 @@ def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
     if not any((root / part).exists() for part in (PUBLIC, PRIVATE, SETTINGS)):
         where = f"`sros distribute_key KEYSTORE {name} {quote(str(root))}`"
         return KeystoreError(what, why, f"If it is not a typo, export it with {where}.")
+    if not may_create:
+        return KeystoreError(what, why, f"See `sros list_enclaves {quote(str(root))}`.")
     create = f"`sros create_enclave {quote(str(root))} {name}`"
     return KeystoreError(what, why, f"If it is not a typo, create it with {create}.")
 

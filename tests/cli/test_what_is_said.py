@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -180,3 +181,38 @@ def test_a_policy_without_the_common_part_says_how_to_get_it(tmp_path: Path) -> 
     assert f"`sros policies --copy {tmp_path}/common`" in said
     sros("policies", "--copy", tmp_path / "common").ok()
     assert sros("check", policy).status == 0
+
+
+# ── small things that misled ───────────────────────────────────────────────────────────────
+
+
+def test_a_keystore_with_another_number_is_no_typing_error(tmp_path: Path) -> None:
+    sros("create_keystore", tmp_path / "ks").ok()
+    sros("generate_artifacts", "-k", tmp_path / "ks2", "-e", "/a").ok()
+    assert "typo" in sros("generate_artifacts", "-k", tmp_path / "kss", "-e", "/a").err
+
+
+def test_nobody_is_advised_to_create_what_is_to_be_revoked(tmp_path: Path) -> None:
+    sros("generate_artifacts", "-k", tmp_path / "ks", "-e", "/a").ok()
+    said = sros("revoke", tmp_path / "ks", "/nope").err
+    assert "create" not in said and "sros list_enclaves" in said
+
+
+def test_the_router_that_sros_made_is_in_no_policy(tmp_path: Path) -> None:
+    policy = tmp_path / "p.xml"
+    policy.write_text(policy_text({"/a": publish("x")}))
+    sros("generate_artifacts", "-k", "ks", "-p", policy, cwd=tmp_path).ok()
+    sros("zenoh", "ks", cwd=tmp_path).ok()
+    recipe = ("--include", "enclave.not-in-policy", "--fail-on", "note", "--policy", policy)
+    sros("check", "ks", *recipe, cwd=tmp_path).ok()
+    sros("create_enclave", "ks", "/other", cwd=tmp_path).ok()
+    found = sros("check", "ks", *recipe, cwd=tmp_path)
+    assert found.status == 1 and "/other" in found.out and "/router" not in found.out
+
+
+def test_a_revocation_list_names_the_enclaves(tmp_path: Path) -> None:
+    sros("generate_artifacts", "-k", tmp_path / "ks", "-e", "/a", "/b").ok()
+    sros("revoke", tmp_path / "ks", "/b").ok()
+    assert sros("crl", tmp_path / "ks").ok().out.splitlines()[1].endswith("  /b")
+    (found,) = json.loads(sros("crl", tmp_path / "ks", "--json").ok().out)["revoked"]
+    assert found["enclave"] == "/b"

@@ -15,8 +15,9 @@ from sros_tool.checks.keystores.documents import DIFFERS as GOVERNANCE_DIFFERS
 from sros_tool.checks.keystores.enclaves import grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
-from sros_tool.checks.policies import ENCLAVE_NAMES, within_root
+from sros_tool.checks.policies import ENCLAVE_NAMES, only_basic, within_root
 from sros_tool.dds.governance import parse_governance
+from sros_tool.dds.permissions import Grant
 from sros_tool.dds.portable import mistaken_names, some_pairs
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
@@ -359,6 +360,8 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
         return
     name, grant = enclave.name, grant_of(enclave)
     if name not in wanted:
+        if _is_plain_router(enclave, grant):
+            return
         yield NOT_IN_POLICY.found(name, "none of the given policies names it", str(enclave.folder))
         return
     if grant is None:
@@ -371,6 +374,14 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
         more = f" and {len(shown) - _RIGHTS_SHOWN} more" if len(shown) > _RIGHTS_SHOWN else ""
         text = f"policy (-) and permissions (+) differ: {'; '.join(shown[:_RIGHTS_SHOWN])}{more}"
         yield STALE.found(name, text, enclave.file("permissions.p7s"))
+
+
+def _is_plain_router(enclave: CheckedEnclave, grant: Grant | None) -> bool:
+    """Return whether an enclave is the Zenoh router that sros made, with no right of the robot."""
+    settings = enclave.keystore.settings
+    if not (settings and settings.zenoh and settings.zenoh.router == enclave.name and grant):
+        return False
+    return only_basic(grant_rights(enclave.name, grant))
 
 
 def wanted_rights(keystore: CheckedKeystore) -> dict[str, frozenset[Right]]:

@@ -583,6 +583,10 @@ def _already_exists(root: Path) -> KeystoreError:
     )
 
 
+def _without_digits(name: str) -> str:
+    return "".join(each for each in name if not each.isdigit())
+
+
 def _check_typo(root: Path) -> None:
     """Refuse a name that looks like a typo of a sibling keystore."""
     try:
@@ -591,6 +595,8 @@ def _check_typo(root: Path) -> None:
         return
     close = difflib.get_close_matches(root.name, siblings, n=3, cutoff=0.5)
     for name in close:
+        if _without_digits(name) == _without_digits(root.name):
+            continue  # ks2 next to ks is meant
         if is_keystore(root.absolute().parent / name):
             raise UsageError(
                 f"'{root}' does not exist, and '{name}' next to it is a keystore",

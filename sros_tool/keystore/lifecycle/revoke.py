@@ -191,7 +191,7 @@ def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         check_enclave_name(name)
         if name not in there:
-            raise no_such_enclave(root, name, existing)
+            raise no_such_enclave(root, name, existing, may_create=False)
     return existing
 
 
