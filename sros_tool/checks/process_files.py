@@ -224,7 +224,7 @@ def _last(entries: Sequence[Entry], what: str) -> Entry | None:
 
 
 def _recorded_window(what: str, entry: Entry) -> Mapping[str, Window]:
-    with suppress(ValueError):
+    with suppress(SrosError, ValueError):
         return {what: Window(parse_iso(entry.not_before), parse_iso(entry.not_after))}
     return {}
 

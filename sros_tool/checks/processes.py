@@ -126,6 +126,15 @@ PROCESS_ELSEWHERE = FindingKind(
     prominent=True,
 )
 
+CONTAINER_ALONE = FindingKind(
+    "runtime.container-alone",
+    NOTE,
+    "only the processes of this container were looked at",
+    "sros runs in a PID namespace, from which the other processes of the machine cannot be seen.",
+    "pid_namespaces(7).",
+    "Run `sros check runtime` on the machine itself, too.",
+    prominent=True,
+)
 NOT_SECURED = FindingKind(
     "runtime.not-secured",
     NOTE,
@@ -448,5 +457,8 @@ def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
         why = ", ".join(sorted({each.why for each in others})[:3])
         count = f"{len(others)} processes" if len(others) > 1 else others[0].label
         reasons.append(f"{count}, of which it is not known whether they are nodes ({why})")
+    if running.container:
+        text = f"{len(running.processes)} of them speak ROS 2"
+        yield CONTAINER_ALONE.found("processes", text)
     if reasons:
         yield PROCESS_NOT_SEEN.found("processes", "; ".join(reasons))

@@ -30,7 +30,8 @@ _KEY, _KEY_ON_TOKEN = "key.pem", "key.p11"
 _UNREAD = (_KEY, _KEY_ON_TOKEN, "governance.p7s")
 """Files whose content says nothing about a process; private keys are never read."""
 _MOST_BYTES = 16 * 1024 * 1024
-_MOST_BYTES_OF_ALL = 256 * 1024 * 1024
+_MOST_BYTES_OF_ALL = 64 * 1024 * 1024
+_LAST_SECOND = 253402300799
 _MOST_LINKS = 40
 _MOST_FOLDERS = 200
 
@@ -83,7 +84,7 @@ class ProcessEnclave:
 
 
 class FileReader:
-    """Reads the files of processes, at most 256 MiB of them, and the same file once."""
+    """Reads the files of processes, at most 64 MiB of them, and the same file once."""
 
     def __init__(self) -> None:
         self._left = _MOST_BYTES_OF_ALL
@@ -277,4 +278,5 @@ def _same_here(path: str, folders: Mapping[str, os.stat_result]) -> Path | None:
 
 
 def _moment(nanoseconds: int) -> datetime:
-    return datetime.fromtimestamp(nanoseconds / 1e9, UTC)
+    # A file system can state any moment; later ones than a datetime can be are as good.
+    return datetime.fromtimestamp(min(max(nanoseconds / 1e9, 0), _LAST_SECOND), UTC)

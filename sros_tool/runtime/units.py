@@ -284,6 +284,7 @@ Type=exec
 User=root
 Restart=always
 RestartSec=5
+Nice=10
 ExecStart={" ".join((_check_path(sros, "the program"), "check", "runtime", "--watch"))}
 {_lines(render_environment(variables, "systemd").splitlines())}
 {_CLOSED.replace("CapabilityBoundingSet=", rights)}

@@ -224,6 +224,9 @@ CASES: dict[str, Change] = {
     "runtime.process-files-replaceable": _others_can_write,
     "runtime.process-elsewhere": changed(0, network="net:[1]"),
     "runtime.process-not-seen": _unseen,
+    "runtime.container-alone": lambda state, _: replace(
+        state, running=replace(state.running, container=True)
+    ),
     "runtime.zenoh-process-unread": on_zenoh("mode: client\n"),
     "runtime.zenoh-open": on_zenoh(**{SESSION: None}),
     "runtime.zenoh-file-not-found": on_zenoh(**{SESSION: "/nowhere/session.json5"}),

@@ -14,7 +14,7 @@ from sros_tool.checks.registry import KINDS, FindingFilter
 from sros_tool.checks.sarif import sarif
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UsageError
-from sros_tool.runtime.processes import ProcessTable, RunningProcesses
+from sros_tool.runtime.processes import ProcessTable, RunningProcesses, UnseenProcess
 from tests.checks import (
     keystore_cases,
     policy_cases,
@@ -210,6 +210,19 @@ def test_the_runtime_and_the_keystore_it_names(
     bench.path("enclaves/arm/key.pem").write_bytes(b"")
     assert "enclave.file-empty" in sros("check", env=env).out
     assert "enclave.file-empty" not in sros("check", "runtime", env=env).out
+
+
+def test_what_could_not_be_looked_at_is_neither_nothing_nor_a_finding(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unseen = UnseenProcess(9, ("talker", "--ros-args"), "Permission denied", speaks=True)
+    monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses(unseen=(unseen,)))
+    ended = sros("check", "runtime")
+    assert ended.status == 2
+    assert "process 9 (talker): warning: processes that could not be looked at" in ended.out
+    assert sros("check", "runtime", env={"ROS_SECURITY_ENABLE": "True"}).status == 1
+    for accepted in (("--exclude", "runtime.process-not-seen"), ("--fail-on", "error")):
+        assert sros("check", "runtime", *accepted).status == 0
 
 
 def test_at_domain_and_policy(bench: Bench) -> None:

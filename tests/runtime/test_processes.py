@@ -130,6 +130,24 @@ def test_what_proc_hides_is_said(proc: Proc) -> None:
     assert proc.look().hidden
 
 
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
+def test_processes_of_other_users_are_named_and_not_passed_over() -> None:
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.setgid(65534)
+            os.setuid(65534)
+            mine = [e for e in ProcessTable().look(NOW).unseen if e.pid == os.getppid()]
+            os.write(writing, mine[0].why.encode())
+        finally:
+            os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as answer:
+        assert answer.read() == "Permission denied"
+    os.waitpid(child, 0)
+
+
 def test_only_what_changed_is_read_again_and_another_process_is_another(proc: Proc) -> None:
     table = ProcessTable(proc.path)
     folder = proc.add(7, *ROS)
