@@ -149,13 +149,13 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
         yield f"  LEDGER DAMAGED: {'; '.join(d['ledger'])}"
     yield f"  {len(d['enclaves'])} enclave{'' if len(d['enclaves']) == 1 else 's'}"
     for enclave in d["enclaves"]:
-        until = enclave["valid_until"]
+        until = enclave["expires"]
         state = "loadable" if enclave["loadable"] else "NOT LOADABLE"
         if enclave["key_on_robot"] and not enclave["problems"]:
             state = "key on its robot"
         elif enclave["token"]:
             state += f", key on the token {enclave['token']['token']}"
-        yield f"    {enclave['name']}  {state}, certificate until {until or 'unknown'}"
+        yield f"    {enclave['name']}  {state}, expires {until or 'at an unknown time'}"
         for problem in enclave["problems"]:
             yield f"      {problem}"
     for problem in d["unreadable"]:
@@ -172,7 +172,7 @@ def _enclave(d: dict[str, Any]) -> Iterator[str]:
     yield f"enclave {d['path']}: {'loadable' if d['loadable'] else 'NOT LOADABLE'}"
     for problem in d["problems"]:
         yield f"  {problem}"
-    yield f"  subject {d['subject']}, valid until {d['valid_until']}"
+    yield f"  subject {d['subject']}, expires {d['expires'] or 'at an unknown time'}"
     identity, permissions = _named(d, "identity_ca"), _named(d, "permissions_ca")
     yield f"  identity CA {identity}, permissions CA {permissions}"
     yield f"  domains {d['domains']}"

@@ -216,6 +216,7 @@ def _describe_enclave(state: OpenedEnclave) -> Description:
         "problems": [str(problem) for problem in state.problems],
         "subject": state.subject or None,
         "valid_until": iso(validity_of(state.certificate).not_after) if state.certificate else None,
+        "expires": iso(until) if (until := state.valid_until()) else None,
         **_authority("identity_ca", state.identity_ca),
         **_authority("permissions_ca", state.permissions_ca),
         "domains": str(domains) if domains else None,

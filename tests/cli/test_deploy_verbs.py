@@ -151,7 +151,7 @@ def test_from_the_request_to_a_running_process(keystore: Path, tmp_path: Path) -
     sros("verify", tmp_path / "robot").ok()
     assert NAME in sros("list_enclaves", keystore).ok().out
     assert sros("inspect", keystore, "--history").ok().out.count(NAME) == 3
-    assert f"{NAME}  key on its robot, certificate until" in sros("inspect", keystore).ok().out
+    assert f"{NAME}  key on its robot, expires" in sros("inspect", keystore).ok().out
     ended = sros("distribute_key", keystore, NAME, tmp_path / "out")
     assert ended.status == 2
     assert "It was made on its robot and stays there" in ended.err

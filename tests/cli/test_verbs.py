@@ -372,6 +372,11 @@ def test_create_keystore_by_options(tmp_path: Path) -> None:
     (enclave,) = described["enclaves"]
     assert enclave["domains"] == "1,3,10-12"
     assert enclave["loadable"] is True
+    # As `verify` says it: that of the permissions, which is before that of the certificate.
+    verified = json.loads(sros("verify", tmp_path / "ks", "--json").out)["enclaves"][0]
+    assert enclave["expires"] == verified["valid_until"] < enclave["valid_until"]
+    for place in ("ks", "ks/enclaves/a"):
+        assert f"expires {enclave['expires']}\n" in sros("inspect", tmp_path / place).ok().out
     assert (
         described["authorities"]["identity"]["subject"]
         == (described["authorities"]["permissions"]["subject"])

@@ -129,6 +129,29 @@ def test_nodes_take_ros_arguments_and_end_quietly(number: signal.Signals, tmp_pa
         assert read_events(tmp_path / f"{name}.jsonl")[-1].kind is EventKind.DONE
 
 
+_INTERRUPTED = """
+import os, signal, sys
+from sros_tool.demo.nodes import ros
+def build(node, options, events):
+    def interrupted():
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            import rclpy
+            rclpy.ok = lambda: True  # it ends a moment later
+            raise RuntimeError("Unable to convert call argument '0' to Python object")
+    node.create_timer(0.01, interrupted)
+ros._ROLES["talker"] = build
+sys.exit(ros.main(["talker", "--report", sys.argv[1]]))
+"""
+
+
+def test_a_signal_inside_rclpy_is_no_failure(tmp_path: Path) -> None:
+    """A KeyboardInterrupt in the middle of rclpy's C++ becomes another error there."""
+    python("-c", _INTERRUPTED, tmp_path / "talker.jsonl")
+    assert read_events(tmp_path / "talker.jsonl")[-1].kind is EventKind.DONE
+
+
 def test_a_cyclone_talker_is_heard_by_an_rclpy_listener(tmp_path: Path) -> None:
     listener = node("listener", tmp_path)
     talker = node("talker", tmp_path, "--period", "0.1", "--text", "Cyclone", on="cyclone")
@@ -165,15 +188,14 @@ def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
 
 
 STOPPED_WHILE_IT_IS_MADE = """
-import sys
+import os, signal, sys
 from pathlib import Path
 from sros_tool.demo.nodes.options import NodeOptions
 from sros_tool.demo.nodes.ros import _run_role
 
 def build(node, options, events):
-    import rclpy
     if "signal" in sys.argv:
-        rclpy.try_shutdown()  # as the handler of a signal does
+        os.kill(os.getpid(), signal.SIGTERM)
     raise RuntimeError("half made")
 
 sys.exit(_run_role(build, NodeOptions("talker", report=Path(sys.argv[1])), []))

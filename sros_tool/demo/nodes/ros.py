@@ -7,6 +7,7 @@ that this module can be imported without ROS.
 from __future__ import annotations
 
 import importlib
+import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +20,8 @@ from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 _LOG_FLUSH_SECONDS = 0.3
 """Time for the logging thread of Fast DDS: if a process exits at once, its log line is lost."""
 
+_TICK_SECONDS = 0.1
+"""Time between two looks at whether a signal came."""
 _QUEUE_DEPTH = 10
 _FIBONACCI_PACKAGES = ("example_interfaces", "test_msgs", "action_tutorials_interfaces")
 
@@ -47,23 +50,21 @@ def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> 
         return _fail(name, error, ProcessStage.IMPORT, events)
     stage = ProcessStage.PARTICIPANT
     nodes: list[Any] = []
-    joined = False
+    ended = _until_signalled()
     try:
-        rclpy.init(args=list(arguments))
-        joined = True
+        from rclpy.signals import SignalHandlerOptions
+
+        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
         nodes.append(rclpy.create_node(name))
         stage = ProcessStage.ENDPOINT
         nodes += build(nodes[0], options, events) or ()
         stage = ProcessStage.RUNNING
         events.report(EventKind.READY)
-        _spin(nodes)
-    except KeyboardInterrupt:
-        pass
+        _spin(nodes, ended)
     except ImportError as error:
         return _fail(name, error, ProcessStage.IMPORT, events)
     except Exception as error:
-        # A signal shuts the context down; then errors are expected.
-        if rclpy.ok() or not joined:
+        if not ended():  # what ends in the middle may fail
             return _fail(name, error, stage, events)
     finally:
         # Leave the domain and free shared memory; an incomplete node may raise here.
@@ -75,21 +76,27 @@ def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> 
     return 0
 
 
-def _spin(nodes: Sequence[Any]) -> None:
-    import rclpy
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+def _spin(nodes: Sequence[Any], ended: Callable[[], bool]) -> None:
+    from rclpy.executors import SingleThreadedExecutor
 
     executor = SingleThreadedExecutor()
     for node in nodes:
         executor.add_node(node)
-    try:
-        executor.spin()
-    except ExternalShutdownException:
-        pass
-    except Exception:
-        # A signal may shut the context down during a callback; that is not a failure.
-        if rclpy.ok():
-            raise
+    while not ended():
+        executor.spin_once(timeout_sec=_TICK_SECONDS)
+
+
+def _until_signalled() -> Callable[[], bool]:
+    """Return a function that says whether SIGINT or SIGTERM came, which from now on do no more.
+
+    Not rclpy's handlers: they shut its context down in the middle of a callback, or just before a
+    wait without end, and a KeyboardInterrupt inside its C++ becomes another error there ("Unable to
+    convert call argument").
+    """
+    received: list[int] = []
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, lambda number, _frame: received.append(number))
+    return lambda: bool(received)
 
 
 def _fail(name: str, error: Exception, stage: ProcessStage, events: EventWriter) -> int:
