@@ -49,11 +49,9 @@ from sros_tool.demo.wire import (
     Injection,
     Wiretap,
     bound_ports,
-    forged_text,
     mapped_segments,
     shared_memory,
-    with_changed_byte,
-    with_replaced_text,
+    with_changed_bit,
 )
 from sros_tool.runtime.events import Event, EventKind, EventReader
 from sros_tool.runtime.vendor_log import plain_text
@@ -433,9 +431,9 @@ async def _end_softly(processes: Collection[_PartyProcess]) -> None:
 _AFTER_REPLAY = 2.0
 _LONGEST_PAUSE = 0.5
 _REPLAY_ROUNDS = 2
-_FORGED_PACKETS = 5
 _LAST_PACKETS = 20
 """Of these last packets of a talker, some have messages."""
+_CHANGED_PLACES = 8
 _AFTER_FORGERY = 1.0
 
 
@@ -455,22 +453,21 @@ async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
 
 
 async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
-    """Suspend a talker, then send changed copies of its last packets.
+    """Suspend a talker, then send changed copies of its last packet of each length.
 
-    The last readable one gets another text; if none is readable, the last large ones get changed
-    bytes, as an attacker without keys can change them.
+    Which of them has a message, and where, an attacker need not know: every sequence number comes
+    with a bit changed in each place, since a reader drops what the change made malformed.
     """
     talker.hold()
     await asyncio.sleep(_GRACE)
-    text, forged = talker.text, forged_text(talker.text)
-    packets = [each.packet for each in reversed(tap.packets(talker.ports()))]
-    last = next((each for each in packets if with_replaced_text(each, text, forged, 1)), b"")
-    steps = range(1, _FORGED_PACKETS + 1)
-    if last:
-        changed = [with_replaced_text(last, text, forged, step) for step in steps]
-    else:
-        large = sorted(packets[:_LAST_PACKETS], key=len, reverse=True)[:_FORGED_PACKETS]
-        changed = [with_changed_byte(packet, step) for packet in large for step in steps]
+    last = {len(each.packet): each.packet for each in tap.packets(talker.ports())[-_LAST_PACKETS:]}
+    places = range(_CHANGED_PLACES)
+    changed = [
+        with_changed_bit(packet, 1 + later, (later + turn) % len(places), len(places))
+        for packet in last.values()
+        for later in places
+        for turn in places
+    ]
     sent = [packet for packet in changed if packet]
     started = time.monotonic()
     for packet in sent:

@@ -238,21 +238,23 @@ def packets_of(kept: Sequence[_CapturedPacket], ports: Collection[int]) -> list[
     return [each for each in kept if each.source in ports]
 
 
-def with_replaced_text(packet: bytes, text: str, forged: str, step: int) -> bytes | None:
-    """Return an RTPS packet with ``text`` replaced by ``forged`` (of the same length).
+def with_changed_bit(packet: bytes, later: int, place: int, places: int) -> bytes | None:
+    """Return an RTPS packet with one bit changed, at one of ``places`` spread over its content.
 
-    The sequence number of the DATA submessage with ``text`` is raised by ``step``, so that a
-    DataReader takes it for a later message of the writer (RTPS 2.3 §9.4.5.3).  Returns None if
-    ``text`` is not readable in the packet.
+    The change does not depend on what can be read: an attacker without keys can do as much to an
+    encrypted packet.  The sequence number of a readable DATA submessage is raised by ``later``, so
+    that a DataReader takes it for a later message of the writer (RTPS 2.3 §9.4.5.3).  Returns None
+    if the packet has no content.
     """
+    begin = (packet[0] & 0x0F) * 4 + 8 + _RTPS_HEADER
+    if len(packet) <= begin:
+        return None
     changed = bytearray(packet)
     for position, end, order in _submessages(packet):
-        place = packet.find(text.encode(), position, end)
-        if packet[position] == _DATA and place >= 0:
-            _raise_number(changed, position, order, step)
-            changed[place : place + len(forged.encode())] = forged.encode()
-            return bytes(changed)
-    return None
+        if packet[position] == _DATA and end >= position + _SEQUENCE_NUMBER + 4:
+            _raise_number(changed, position, order, later)
+    changed[begin + (2 * place + 1) * (len(packet) - begin) // (2 * places)] ^= 1
+    return bytes(changed)
 
 
 def _raise_number(packet: bytearray, position: int, order: _Order, step: int) -> None:
@@ -260,28 +262,6 @@ def _raise_number(packet: bytearray, position: int, order: _Order, step: int) ->
     number = slice(position + _SEQUENCE_NUMBER, position + _SEQUENCE_NUMBER + 4)
     raised = int.from_bytes(packet[number], order) + step
     packet[number] = (raised & 0xFFFFFFFF).to_bytes(4, order)
-
-
-def with_changed_byte(packet: bytes, step: int) -> bytes | None:
-    """Return an RTPS packet with one byte of its last quarter inverted, another for each ``step``.
-
-    There the payload is, encrypted or not.  The sequence number of a readable DATA submessage is
-    raised by ``step``.  Returns None if the packet has no content.
-    """
-    begin = (packet[0] & 0x0F) * 4 + 8 + _RTPS_HEADER
-    size = (len(packet) - begin) // 4
-    if size <= 0:
-        return None
-    changed = bytearray(packet)
-    for position, end, order in _submessages(packet):
-        if packet[position] == _DATA and end >= position + _SEQUENCE_NUMBER + 4:
-            _raise_number(changed, position, order, step)
-    changed[len(packet) - 1 - step * _STRIDE % size] ^= 0xFF
-    return bytes(changed)
-
-
-_STRIDE = 7
-"""Bytes between two changed bytes; a prime, so that the steps meet different ones."""
 
 
 def _submessages(packet: bytes) -> Iterator[tuple[int, int, _Order]]:
@@ -380,8 +360,3 @@ class Injection:
 
     packets: int
     time: float
-
-
-def forged_text(text: str) -> str:
-    """Return the forged form of a talker's ``text``, of the same length."""
-    return text.swapcase()

@@ -1,4 +1,4 @@
-"""Packets that are sent again: without a checksum, and with other words in the same place."""
+"""Packets that are sent again: without a checksum, and changed."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import pytest
 
 from sros_tool.demo.wire import (
     PacketCounter,
-    forged_text,
     packets_of,
-    with_replaced_text,
+    with_changed_bit,
     without_checksum,
 )
 from tests.demo.test_demo_capture import packet
@@ -35,19 +34,27 @@ def test_the_checksum_goes_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_other_words_under_a_later_number(order: str) -> None:
-    others = forged_text(WORDS)
-    assert len(others) == len(WORDS)
-    assert others != WORDS
-    changed = with_replaced_text(packet(data(f"{WORDS}: 1", 7, order)), WORDS, others, 3)
-    assert changed == packet(data(f"{others}: 1", 10, order))
+def test_another_bit_in_each_place_under_a_later_number(order: str) -> None:
+    later = packet(data(f"{WORDS}: 1", 10, order))
+    found = [
+        with_changed_bit(packet(data(f"{WORDS}: 1", 7, order)), 3, place, 8) for place in range(8)
+    ]
+    places = [
+        [at for at, pair in enumerate(zip(each or b"", later, strict=True)) if len(set(pair)) == 2]
+        for each in found
+    ]
+    assert all(len(each) == 1 for each in places)
+    assert len({each[0] for each in places}) == 8
+    assert min(each[0] for each in places) >= 48, "behind the headers of IP, UDP and RTPS"
+    assert sum(WORDS.encode() not in (each or b"") for each in found) > 1
 
 
 @pytest.mark.parametrize(
-    "payload", [data("nothing of it", 7), b"RTPS" + bytes(16), b"", data(WORDS, 7)[:40]]
+    ("payload", "changed"),
+    [(b"RTPS" + bytes(16), False), (b"", False), (data(WORDS, 7)[:40], True)],
 )
-def test_packets_that_do_not_say_it(payload: bytes) -> None:
-    assert with_replaced_text(packet(payload), WORDS, forged_text(WORDS), 1) is None
+def test_packets_with_little_in_them(payload: bytes, changed: bool) -> None:
+    assert bool(with_changed_bit(packet(payload), 1, 0, 8)) is changed
 
 
 def test_packets_are_kept_in_order_and_found_by_port() -> None:

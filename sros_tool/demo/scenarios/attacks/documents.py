@@ -72,6 +72,7 @@ ROWS: tuple[Row, ...] = (
         RowStatus.NOT_HEARD,
         "the attacker's DDS accepts this CA; its peers verify with the CA that they trust",
         attack="the attacker's own permissions CA",
+        variants=(Variant((Condition.FAST,), RowStatus.NOT_HEARD),),
     ),
     injection(
         "the attacker's own permissions CA, trusted by the listener",
