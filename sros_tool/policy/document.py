@@ -415,7 +415,9 @@ class _Reader:
                 f"sros reads version {VERSION} of the SROS2 policy format. {_EARLIER}"
                 if version == "0.1.0"
                 else f"sros reads version {VERSION} of the SROS2 policy format.",
-                self._how_to_convert() if version == "0.1.0" else "",
+                self._how_to_convert()
+                if version == "0.1.0"
+                else f'If it is that format, write version="{VERSION}".',
             )
         blocks = self._children(root, place)
         if len(blocks) == 1 and blocks[0][0].tag in _EARLIER_BLOCKS:
@@ -704,7 +706,12 @@ class _Reader:
                 and not name.startswith(_XML_ATTRIBUTES)
             ):
                 where = self._where(element, place)
-                raise PolicyError(f"{where}: <{tag_of(element)}> has no attribute {_short(name)}")
+                known = ", ".join(f"{each}=" for each in (*required, *optional))
+                raise PolicyError(
+                    f"{where}: <{tag_of(element)}> has no attribute {_short(name)}",
+                    "",
+                    f"It has {known}." if known else "It has none: remove it.",
+                )
         for name in required:
             if name not in present:
                 raise PolicyError(

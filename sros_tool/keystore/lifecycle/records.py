@@ -65,8 +65,9 @@ def trust_records(
         authority = load_authorities(root, settings, keyring, now).identity
         append(transaction, entries, authority, now)
         transaction.commit()
+    number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
     text = (
-        f"taken on trust: the rights of {len(names)} enclaves, as the ledger has them in lines "
+        f"taken on trust: the rights of {number}, as the ledger has them in lines "
         "without a chain. If somebody removed one of these lines, older permissions may be in "
         "force again: compare them with your policy (`sros diff_policy`)."
     )
