@@ -342,29 +342,33 @@ def _shared_by(
 
     A name that some enclave states is better than one that only wildcards match.
     """
-    counts: Counter[str] = Counter()
+    exactly: Counter[str] = Counter()  # by holders without wildcards
+    stated: set[str] = set()
+    wild: list[NameSet] = []
     longest = world.longest
     for parts in holders:
-        counts.update(
-            {part.topics(expression).ros_name(t) for part, met in parts for t in met.stated}
-        )
+        names = {part.topics(expression).ros_name(t) for part, met in parts for t in met.stated}
+        stated |= names
         longest = min(longest, *(world.longest - part.longer for part, _ in parts))
-    if not any(met.wild for parts in holders for _, met in parts):
-        return shortest(name for name, number in counts.items() if number >= count)
-    shared = NameSet.at_least(
-        count,
-        (
-            NameSet.union(met.names.between(part.begin, part.end) for part, met in parts)
-            for parts in holders
-        ),
-    )
+        if any(met.wild for _, met in parts):
+            own = (met.names.between(part.begin, part.end) for part, met in parts)
+            wild.append(NameSet.union(own))
+        else:
+            exactly.update(names)
+
+    def is_shared(name: str) -> bool:
+        least = count - exactly[name]
+        return least <= len(wild) and sum(name in each for each in wild) >= least
+
     if not is_expression(expression):
-        return expression if expression in shared else None
-    every = Topics("", expression, "")
-    known = [each for each in counts if each in shared]
+        return expression if is_shared(expression) else None
+    known = [each for each in stated if is_shared(each)]
+    valid = shortest(each for each in known if each in valid_topics("", ""))
+    if valid or len(wild) < count:  # nobody but holders with wildcards has a name not stated
+        return valid or shortest(known)
+    shared, every = NameSet.at_least(count, wild), Topics("", expression, "")
     return (
-        shortest(each for each in known if each in valid_topics("", ""))
-        or (shared & every.valid()).example(limit, longest=longest)
+        (shared & every.valid()).example(limit, longest=longest)
         or shortest(known)
         or (shared & every.every()).example(limit, longest=longest)
     )
