@@ -40,7 +40,7 @@ from sros_tool.cli.explain_zenoh import (
 )
 from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import NEWEST, Vendor
-from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
+from sros_tool.errors import KeystoreError, Note, SrosError, UsageError, counted
 from sros_tool.names import check_enclave_name, is_expression
 from sros_tool.terminal import Coloured, echo
 from sros_tool.validity import iso
@@ -896,8 +896,8 @@ def _show_zenoh_who(
             }
         )
     else:
-        _echo(zenoh_who_lines(found))
-        echo(f"{question}, on {ZENOH_TITLE} ({why})", err=True)
+        _echo(zenoh_who_lines(question, found))
+        echo(f"decided by {ZENOH_TITLE} ({why})", err=True)
     if any(each.mode == "peer" for each in found):
         text = "peers decide by their own files, and this is by that of the router, which has the "
         text += (
@@ -1210,10 +1210,10 @@ def _show_who(
             }
         )
     else:
-        for line in _who_lines(found, load_fleet(keystore)):
+        for line in _who_lines(question, found, load_fleet(keystore)):
             echo(line)
         documented = ", as documented" if chosen.documented_only else ""
-        echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
+        echo(f"decided by {chosen.title} ({why}{documented})", err=True)
         if question.type == "service" and question.word == "call" and not kind and not allowed:
             action = ask("call", question.name, "action")
             as_action = who(keystore, action, chosen, options.context, at=options.at, names=names)
@@ -1246,7 +1246,9 @@ def _question_of_who(rest: tuple[str, ...], kind: str | None) -> Question:
     return ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
 
 
-def _who_lines(found: Sequence[EnclaveOutcome], fleet: Fleet | None) -> Iterator[str]:
+def _who_lines(
+    question: Question, found: Sequence[EnclaveOutcome], fleet: Fleet | None
+) -> Iterator[str]:
     """Yield the allowed enclaves, those whose participant does not start now, and the counts.
 
     The enclaves of a fleet are folded by robot.
@@ -1264,7 +1266,7 @@ def _who_lines(found: Sequence[EnclaveOutcome], fleet: Fleet | None) -> Iterator
             text = f"  not now: {each.enclave}  {each.text.partition(': ')[2]}"
             lines.append((each.enclave, text))
     yield from folded(fleet, lines)
-    yield f"{len(able)} of {len(found)} enclaves may"
+    yield f"{len(able)} of {counted(len(found), 'enclave')} may {question}"
 
 
 def _outcome_json(each: EnclaveOutcome) -> dict[str, Any]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+from sros_tool.errors import counted
 from sros_tool.validity import iso
 
 if TYPE_CHECKING:
+    from sros_tool.explain.question import Question
     from sros_tool.explain.zenoh import ZenohAnswer
     from sros_tool.zenoh.delivery import Check
 
@@ -149,7 +151,7 @@ def _check_json(check: Check) -> dict[str, Any]:
     }
 
 
-def zenoh_who_lines(found: Sequence[ZenohAnswer]) -> Iterator[str]:
+def zenoh_who_lines(question: Question, found: Sequence[ZenohAnswer]) -> Iterator[str]:
     """Yield the allowed enclaves, those whose processes open no session, and the counts."""
     able = [each for each in found if each.outcome.ok]
     for each in able:
@@ -158,7 +160,7 @@ def zenoh_who_lines(found: Sequence[ZenohAnswer]) -> Iterator[str]:
     for each in found:
         if each.outcome == "refused":
             yield f"  not now: {each.enclave}  {each.text}"
-    yield f"{len(able)} of {len(found)} enclaves may"
+    yield f"{len(able)} of {counted(len(found), 'enclave')} may {question}"
 
 
 def zenoh_who_json(each: ZenohAnswer) -> dict[str, Any]:

@@ -427,9 +427,10 @@ def test_a_name_that_is_an_action_is_asked_about_as_one(
 
 
 def test_a_name_that_is_an_action_is_asked_about_as_one_of_everybody(fibonacci: Path) -> None:
-    for word, who in (("call", CLIENT), ("serve", SERVER)):
+    for word, right, who in (("call", "call", CLIENT), ("serve", "execute", SERVER)):
         found = explain(fibonacci, "--who", word, "/fibonacci")
-        assert (found.status, found.out) == (0, f"{who}\n1 of 2 enclaves may\n")
+        may = f"1 of 2 enclaves may {right} action /fibonacci\n"
+        assert (found.status, found.out) == (0, f"{who}\n{may}")
         assert "note [explain.an-action]" in found.err
     as_action = explain(fibonacci, "--who", "call", "/fibonacci", "--type", "action")
     assert as_action.out.splitlines()[0] == CLIENT
@@ -546,11 +547,13 @@ def test_the_default_of_the_template_is_no_policy_file(template: str, tmp_path: 
 
 def test_who(keystore: Path) -> None:
     found = explain(keystore, "--who", "publish", "/chatter")
-    assert (found.status, found.out) == (0, f"{ENCLAVE}\n1 of 2 enclaves may\n")
+    may = "enclaves may publish topic /chatter\n"
+    assert (found.status, found.out) == (0, f"{ENCLAVE}\n1 of 2 {may}")
+    assert found.err.startswith("decided by Fast DDS 2.14 (")
     env: dict[str, str | None] = {"ROS_SECURITY_KEYSTORE": str(keystore)}
     assert explain("--who", "subscribe", "/chatter", env=env).out.startswith(OTHER)
     nobody = explain(keystore, "--who", "publish", "/nothing")
-    assert (nobody.status, nobody.out) == (1, "0 of 2 enclaves may\n")
+    assert (nobody.status, nobody.out) == (1, "0 of 2 enclaves may publish topic /nothing\n")
     told = answer(keystore, "--who", "publish", "/chatter")
     assert {each["enclave"]: each["allowed"] for each in told["enclaves"]} == {
         ENCLAVE: True,
@@ -564,7 +567,7 @@ def test_who_tells_wildcards_and_what_cannot_run(keystore: Path) -> None:
     found = explain(keystore, "--who", "publish", "/chatter")
     assert "/open  by the wildcard rt/*" in found.out
     assert f"not now: {ENCLAVE}  cert.pem: it expired" in found.out
-    assert "1 of 3 enclaves may" in found.out
+    assert "1 of 3 enclaves may publish topic /chatter" in found.out
 
 
 def test_reach(whole: Path) -> None:

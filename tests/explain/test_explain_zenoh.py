@@ -141,7 +141,10 @@ def test_who_may(made: Path, mode: str) -> None:
     able = {each["enclave"]: each["wildcard"] for each in found["enclaves"] if each["allowed"]}
     assert able == {"/listener": None, "/recorder": "0/*/*/*/**"}
     shown = explain(made / mode, "--who", "subscribe", "/chatter", "--vendor", "zenoh").ok()
-    assert "/recorder  by the wildcard 0/*/*/*/**\n2 of 6 enclaves may\n" in shown.out
+    assert (
+        "/recorder  by the wildcard 0/*/*/*/**\n2 of 6 enclaves may subscribe topic /chatter\n"
+        in shown.out
+    )
     assert explain(made / mode, "--who", "call", "/nope", "--vendor", "zenoh").status == 1
 
 

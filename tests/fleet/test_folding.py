@@ -78,9 +78,13 @@ def test_two_fleets_are_compared(made: Path) -> None:
 
 def test_who_and_reach_are_folded(made: Path) -> None:
     said = sros("explain", "ks", "--who", "join", cwd=made).ok().out
-    assert said.splitlines() == ["/d", "/{robot}/base  (all 3 robots)", "4 of 4 enclaves may"]
+    assert said.splitlines() == [
+        "/d",
+        "/{robot}/base  (all 3 robots)",
+        "4 of 4 enclaves may join the domain",
+    ]
     one = sros("explain", "ks", "--who", "join", "--robot", "r2", cwd=made).ok().out
-    assert one.splitlines() == ["/r2/base", "1 of 1 enclaves may"]
+    assert one.splitlines() == ["/r2/base", "1 of 1 enclave may join the domain"]
     found = json.loads(sros("explain", "ks", "--who", "join", "--json", cwd=made).out)
     assert [each["enclave"] for each in found["enclaves"]] == [
         "/d",
