@@ -241,6 +241,7 @@ class _Enclaves:
 
     ``rights`` are the grants of sound enclaves.  ``faulty`` has the first fault of each enclave
     that the others do not accept, ``revoked`` whether its own list names a revoked enclave.
+    ``unreadable`` have files that no process should be let read, as one of the kernel without end.
     ``elsewhere`` are those whose key is not in the keystore.  ``without_list`` lack the newest
     revocation list of their keystore; ``other_governance`` have another governance than the rest.
     """
@@ -248,6 +249,7 @@ class _Enclaves:
     rights: Mapping[str, Grant]
     faulty: Mapping[str, str]
     revoked: Mapping[str, bool]
+    unreadable: tuple[str, ...]
     elsewhere: tuple[str, ...]
     without_list: frozenset[str]
     other_governance: tuple[str, ...]
@@ -263,6 +265,8 @@ class _Enclaves:
         more = len(self.revoked) + len(self.faulty) - _MOST_FAULTY
         if more > 0:
             yield f"{more} more enclaves with faulty or revoked files"
+        if self.unreadable:
+            yield f"{_listed(self.unreadable)} with files that cannot be read"
         if self.without_list and cast["listener"] not in self.without_list:
             yield f"{_listed(self.without_list)} without the newest revocation list"
         if self.other_governance:
@@ -285,6 +289,7 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
     rights: dict[str, Grant] = {}
     faulty: dict[str, str] = {}
     revoked: dict[str, bool] = {}
+    unreadable: list[str] = []
     elsewhere: list[str] = []
     without_list: list[str] = []
     governances: dict[str, Governance | None] = {}
@@ -294,7 +299,9 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
         state = keystore.enclave(name, now=now, domain=domain)
         faults = [each for each in state.problems if each.fault is not Fault.REVOKED]
         own = len(faults) < len(state.problems)
-        if KEY_FILE not in state.files and (state.key_on_robot or state.token):
+        if any(each.fault is Fault.FILE_UNREADABLE for each in faults):
+            unreadable.append(name)
+        elif KEY_FILE not in state.files and (state.key_on_robot or state.token):
             elsewhere.append(name)
         elif own or (state.certificate and state.certificate.serial_number in serials):
             revoked[name] = own
@@ -312,6 +319,7 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
         rights,
         faulty,
         revoked,
+        tuple(unreadable),
         tuple(elsewhere),
         frozenset(without_list),
         tuple(name for name, found in governances.items() if found != usual[0][0]),

@@ -7,11 +7,12 @@ from pathlib import Path
 
 from sros_tool.dds.permissions import Grant, Rule, parse_permissions
 from sros_tool.errors import SrosError
-from sros_tool.keystore.layout import enclave_path
+from sros_tool.keystore.layout import PERMISSIONS_FILE, enclave_path
 from sros_tool.names import ACTION_SEPARATOR
 from sros_tool.pki import smime
 from sros_tool.policy.patterns import matches
 from sros_tool.topics import dds_names
+from sros_tool.xml import read_bytes
 
 _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events", "rt/clock", "ros_discovery_info")
 _WILD = set("*?[")
@@ -20,7 +21,7 @@ _WILD = set("*?[")
 def enclave_grant(root: Path, enclave: str) -> Grant | None:
     """Return the first grant of an enclave, or None if its permissions cannot be read."""
     try:
-        signed = (enclave_path(root, enclave) / "permissions.p7s").read_bytes()
+        signed = read_bytes(enclave_path(root, enclave) / PERMISSIONS_FILE, "permissions document")
         grants = parse_permissions(smime.parse(signed).document).grants
     except (SrosError, OSError):
         return None

@@ -212,3 +212,18 @@ def test_a_keystore_is_not_proved_by_what_was_not_tried(row: object, proved: boo
     assert f"**{verdict}, " in summary_page(shown, NOW)
     wrong = replace(scenario, rows=(replace(CLOSED, observed=RowStatus.HEARD), *scenario.rows))
     assert replace(shown, scenarios=(wrong,)).exit_status == 1
+
+
+def test_an_enclave_with_a_file_of_the_kernel_is_neither_copied_nor_started(
+    place: Place, tmp_path: Path
+) -> None:
+    for enclave, file in (("/odd/victim", "permissions.p7s"), ("/odd/other", "crl.pem")):
+        path = place.root / f"enclaves{enclave}" / file
+        path.unlink(missing_ok=True)
+        path.symlink_to("/dev/zero")
+    user = opened(place.root)
+    assert user.not_tried == ("/odd/other and 1 more with files that cannot be read",)
+    assert [row.name for row in user.rows if OTHERS in row.name] == []
+    assert not {place.victim, place.other} & {*user.cast.values()}
+    user.copy(tmp_path / "copy")
+    assert not (tmp_path / "copy/enclaves/odd").exists()
