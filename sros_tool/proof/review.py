@@ -7,6 +7,7 @@ compared is in the result.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -50,6 +51,8 @@ No policy is larger.
 """
 _OF_POLICIES = ((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns="))
 """What an XML file that is a policy, or a part of one, has, and what follows in it."""
+_ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
+_READABLE = (b"utf-8", b"utf8", b"utf-16", b"us-ascii", b"ascii", b"iso-8859-", b"windows-125")
 _OK, _FOUND, _UNDECIDED = 0, 1, 2
 
 
@@ -575,6 +578,9 @@ def _may_be_policy(content: bytes) -> bool:
     text = b" ".join(content.replace(b"\0", b"").split())  # UTF-16 has a zero in each letter
     if not text.lstrip(b"\xef\xbb\xbf\xfe\xff").startswith(b"<"):
         return False
+    encoding = _ENCODING.search(text[:200])
+    if encoding and not encoding[1].lower().startswith(_READABLE):
+        return True  # such as UTF-7, in which no element is readable here
     return any(second in text.partition(first)[2] for first, second in _OF_POLICIES)
 
 

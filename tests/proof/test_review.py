@@ -105,6 +105,11 @@ def test_what_a_partial_clone_lacks_is_not_passed_over(change: Change) -> None:
         ("evil.XML", policy_text(WIDER).encode()),
         ("robots/deep/evil.txt", policy_text(WIDER).encode()),
         ("evil.xml", b"\xff\xfe" + policy_text(WIDER).encode("utf-16-le")),
+        (
+            "seven.xml",
+            b'<?xml version="1.0" encoding="UTF-7"?>'
+            + policy_text(WIDER).replace("<", "+ADw-").replace(">", "+AD4-").encode(),
+        ),
         ("part.xml", b'<profile ns="/" node="n"/>'),
     ],
 )
