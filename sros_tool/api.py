@@ -511,7 +511,13 @@ def check_requirements(
     return tuple(each for each in found if each.severity > NOTE or each.kind.prominent)
 
 
-def new_access(base: AnyPath, head: AnyPath, *, fleet: AnyPath | None = None) -> Growth:
+def new_access(
+    base: AnyPath,
+    head: AnyPath,
+    *,
+    fleet: AnyPath | None = None,
+    base_fleet: AnyPath | None = None,
+) -> Growth:
     """Return what ``head`` lets enclaves do that ``base`` does not, decided for all names.
 
     Args:
@@ -520,6 +526,7 @@ def new_access(base: AnyPath, head: AnyPath, *, fleet: AnyPath | None = None) ->
             "git:main:policies/robot.xml".
         head: What is there afterwards: any of these.
         fleet: The file with the robots that the placeholders of policies stand for.
+        base_fleet: That of ``base``, if it is another one.
 
     Returns:
         What is ``added`` and ``removed``, whom enclaves can influence now (``reach``), and the
@@ -541,8 +548,8 @@ def new_access(base: AnyPath, head: AnyPath, *, fleet: AnyPath | None = None) ->
     from sros_tool.proof.sources import load_side
 
     robots = read_fleet(Path(fleet)) if fleet else None
-    before, after = (load_side(Path(each), robots) for each in (base, head))
-    return compare_access(before, after)
+    earlier = read_fleet(Path(base_fleet)) if base_fleet else robots
+    return compare_access(load_side(Path(base), earlier), load_side(Path(head), robots))
 
 
 def _moment(now: datetime | None) -> datetime:

@@ -298,6 +298,11 @@ def test_new_access_is_what_a_change_adds(tmp_path: Path) -> None:
     (gain,) = found.added
     assert (gain.enclaves, gain.action, str(gain.source)) == (("/a",), "publish", f"{head}:1")
     assert gain.name.startswith("/x") and found
-    assert not sros_tool.new_access(head, base, fleet=fleet)
+    less = sros_tool.new_access(head, base, fleet=fleet)
+    assert not less and less.left_out[0] == "dates" and less.assumed
+    moved = tmp_path / "moved.toml"
+    moved.write_text("[robots.r1]\ndomain = 7\n")
+    assert not sros_tool.new_access(base, base, fleet=moved, base_fleet=fleet)
+    assert sros_tool.new_access(base, base, fleet=fleet, base_fleet=moved).domains == (0, 7)
     with pytest.raises(DocumentError, match="placeholder"):
         sros_tool.new_access(base, head)

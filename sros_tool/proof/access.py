@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from functools import lru_cache
 from itertools import count
 
 from sros_tool.automata import NameSet
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.policy.model import ALLOW
 from sros_tool.proof.places import topics_of
 from sros_tool.proof.worlds import TopicAccess, named, valid_topics
@@ -101,10 +102,13 @@ def is_enforced(
     )
 
 
-def domains_of(enforcers: Iterable[Enforcement]) -> tuple[int, ...]:
+def domains_of(
+    enforcers: Iterable[Enforcement], others: Collection[DomainSet] = ()
+) -> tuple[int, ...]:
     """Return the ROS domains of the keys in rules: of those with the same rules the first one.
 
-    Where keys have a wildcard in place of the domain, one is added that no key names.
+    Where keys have a wildcard in place of the domain, one is added that no key names.  Domains in
+    ``others`` are added, too; which of these sets they are in tells domains apart as rules do.
     """
     rules: dict[int, set[object]] = {}
     wild = False
@@ -120,9 +124,14 @@ def domains_of(enforcers: Iterable[Enforcement]) -> tuple[int, ...]:
                 wild |= "*" in begin
                 if _DOMAIN.match(begin):
                     rules.setdefault(int(begin), set()).add((*what, rest))
-    kinds = {frozenset(rules[each]): each for each in sorted(rules, reverse=True)}
-    other = next(each for each in count() if each not in rules)
-    return tuple(sorted({*kinds.values(), *([other] if wild else [])}))
+    unnamed = next(each for each in count() if each not in rules)
+    known = {*rules, *(range(MAX_DOMAIN + 1) if others else ()), *([unnamed] if wild else ())}
+    kinds: dict[object, int] = {}
+    for each in sorted(known, reverse=True):
+        inside = tuple(each in one for one in others)
+        if each in rules or any(inside) or wild:
+            kinds[frozenset(rules.get(each, ())), inside] = each
+    return tuple(sorted(kinds.values()))
 
 
 _DOMAIN = re.compile(r"(?:0|[1-9][0-9]{0,8})\Z", re.ASCII)

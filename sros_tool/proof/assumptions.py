@@ -9,15 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance
 from sros_tool.dds.permissions import Permissions
 from sros_tool.fleet.enclaves import robot_of
 from sros_tool.proof.protection import strict_protection
-from sros_tool.proof.sources import AccessSource
+from sros_tool.proof.sources import ALL_DOMAINS, AccessSource
 from sros_tool.translate import governance_for
-
-_ALL = DomainSet.of((0, MAX_DOMAIN))
+from sros_tool.zenoh.configuration import Mode
 
 
 def completed(side: AccessSource, other: AccessSource) -> AccessSource:
@@ -42,7 +41,7 @@ def completed(side: AccessSource, other: AccessSource) -> AccessSource:
     if governance is None:
         known = DomainSet((*own.ranges, *_granted(other).ranges)).closed()
         open_ended = {"policy"} >= {side.kind, other.kind}
-        governance = governance_for(strict_protection(), _ALL if open_ended else known)
+        governance = governance_for(strict_protection(), ALL_DOMAINS if open_ended else known)
     return replace(side, permissions=permissions, governance=governance)
 
 
@@ -158,6 +157,10 @@ def _left_out(base: AccessSource, head: AccessSource) -> Iterator[str]:
         yield "partitions other than the default one"
     if {base.kind, head.kind} & {"keystore", "enclave"}:
         yield "who holds which key"
+    if any(
+        each.document.mode is Mode.CLIENT for _, side in sides for each in side.zenoh_files.values()
+    ):
+        yield "what clients of Zenoh let their router do"
     for name, side in sides:
         other = head if side is base else base
         if side.trusts is not None and other.trusts is None:

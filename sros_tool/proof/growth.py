@@ -33,6 +33,7 @@ from sros_tool.proof.worlds import ROS_TOPICS
 from sros_tool.proof.zenoh_settings import unknown_settings
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
 from sros_tool.topics import dds_names
+from sros_tool.translate import grant_rights
 
 _VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 _ZENOH = "Zenoh"
@@ -194,25 +195,37 @@ def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
             longest = vendor.traits.longest_topic_name
             found.append(_World(vendor.title, vendor.traits.style, domains, by_side, longest))
     if base.zenoh is not None or head.zenoh is not None:
-        of_robots = [domains_of_robots(base, head), domains_of_robots(head, base)]
-        own = {domain for each in of_robots for domain in each.values()}
-        domains = tuple(sorted({*domains_of((*base.enforcers, *head.enforcers)), *own})) or (0,)
-        found.append(_World(_ZENOH, Style.FNMATCH, domains, _on_zenoh(base, head)))
+        found.append(
+            _World(_ZENOH, Style.FNMATCH, _zenoh_domains(base, head), _on_zenoh(base, head))
+        )
     return found
+
+
+def _zenoh_domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
+    """Return one domain of each kind: by rules of Zenoh, and by the domains of what has none."""
+    found: set[DomainSet] = set()
+    for side, other in ((base, head), (head, base)):
+        found.update(DomainSet.of((e, e)) for e in domains_of_robots(side, other).values())
+        if side.zenoh is None and side.kind != "policy":
+            found.update(each.closed() for each in _granted(side))
+    return domains_of((*base.enforcers, *head.enforcers), found) or (0,)
 
 
 def _domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
     """Return one domain of each kind: between two of them, all have the same rules as the first."""
     governances = (each.governance for each in (base, head) if each.governance)
     listed = {rule.domains for each in governances for rule in each.domain_access_rules}
-    granted = {
+    return DomainSet.one_of_each_kind(listed, _granted(base) | _granted(head))
+
+
+def _granted(side: AccessSource) -> set[DomainSet]:
+    """Return the sets of domains for which permissions have rules."""
+    return {
         rule.domains
-        for side in (base, head)
         for each in side.permissions.values()
         for grant in each.grants
         for rule in grant.rules
     }
-    return DomainSet.one_of_each_kind(listed, granted)
 
 
 def _of_vendor(vendor: Vendor) -> _AccessOf:
@@ -239,14 +252,15 @@ def _of_vendor(vendor: Vendor) -> _AccessOf:
 
 def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
     """Return the access that rules of Zenoh give, or for a side without them its rights."""
-    sides = (base, head)
-    stated = _of_rights({id(each): each.rights for each in sides if each.zenoh is None})
-    robots = {id(one): domains_of_robots(one, other) for one, other in (sides, sides[::-1])}
+    stated = {
+        id(side): _of_rights(side, domains_of_robots(side, other))
+        for side, other in ((base, head), (head, base))
+        if side.zenoh is None
+    }
 
     def access(side: AccessSource, enclave: str, domain: int) -> _Access:
         if side.zenoh is None:
-            elsewhere = robots[id(side)].get(enclave, domain) != domain
-            return _NO_ACCESS if elsewhere else stated(side, enclave, domain)
+            return stated[id(side)](enclave, domain)
         if enclave == side.router:
             return _NO_ACCESS
         found = enforced_access(side.enforcers, enclave, domain)
@@ -263,14 +277,24 @@ def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
     return access
 
 
-def _of_rights(
-    rights: Mapping[int, Collection[Right]],
-) -> _AccessOf:
-    """Return the access that rights in ROS terms give, by the id of a side."""
-    by_enclave = {side: _by_enclave(some) for side, some in rights.items()}
+def _of_rights(side: AccessSource, robots: Mapping[str, int]) -> Callable[[str, int], _Access]:
+    """Return the access that rights in ROS terms give in a domain.
 
-    def access(side: AccessSource, enclave: str, _: int) -> _Access:
-        own = by_enclave[id(side)].get(enclave, ())
+    ``robots`` are the domains of enclaves of a policy that have one of their own.
+    """
+    by_enclave = _by_enclave(side.rights)
+
+    def rights_in(enclave: str, domain: int) -> Collection[Right]:
+        if side.kind == "policy":
+            elsewhere = robots.get(enclave, domain) != domain
+            return () if elsewhere else by_enclave.get(enclave, ())
+        grants = side.permissions[enclave].grants if enclave in side.permissions else ()
+        return [
+            right for each in grants for right in grant_rights(enclave, _in_domain(each, domain))
+        ]
+
+    def access(enclave: str, domain: int) -> _Access:
+        own = rights_in(enclave, domain)
         allowed, denied = (
             {
                 verb: [
@@ -297,6 +321,11 @@ def _of_rights(
         return _Access({verb: topics(verb) for verb in _VERBS}, decide, joins=bool(own))
 
     return access
+
+
+def _in_domain(grant: Grant, domain: int) -> Grant:
+    rules = (each for each in grant.rules if domain in each.domains.closed())
+    return replace(grant, rules=tuple(rules))
 
 
 def _by_enclave(rights: Iterable[Right]) -> dict[str, list[Right]]:
@@ -402,6 +431,7 @@ class _Stated:
     def __init__(self, old: AccessSource, new: AccessSource) -> None:
         self._old, self._new = old, new
         self._examples: dict[tuple[str, AccessVerb, str], list[str]] = defaultdict(list)
+        self._found: dict[tuple[object, ...], list[Gain]] = {}
         rights = new.rights if new.zenoh is None else new.rights | new.zenoh
         earlier = old.rights if old.zenoh is None else old.rights | old.zenoh
         self._allowed = _by_enclave(each for each in rights if each.qualifier is ALLOW)
@@ -417,6 +447,21 @@ class _Stated:
         limit: SearchLimit,
     ) -> Iterator[Gain]:
         """Yield a gain for each right that is stated for some of ``more``, and for the rest."""
+        key = enclave, verb, more, world.style, world.longest  # often so in several domains
+        if key not in self._found:
+            self._found[key] = list(self._searched(enclave, verb, more, world, domain, limit))
+        for each in self._found[key]:
+            yield replace(each, worlds=(world.title,), domains=(domain,))
+
+    def _searched(
+        self,
+        enclave: str,
+        verb: AccessVerb,
+        more: NameSet,
+        world: _World,
+        domain: int,
+        limit: SearchLimit,
+    ) -> Iterator[Gain]:
         allowed = [(each, _topics_of(each)[verb]) for each in self._allowed.get(enclave, ())]
         denials = self._denied.get(enclave, ())
         denied = names_of(world.style, (e for each in denials for e in _topics_of(each)[verb]))

@@ -125,6 +125,7 @@ def less_protection(
                 else "whoever has its key can give any right",
             )
     yield from _trusted_again(old, new)
+    yield from _certified_otherwise(old, new)
     if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
         text = "nothing enforces on Zenoh what its files enforced"
         yield SettingChange(Effect.LOOSER, "files of Zenoh", "present", "missing", text)
@@ -165,6 +166,16 @@ def _looser_later(
                     domain,
                     "what is signed for it later is valid there",
                 )
+
+
+def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
+    """Yield the certificates whose name is not that of their enclave, or of their key before."""
+    names = {key: name for name, key in old.certified.values()}
+    for enclave, (name, key) in new.certified.items():
+        before = names.get(key, enclave)
+        if name not in (before, old.certified.get(enclave, (enclave, ""))[0]):
+            text = "whoever has its key is that enclave to all others"
+            yield SettingChange(Effect.LOOSER, f"certificate of {enclave}", before, name, text)
 
 
 def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:

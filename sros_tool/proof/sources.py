@@ -18,6 +18,7 @@ from sros_tool.errors import DocumentError, Note, SrosError
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
     CRL,
     CRL_FILE,
     GOVERNANCE_FILE,
@@ -43,6 +44,7 @@ from sros_tool.names import expand
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     common_name,
+    common_name_of,
     fingerprints,
     load_certificate,
     load_certificates,
@@ -101,7 +103,8 @@ class AccessSource:
     for; None for all.  ``governance`` is None if it has none of its own.  ``authorities`` are the
     CAs that its enclaves trust, pairs of role and fingerprint, and ``trusts`` whom each of them
     trusts, and `KEYSTORE_ITSELF`; None if it does not say.  ``later`` are the settings for enclaves
-    that are created later, None without any.  ``zenoh_files`` are the configurations of Zenoh, by
+    that are created later, None without any.  ``certified`` has the common name in the certificate
+    of each enclave, with a digest of its key.  ``zenoh_files`` are the configurations of Zenoh, by
     enclave and file name.
     """
 
@@ -116,6 +119,7 @@ class AccessSource:
     authorities: frozenset[tuple[str, str]] | None = None
     trusts: Mapping[str, Trust] | None = None
     later: Template | None = None
+    certified: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     zenoh_files: Mapping[str, SignedConfiguration] = field(default_factory=dict)
     scope: frozenset[str] | None = None
     notes: tuple[Note, ...] = ()
@@ -191,13 +195,23 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
     if source.kind == "zenoh":
         (document,) = source.configurations.values()
         lone = {LONE: _zenoh_file(path, document)}
-        return replace(side, zenoh=source.rights, enforcers=source.enforcers, zenoh_files=lone)
+        # Enclaves that its rules do not name get nothing by it.
+        return replace(
+            side, zenoh=source.rights, enforcers=source.enforcers, zenoh_files=lone, scope=None
+        )
     if source.kind == "enclave":
         has_one = (path / GOVERNANCE_FILE).exists()
         governance = _governance(path / GOVERNANCE_FILE) if has_one else None
         files = path / IDENTITY_CA_FILE, path / CRL_FILE
         trusts = _trusts(dict.fromkeys(source.scope or (), files), {})
-        return replace(side, governance=governance, authorities=_authorities([path]), trusts=trusts)
+        certified = _certified(dict.fromkeys(source.scope or (), path))
+        return replace(
+            side,
+            governance=governance,
+            authorities=_authorities([path]),
+            trusts=trusts,
+            certified=certified,
+        )
     if source.kind != "keystore":
         return side
     folders = {name: enclave_path(path, name) for name in enclave_names(path, hidden=True)}
@@ -210,6 +224,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         authorities=_authorities(folders.values()),
         trusts=_trusts(trusting, _expiries(path)),
         later=load_settings(path) if OpenedKeystore(path).is_home else None,
+        certified=_certified(folders),
     )
     if not has_zenoh_files(path, hidden=True):
         return side
@@ -229,6 +244,17 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         router=found.router,
         zenoh_files=configurations,
     )
+
+
+def _certified(folders: Mapping[str, Path]) -> dict[str, tuple[str, str]]:
+    """Map enclaves to the common name in their certificate, and a digest of the certified key."""
+    found = {}
+    for name, folder in folders.items():
+        if (file := folder / CERTIFICATE_FILE).exists():
+            certificate = load_certificate(read_bytes(file, "certificate"), f"'{file}'")
+            key = key_digest(certificate.public_key())  # type: ignore[arg-type]
+            found[name] = common_name_of(certificate.subject), key
+    return found
 
 
 def _zenoh_file(path: Path, document: ConfigurationDocument) -> SignedConfiguration:

@@ -7,134 +7,168 @@ import os
 import shutil
 import subprocess
 from collections import Counter
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from random import Random
 
 import pytest
 
-from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import matches
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
-from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
-from sros_tool.policy.document import write_policy
-from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Profiles, Qualifier
+from sros_tool.dds.decision.vendors import MEASURED, Style
+from sros_tool.errors import DocumentError
+from sros_tool.fleet.document import read_fleet
 from sros_tool.proof.growth import Gain, compare_access
-from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource, load_side
-from sros_tool.topics import SERVICE_ENDS, dds_names
-from sros_tool.translate import governance_for
+from sros_tool.proof.sources import load_side
+from sros_tool.proof.zenoh_settings import LONE
+from sros_tool.topics import dds_names
+from tests.proof.drawn_sides import (
+    DOMAINS,
+    TOPICS,
+    VERBS,
+    Drawn,
+    Side,
+    changed,
+    draw,
+    loosened,
+    unknown,
+)
+from tests.proof.drawn_sides import write as write_side
 from tests.support.children import LONG
 from tests.support.harness import policy_text, publish, sros
 
-PAIRS = 5000 if LONG else 12
-VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
-GOVERNANCE = governance_for(load_template(DEFAULT_TEMPLATE).protection, ALL_DOMAINS)
-NAMES = (
-    "/a", "/b", "/ab", "/a/b", "/*", "/a*", "/*b", "/?", "/[ab]", "/[!a]", "/[a-b]?", "/a?*",
-    "/*a*", "/a/*", "/[!b]*", "/?b", "/ab*",
-)  # fmt: skip
-SHORT = [
-    name
-    for length in (1, 2, 3)
-    for name in ("/" + "".join(letters) for letters in product("abc/", repeat=length))
-    if "//" not in name and not name.endswith("/")
-]
-TOPICS = [
-    *(f"rt{name}" for name in SHORT),
-    *(f"{begin}{name}{end}" for begin, end in SERVICE_ENDS.items() for name in SHORT[:20]),
-]
+PAIRS = int(os.environ.get("SROS_PAIRS", "5000" if LONG else "25"))
+SEED = int(os.environ.get("SROS_PAIRS_SEED", "1"))
 
 
-def drawn_policy(dice: Random) -> Policy:
-    enclaves = []
-    for path in dice.sample(("/a", "/b"), dice.randint(1, 2)):
-        groups = []
-        for _ in range(dice.randint(1, 4)):
-            kind = dice.choice(("topics", "topics", "topics", "services"))
-            rights = dice.sample(RIGHTS[kind], dice.randint(1, 2))
-            qualifier = dice.choices(tuple(Qualifier), (3, 1))[0]
-            names = tuple(dice.sample(NAMES, dice.randint(1, 3)))
-            groups.append(Group(kind, tuple((r, qualifier) for r in sorted(rights)), names))
-        profile = Profile("/", "n", tuple(groups))
-        enclaves.append(Enclave(path, (Profiles((profile,)),)))
-    return Policy(tuple(enclaves))
+Used = tuple[AccessVerb, str]
+"""The use of a topic."""
 
 
-def changed(policy: Policy, dice: Random) -> Policy:
-    """The policy with one name, one qualifier or one enclave changed, or another policy."""
-    if dice.random() < 0.2:
-        return drawn_policy(dice)
-    enclaves = list(policy.enclaves)
-    at = dice.randrange(len(enclaves))
-    profile = enclaves[at].profiles[0].profiles[0]
-    groups = list(profile.groups)
-    one = dice.randrange(len(groups))
-    if dice.random() < 0.7:
-        groups[one] = replace(groups[one], names=tuple(dice.sample(NAMES, dice.randint(1, 3))))
-    else:
-        del groups[one]
-    kept = replace(profile, groups=tuple(groups))
-    enclaves[at] = replace(enclaves[at], profiles=(Profiles((kept,)),))
-    return Policy(tuple(enclaves))
-
-
-def allowed(side: AccessSource, vendor: Vendor, enclave: str) -> set[tuple[AccessVerb, str]]:
-    permissions = side.permissions.get(enclave)
-    if permissions is None:
-        return set()
-    subject = permissions.grants[0].subject
-    access = Access(vendor, GOVERNANCE, permissions, subject, domain=0, at=AT)
-    return {(v, t) for v in VERBS for t in TOPICS if access.decide(v, t).outcome.ok}
-
-
-def says(gain: Gain, enclave: str, verb: AccessVerb, topic: str, vendor: Vendor) -> bool:
-    if enclave not in gain.enclaves or vendor.title not in gain.worlds:
-        return False
+def says(gain: Gain, style: Style, used: Used) -> bool:
+    """Return whether a gain stands for the use of a topic, by its right."""
+    verb, topic = used
     if gain.right is None:
-        return gain.topic == topic
+        return gain.action == ("write" if verb is AccessVerb.PUBLISH else "read")
+    if gain.right.kind == "dds":
+        return matches(style, gain.right.name, topic)
     names = dds_names(gain.right.right, gain.right.name)
     topics = names.publish if verb is AccessVerb.PUBLISH else names.subscribe
-    return any(matches(vendor.traits.style, each, topic) for each in topics)
+    return any(matches(style, each, topic) for each in topics)
 
 
-def test_random_pairs_against_every_short_name(tmp_path: Path) -> None:
-    dice = Random(17)
-    seen: Counter[bool] = Counter()
-    for _ in range(PAIRS):
-        policy = drawn_policy(dice)
-        sides = []
-        for name, one in (("base", policy), ("head", changed(policy, dice))):
-            (tmp_path / f"{name}.xml").write_bytes(write_policy(one))
-            sides.append(load_side(tmp_path / f"{name}.xml"))
-        base, head = sides
-        growth = compare_access(base, head)
-        for vendor, enclave in product(MEASURED, ("/a", "/b")):
-            before, after = (allowed(side, vendor, enclave) for side in sides)
-            for found, more in ((growth.added, after - before), (growth.removed, before - after)):
-                for verb, topic in more:
-                    assert any(says(e, enclave, verb, topic, vendor) for e in found), (
-                        policy, vendor, verb, topic
-                    )  # fmt: skip
-                seen[bool(more)] += 1
-        assert not compare_access(head, head)
-    assert min(seen[True], seen[False]) > PAIRS
+Decide = Callable[..., bool]
+USES = tuple(product(VERBS, TOPICS))
 
 
-def test_each_name_that_is_reported_is_new(tmp_path: Path) -> None:
-    """The comparison confirms each name itself: a wrong one would be an error there."""
-    dice = Random(3)
-    for _ in range(max(PAIRS // 10, 3)):
-        files = [tmp_path / "base.xml", tmp_path / "head.xml"]
-        for file in files:
-            file.write_bytes(write_policy(drawn_policy(dice)))
-        base, head = map(load_side, files)
-        for gain in compare_access(base, head).added:
-            for enclave, vendor in product(gain.enclaves, MEASURED):
-                if vendor.title in gain.worlds and gain.topic in TOPICS:
-                    before, after = (allowed(side, vendor, enclave) for side in (base, head))
-                    assert gain.topic in {topic for _, topic in after - before}
+def questions(base: Drawn, head: Drawn) -> Iterator[tuple[str, Style, Decide]]:
+    """Yield title, style and decision of each world in which a pair is compared."""
+    if "zenoh" not in (base.kind, head.kind):
+        for vendor in MEASURED:
+            yield vendor.title, vendor.traits.style, partial(Side.dds, vendor=vendor)
+    if base.zenoh or head.zenoh:
+        yield "Zenoh", Style.FNMATCH, Side.on_zenoh
+
+
+@pytest.mark.parametrize("part", range(8 if LONG else 1))
+def test_random_pairs_against_single_questions(tmp_path: Path, part: int) -> None:
+    """Policies, keystores, fleets and files of Zenoh: what is new is found, and nothing else."""
+    seen: Counter[str] = Counter()
+    parts = 8 if LONG else 1
+    for number in range(part, PAIRS, parts):
+        dice = Random(f"{SEED}.{number}")
+        base = draw(dice)
+        head = changed(base, dice)
+        if dice.random() < 0.5:
+            base, head = head, base
+        seen.update(check_pair(tmp_path / str(number), base, head, f"{SEED}.{number}"))
+        shutil.rmtree(tmp_path / str(number))
+    print(sorted(seen.items()))
+    assert min(seen[each] for each in ("gain", "none", "less")) > PAIRS // parts // 20
+
+
+def check_pair(folder: Path, base: Drawn, head: Drawn, name: str) -> Counter[str]:
+    """Compare two drawn sides; return how often what was seen."""
+    folder.mkdir()
+    sides = []
+    for each, drawn in (("base", base), ("head", head)):
+        path, fleet = write_side(drawn, folder / each)
+        sides.append(load_side(path, read_fleet(fleet) if fleet else None))
+    of_base, of_head = Side(base, head), Side(head, base)
+
+    def is_new(decide: Decide, enclave: str, domain: int, used: Used) -> bool:
+        verb, topic = used
+        asked = {"enclave": enclave, "domain": domain, "verb": verb, "topic": topic}
+        return decide(of_head, **asked) and not decide(of_base, **asked)
+
+    new = {
+        (title, style, enclave): {
+            domain: {each for each in USES if is_new(decide, enclave, domain, each)}
+            for domain in DOMAINS
+        }
+        for title, style, decide in questions(base, head)
+        for enclave in of_head.enclaves()
+    }
+    less = loosened(base, head, tuple(Style))
+    seen = {f"{base.kind} {head.kind}": 1}
+    try:
+        growth = compare_access(*sides)
+    except DocumentError as error:
+        assert unknown(base, head), (name, error)
+        assert not any(used for domains in new.values() for used in domains.values()), name
+        assert not less, (name, less)
+        return Counter({**seen, "not compared": 1})
+    assert bool(growth.not_compared) >= unknown(base, head), name
+    for (title, style, enclave), domains in new.items():
+        gains = [e for e in growth.added if enclave in e.enclaves and title in e.worlds]
+        for domain, uses in domains.items():
+            # One domain is named of those in which the same is new.
+            alike = {each for each in domains if domains[each] == uses} | {*others(gains)}
+            for used in uses:
+                assert any(alike & {*each.domains} and says(each, style, used) for each in gains), (
+                    name, title, enclave, domain, used
+                )  # fmt: skip
+    decided = {title: decide for title, _, decide in questions(base, head)}
+    for gain in growth.added:
+        if gain.action == "join":
+            continue
+        used = (AccessVerb.PUBLISH if writes(gain) else AccessVerb.SUBSCRIBE), gain.topic
+        for enclave, title in product(of_head.enclaves() & {*gain.enclaves}, gain.worlds):
+            assert any(is_new(decided[title], enclave, each, used) for each in gain.domains), (
+                name, title, gain
+            )  # fmt: skip
+    keys = [each.key for each in growth.lost]
+    for each in less:
+        assert any(key.startswith(SAID.get(each, f"protection.{each}")) for key in keys) or (
+            each == "zenoh" and any("router.json5" in key or LONE in key for key in keys)
+        ), (name, less, keys)
+    found = [what for what, some in (("gain", growth.added), ("less", growth.lost)) if some]
+    return Counter({**seen, **dict.fromkeys(found or ["none"], 1)})
+
+
+SAID = {
+    "signature": "signature of",
+    "later": "later enclaves",
+    "files": "files of Zenoh",
+    "protect": "protect ",
+    "data or metadata": "protection.",
+}
+"""How the key begins that says what is protected less, where it is not the attribute."""
+
+
+def others(gains: Sequence[Gain]) -> Iterator[int]:
+    """Yield domains of gains in which nothing was asked."""
+    return (domain for each in gains for domain in each.domains if domain not in DOMAINS)
+
+
+def writes(gain: Gain) -> bool:
+    """Return whether the topic of a gain is one that it writes."""
+    if gain.right is None or gain.right.kind == "dds":
+        return gain.action in ("write", "publish")
+    names = dds_names(gain.right.right, gain.right.name)
+    return any(matches(Style.FNMATCH, each, gain.topic) for each in names.publish)
 
 
 POLICY = """<policy version="0.2.0" xmlns:xi="http://www.w3.org/2001/XInclude">
