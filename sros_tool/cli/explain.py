@@ -947,7 +947,7 @@ def _answer_lines(
             "from",
             f"the default of the keystore's template, {default}: no policy file has been signed"
             if default
-            else f"a policy file with the digest {digest[:12]}; name it with --policy",
+            else f"a policy file: add --policy FILE to see its line (digest {digest[:12]})",
         )
     if answer.allowed:
         yield row("protected", ", ".join(_protection_words(answer)))
