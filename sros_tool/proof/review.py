@@ -8,7 +8,7 @@ compared is in the result.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
@@ -37,7 +37,7 @@ from sros_tool.proof.growth import Growth, compare_access
 from sros_tool.proof.repository import FILES, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import Requirement, read_requirements
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
-from sros_tool.proof.system import System, policy_system
+from sros_tool.proof.system import System, load_system, policy_system
 
 _HEAD, _BASE = "HEAD", "BASE"
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
@@ -253,7 +253,8 @@ class _Review:
                 ]
         for each in of_head:
             yield from self._checked("policy", str(each), partial(self._findings, each, head_fleet))
-        yield from self._requirements(of_head, head_fleet)
+        keystores = yield from self._keystores(self.head)
+        yield from self._requirements(of_head, head_fleet, keystores)
         if self.base:
             yield from self._checked(
                 "new-access",
@@ -270,7 +271,6 @@ class _Review:
                         path,
                         partial(self._rights, (before, base_fleet), (each, head_fleet)),
                     )
-        keystores = yield from self._keystores(self.head)
         for path, keystore in keystores.items():
             yield from self._keystore(path, keystore)
         if self.base:
@@ -433,8 +433,6 @@ class _Review:
             yield "new access does not fail the review, as asked"
         for path in asked.left_out:
             yield f"policies below '{path}' are not looked at, as asked"
-        if asked.keystores and asked.requirements:
-            yield "requirements are decided of the policies, not of the keystores"
         if asked.keystores:
             yield "private keys of keystores are not looked at"
         for side in (self.head, self.base):
@@ -504,24 +502,33 @@ class _Review:
                 yield ReviewStep("requirements", path, _UNDECIDED, error)
         return found
 
-    def _requirements(self, policies: Sequence[Path], fleet: Fleet | None) -> Iterator[ReviewStep]:
+    def _requirements(
+        self, policies: Sequence[Path], fleet: Fleet | None, keystores: Mapping[str, Path]
+    ) -> Iterator[ReviewStep]:
         if not self.request.requirements:
             return
         wanted = yield from self._read_requirements(self.head)
         earlier: list[Requirement] = []
         if self.base:
             earlier = yield from self._read_requirements(self.base)
-        dropped = dropped_requirements(earlier, wanted)
-        subject = " ".join(self.request.policies)
-        try:
-            system = policy_system(_together(policies, fleet), at=self.request.at)
-        except SrosError as error:
-            yield ReviewStep("requirements", subject, _UNDECIDED, error)
-            return
-        yield from self._checked("requirements", subject, partial(_decided, wanted, system))
-        if dropped:
-            decide = partial(self._dropped, earlier, wanted, system)
-            yield from self._checked("requirements-before", subject, decide)
+        at, zone = self.request.at, self.request.zone
+        systems: dict[str, Callable[[], System]] = {
+            path: partial(load_system, folder, at=at, zone=zone)
+            for path, folder in keystores.items()
+        }
+        if self.request.policies:
+            named = " ".join(self.request.policies)
+            systems[named] = lambda: policy_system(_together(policies, fleet), at=at)
+        for subject, load in systems.items():
+            try:
+                system = load()
+            except SrosError as error:
+                yield ReviewStep("requirements", subject, _UNDECIDED, error)
+                continue
+            yield from self._checked("requirements", subject, partial(_decided, wanted, system))
+            if dropped_requirements(earlier, wanted):
+                decide = partial(self._dropped, earlier, wanted, system)
+                yield from self._checked("requirements-before", subject, decide)
 
     def _dropped(
         self, earlier: Sequence[Requirement], wanted: Sequence[Requirement], system: System

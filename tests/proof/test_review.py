@@ -158,8 +158,10 @@ def test_the_access_of_a_keystore_is_compared(
     public = change.folder / "ks"
     shutil.copytree(made_keystores / "before", public, symlinks=True)
     change.base = change.commit({})
-    words = ("--policy", "robot.xml", "--keystore", "ks")
+    words = ("--policy", "robot.xml", "--keystore", "ks", "--requirements", "robot.toml")
+    change.commit({"README": "x"})
     same = change.review(*words)
+    assert "requirements ks: nothing found" in same.out
     assert "new-access ks: nobody gets more access" in same.out, same
     shutil.rmtree(public)
     shutil.copytree(made_keystores / case, public, symlinks=True)
@@ -168,6 +170,7 @@ def test_the_access_of_a_keystore_is_compared(
     assert ended.status > 0
     (line,) = (each for each in ended.out.splitlines() if each.startswith("new-access ks"))
     assert "nobody gets more" not in line
+    assert ("requirements ks: 1 error" in ended.out) == (case == "rights")
 
 
 @pytest.fixture(scope="module")
