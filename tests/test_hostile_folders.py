@@ -692,7 +692,10 @@ def test_no_module_of_the_working_folder_is_run(tmp_path: Path) -> None:
     env = {k: v for k, v in os.environ.items() if not k.startswith("ROS_")}
     env["PYTHONPATH"] = str(Path(sros_tool.__file__).parents[1])
     doctor = ("-m", "sros_tool", "doctor")
-    run([sys.executable, "-P", *doctor], cwd=tmp_path, env=env, status=None)
+    program = tmp_path / "bin/sros"  # as pip writes it
+    program.parent.mkdir()
+    program.write_text("import sys\nfrom sros_tool.cli import main\nsys.exit(main())\n")
+    run([sys.executable, program, "doctor"], cwd=tmp_path, env=env, status=None)
     assert not mark.exists()
     run([sys.executable, *doctor], cwd=tmp_path, env=env, status=None)
     assert mark.exists()

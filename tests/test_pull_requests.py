@@ -31,6 +31,8 @@ from tests.support.code_host import (
 from tests.support.harness import sros
 
 ALL = {"policy": POLICY, "requirements": REQUIRED}
+MARKS_OF_JOBS: list[str] = []
+"""What ended the part of each job in which the runner takes no commands."""
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +54,10 @@ def run_action(origin: Origin, clone: Path, **inputs: str) -> tuple[int, str, di
     job = action_job(origin, clone, **inputs)
     ended = job.run()
     begin, *_, end = ended.stdout.splitlines()
-    assert begin.removeprefix("::stop-commands::") == end.strip(":")
+    mark = begin.removeprefix("::stop-commands::")
+    assert mark == end.strip(":") and len(mark) >= 32
+    assert mark not in MARKS_OF_JOBS, "a pull request could print it"
+    MARKS_OF_JOBS.append(mark)
     outputs = dict(
         line.split("=", 1) for line in job.files["GITHUB_OUTPUT"].read_text().splitlines()
     )

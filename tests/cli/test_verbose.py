@@ -71,7 +71,9 @@ def test_no_secret_is_reported(tmp_path: Path) -> None:
         said += done.err + done.out
     assert "opened the key of the permissions CA" in said and "committed" in said
     assert PASSPHRASE not in said
-    keys = [path for path in root.rglob("*") if path.is_file() and b"PRIVATE" in path.read_bytes()]
+    files = [path for path in root.rglob("*") if path.is_file()]
+    assert [path for path in files if PASSPHRASE.encode() in path.read_bytes()] == []
+    keys = [path for path in files if b"PRIVATE" in path.read_bytes()]
     assert keys
     for key in keys:
         for line in key.read_text().splitlines():

@@ -451,6 +451,9 @@ def test_exports_repeat_byte_by_byte(keystore: Path, tmp_path: Path) -> None:
     exported = snapshot(tmp_path / "1")
     assert not [path for path, (mode, _) in exported.items() if stat.S_ISLNK(mode)]
     assert not [path for path in exported if PRIVATE in path or "/b" in path]
+    ca_keys = [path.read_bytes().strip() for path in (keystore / PRIVATE).glob("*.key.pem")]
+    files = [path.read_bytes() for path in (tmp_path / "1").rglob("*") if path.is_file()]
+    assert ca_keys and not [key for key in ca_keys for file in files if key in file]
     shutil.rmtree(keystore)
     (tmp_path / "robot").mkdir()
     # As on a robot; Python's own way differs between its minor versions.

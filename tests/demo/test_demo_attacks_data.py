@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from datetime import UTC, datetime
 from itertools import chain, combinations
 from pathlib import Path
@@ -16,6 +17,7 @@ from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.demo.scenarios.model import DENIALS, FOREIGN, OWN, Condition, Row, RowStatus
 from sros_tool.errors import KeystoreError
+from tests.support.checkout import CHECKOUT
 
 ROWS = (
     *ATTACKS.rows,
@@ -49,6 +51,13 @@ def test_every_closed_door_opens_without_its_defence() -> None:
     for row in ROWS:
         if row.removed:
             assert row.expected not in CLOSED, row.name
+
+
+def test_the_page_lists_the_attacks_that_work() -> None:
+    _, _, text = (CHECKOUT / "docs/attacks.md").read_text().partition("Attacks that are known to work:\n")
+    listed = re.findall(r"^\| (.+?) \|", text.strip().partition("\n\n")[0], re.MULTILINE)[2:]
+    assert listed == [row.name for row in ROWS if row.open_because and not row.removed]
+    assert len(listed) == 7, "docs/security.md has the number"
 
 
 @BY_NAME

@@ -189,6 +189,9 @@ def test_the_rights_are_those_of_the_policy_and_a_renewal_keeps_them(
 ) -> None:
     (tmp_path / "p.xml").write_text(policy_text({NAME: publish("image")}))
     policy = read_policy(tmp_path / "p.xml")
+    other = create_request(robot, "/arm/other").file.read_bytes()
+    sign_request(home, other, now=NOW)
+    assert topics_of(home / "enclaves/arm/other") == topics_of(home / "enclaves/base")
     sign_request(home, request_of(robot), now=NOW, policy=policy)
     assert topics_of(home / FOLDER) == {"rt/image", "ros_discovery_info"}
     first = certificate(home / FOLDER / "cert.pem")

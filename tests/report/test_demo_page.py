@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from lxml import html
 
+from sros_tool.cli.demo import _write_report
 from sros_tool.report.demo_page import render_demo_page, without_folders
 from sros_tool.terminal import visible_line
 from tests.report.pictures import HOSTILE, new_page
@@ -142,6 +144,17 @@ def test_no_place_of_the_machine_is_told() -> None:
         "b": {"c": "…"},
         "d": None,
     }
+
+
+def test_no_place_of_the_machine_is_written(tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    places = (Path.home(), Path.cwd(), Path(tempfile.gettempdir()), kept)
+    detail = " ".join(f"'{place}/log'" for place in places)
+    page, shown = tmp_path / "demo.html", result(row("a row", detail=detail))
+    _write_report(page, shown, kept)
+    text = page.read_text()
+    assert "…/log" in text
+    assert [place for place in places if str(place) in text] == []
 
 
 @pytest.mark.browser
