@@ -54,7 +54,8 @@ def test_every_closed_door_opens_without_its_defence() -> None:
 
 
 def test_the_page_lists_the_attacks_that_work() -> None:
-    _, _, text = (CHECKOUT / "docs/attacks.md").read_text().partition("Attacks that are known to work:\n")
+    page = (CHECKOUT / "docs/attacks.md").read_text()
+    _, _, text = page.partition("Attacks that are known to work:\n")
     listed = re.findall(r"^\| (.+?) \|", text.strip().partition("\n\n")[0], re.MULTILINE)[2:]
     assert listed == [row.name for row in ROWS if row.open_because and not row.removed]
     assert len(listed) == 7, "docs/security.md has the number"
