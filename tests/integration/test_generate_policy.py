@@ -20,6 +20,7 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY
+from sros_tool.graph.learn import is_tool_name
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
@@ -320,7 +321,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
 def observed_endpoints(learned: Learned) -> dict[str, set[Endpoint]]:
     found: dict[str, set[Endpoint]] = {}
     for each in learned.observed["nodes"]:
-        if each["name"].startswith("_ros2cli"):
+        if is_tool_name(each["name"]):  # also the observers of the other commands
             continue
         (enclave,) = each["enclaves"]
         for way in ("publish", "subscribe"):

@@ -54,8 +54,9 @@ ASK = {fastdds_vendor(): ask_fastdds, Vendor.CYCLONE: ask_cyclone}
 
 def witnesses(world: str, domain: int = DOMAIN) -> Iterator[tuple[Policy, Use, bool]]:
     """Yield uses of witnesses in a world, each with its policy and whether it is allowed."""
-    number = found = 0
-    while found < COUNT:
+    number = 0
+    left = {True: COUNT // 6, False: COUNT - COUNT // 6}  # witnesses of `Must`, which is denied
+    while any(left.values()):
         draw = random.Random(f"witness {number}")
         number += 1
         policy = draw_policy(draw)
@@ -66,11 +67,10 @@ def witnesses(world: str, domain: int = DOMAIN) -> Iterator[tuple[Policy, Use, b
         for requirement in (draw_requirement(draw) for _ in range(10)):
             witness = decide(requirement, system.worlds[0]).witness
             known = {each.path for each in policy.enclaves}
-            if witness and witness.uses[0].enclave in known and found < COUNT:
-                found += 1
-                yield from (
-                    (policy, use, not isinstance(requirement, Must)) for use in witness.uses
-                )
+            denied = isinstance(requirement, Must)
+            if witness and witness.uses[0].enclave in known and left[denied]:
+                left[denied] -= 1
+                yield from ((policy, use, not denied) for use in witness.uses)
 
 
 @pytest.mark.dds

@@ -109,14 +109,15 @@ def test_the_jobs_do_their_work_under_their_restrictions(robot: Path, tmp_path: 
     (tmp_path / "robot.xml").write_text(policy_text({"/{robot}/a": publish("/a")}))
     stated = ("-p", tmp_path / "robot.xml", "--fleet", tmp_path / "fleet.toml")
     sros("generate_artifacts", "-k", keystore, *stated).ok()
-    for job in Job:
+    ended = {Job.CHECK: 1, Job.FLEET: 1}  # no node starts with these rights; r1 confirmed nothing
+    for job in (each for each in Job if each is not Job.GUARD):  # the guard never ends
         files = job_units(job, str(keystore), user="root", sros="/bin/sros")
         (tmp_path / "job").write_text(files[f"sros-{job}.service"])
         (line,) = re.findall("^ExecStart=/bin/sros (.*)$", (tmp_path / "job").read_text(), re.M)
         words = line.replace("/var/lib/sros-metrics", str(metrics)).replace("30d", "9999d")
         program = [sys.executable, "-m", "sros_tool", *words.split()]
         confined = [sys.executable, CONFINED, tmp_path / "job", keystore, metrics, "--", *program]
-        run(confined, status=1 if job is Job.FLEET else 0)
+        run(confined, status=ended.get(job, 0))
     assert (keystore / "enclaves/arm/cert.pem").read_bytes() != before
     assert "sros_enclaves{" in (metrics / "sros.prom").read_text()
     assert 'robot="r1"' in (metrics / "fleet.prom").read_text()
