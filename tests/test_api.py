@@ -6,6 +6,7 @@ import inspect
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -53,6 +54,15 @@ def test_the_first_script_prints_what_the_document_says(tmp_path: Path) -> None:
     assert (tmp_path / "robot.tar.gz").is_file()
 
 
+@pytest.fixture
+def same_recursion_limit() -> Iterator[None]:
+    """Put back the limit of the tests' process, which mypy raises for good."""
+    limit = sys.getrecursionlimit()
+    yield
+    sys.setrecursionlimit(limit)
+
+
+@pytest.mark.usefixtures("same_recursion_limit")
 def test_a_type_checker_knows_the_names_and_finds_a_wrong_call(tmp_path: Path) -> None:
     api = pytest.importorskip("mypy.api")
     script = tmp_path / "script.py"
