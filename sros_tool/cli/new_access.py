@@ -84,6 +84,8 @@ def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
         text = f"{who} {gain.right.describe()}"
         if gain.source:
             text += f"  ({gain.source})"
+        if gain.right.enclave not in gain.enclaves:
+            text += f" by the permissions of {gain.right.enclave}, which fit its certificate"
         if gain.name != gain.right.name:
             text += f": such as {gain.name}"
     if gain.denied:

@@ -6,8 +6,9 @@ domains.  Permissions do not say the first.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from hashlib import sha256
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance
@@ -26,7 +27,7 @@ def completed(side: AccessSource, other: AccessSource) -> AccessSource:
     has access control of everything, in the domains of the other side and in its own ones.
     """
     domains = domains_of_robots(side, other)
-    permissions = side.permissions
+    permissions = _certified_as(side, other)
     if domains:
         permissions = {
             name: _for_domain(each, domains[name]) if name in domains else each
@@ -43,6 +44,27 @@ def completed(side: AccessSource, other: AccessSource) -> AccessSource:
         open_ended = {"policy"} >= {side.kind, other.kind}
         governance = governance_for(strict_protection(), ALL_DOMAINS if open_ended else known)
     return replace(side, permissions=permissions, governance=governance)
+
+
+def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permissions]:
+    """Return the permissions of a side; a policy's for the subjects that the other side has.
+
+    Where the other side is a keystore that gives unique subjects, further enclaves get one, too.
+    """
+    if side.kind != "policy" or other.kind == "policy":
+        return side.permissions
+    unique = other.later is not None and other.later.unique_subject
+    found = {}
+    for name, permissions in side.permissions.items():
+        known = other.permissions.get(name)
+        subject = next((grant.subject for grant in known.grants), "") if known else ""
+        if not subject and unique:
+            subject = f"CN={name},OU={sha256(name.encode()).hexdigest()}"
+        grants = permissions.grants
+        if subject:
+            grants = tuple(replace(grant, subject=subject) for grant in grants)
+        found[name] = Permissions(grants)
+    return found
 
 
 def domains_of_robots(side: AccessSource, other: AccessSource) -> dict[str, int]:

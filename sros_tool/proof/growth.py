@@ -17,9 +17,11 @@ from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import matches, names_of
+from sros_tool.dds.decision.subjects import also_fitting
 from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Grant
+from sros_tool.dds.governance import Governance
+from sros_tool.dds.permissions import Grant, Permissions
 from sros_tool.errors import DocumentError
 from sros_tool.keystore.comparison import Effect, SettingChange
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
@@ -46,7 +48,8 @@ class Gain:
 
     ``action`` is publish, subscribe, request, reply, call or execute; write or read for a DDS
     ``topic`` that no stated right gives; or join.  ``right`` is the right that gives it, at
-    ``source``, if one is stated.  ``name`` is an example: a name for which it is so.  ``denied``
+    ``source``, if one is stated; it is of another enclave if a vendor takes that one's permissions
+    for those of ``enclaves``, too.  ``name`` is an example: a name for which it is so.  ``denied``
     is where the other side denies it.  ``worlds`` are the vendors that decide so, ``domains``
     examples of domains.
     """
@@ -173,6 +176,8 @@ _NO_ACCESS = _Access(dict.fromkeys(_VERBS, NameSet()), lambda verb, topic: False
 
 _AccessOf = Callable[[AccessSource, str, int], _Access]
 """The access of an enclave of a side in a domain."""
+_Lenders = Callable[[AccessSource, str], tuple[str, ...]]
+"""The other enclaves of a side whose permissions fit the certificate of an enclave as well."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +188,7 @@ class _World:
     style: Style
     domains: tuple[int, ...]
     access: _AccessOf
+    lenders: _Lenders = lambda side, enclave: ()
     longest: int | None = None
 
 
@@ -191,9 +197,14 @@ def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
     if "zenoh" not in (base.kind, head.kind):
         domains = _domains(base, head)
         for vendor in MEASURED:
-            by_side = _of_vendor(vendor)
-            longest = vendor.traits.longest_topic_name
-            found.append(_World(vendor.title, vendor.traits.style, domains, by_side, longest))
+            lenders = _lenders(vendor, base, head)
+            access = _of_vendor(vendor, lenders)
+            traits = vendor.traits
+            found.append(
+                _World(
+                    vendor.title, traits.style, domains, access, lenders, traits.longest_topic_name
+                )
+            )
     if base.zenoh is not None or head.zenoh is not None:
         found.append(
             _World(_ZENOH, Style.FNMATCH, _zenoh_domains(base, head), _on_zenoh(base, head))
@@ -228,23 +239,44 @@ def _granted(side: AccessSource) -> set[DomainSet]:
     }
 
 
-def _of_vendor(vendor: Vendor) -> _AccessOf:
-    def access(side: AccessSource, enclave: str, domain: int) -> _Access:
-        permissions = side.permissions.get(enclave)
-        if permissions is None or side.governance is None:
-            return _NO_ACCESS
+def _lenders(vendor: Vendor, *sides: AccessSource) -> _Lenders:
+    by_side = {}
+    for side in sides:
+        granted = {
+            name: [grant.subject for grant in permissions.grants]
+            for name, permissions in side.permissions.items()
+        }
+        certified = {name: subjects[0] for name, subjects in granted.items() if subjects}
+        by_side[id(side)] = also_fitting(vendor.traits, certified, granted)
+    return lambda side, enclave: by_side[id(side)].get(enclave, ())
+
+
+def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
+    def own_access(
+        side: AccessSource, governance: Governance, permissions: Permissions, enclave: str, at: int
+    ) -> Access:
         subject = permissions.grants[0].subject if permissions.grants else ""
-        found = Access(vendor, side.governance, permissions, subject, domain=domain, at=AT)
+        found = Access(vendor, governance, permissions, subject, domain=at, at=AT)
         if found.join().reason in ("no-grant", "malformed") or found.join().outcome == "crashes":
             raise DocumentError(
                 f"the permissions of {enclave} in '{side.shown}' cannot be compared",
                 found.join().text,
                 "Sign them again.",
             )
+        return found
+
+    def access(side: AccessSource, enclave: str, domain: int) -> _Access:
+        governance = side.governance
+        if enclave not in side.permissions or governance is None:
+            return _NO_ACCESS
+        usable = [
+            own_access(side, governance, side.permissions[name], name, domain)
+            for name in (enclave, *lenders(side, enclave))
+        ]
         return _Access(
-            {verb: found.topics(verb) for verb in _VERBS},
-            lambda verb, topic: found.decide(verb, topic).outcome.ok,
-            found.join().outcome.ok,
+            {verb: NameSet.union([each.topics(verb) for each in usable]) for verb in _VERBS},
+            lambda verb, topic: any(each.decide(verb, topic).outcome.ok for each in usable),
+            any(each.join().outcome.ok for each in usable),
         )
 
     return access
@@ -413,7 +445,13 @@ def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> 
         return None not in (old.zenoh, new.zenoh) and old.enforcers == new.enforcers
     if old.governance != new.governance:
         return False
-    one, other = old.permissions.get(enclave), new.permissions.get(enclave)
+    names = (enclave, *world.lenders(old, enclave))
+    return names == (enclave, *world.lenders(new, enclave)) and all(
+        _same_grants(old.permissions.get(each), new.permissions.get(each)) for each in names
+    )
+
+
+def _same_grants(one: Permissions | None, other: Permissions | None) -> bool:
     if one is None or other is None:
         return one is other
     return [_without_name(each) for each in one.grants] == [
@@ -447,7 +485,8 @@ class _Stated:
         limit: SearchLimit,
     ) -> Iterator[Gain]:
         """Yield a gain for each right that is stated for some of ``more``, and for the rest."""
-        key = enclave, verb, more, world.style, world.longest  # often so in several domains
+        lenders = world.lenders(self._new, enclave)
+        key = enclave, lenders, verb, more, world.style, world.longest  # often in several domains
         if key not in self._found:
             self._found[key] = list(self._searched(enclave, verb, more, world, domain, limit))
         for each in self._found[key]:
@@ -462,7 +501,11 @@ class _Stated:
         domain: int,
         limit: SearchLimit,
     ) -> Iterator[Gain]:
-        allowed = [(each, _topics_of(each)[verb]) for each in self._allowed.get(enclave, ())]
+        allowed = [
+            (each, _topics_of(each)[verb])
+            for name in (enclave, *world.lenders(self._new, enclave))
+            for each in self._allowed.get(name, ())
+        ]
         denials = self._denied.get(enclave, ())
         denied = names_of(world.style, (e for each in denials for e in _topics_of(each)[verb]))
         for right, topics in allowed:

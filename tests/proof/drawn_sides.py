@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import matches
-from sros_tool.dds.decision.vendors import Style, Vendor
+from sros_tool.dds.decision.vendors import Style, Subjects, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import (
     DomainRule,
@@ -63,7 +63,7 @@ from sros_tool.zenoh.enforcement import Enforcement, Remote
 VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 DOMAINS = (0, 7, 8, 9)
 """Two that keystores have, one that only robots have, and one that nobody names."""
-ENCLAVES = ("/a", "/r1", "/r2")
+ENCLAVES = ("/a", "/a/b", "/r1", "/r2")
 HIDDEN = "/.h"
 AT = datetime(2026, 1, 1, tzinfo=UTC)
 NAMES = (
@@ -178,7 +178,7 @@ def drawn_policy(
     dice: Random, *, robots: bool = False, plain: bool = False, hidden: bool = False
 ) -> Policy:
     """A policy of few enclaves; of robots by a placeholder, ``plain`` without what Zenoh lacks."""
-    paths = ["/a", "/{robot}"] if robots else dice.sample(ENCLAVES, dice.randint(1, 2))
+    paths = ["/a", "/{robot}"] if robots else dice.sample(ENCLAVES, dice.randint(1, 3))
     enclaves = [drawn_enclave(dice, path, plain) for path in paths]
     if hidden:
         enclaves.append(drawn_enclave(dice, HIDDEN, plain, protect=False))
@@ -347,7 +347,7 @@ def _write_keystore(drawn: Drawn, root: Path) -> None:
         (root / "fleet.toml").write_text(_fleet(drawn.robots, 'enclaves = ["/{robot}"]'))
     for each in drawn.policy.enclaves:
         folder = root / f"enclaves{each.path}"
-        folder.mkdir()
+        folder.mkdir(parents=True, exist_ok=True)
         permissions = permissions_for(
             each,
             subject=f"CN={each.path}",
@@ -443,9 +443,34 @@ class Side:
         return {*others, *(fixed[each] for each in fixed if each in self._stated)}
 
     def dds(self, vendor: Vendor, enclave: str, domain: int, verb: AccessVerb, topic: str) -> bool:
-        """Whether a vendor lets an enclave use a topic in a domain."""
+        """Whether a vendor lets an enclave use a topic in a domain, also as another enclave."""
         if enclave not in self._stated:
             return False
+        return any(
+            self._by_permissions(vendor, each, domain, verb, topic)
+            for each in (enclave, *self._lenders(vendor, enclave))
+        )
+
+    def _lenders(self, vendor: Vendor, enclave: str) -> Iterator[str]:
+        """The enclaves whose permissions Cyclone DDS takes for those of another one."""
+        if vendor.traits.subjects is Subjects.SUBSET and not self._is_unique(enclave):
+            parts = set(enclave.split("/"))
+            yield from (e for e in self._stated if e != enclave and parts < {*e.split("/")})
+
+    def _is_unique(self, enclave: str) -> bool:
+        """Whether a policy's enclave is created later, in a keystore of the template production."""
+        other = self._other
+        return (
+            self.own.kind == "policy"
+            and other.kind == "keystore"
+            and other.settings == SETTINGS.index("production")
+            and all(each.path != enclave for each in _expanded(other).enclaves)
+        )
+
+    def _by_permissions(
+        self, vendor: Vendor, enclave: str, domain: int, verb: AccessVerb, topic: str
+    ) -> bool:
+        """Whether the permissions of an enclave let it use a topic in a domain."""
         if self.own.kind == "policy":
             if not self._in_domain(enclave, domain):
                 return False

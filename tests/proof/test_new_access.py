@@ -602,3 +602,24 @@ def test_a_fleet_in_another_domain_is_said_when_it_is_signed(fleet: Path) -> Non
     assert "/r1/base: what it lost works until" in ended.err
     rights = json.loads(sros(*words[:-1], "any.toml", "--dry-run", "--json", cwd=fleet).out)
     assert [each["gained_domains"] for each in rights["rights"]] == ["0"]
+
+
+NAMED = """<policy version="0.2.0"><enclaves>{}</enclaves></policy>"""
+SENDER = """<enclave path="{}"><profiles><profile ns="/" node="n">
+  <topics publish="ALLOW"><topic>{}</topic></topics></profile></profiles></enclave>"""
+
+
+def test_an_enclave_whose_subject_fits_the_permissions_of_another_one(tmp_path: Path) -> None:
+    """Cyclone DDS takes the permissions of /robot/mux for those of /mux: a new /mux has them."""
+    old, new = SENDER.format("/robot/mux", "cmd_vel"), SENDER.format("/mux", "log")
+    for name, text in (("base.xml", old), ("head.xml", old + new)):
+        (tmp_path / name).write_text(NAMED.format(text), encoding="utf-8")
+    ended = sros("diff_policy", "--no-new-access", "base.xml", "head.xml", cwd=tmp_path)
+    assert ended.status == 1
+    (line,) = [each for each in ended.out.splitlines() if "/robot/mux" in each]
+    assert line == (
+        "+ /mux publish topic /cmd_vel  (head.xml:2) by the permissions of /robot/mux, which fit "
+        "its certificate; with Cyclone DDS 0.10.2"
+    )
+    back = compare_access(*(load_side(tmp_path / each) for each in ("head.xml", "base.xml")))
+    assert not back.added
