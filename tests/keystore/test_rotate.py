@@ -602,11 +602,17 @@ def test_a_ca_ends_before_the_old_one_only_if_it_was_chosen(tmp_path: Path) -> N
         assert note.id not in {each.id for each in done.notes}
 
 
-def test_no_default_replaces_a_ca_by_one_that_ends_before(tmp_path: Path) -> None:
-    """A keystore of ros2/sros2 has no settings that could choose it."""
-    root = tmp_path / "ks"
+def test_no_default_replaces_a_ca_by_one_that_ends_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A keystore of ros2/sros2 has no settings that could choose it, until sros takes it over."""
+    root, taken_over = tmp_path / "ks", tmp_path / "taken over"
+    made_by_ros2.make(taken_over, "/a", now=NOW)
+    rotate_ca(taken_over, now=NOW, validity=timedelta(days=7300), finish=True)
+    noted = rotate_ca(taken_over, now=NOW).notes
+    assert "keystore.ca-expires-earlier" in {each.id for each in noted}
+    monkeypatch.setattr(made_by_ros2, "VALIDITY", timedelta(days=7300))
     made_by_ros2.make(root, "/a", now=NOW)
-    rotate_ca(root, now=NOW, validity=timedelta(days=7300), finish=True)
     refused(lambda: rotate_ca(root, now=NOW), root, "expire before the old")
 
 

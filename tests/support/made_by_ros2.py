@@ -70,6 +70,8 @@ _PERMISSIONS = """<dds {schema}>
 """
 _OF_ROS = "".join(f"<topic>{each}</topic>" for each in ("rq/*Request", "rr/*Reply", "rt/*"))
 _TOPICS = f"{_OF_ROS}<topic>ros_discovery_info</topic><topic>*</topic>"
+VALIDITY = timedelta(days=3650)
+"""How long its certificates are valid."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ def make(
             schema=SCHEMA.format("permissions"),
             name=name,
             begin=now - timedelta(days=1),
-            end=now + timedelta(days=3650),
+            end=now + VALIDITY,
             domain=domain,
             topics=_TOPICS if made.discovery is None else _OF_ROS,
         )
@@ -152,7 +154,7 @@ def issue(
         key.public_key(),
         x509.random_serial_number(),
         now - timedelta(days=1),
-        now + timedelta(days=3650),
+        now + VALIDITY,
     ).add_extension(constraints, critical=issuer is None)
     return builder.sign(issuer[1] if issuer else key, hashes.SHA256()), key
 
