@@ -158,6 +158,13 @@ def test_what_cannot_be_compared_fails_in_the_action(origin: Origin, tmp_path: P
     assert "'fial' is not one of 'fail', 'allow'" in found
 
 
+def test_a_checkout_below_the_workspace_is_reviewed(origin: Origin, tmp_path: Path) -> None:
+    origin.clone(tmp_path / "workspace/robot-sources", "wider")
+    job = action_job(origin, tmp_path / "workspace", **ALL, checkout="robot-sources")
+    ended = job.run()
+    assert (ended.returncode, "requirement" in ended.stdout) == (1, True), ended
+
+
 @pytest.mark.parametrize(
     ("inputs", "said"),
     [

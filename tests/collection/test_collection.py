@@ -128,3 +128,22 @@ def test_a_revoked_robot_is_left_out_and_no_failure(tmp_path: Path) -> None:
     with pytest.raises(RefusedError, match="the robot r3 has no enclave") as refused:
         export({**arguments, "robot": "r3"})
     assert not isinstance(refused.value, LeftOutError)
+
+
+@needs_ansible
+def test_facts_named_as_variables_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ansible import constants
+
+    from ansible_collections.sros.fleet.plugins.plugin_utils.facts import check_facts
+
+    def task(*names: str) -> dict[str, object]:
+        """Return the variables of a task on a robot that has facts with these names."""
+        known = dict.fromkeys(names, "x")
+        injected = known if constants.INJECT_FACTS_AS_VARS else {}
+        return {"my_keystore": "/ks", **injected, "ansible_facts": known}
+
+    for inject, refused in ((True, "my_keystore"), (True, "sros_robot"), (False, "sros_robot")):
+        monkeypatch.setattr(constants, "INJECT_FACTS_AS_VARS", inject)
+        with pytest.raises(RefusedError, match=f"take the place of variables \\({refused}\\)"):
+            check_facts(task("distribution", refused) if not inject else task(refused))
+    check_facts(task("distribution", "my_keystore"))

@@ -186,33 +186,36 @@ def test_robots_that_lie_in_many_ways(tmp_path: Path) -> None:
     flat = " ".join(text.split())
     assert "Revoked: /r4/a." in flat and "processes: /dispatcher." in flat, text
     assert "The revocation list did not get to r2, r3, r5, r6, r7," in flat, text
+    assert "This robot has facts that take the place of variables (sros_robot)" in flat, text
 
 
-@pytest.mark.parametrize(("which", "module"), [("status", "enclaves")])
-def test_facts_of_a_robot_choose_no_command_and_no_keys(
-    tmp_path: Path, which: str, module: str
-) -> None:
-    """Neither an export nor a record is made with the settings that a robot returned as facts."""
+def test_facts_of_a_robot_choose_no_command_and_no_keys(tmp_path: Path) -> None:
+    """Home runs no command for another robot with what a robot returned as facts."""
     keystore = tmp_path / "keystore"
     sros("create_keystore", keystore).ok()
     sros("create_enclave", keystore, "/r1/a", "/r2/a").ok()
-    trace = tmp_path / "trace"
+    trace, asked = tmp_path / "trace", tmp_path / "asked"
     facts = {
         "sros_program": ["/bin/sh", "-c", f"echo here >> '{trace}'; echo '{{}}'"],
         "sros_robot": "r2",
+        "sros_patterns": ["/r2/*"],
     }
     answers: dict[str, dict[str, Any]] = {"reach": {"reached": True}, "enclaves": INSTALLED}
-    answers[module] = {**answers[module], "ansible_facts": facts}
+    answers = {module: {**answer, "ansible_facts": facts} for module, answer in answers.items()}
+    sros_and_note = f"echo \"$*\" >> '{asked}'; exec '{sys.executable}' -m sros_tool \"$@\""
     robot = {
         "ansible_connection": "local",
         "ansible_python_interpreter": str(hostile(tmp_path, "r1", answers)),
         "sros_patterns": ["/r1/*"],
         "sros_confirm": False,
-        "sros_program": [sys.executable, "-m", "sros_tool"],
+        "sros_program": ["/bin/sh", "-c", sros_and_note, "sros"],
     }
-    text = play(tmp_path, which, {"r1": robot}, sros_keystore=str(keystore))
+    text = play(tmp_path, "deliver", {"r1": robot}, sros_keystore=str(keystore))
     assert "failed=0" in text, text
     assert not trace.exists()
+    commands = asked.read_text()
+    assert "distribute_key" in commands and "/r1/*" in commands
+    assert "r2" not in commands
 
 
 def test_bad_requests_of_robots_get_no_certificate_and_stop_no_other(tmp_path: Path) -> None:

@@ -173,6 +173,41 @@ def test_the_access_of_a_keystore_is_compared(
     assert ("requirements ks: 1 error" in ended.out) == (case == "rights")
 
 
+def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
+    change: Change, made_keystores: Path
+) -> None:
+    shutil.copytree(made_keystores / "before", change.folder / "ks", symlinks=True)
+    change.base = change.commit({})
+    change.commit({"README": "x"})
+    words = ("--keystore", "ks", "--renew-within")
+    sound = change.review(*words, "1d").ok()
+    assert "expiry ks: 0 of 2 enclaves need to be renewed" in sound.out
+    late = change.review(*words, "3000d")
+    assert (late.status, "expiry ks: 2 of 2 enclaves" in late.out) == (1, True), late
+    certificate = change.folder / "ks/enclaves/a/cert.pem"
+    change.commit({"ks/enclaves/a/cert.pem": "damaged"})
+    damaged = change.review(*words, "1d")
+    assert (damaged.status, "keystore ks: 1 error" in damaged.out) == (2, True), damaged
+    certificate.unlink()
+    certificate.symlink_to("../../../robot.xml")
+    change.commit({})
+    linked = change.review(*words, "1d")
+    assert (linked.status, "cert.pem' is a link out of 'ks'" in linked.out) == (2, True), linked
+
+
+def test_what_is_new_included_or_cannot_fail(change: Change) -> None:
+    included = (change.folder / "common/node.xml").read_text()
+    change.commit({"common/node.xml": f"{included}<!-- more -->\n"})
+    assert "node.xml" not in change.review("--policy", "robot.xml").ok().out
+    change.commit({"new.xml": policy_text({"/c": publish("/z")})})
+    new = change.review("--policy", "new.xml")
+    assert (new.status, "is new, so that all of its access is new" in new.out) == (1, True), new
+    change.base = change.commit({"robot.toml": ONLY.replace("/x", "/nobody")})
+    change.commit({"README": "x"})
+    empty = change.review("--policy", "robot.xml", "--requirements", "robot.toml")
+    assert (empty.status, "requirements robot.xml: 1 warning" in empty.out) == (1, True), empty
+
+
 @pytest.fixture(scope="module")
 def made_keystores(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the public part of a keystore, and what a change makes of it."""
