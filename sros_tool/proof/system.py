@@ -300,10 +300,10 @@ def _keystore_system(
 
     Its documents decide what an enclave may do, whether or not its key is here and its files would
     be loaded now: the robot may have others.  Permissions that become valid later count as well,
-    and the governance of each enclave for all.
+    and the governance of each enclave for all.  Enclaves in hidden folders are among them.
     """
-    names = enclave_names(root)
-    source = load_rights(root)
+    names = enclave_names(root, hidden=True)
+    source = load_rights(root, hidden=True)
     rights = frozenset(each for each in source.rights if each.qualifier is ALLOW)
     stated = _stated(names, rights)
     folders = {name: enclave_path(root, name) for name in names}
@@ -373,7 +373,7 @@ def _keystore_system(
             access[name] = tuple(each for each in found if each is not None)
         lenders = also_fitting(vendor.traits, subjects, granting)
         worlds.append(_dds_world(vendor, access, stated, title=title, idle=idle, lenders=lenders))
-    if world == _ZENOH or (not world and has_zenoh_files(root)):
+    if world == _ZENOH or (not world and has_zenoh_files(root, hidden=True)):
         worlds += _zenoh_worlds(root, domain, stated)
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}
     places = {
@@ -422,7 +422,7 @@ def _zenoh_worlds(
     Raises:
         KeystoreError: there are no configurations of Zenoh, or it is not certain what they enforce.
     """
-    found = load_zenoh_rights(root)
+    found = load_zenoh_rights(root, hidden=True)
     for note in found.notes:
         if note.id in UNCERTAIN:
             raise KeystoreError(

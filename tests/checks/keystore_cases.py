@@ -96,6 +96,9 @@ CASES |= {
     "keystore.transaction-left": lambda b: b.path(".sros-transaction").mkdir(0o700),
     "keystore.transaction-not-ours": lambda b: b.path(".sros-transaction").mkdir(0o755),
     "keystore.unknown-file": lambda b: b.path("notes.txt").write_text("call Bob"),
+    "keystore.hidden-enclave": lambda b: shutil.copytree(
+        b.path("enclaves/base"), b.path("enclaves/.base"), symlinks=True
+    ),
     "keystore.stray-key": lambda b: shutil.copy(
         b.path("enclaves/base/key.pem"), b.path("enclaves/base/key.pem.bak")
     ),

@@ -116,6 +116,12 @@ def without_keys(keystore: Path) -> None:
     shutil.rmtree(keystore / "private")
 
 
+def a_hidden_enclave(keystore: Path) -> None:
+    """DDS loads a copy of /mux, and the keystore does not list it."""
+    shutil.copytree(keystore / "enclaves/mux", keystore / "enclaves/.h")
+    signed(keystore, "enclaves/.h/permissions.p7s", lambda old: old.replace(b"/mux", b"/.h"))
+
+
 def rules(keystore: Path, change: Callable[[dict[str, object]], None]) -> None:
     document = json.loads((keystore / ROUTER).read_text())
     change(document)
@@ -207,6 +213,7 @@ def another_router(keystore: Path) -> None:
         (in_another_domain, "/web: may publish /cmd_vel, but"),
         (from_later_on, "/web: may publish /cmd_vel, but"),
         (without_keys, "/web: may publish /cmd_vel, but"),
+        (a_hidden_enclave, "/.h: may publish /cmd_vel with the permissions of /mux, but"),
         (a_name_without_an_enclave, "/ghost: may publish /cmd_vel, but"),
         (a_weaker_governance_of_one_enclave, "/router: may publish /cmd_vel, and so may /web"),
         (at_many_times, "become valid at more than 10 different times"),

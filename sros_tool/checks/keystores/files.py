@@ -38,6 +38,7 @@ from sros_tool.keystore.layout import (
     UnreadPath,
     enclave_folder,
     enclave_path,
+    search_enclaves,
 )
 from sros_tool.keystore.transaction.stage import check_interrupted
 from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
@@ -177,6 +178,16 @@ UNREADABLE = FindingKind(
     "sros keystore layout.",
     "Restore it from a backup.",
 )
+HIDDEN_ENCLAVE = FindingKind(
+    "keystore.hidden-enclave",
+    ERROR,
+    "an enclave in a hidden folder",
+    "DDS loads it, and a node that names it has its rights. No verb of sros lists, renews, revokes "
+    "or exports it, and the check of enclaves leaves it out.",
+    "rcl 9 (rcl/src/rcl/security.c) takes a folder of any name; sros keystore layout.",
+    "Remove the folder, or give the enclave a name without a dot (`sros create_enclave`). If "
+    "others had it, replace the CA (`sros rotate_ca`): its certificate stays valid.",
+)
 UNKNOWN_FILE = FindingKind(
     "keystore.unknown-file",
     NOTE,
@@ -222,6 +233,7 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     yield from _writers(root, state, trusted)
     links = _Links(root)
     if names is None:
+        yield from _hidden_enclaves(keystore)
         yield from _below(root, keystore, links, trusted, kept)
         if kept and not (keystore.is_home and _has_links(keystore)):
             yield HOME_OR_ROBOT.found(root, f"it has {some_names(kept)}", root)
@@ -234,6 +246,16 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     for folder in sorted(passed):
         path = os.path.join(root, folder)
         yield from _writers(path, Path(path).stat(), trusted)
+
+
+def _hidden_enclaves(keystore: CheckedKeystore) -> Iterator[Finding]:
+    hidden = set(search_enclaves(keystore.root, hidden=True)[0]).difference(keystore.names)
+    for name in sorted(hidden):
+        folder = enclave_path(keystore.root, name)
+        if STAGE not in folder.parts:  # an interrupted change, which is a finding
+            yield HIDDEN_ENCLAVE.found(
+                name, "its folder or one above it begins with a dot", str(folder)
+            )
 
 
 def _has_links(keystore: CheckedKeystore) -> bool:
