@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shlex
 import shutil
 import stat
@@ -715,6 +716,17 @@ def test_the_name_of_a_file_becomes_no_command_in_a_remedy(keystore: Path) -> No
     }
     command = remedy.removeprefix("Run `").removesuffix("`.")
     assert shlex.split(command) == ["chmod", "600", str(copied)]
+    odd = keystore.parent / "x; touch owned; '; touch owned; '"  # unquoted, or in quotes
+    keystore.rename(odd)
+    (odd / "enclaves/a").chmod(0o777)
+    for name, damage in (("key.pem", b""), ("cert.pem", b"x"), ("governance.p7s", b"x")):
+        (odd / "enclaves/a" / name).write_bytes(damage)
+    (odd / "public/identity_ca.cert.pem").unlink()
+    found_there = [*keystore_findings(odd, now=NOW), *verify_arrival(odd, now=NOW).findings]
+    commands = [each for found in found_there for each in re.findall("`(.+?)`", found.remedy)]
+    with_name = [shlex.split(each) for each in commands if "touch" in each]
+    assert len({words[0] for words in with_name}) >= 2, commands
+    assert [words for words in with_name if "touch" in words or "owned" in words] == []
 
 
 def test_a_file_of_the_kernel_is_not_read(keystore: Path) -> None:

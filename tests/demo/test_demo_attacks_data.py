@@ -15,7 +15,16 @@ from sros_tool.demo.forger import KeystoreCopy, Undefended, name_of
 from sros_tool.demo.keystores import KeystoreSet
 from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.attacks import ATTACKS
-from sros_tool.demo.scenarios.model import DENIALS, FOREIGN, OWN, Condition, Row, RowStatus
+from sros_tool.demo.scenarios.model import (
+    DENIALS,
+    FOREIGN,
+    OWN,
+    Condition,
+    Row,
+    RowStatus,
+    Scenario,
+)
+from sros_tool.demo.scenarios.zenoh.attacks import ATTACKS as ZENOH_ATTACKS
 from sros_tool.errors import KeystoreError
 from tests.support.checkout import CHECKOUT
 
@@ -53,12 +62,17 @@ def test_every_closed_door_opens_without_its_defence() -> None:
             assert row.expected not in CLOSED, row.name
 
 
-def test_the_page_lists_the_attacks_that_work() -> None:
+@pytest.mark.parametrize(
+    ("title", "scenario", "count"),
+    [("", ATTACKS, 7), (" on Zenoh", ZENOH_ATTACKS, 6)],
+    ids=["DDS", "Zenoh"],
+)
+def test_the_page_lists_the_attacks_that_work(title: str, scenario: Scenario, count: int) -> None:
     page = (CHECKOUT / "docs/attacks.md").read_text()
-    _, _, text = page.partition("Attacks that are known to work:\n")
+    _, _, text = page.partition(f"Attacks that are known to work{title}:\n")
     listed = re.findall(r"^\| (.+?) \|", text.strip().partition("\n\n")[0], re.MULTILINE)[2:]
-    assert listed == [row.name for row in ROWS if row.open_because and not row.removed]
-    assert len(listed) == 7, "docs/security.md has the number"
+    assert listed == [row.name for row in scenario.rows if row.open_because and not row.removed]
+    assert len(listed) == count, "docs/security.md has the number"
 
 
 @BY_NAME
