@@ -314,7 +314,7 @@ def _replace(change: Change, wider: str) -> None:
     change.git("replace", wider, change.git("rev-parse", f"{change.base}:robot.xml"))
 
 
-def _graft(change: Change, _: str) -> None:
+def _replace_commit(change: Change, _: str) -> None:
     head = change.git("rev-parse", "HEAD")
     change.git("replace", head, change.base)
 
@@ -329,8 +329,8 @@ def _damage(change: Change, wider: str) -> None:
 
 @pytest.mark.parametrize(
     ("trick", "status"),
-    [(_replace, 1), (_graft, 1), (_damage, 2)],
-    ids=["replace", "graft", "loose"],
+    [(_replace, 1), (_replace_commit, 1), (_damage, 2)],
+    ids=["file", "commit", "loose"],
 )
 def test_objects_are_what_their_hashes_say(
     named: Change, trick: Callable[[Change, str], None], status: int
