@@ -147,3 +147,17 @@ def test_facts_named_as_variables_are_refused(monkeypatch: pytest.MonkeyPatch) -
         with pytest.raises(RefusedError, match=f"take the place of variables \\({refused}\\)"):
             check_facts(task("distribution", refused) if not inject else task(refused))
     check_facts(task("distribution", "my_keystore"))
+
+
+@needs_ansible
+@pytest.mark.parametrize("fact", ["control_path", "sftp_executable", "host_key_checking"])
+def test_facts_that_set_ssh_at_home_are_refused(fact: str) -> None:
+    """Ansible takes them for its settings, though they come from a robot."""
+    from ansible.plugins.loader import connection_loader
+
+    from ansible_collections.sros.fleet.plugins.plugin_utils.facts import check_facts
+
+    assert connection_loader.get("ssh", class_only=True)
+    with pytest.raises(RefusedError, match=f"take the place of variables \\({fact}\\)"):
+        check_facts({f"ansible_{fact}": "x", "ansible_facts": {fact: "x", "distribution": "x"}})
+    check_facts({"ansible_distribution": "x", "ansible_facts": {"distribution": "x"}})

@@ -24,6 +24,7 @@ INSTALLED: dict[str, Any] = {
     "restart": [],
     "routers": [],
     "confirmation": CONFIRMATION,
+    "verification": {"by": "openssl", "ok": True, "problems": [], "remarks": []},
 }
 
 
@@ -216,6 +217,77 @@ def test_facts_of_a_robot_choose_no_command_and_no_keys(tmp_path: Path) -> None:
     commands = asked.read_text()
     assert "distribute_key" in commands and "/r1/*" in commands
     assert "r2" not in commands
+
+
+def test_a_revoked_robot_gets_no_certificate_for_another_key(tmp_path: Path) -> None:
+    keystore = fleet_keystore(tmp_path, 2)
+    sros("revoke", keystore, "--robot", "r2").ok()
+    hosts: dict[str, Any] = {}
+    for name, own in (("r1", "/spare"), ("r2", "/r2/a")):
+        sros("create_request", own, tmp_path / "asked").ok()
+        made = (tmp_path / f"asked/enclaves{own}/request.pem").read_text()
+        answers: dict[str, dict[str, Any]] = {
+            "reach": {"reached": True},
+            "requests": {"changed": True, "made": [own], "requests": {own: made}},
+            "enclaves": INSTALLED,
+        }
+        hosts[name] = {
+            "ansible_connection": "local",
+            "ansible_python_interpreter": str(hostile(tmp_path, name, answers)),
+            "sros_own_keys": [own],
+            "sros_confirm": False,
+        }
+    program = [sys.executable, "-m", "sros_tool"]
+    text = play(tmp_path, "requests", hosts, sros_keystore=str(keystore), sros_program=program)
+    assert enclaves(keystore) == ["/dispatcher", "/r1/a", "/spare"], text
+    assert "failed=1" not in text, text
+
+
+def test_a_status_is_green_only_if_all_were_asked_and_verify(tmp_path: Path) -> None:
+    keystore = fleet_keystore(tmp_path, 3)
+    broken = {"verification": {"ok": False, "problems": ["/r1/a: key.pem: not the key"]}}
+    reached: dict[str, dict[str, Any]] = {"reach": {"reached": True}}
+    hosts: dict[str, Any] = {}
+    for name, answer in (("r1", INSTALLED | broken), ("r2", INSTALLED)):
+        python = hostile(tmp_path, name, {**reached, "enclaves": answer})
+        hosts[name] = {"ansible_connection": "local", "ansible_python_interpreter": str(python)}
+    hosts["r3"] = {"ansible_connection": "ssh", "ansible_ssh_executable": "/bin/false"}
+    own: dict[str, Any] = {"sros_program": [sys.executable, "-m", "sros_tool"]}
+    own |= {"sros_keystore": str(keystore), "sros_confirm": False}
+    text = " ".join(play(tmp_path, "status", hosts, **own, sros_hosts="r1,r2,r3,r33").split())
+    assert "/r1/a: key.pem: not the key" in text, text
+    assert "No robot of the inventory is meant by r33 in sros_hosts" in text, text
+    assert "Not reached, or lost on the way: r3." in text, text
+    assert "r3 :" in text and "failed=1" in text, text
+
+
+@pytest.mark.parametrize("which", ["deliver", "status"])
+def test_no_robot_meant_is_an_error(tmp_path: Path, which: str) -> None:
+    own = {"sros_keystore": str(fleet_keystore(tmp_path, 1)), "sros_hosts": "r*9"}
+    program = [sys.executable, "-m", "sros_tool"]
+    text = " ".join(play(tmp_path, which, {"r1": {}}, **own, sros_program=program).split())
+    assert "No robot of the inventory is meant by r*9 in sros_hosts" in text, text
+
+
+def test_a_robot_names_only_enclaves_to_restart(tmp_path: Path) -> None:
+    """Its operator is told to restart them, in a sentence that is not the robot's."""
+    keystore = fleet_keystore(tmp_path, 1)
+    lie = ["/r1/a (on each robot: fetch a repair and run it)"]
+    answers: dict[str, dict[str, Any]] = {
+        "reach": {"reached": True},
+        "enclaves": {**INSTALLED, "restart": lie},
+        "restarted": {"changed": False, "restart": lie},
+    }
+    robot = {
+        "ansible_connection": "local",
+        "ansible_python_interpreter": str(hostile(tmp_path, "r1", answers)),
+        "sros_confirm": False,
+    }
+    program = [sys.executable, "-m", "sros_tool"]
+    own = {"sros_keystore": str(keystore), "sros_program": program}
+    text = play(tmp_path, "deliver", {"r1": robot}, **own)
+    assert "another kind of value than it should for restart" in text, text
+    assert "a repair" not in text, text
 
 
 def test_bad_requests_of_robots_get_no_certificate_and_stop_no_other(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedE
 from ansible_collections.sros.fleet.plugins.module_utils.home import ask, decoded
 from ansible_collections.sros.fleet.plugins.plugin_utils.answers import (
     DIFFERENCES,
+    enclave,
     flag,
     list_of,
     map_of,
@@ -30,7 +31,7 @@ class ActionModule(RobotAction):
 
     readers = {  # noqa: RUF012 - a ClassVar of the class above
         **dict.fromkeys(
-            ("changed_enclaves", "removed_enclaves", "restart", "routers"), list_of(name)
+            ("changed_enclaves", "removed_enclaves", "restart", "routers"), list_of(enclave)
         ),
         "verification": record(by=name, ok=flag, problems=list_of(text), remarks=list_of(text)),
         "confirmation": record(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from ansible_collections.sros.fleet.plugins.plugin_utils.answers import (
     document,
+    enclave,
     list_of,
     map_of,
-    name,
 )
 from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import RobotAction
 
@@ -14,4 +14,4 @@ from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import Rob
 class ActionModule(RobotAction):
     """Run the module on the robot."""
 
-    readers = {"made": list_of(name), "requests": map_of(document)}  # noqa: RUF012 - as above
+    readers = {"made": list_of(enclave), "requests": map_of(document)}  # noqa: RUF012 - as above

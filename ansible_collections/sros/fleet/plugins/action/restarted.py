@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from ansible_collections.sros.fleet.plugins.plugin_utils.answers import list_of, name
+from ansible_collections.sros.fleet.plugins.plugin_utils.answers import enclave, list_of
 from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import RobotAction
 
 
 class ActionModule(RobotAction):
     """Run the module on the robot."""
 
-    readers = {"restart": list_of(name)}  # noqa: RUF012 - as above
+    readers = {"restart": list_of(enclave)}  # noqa: RUF012 - as above

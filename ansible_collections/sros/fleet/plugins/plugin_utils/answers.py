@@ -6,7 +6,10 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
+from ansible_collections.sros.fleet.plugins.module_utils.exports import (
+    RefusedError,
+    check_enclave,
+)
 from ansible_collections.sros.fleet.plugins.module_utils.home import harmless
 
 _MOST_BYTES = 16 << 20
@@ -43,6 +46,14 @@ def text(value: Any) -> str:
 def name(value: Any) -> str:
     """Return a name as one line."""
     return harmless(_str(value), most=_LONGEST_NAME)
+
+
+def enclave(value: Any) -> str:
+    """Return the name of an enclave, which the plays show as what is to be restarted."""
+    try:
+        return check_enclave(_str(value))
+    except RefusedError as error:
+        raise ValueError from error
 
 
 def document(value: Any) -> str:

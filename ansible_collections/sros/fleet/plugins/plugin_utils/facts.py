@@ -48,8 +48,30 @@ def _replacing(variables: Mapping[str, Any]) -> list[str]:
     if not constants.INJECT_FACTS_AS_VARS:
         return sorted(each for each in facts if each.startswith(_SETTINGS))
     # Ansible takes the prefix ansible_ off the names of facts, and not off those of variables.
+    options = _options()
+    steering = {each for each in facts if {each, f"ansible_{each}"} & options}
     return sorted(
         each
         for each in facts
-        if each in variables and each not in _OF_SETUP and not each.startswith(_OF_ANSIBLE)
+        if each in steering
+        or (each in variables and each not in _OF_SETUP and not each.startswith(_OF_ANSIBLE))
     )
+
+
+def _options() -> set[str]:
+    """Return the names of variables by which ssh, the shell and become are set at home.
+
+    Ansible takes only some of them out of the facts of a robot, which could choose by the others
+    the path of the socket of ssh, or the program that copies files.
+    """
+    plugins = (
+        each
+        for kind in ("connection", "shell", "become")
+        for each in (constants.config.get_configuration_definitions(kind) or {}).values()
+    )
+    return {
+        variable["name"]
+        for options in plugins
+        for option in options.values()
+        for variable in option.get("vars") or ()
+    }
