@@ -468,6 +468,8 @@ class _Stated:
 
     def __init__(self, old: AccessSource, new: AccessSource) -> None:
         self._old, self._new = old, new
+        self._old_sources: _Sources = {}
+        self._new_sources: _Sources = {}
         self._examples: dict[tuple[str, AccessVerb, str], list[str]] = defaultdict(list)
         self._found: dict[tuple[object, ...], list[Gain]] = {}
         rights = new.rights if new.zenoh is None else new.rights | new.zenoh
@@ -568,12 +570,24 @@ class _Stated:
             right,
             name,
             topic,
-            self._new.source_of(right) if right else None,
+            _source(self._new_sources, self._new, right),
             denied,
-            self._old.source_of(denied) if denied else None,
+            _source(self._old_sources, self._old, denied),
             (world.title,),
             (domain,),
         )
+
+
+_Sources = dict[str, dict[Right, Source]]
+"""By enclave: where its rights are stated, of those enclaves that were asked for."""
+
+
+def _source(known: _Sources, side: AccessSource, right: Right | None) -> Source | None:
+    if right is None:
+        return None
+    if right.enclave not in known:
+        known[right.enclave] = side.sources_of(right.enclave)
+    return known[right.enclave].get(right)
 
 
 def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit) -> str | None:

@@ -52,6 +52,8 @@ _ELSEWHERE = (
     *("GIT_REPLACE_REF_BASE", "GIT_SHALLOW_FILE", "GIT_WORK_TREE"),
 )
 """Variables that would have git read another repository than that of its folder."""
+_OF_SETTINGS = ("HOME", "XDG_CONFIG_HOME", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM")
+"""Variables that say where git reads settings outside of the repository."""
 _HASH = re.compile(r"[0-9a-f]{40}(?:[0-9a-f]{24})?\Z")
 _ABBREVIATED = re.compile(r"[0-9a-fA-F]{4,64}\Z")
 _NO_REFERENCE = re.compile(r"[\x00-\x20\x7f*?\[\\~^:]|\A-|\A\Z")
@@ -330,8 +332,11 @@ class Repository:
     def fetch_missing(self, digits: str, remote: str) -> None:
         """Fetch a commit without its history, unless it is there, by the settings of a remote.
 
+        Those of the clone, the user and the machine count, because they have the credentials.
+
         Raises:
-            UsageError: ``digits`` is no full id, or ``remote`` no remote of the repository.
+            UsageError: ``digits`` is no full id, ``remote`` no remote of the repository, or git
+                would read settings in the work tree.
             DocumentError: it cannot be fetched.
         """
         if not _HASH.match(digits):
@@ -340,12 +345,32 @@ class Repository:
             raise UsageError(f"'{remote}' is no remote of the repository", "", "See `git remote`.")
         if self.sizes([digits]):
             return
+        self._refuse_settings_inside()
         options = (
             *("--quiet", "--depth=1", "--no-tags", "--no-prune", "--no-recurse-submodules"),
             *("--no-auto-maintenance", "--no-write-fetch-head", "--refmap="),
             *("--upload-pack=git-upload-pack", "--", remote, digits),
         )
         self._git(["fetch", *options], environment=_FETCHING, wait=_WAIT_FOR_SERVER)
+
+    def _refuse_settings_inside(self) -> None:
+        """Refuse settings of git that lie in the work tree, whose files anybody may have written.
+
+        Raises:
+            UsageError: a variable names such a place; a fetch would run programs named there.
+        """
+        top = self.top()
+        if top is None:
+            return
+        inside = os.path.realpath(top)
+        for name in _OF_SETTINGS:
+            place = os.environ.get(name, "")
+            if place and Path(os.path.realpath(self.folder / place)).is_relative_to(inside):
+                raise UsageError(
+                    f"{name} is '{place}', inside of the work tree '{top}'",
+                    "Git reads settings there, and a fetch runs programs that they name.",
+                    f"Set {name} to a place elsewhere, or fetch the commit before the review.",
+                )
 
     # ── git ────────────────────────────────────────────────────────────────────────────────
 

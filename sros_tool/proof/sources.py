@@ -128,17 +128,19 @@ class AccessSource:
     enclaves: Mapping[str, Enclave] = field(default_factory=dict)
     revision: Revision | None = None
 
-    def source_of(self, right: Right) -> Source | None:
-        """Return the file and line that states a right; None unless it is one of a policy."""
-        enclave = self.enclaves.get(right.enclave)
-        for profile in enclave.all_profiles() if enclave else ():
+    def sources_of(self, enclave: str) -> dict[Right, Source]:
+        """Return the file and line that states each right of an enclave, if it is of a policy."""
+        found: dict[Right, Source] = {}
+        stated = self.enclaves.get(enclave)
+        for profile in stated.all_profiles() if stated else ():
             for group in profile.groups:
-                if (right.right, right.qualifier) not in group.rights:
-                    continue
                 for index, name in enumerate(group.names):
-                    if expand(name, profile.ns, profile.node) == right.name:
-                        return self.shown_source(group.source_of(index))
-        return None
+                    full = expand(name, profile.ns, profile.node)
+                    for right, qualifier in group.rights:
+                        key = Right(enclave, qualifier, right, full)
+                        if key not in found:
+                            found[key] = self.shown_source(group.source_of(index))
+        return found
 
     def shown_source(self, source: Source) -> Source:
         """Return a source of this side as a user would name it."""

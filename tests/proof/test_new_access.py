@@ -18,9 +18,11 @@ import pytest
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import MEASURED, Style
-from sros_tool.errors import DocumentError
+from sros_tool.errors import DocumentError, UsageError
 from sros_tool.fleet.document import read_fleet
+from sros_tool.proof import sources
 from sros_tool.proof.growth import Gain, compare_access
+from sros_tool.proof.repository import Repository
 from sros_tool.proof.sources import load_side
 from sros_tool.proof.zenoh_settings import LONE
 from sros_tool.topics import dds_names
@@ -623,3 +625,39 @@ def test_an_enclave_whose_subject_fits_the_permissions_of_another_one(tmp_path: 
     )
     back = compare_access(*(load_side(tmp_path / each) for each in ("head.xml", "base.xml")))
     assert not back.added
+
+
+def test_the_work_grows_with_the_number_of_new_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tens of thousands of names take seconds: the place of a right is looked up once."""
+    base, head = tmp_path / "base.xml", tmp_path / "head.xml"
+    topics = "</topic><topic>".join(f"t{number}" for number in range(100))
+    base.write_text(NAMED.format(SENDER.format("/a", "x")), encoding="utf-8")
+    head.write_text(NAMED.format(SENDER.format("/a", f"x</topic><topic>{topics}")), "utf-8")
+    sides = load_side(base), load_side(head)
+    asked: list[str] = []
+
+    def expand(name: str, *_: str) -> str:
+        asked.append(name)
+        return f"/{name}"
+
+    monkeypatch.setattr(sources, "expand", expand)
+    added = compare_access(*sides).added
+    assert len(added) == 100
+    assert all(each.source and each.source.line == 2 for each in added)
+    assert len(asked) < 300
+
+
+@pytest.mark.parametrize("name", ["HOME", "XDG_CONFIG_HOME", "GIT_CONFIG_GLOBAL"])
+def test_nothing_is_fetched_with_settings_from_the_work_tree(
+    repository: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A .gitconfig of a pull request could name a program that a fetch runs."""
+    git(repository, "remote", "add", "origin", "ext::true")
+    monkeypatch.setenv(name, str(repository / "home"))
+    with pytest.raises(UsageError, match=f"{name} is '.*/home', inside of the work tree"):
+        Repository(repository).fetch_missing("0" * 40, "origin")
+    monkeypatch.setenv(name, str(repository.parent / "home"))
+    with pytest.raises(DocumentError, match="not allowed"):
+        Repository(repository).fetch_missing("0" * 40, "origin")
