@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -212,6 +213,32 @@ def test_the_job_of_gitlab(origin: Origin, tmp_path: Path) -> None:
     Sarif.model_validate(json.loads((clone / folder / "review.sarif").read_text()))
     assert sorted(each.name for each in (clone / folder).iterdir()) == ["review.md", "review.sarif"]
     assert not origin.git("worktree", "list", cwd=clone).partition("\n")[2]
+
+
+def test_the_job_of_gitlab_has_no_result_of_the_merge_request(
+    origin: Origin, tmp_path: Path
+) -> None:
+    """An installation that fails would leave as an artifact what the merge request has there."""
+    clone = origin.clone(tmp_path / "clone", "wider")
+    (clone / "sros-review").mkdir()
+    (clone / "sros-review" / "review.md").write_text("## Review: nothing found\n")
+    job = gitlab_job(origin, clone, **ALL)
+    script = job.words[-1].replace("status=0\n", "exit 1\n", 1)
+    assert replace(job, words=[*job.words[:-1], script]).run().returncode == 1
+    assert not list((clone / "sros-review").iterdir())
+
+
+def test_the_job_of_gitlab_compares_with_what_is_merged_into(
+    origin: Origin, tmp_path: Path
+) -> None:
+    """The target branch has lost a right since the merge request began, which has it still."""
+    clone = origin.clone(tmp_path / "clone", "dropped", depth=20)
+    began = origin.git("rev-parse", "wider")
+    job = gitlab_job(origin, clone, **{**ALL, "requirements": ""}, base=began)
+    known = {**job.environment, "CI_MERGE_REQUEST_DIFF_BASE_SHA": began}
+    assert replace(job, environment=known).run().returncode == 0
+    known["CI_MERGE_REQUEST_TARGET_BRANCH_SHA"] = origin.base
+    assert replace(job, environment=known).run().returncode == 1
 
 
 def test_both_code_hosts_run_the_same_command() -> None:

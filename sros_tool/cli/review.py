@@ -204,6 +204,7 @@ def review(
     repository = Repository(folder.resolve())
     threshold = parse_threshold(renew_within)
     outputs = _Outputs(repository, summary, sarif)
+    outputs.write_unfinished()
     try:
         request = ReviewRequest(
             repository,
@@ -265,6 +266,10 @@ class _Outputs:
     def write(self, result: Review, request: ReviewRequest) -> None:
         """Write the result."""
         self._write(_markdown(result, request), [result.shown_finding(e) for e in _all(result)])
+
+    def write_unfinished(self) -> None:
+        """Write what counts if the review is ended from outside, such as by a limit of time."""
+        self._write("## Review: could not be decided\n\nIt was ended before its result.\n", [])
 
     def write_error(self, error: SrosError) -> None:
         """Write why there is no result."""

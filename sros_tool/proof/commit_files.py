@@ -17,7 +17,6 @@ from sros_tool.folders import Folder
 from sros_tool.policy.document import MissingFileError, read_policy
 from sros_tool.proof.repository import FILES, FOLDER, LINK, Repository, TreeEntry, walk
 from sros_tool.proof.revisions import Revision
-from sros_tool.xml import parse
 
 _MOST_ENTRIES = 200_000
 _MOST_BYTES = 512 * 1024 * 1024
@@ -78,7 +77,8 @@ class CommitFiles:
         The files that they include are written, too.  The list is empty if nothing is there.
 
         Raises:
-            DocumentError: it is no file and no folder, or a file that could be a policy is damaged.
+            DocumentError: it is no file and no folder, a file that could be a policy is damaged, or
+                the folder has links, submodules, or too much.
         """
         entry = self.entry(path)
         if entry is None:
@@ -87,18 +87,12 @@ class CommitFiles:
             return [self._policy(path, placeholders)]
         if entry.mode != FOLDER:
             raise self._no_file(path, entry)
-        found = sorted(
-            f"{path}/{name}"
-            for name, _ in walk(self.repository, entry.id, most=_MOST_ENTRIES)
-            if name.lower().endswith(".xml")
-        )
-        revision = Revision(self.repository, self.name, self.commit, path)
-        return [
-            self._policy(each, placeholders)
-            for each in found
-            if parse(revision.read(self._nowhere(each)), f"'{each}'", instructions=True).tag
-            in ("policy", "profiles")
-        ]
+        folder = Revision(self.repository, self.name, self.commit, path)
+        try:
+            return [self._policy(each.path, placeholders) for each in folder.policies()]
+        except SrosError as error:
+            texts = (folder.shown(each) for each in (error.what, error.why, error.remedy))
+            raise DocumentError(*texts) from error
 
     def tree(self, path: str) -> Path | None:
         """Return a folder with all that is below it, such as a keystore; None if nothing is there.

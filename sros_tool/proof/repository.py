@@ -214,6 +214,12 @@ class Repository:
         """Return the id of the top folder of a commit."""
         return _header(self._objects([commit])[commit][1], b"tree")
 
+    def parents(self, commit: str) -> tuple[str, ...]:
+        """Return the ids of the commits that a commit follows; a merge has several."""
+        head = self._objects([commit])[commit][1].partition(b"\n\n")[0]
+        lines = head.decode(errors="replace").split("\n")
+        return tuple(each.removeprefix("parent ") for each in lines if each.startswith("parent "))
+
     def folders(self, ids: Iterable[str]) -> dict[str, dict[str, TreeEntry]]:
         """Return the entries of folders by id and name.
 
@@ -310,14 +316,17 @@ class Repository:
         asked = "".join(f"{each}\n" for each in ids).encode()
         data = self._git(["cat-file", "--batch"], stdin=asked)
         found: dict[str, tuple[str, bytes]] = {}
+        at = 0
         for each in ids:
-            line, _, data = data.partition(b"\n")
+            end = data.find(b"\n", at)
+            line, at = data[at:end], end + 1
             words = line.decode(errors="replace").split()
             if words[-1:] == ["missing"]:
                 continue
             if len(words) != 3 or not words[2].isdecimal():
                 raise DocumentError(f"git cannot read it: {line[:200].decode(errors='replace')}")
-            content, data = data[: int(words[2])], data[int(words[2]) + 1 :]
+            content = data[at : at + int(words[2])]
+            at += len(content) + 1
             if _digest(words[1], content, len(each)) != each:
                 raise DocumentError(
                     f"the object {each} of the repository is damaged",

@@ -7,6 +7,7 @@ compared is in the result.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -30,14 +31,16 @@ from sros_tool.keystore.layout import KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.policy.model import Policy
+from sros_tool.policy.rights import policy_rights
 from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.dropped import dropped_findings, dropped_requirements
 from sros_tool.proof.findings import requirement_findings
 from sros_tool.proof.growth import Growth, compare_access
-from sros_tool.proof.repository import FILES, SUBMODULE, Repository, TreeEntry, walk
+from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import Requirement, read_requirements
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
 from sros_tool.proof.system import System, load_system, policy_system
+from sros_tool.xml import parse
 
 _HEAD, _BASE = "HEAD", "BASE"
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
@@ -49,8 +52,13 @@ _MOST_OUTSIDE = 32 * 1024 * 1024
 
 No policy is larger.
 """
-_OF_POLICIES = ((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns="))
+_OF_POLICIES = (
+    *((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns=")),
+    *((b"<topics", b"ALLOW"), (b"<services", b"ALLOW"), (b"<actions", b"ALLOW")),
+)
 """What an XML file that is a policy, or a part of one, has, and what follows in it."""
+_EBCDIC = b"\x4c\x6f\xa7\x94"
+"""The beginning of an XML file in EBCDIC (XML 1.0, appendix F)."""
 _ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
 _READABLE = (b"utf-8", b"utf8", b"utf-16", b"us-ascii", b"ascii", b"iso-8859-", b"windows-125")
 _OK, _FOUND, _UNDECIDED = 0, 1, 2
@@ -274,7 +282,10 @@ class _Review:
         for path, keystore in keystores.items():
             yield from self._keystore(path, keystore)
         if self.base:
-            yield from self._checked("files", "", self._others)
+            yield from self._checked("files", "", partial(self._others, of_head, head_fleet))
+            if base_fleet and head_fleet:
+                where = partial(self._places, base_fleet, head_fleet)
+                yield from self._checked("new-access", asked.fleet, where)
         for error in self.head.refused + (self.base.refused if self.base else []):
             yield ReviewStep("files", "", _UNDECIDED, error)
 
@@ -367,8 +378,18 @@ class _Review:
         before = other.repository.tree(other.commit) if other else ""
         return walk(side.repository, tree, most=_MOST_ENTRIES, other=before)
 
-    def _others(self) -> tuple[int, Content] | None:
-        """Return the policies that change and are not reviewed, and what became of others."""
+    def _places(self, before: Fleet, after: Fleet) -> tuple[int, Content] | None:
+        """Return the robots whose keys are delivered to another place than before."""
+        lines = []
+        for name, new in after.robots.items():
+            old = before.robots.get(name)
+            if old and (old.address, old.user) != (new.address, new.user):
+                place = f"{new.user}@{new.address}" if new.user else new.address
+                lines.append((f"gets its keys at another place, {place or 'its name'}", name))
+        return (self._new_access, Facts(tuple(lines))) if lines else None
+
+    def _others(self, reviewed: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content] | None:
+        """Return what changes and is not reviewed of policies, and what became of others."""
         assert self.base
         lines: list[tuple[str, str]] = []
         status = _OK
@@ -379,6 +400,13 @@ class _Review:
         for path in self._policies_among(changed, self.head):
             lines.append(("changes and is not reviewed, as no policy that is uses it", path))
             status = self._new_access
+        for path in self._used_in_part(changed, reviewed, fleet):
+            lines.append(("changes and is used only in part, and the rest is not reviewed", path))
+            status = self._new_access
+        for path, entry in changed:
+            if said := self._unseen(path, entry):
+                lines.append((f"changes and is not reviewed: it is {said}", path))
+                status = self._new_access
         gone = [
             (path, entry)
             for path, entry in self._changed(self.base, self.head)
@@ -387,10 +415,52 @@ class _Review:
         for path in self._policies_among(gone, self.base, known=False):
             new = names.get(dict(gone)[path].id)
             lines.append((f"is renamed to '{new}'" if new else "is deleted", path))
-        for path, entry in changed:
-            if entry.mode == SUBMODULE:
-                lines.append(("is a submodule that changes, whose files are not reviewed", path))
         return (status, Facts(tuple(lines))) if lines else None
+
+    def _used_in_part(
+        self,
+        changed: Iterable[tuple[str, TreeEntry]],
+        reviewed: Sequence[Path],
+        fleet: Fleet | None,
+    ) -> Iterator[str]:
+        """Yield policies of which the reviewed ones, or a keystore, have the file, but not all."""
+        named = {str(each.relative_to(self.head.folder)) for each in reviewed}
+        known = [path for path, _ in changed if path in self.head.files and path not in named]
+        policies = [path for path in known if self._is_policy(self.head.files[path])]
+        if not policies:
+            return
+        rights = {each for file in reviewed for each in policy_rights(read_policy_for(file, fleet))}
+        for path in policies:
+            with suppress(SrosError):
+                (file,) = self.head.policies(path, placeholders=fleet is not None)
+                if rights.issuperset(policy_rights(read_policy_for(file, fleet))):
+                    continue
+            yield path
+
+    def _is_policy(self, entry: TreeEntry) -> bool:
+        """Return whether a file is a whole policy, or may be one."""
+        content = self.request.repository.content(entry.id)
+        if not _may_be_policy(content):
+            return False
+        try:
+            return parse(content, "the file").tag in ("policy", "profiles")
+        except DocumentError:
+            return True
+
+    def _unseen(self, path: str, entry: TreeEntry) -> str:
+        """Return what at a path of HEAD may lead to policies that are not reviewed, or ""."""
+        apart = (*self.request.left_out, *self.request.keystores)
+        if entry.mode not in (LINK, SUBMODULE) or _is_below(path, apart):
+            return ""
+        if entry.mode == SUBMODULE:
+            return entry.kind
+        repository = self.request.repository
+        target = os.fsdecode(repository.content(entry.id))
+        with suppress(SrosError):
+            there = self.head.entry(os.path.normpath(Path(path).parent / target))
+            if there and there.mode in FILES and not _may_be_policy(repository.content(there.id)):
+                return ""
+        return f"a symbolic link to '{target}'"
 
     @staticmethod
     def _has(side: CommitFiles, path: str) -> bool:
@@ -408,7 +478,7 @@ class _Review:
             for path, entry in entries
             if entry.mode in FILES
             and not (known and path in side.files)
-            and not any(f"{path}/".startswith(f"{each}/") for each in self.request.left_out)
+            and not _is_below(path, self.request.left_out)
         }
         sizes = side.repository.sizes(dict.fromkeys(each.id for each in wanted.values()))
         small = {p: e.id for p, e in wanted.items() if sizes.get(e.id, 0) <= _MOST_OUTSIDE}
@@ -439,6 +509,9 @@ class _Review:
             for path in dict.fromkeys(side.fell_back if side else ()):
                 assert side
                 yield f"'{path}' is not in {side.name}, so that a fallback counts in its place"
+        parents = asked.repository.parents(asked.head)
+        if asked.base and len(parents) > 1 and asked.base not in parents:
+            yield "what branches that HEAD merges have lost since BASE, and the merge brings back"
         top = asked.repository.top()
         if not top:
             return
@@ -580,12 +653,19 @@ class _Review:
         return status, ExpiryCheck(due, unreadable, count)
 
 
+def _is_below(path: str, folders: Iterable[str]) -> bool:
+    return any(f"{path}/".startswith(f"{each}/") for each in folders)
+
+
 def _may_be_policy(content: bytes) -> bool:
     """Return whether a file could be a policy, or a part of one, whatever its name is."""
-    text = b" ".join(content.replace(b"\0", b"").split())  # UTF-16 has a zero in each letter
-    if not text.lstrip(b"\xef\xbb\xbf\xfe\xff").startswith(b"<"):
+    text = content.replace(b"\0", b"")  # UTF-16 has a zero in each letter
+    if text.startswith(_EBCDIC):
+        return True
+    if not text.lstrip(b"\xef\xbb\xbf\xfe\xff \t\r\n").startswith(b"<"):
         return False
-    encoding = _ENCODING.search(text[:200])
+    text = b" ".join(text.split())
+    encoding = _ENCODING.search(text.partition(b"?>")[0])
     if encoding and not encoding[1].lower().startswith(_READABLE):
         return True  # such as UTF-7, in which no element is readable here
     return any(second in text.partition(first)[2] for first, second in _OF_POLICIES)

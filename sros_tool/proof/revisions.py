@@ -58,8 +58,9 @@ class Revision:
         for file, each in found:
             if each.mode not in FILES:
                 raise DocumentError(f"'{file}' is {each.kind}", "", "Name a policy in the folder.")
-        ids = [each.id for _, each in found]
-        if sum(self.repository.sizes(ids).values()) > _MOST_BYTES:
+        ids = dict.fromkeys(each.id for _, each in found)
+        sizes = self.repository.sizes(ids)
+        if sum(sizes.get(each.id, 0) for _, each in found) > _MOST_BYTES:
             raise DocumentError(
                 f"'{self}' has more than {_MOST_BYTES} bytes", "", "Name a policy in it."
             )

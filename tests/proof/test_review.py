@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
+from sros_tool.cli.review import review as review_verb
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import PROJECT
@@ -110,7 +112,17 @@ def test_what_a_partial_clone_lacks_is_not_passed_over(change: Change) -> None:
             b'<?xml version="1.0" encoding="UTF-7"?>'
             + policy_text(WIDER).replace("<", "+ADw-").replace(">", "+AD4-").encode(),
         ),
+        (
+            "padded.xml",
+            b'<?xml version="1.%s" encoding="UTF-7"?>' % (b"0" * 300)
+            + policy_text(WIDER).replace("<", "+ADw-").replace(">", "+AD4-").encode(),
+        ),
+        ("ebcdic.xml", f'<?xml version="1.0" encoding="IBM037"?>{ROBOT}'.encode("cp037")),
         ("part.xml", b'<profile ns="/" node="n"/>'),
+        (
+            "common/Node.xml",
+            b'<profile>\n<topics publish="ALLOW"><topic>/x</topic></topics></profile>',
+        ),
     ],
 )
 def test_a_policy_that_is_not_named_is_said(change: Change, name: str, content: bytes) -> None:
@@ -121,6 +133,92 @@ def test_a_policy_that_is_not_named_is_said(change: Change, name: str, content: 
     change.base = change.git("rev-parse", "HEAD")
     change.commit({name: None})
     assert f"'{name}' is deleted" in change.review("--policy", "robot.xml").out
+
+
+def test_a_policy_that_is_included_in_part_is_said(change: Change) -> None:
+    """What the reviewed policy does not take from it gets no review."""
+    part = """<xi:include href="second.xml" xpointer="xpointer(/policy/enclaves/*[@path='/b'])"/>"""
+    first = policy_text({"/a": publish("/x")}).replace("</enclaves>", f"{part}</enclaves>")
+    files: dict[str, str | bytes | None] = {"robot.xml": first}
+    files |= {"second.xml": policy_text({"/b": publish("/y")})}
+    change.base = change.commit({"README": "x"})
+    change.commit(files)
+    whole = change.review("--policy", "robot.xml")
+    assert whole.status == 0, whole
+    change.commit({"second.xml": policy_text({"/b": publish("/y"), "/evil": publish("/x")})})
+    ended = change.review("--policy", "robot.xml")
+    assert ended.status == 1, ended
+    assert (
+        "'second.xml' changes and is used only in part, and the rest is not reviewed" in ended.out
+    )
+
+
+@pytest.mark.parametrize(
+    ("path", "target", "status"),
+    [
+        ("deploy/robot.xml", "../tests/robot.xml", 1),  # a policy that is left out
+        ("deploy", "tests", 1),
+        ("deploy.xml", "/etc/robot.xml", 1),
+        ("tests/link.xml", "robot.xml", 0),  # left out
+        ("NOTES", "robot.toml", 0),
+        ("robots/sub", "../tests", 2),  # in a folder that is reviewed
+        ("robots/sub", "", 2),
+        ("vendor", "", 1),
+    ],
+)
+def test_links_and_submodules_hide_no_policy(
+    change: Change, path: str, target: str, status: int
+) -> None:
+    """A checkout has policies there that no commit of this repository has at that path."""
+    text = policy_text({"/c": publish("/z")})
+    shutil.copytree(change.folder / "common", change.folder / "robots" / "common")
+    text = policy_text({"/c": publish("/z")})
+    change.base = change.commit({"tests/robot.xml": policy_text(WIDER), "robots/c.xml": text})
+    place = change.folder / path
+    place.parent.mkdir(exist_ok=True)
+    if target:
+        place.symlink_to(target)
+    else:
+        change.git("update-index", "--add", "--cacheinfo", f"160000,{change.base},{path}")
+        place.mkdir()
+    change.commit({})
+    ended = change.review("--policy", "robot.xml\nrobots", "--leave-out", "tests")
+    assert ended.status == status, ended
+    assert (path in ended.out) == bool(status)
+
+
+def test_a_merge_of_later_commits_is_said(change: Change) -> None:
+    """What main lost since the base, a merge can bring back: the base has it, too."""
+    main = change.commit({"README": "x"})
+    tree = change.git("rev-parse", "HEAD^{tree}")
+    merge = change.git("commit-tree", tree, "-p", main, "-p", change.base, "-m", "x")
+    change.git("reset", "--hard", merge)
+    assert change.review("--policy", "robot.xml").out.count("and the merge brings back") == 0
+    change.base = change.git("commit-tree", tree, "-m", "earlier")
+    assert "what branches that HEAD merges have lost" in (
+        change.review("--policy", "robot.xml").out
+    )
+
+
+def test_a_review_that_is_ended_has_no_result(change: Change, tmp_path: Path) -> None:
+    """A comment of an earlier commit would stay otherwise, as green as it was."""
+    summary = tmp_path.with_name("ended.md")
+    words = ("--base", "refs/heads/main", "--policy", "robot.xml", "--summary", str(summary))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(change.folder)
+        patch.setattr("sros_tool.proof.review.review", lambda *_: os.abort)
+        with pytest.raises(AttributeError):
+            review_verb.main(list(words), standalone_mode=False)
+    assert summary.read_text().startswith("## Review: could not be decided")
+
+
+def test_a_folder_with_endless_policies_is_refused(change: Change) -> None:
+    """A few objects can stand for gigabytes, and many small ones are read in a moment."""
+    text = policy_text({"/c": "<!-- -->" * 90_000})
+    change.commit({f"robots/{number}.xml": text for number in range(100)})
+    ended = change.review("--policy", "robots")
+    assert ended.status == 2
+    assert "has more than 67108864 bytes" in ended.out
 
 
 def test_only_commits_count(change: Change) -> None:
@@ -149,6 +247,11 @@ def test_a_fleet_counts_as_each_commit_has_it(change: Change) -> None:
     ended = change.review(*words)
     assert ended.status == 1, ended
     assert "new-access fleet.xml: " in ended.out
+    change.base = change.commit({"fleet.toml": f'{fleet}address = "10.0.0.1"\n'})
+    change.commit({"fleet.toml": f'{fleet}address = "10.6.6.6"\n'})
+    ended = change.review(*words)
+    assert ended.status == 1, ended
+    assert "new-access fleet.toml: 'r1' gets its keys at another place, 10.6.6.6" in ended.out
 
 
 @pytest.mark.parametrize("case", ["rights", "ca", "governance", "default"])
