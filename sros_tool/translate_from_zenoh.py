@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-from sros_tool.errors import InvalidNameError
+from sros_tool.errors import DocumentError, InvalidNameError
 from sros_tool.names import check_enclave_name, expression_problem
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.policy.patterns import ComparisonLimit, covers
 from sros_tool.policy.rights import KIND_OF, RIGHT_ORDER, Right, folded
-from sros_tool.translate_zenoh import chunks_of
+from sros_tool.translate_zenoh import chunks_of, number_of_chunks
 from sros_tool.zenoh.access import Flow, Message
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import ConfigurationDocument
@@ -167,6 +167,12 @@ def _rights(
 
 @lru_cache(maxsize=_MANY)
 def _keys_of(domain: str, name: str) -> tuple[str, ...]:
+    if number_of_chunks(name) > _MANY:
+        raise DocumentError(
+            f"the rules of Zenoh for {name} cannot be compared",
+            f"Its wildcards stand for more than {_MANY} key expressions.",
+            "Name it with fewer wildcards.",
+        )
     return tuple(canonical((domain, *chunks, *_OF_TYPE)) for chunks in chunks_of(name))
 
 

@@ -260,8 +260,9 @@ class _Denials:
                 except CannotSubtract as error:
                     raise self._inside(name, place, error.denied, denied[0]) from None
             for each in names:
-                found.update(chunks_of(each))
-                if len(found) > most:
+                if number_of_chunks(each) <= most:
+                    found.update(chunks_of(each))
+                if number_of_chunks(each) > most or len(found) > most:
                     raise (
                         self._inside(name, place, "", denied[0])
                         if denied
@@ -325,12 +326,18 @@ def _too_many(name: str, place: Source) -> PolicyError:
     )
 
 
+def number_of_chunks(name: str) -> int:
+    """Return at least how many key expressions `chunks_of` makes: they double with each ``*``."""
+    stars_within = len(re.findall(r"(?<=[^/*])\*+(?=[^/*])", name))
+    return 1 << stars_within
+
+
 def chunks_of(name: str) -> list[tuple[str, ...]]:
     """Return the chunks of the key expressions that together match the ROS names of ``name``.
 
     ``name`` is absolute, with ``*`` and `IN_PART` as its only wildcards.  A ``*`` of a policy also
     matches "/", so it becomes ``**`` where it stands next to a slash, and two expressions within a
-    part of a name.
+    part of a name: `number_of_chunks` tells beforehand whether that is too many.
     """
     if "*" not in name:
         return [tuple(name.replace(IN_PART, ANY_PART)[1:].split("/"))]

@@ -131,6 +131,12 @@ def test_a_right_is_exactly_these_messages(right: str, tmp_path: Path) -> None:
     assert not any(control.allows("/robot", *each[:2], key) for each in NAMED)
 
 
+def test_wildcards_whose_keys_double_with_each_are_refused_at_once(tmp_path: Path) -> None:
+    """Forty wildcards in a part of a name are a million million key expressions."""
+    with pytest.raises(PolicyError, match="cannot be said to Zenoh"):
+        remote_rights(enclave(tmp_path, publish("/" + "a*" * 40 + "a")), 0)
+
+
 @pytest.mark.parametrize("name", ["/a#b", "/a$b", "/a//b", "/a/", "/#*"])
 @pytest.mark.parametrize("qualifier", [ALLOW, DENY_])
 def test_a_name_that_is_no_key_of_zenoh_is_refused(name: str, qualifier: Qualifier) -> None:
