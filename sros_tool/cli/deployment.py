@@ -429,8 +429,8 @@ Example:
     "only",
     multiple=True,
     metavar="NAME",
-    help="With --no-answer: refuse a request for another enclave.  Once for each request, in their "
-    "order.",
+    help="Refuse a request for another enclave; a revoked one is signed only if it is named here. "
+    "Once for each request, in their order.",
 )
 @dry_run_option
 @json_option
@@ -469,8 +469,6 @@ def sign_request(
         policy = _policy(policy_file, fleet_file)
         _certify(root, request, policy, only, renew=renew, dry_run=dry_run, as_json=as_json)
         return
-    if only:
-        raise UsageError("--enclave is for --no-answer")
     if output is None:
         output = _STREAM if request == _STREAM else Path(request.name).with_suffix(".answer.tar.gz")
     stream = output == _STREAM
@@ -483,6 +481,7 @@ def sign_request(
         read_named(request, "signing request"),
         now=now(),
         policy=_policy(policy_file, fleet_file),
+        only=only,
         renew=renew,
         answer=None if stream else output,
         force=force,

@@ -8,7 +8,7 @@ compared by the SHA-256 of their SubjectPublicKeyInfo (DER).
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -91,6 +91,16 @@ class KnownKeys:
                     if certificate.serial_number in self._revoked_serials:
                         found.add(common_name_of(certificate.subject))
         return found
+
+    def revoked_before_notes(self, names: Iterable[str]) -> Iterator[Note]:
+        """Yield a note for each of ``names`` that was revoked, and is created again."""
+        for name in names:
+            if name in self.revoked_enclaves:
+                yield Note(
+                    "keystore.revoked-before",
+                    f"{name} was revoked, and now exists again, with another key and certificate; "
+                    "the revoked ones stay revoked.",
+                )
 
     @cached_property
     def _enclaves(self) -> Mapping[str, Sequence[str]]:

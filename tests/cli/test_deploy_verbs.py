@@ -351,7 +351,9 @@ def test_a_revoked_enclave_asks_again_with_a_new_key(keystore: Path, tmp_path: P
     assert "was revoked" in ended.err
     sros("create_request", NAME, tmp_path / "new").ok()
     new = tmp_path / "new" / FOLDER / "request.pem"
-    sros("sign_request", keystore, new, "-o", tmp_path / "new.tgz").ok()
+    ended = sros("sign_request", keystore, new, "-o", tmp_path / "new.tgz")
+    assert ended.status == 2 and f"add --enclave {NAME}" in ended.err
+    sros("sign_request", keystore, new, "-o", tmp_path / "new.tgz", "--enclave", NAME).ok()
     sros("import", tmp_path / "new.tgz", tmp_path / "new").ok()
     assert (tmp_path / "new" / FOLDER / "crl.pem").exists()
     sros("verify", tmp_path / "new").ok()

@@ -24,7 +24,7 @@ from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
 from sros_tool.keystore.delivery.answer import import_answer
 from sros_tool.keystore.delivery.archive import MAX_MEMBER, MAX_UNPACKED, pack, unpack
 from sros_tool.keystore.delivery.request import create_request
-from sros_tool.keystore.delivery.signing import Signed, sign_request
+from sros_tool.keystore.delivery.signing import Signed, certify_requests, sign_request
 from sros_tool.keystore.history import history
 from sros_tool.keystore.layout import SEAL, list_enclaves
 from sros_tool.keystore.ledger import read_ledger
@@ -251,8 +251,28 @@ def test_a_revoked_key_is_not_certified_again(home: Path, robot: Path) -> None:
     revoke(home, [NAME], now=NOW)
     assert not (home / FOLDER).exists()
     assert list_enclaves(home) == ("/base",)
-    with pytest.raises(KeystoreError, match="was revoked"):
+    with pytest.raises(KeystoreError, match=r"the key of the request for .* was revoked"):
         sign(home, robot)
+
+
+def test_a_revoked_enclave_comes_back_only_if_it_is_named(
+    home: Path, robot: Path, tmp_path: Path
+) -> None:
+    """Who stole the robot can make another key, and choose what the request says."""
+    sign(home, robot)
+    revoke(home, [NAME], now=NOW)
+    create_request(tmp_path / "second", NAME)
+    request = request_of(tmp_path / "second")
+    before = snapshot(home)
+    for attempt in (sign_request, certify_requests):
+        with pytest.raises(KeystoreError, match=f"enclave {NAME} was revoked") as caught:
+            attempt(home, request, now=NOW)
+        assert f"--enclave {NAME}" in str(caught.value)
+    with pytest.raises(KeystoreError, match="should be for /base"):
+        sign_request(home, request, now=NOW, only=["/base"])
+    assert snapshot(home) == before
+    signed = sign_request(home, request, now=NOW, only=[NAME])
+    assert "keystore.revoked-before" in {each.id for each in signed.notes}
 
 
 def other_subject(

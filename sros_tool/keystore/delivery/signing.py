@@ -104,6 +104,7 @@ def sign_request(
     *,
     now: datetime,
     policy: Policy | None = None,
+    only: Sequence[str] = (),
     renew: bool = False,
     answer: Path | None = None,
     force: bool = False,
@@ -119,16 +120,21 @@ def sign_request(
 
     Args:
         data: the request (PEM).
+        only: the enclave that the request has to be for, if it is known: a robot chooses what its
+            request says.
         answer: the path for the answer, which is put in place after the keystore has changed.
         force: replace ``answer`` if it exists.
         domain: refuse a keystore that is not made for this domain.
 
     Raises:
         PkiError: the request is not valid.
-        KeystoreError: the enclave exists (without ``renew``) or does not (with it), its key was
-            revoked or belongs to another enclave, ``answer`` exists, or the keystore cannot issue.
+        KeystoreError: the enclave exists (without ``renew``) or does not (with it), it was revoked
+            and ``only`` does not name it, it is another one than ``only`` says, its key was revoked
+            or belongs to another enclave, ``answer`` exists, or the keystore cannot issue.
     """
     request = load_request(data, "that was given")
+    if only:
+        _check_asked([request], only)
     name = check_enclave_name(request.name)
     stated = stated_enclave(policy, name) if policy else None
     if answer is not None:
@@ -138,7 +144,7 @@ def sign_request(
     list_enclaves(root)
     with Transaction(root, dry_run=dry_run) as transaction:
         signer = _Signer(transaction, keyring, domain, now)
-        issued = signer.certify(request, stated, renew=renew)
+        issued = signer.certify(request, stated, renew=renew, named=bool(only))
         kept = signer.keep_zenoh()
         files = _answer_files(root, issued, kept)
         number = read_ledger(root, having=("what", "answer")).next_number()
@@ -223,7 +229,7 @@ def certify_requests(
         signer = _Signer(transaction, keyring, domain, now)
         for request in requests:
             if request.name not in kept:
-                signer.certify(request, stated[request.name], renew=renew)
+                signer.certify(request, stated[request.name], renew=renew, named=bool(only))
         if len(kept) < len(requests):
             signer.keep_zenoh()
             signer.record()
@@ -315,18 +321,30 @@ class _Signer:
         self._new: list[str] = []
         self._notes: list[Note] = []
 
-    def certify(self, request: SigningRequest, stated: Enclave | None, *, renew: bool) -> Issued:
-        """Write all files of an enclave except its key; its rights are ``stated``, or kept."""
+    def certify(
+        self, request: SigningRequest, stated: Enclave | None, *, renew: bool, named: bool
+    ) -> Issued:
+        """Write all files of an enclave except its key; its rights are ``stated``, or kept.
+
+        ``named`` is whether the enclave was named at home, and not by the request alone.
+        """
         root, name = self._root, request.name
         _check_name(root, name, renew, name in self._existing)
         if stated is not None:
             refuse_less_protected(root, self._governance, stated_protections([stated]))
         _check_key(root, request, self._known, renew)
+        if not renew and not named and name in self._known.revoked_enclaves:
+            raise KeystoreError(
+                f"enclave {name} was revoked in keystore '{root}'",
+                "Whoever has the revoked key could have made this request, to be let in again.",
+                f"If the robot is yours again and shall have the enclave, add --enclave {name}.",
+            )
         if renew:
             note = _new_key_note(root, request)
             self._notes += note or [*self._known.shared_notes([name])]
         else:
             self._new.append(name)
+            self._notes += self._known.revoked_before_notes([name])
         authority = self.authorities.permissions.certificate
         rights: EarlierRights | StatedRights
         if renew and stated is None:

@@ -361,14 +361,7 @@ def _revoked_before(
             f"`sros generate_artifacts -k {quote(str(root))} -e {' '.join(unasked)} -p POLICY_FILE"
             f"{' --fleet FLEET_FILE' if fleet else ''}`.",
         )
-    return [
-        Note(
-            "keystore.revoked-before",
-            f"{name} was revoked, and now exists again, with another key and certificate; the "
-            "revoked ones stay revoked.",
-        )
-        for name in again
-    ]
+    return list(keystore.known.revoked_before_notes(again))
 
 
 def refuse_other_template(root: Path, template: Template) -> None:
