@@ -146,6 +146,14 @@ NOT_SECURED = FindingKind(
     '`eval "$(sros env ROOT NAME)"`.',
     prominent=True,
 )
+NODE_OPEN = FindingKind(
+    "runtime.node-open",
+    WARNING,
+    "a node that runs open in a domain without secured nodes",
+    "Everybody on the network hears it and can send to it.",
+    "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
+    "Start it with `sros run ROOT NAME -- COMMAND...`, or end it if nobody needs it.",
+)
 
 _MOST_NODES = 20
 
@@ -319,9 +327,12 @@ def _is_open(environment: Mapping[str, str]) -> bool:
 def _not_secured(
     environment: Mapping[str, str], nodes: Sequence[Process], *, one_by_one: bool
 ) -> Iterator[Finding]:
-    """Yield a finding, with the open nodes that run, unless the variables ask for security."""
+    """Yield the open nodes that run; in one finding where the variables ask for no security."""
     asks = environment.get(ENABLE) not in (None, "", "false") or asks_in_vain(environment)
     if asks or not _is_open(environment):
+        for each in nodes:
+            if not each.network:  # the others are named as such, with their security
+                yield NODE_OPEN.found(each.label, f"it runs {_where(each)}")
         return
     if one_by_one:
         for each in nodes:

@@ -213,6 +213,7 @@ CASES: dict[str, Change] = {
     "runtime.daemon-unsecured": running(1, **{ENABLE: None}),
     "runtime.daemon-differs": running(1, **{ENCLAVE: "/arm"}),
     "runtime.process-unsecured": running(0, **{ENABLE: None}),
+    "runtime.node-open": running(0, **{ENABLE: None, DOMAIN: "5"}),
     "runtime.process-runs-unsecured": running(0, **{STRATEGY: "Permissive", ENCLAVE: "/gone"}),
     "runtime.process-outdated": _written_since,
     "runtime.process-revoked": _revoked,
