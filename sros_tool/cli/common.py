@@ -172,6 +172,18 @@ def several_enclaves(function: Decorated) -> Decorated:
     )
 
 
+def check_chosen(
+    names: Sequence[str], patterns: Sequence[str], robots: Sequence[str], *, every: bool
+) -> None:
+    """Raise `UsageError` if the arguments and the options of `several_enclaves` name no enclave."""
+    if not (names or patterns or robots or every):
+        raise UsageError(
+            "no enclave is named",
+            "",
+            "Name one or more, such as /talker, or give --match PATTERN, --robot NAME or --all.",
+        )
+
+
 def chosen_enclaves(
     root: Path,
     names: Sequence[str],
@@ -186,12 +198,7 @@ def chosen_enclaves(
         UsageError: none is named.
         KeystoreError: a pattern matches none, or a robot has none.
     """
-    if not (names or patterns or robots or every):
-        raise UsageError(
-            "no enclave is named",
-            "",
-            "Name one or more, such as /talker, or give --match PATTERN, --robot NAME or --all.",
-        )
+    check_chosen(names, patterns, robots, every=every)
     if not (patterns or robots or every):
         return tuple(names)  # the verb says what is wrong with a name
     from sros_tool.keystore.selection import select_enclaves

@@ -23,7 +23,6 @@ from sros_tool.cli.common import (
     moment_of,
     now,
     only_enclaves,
-    policy_for,
     print_closed,
     print_json,
     print_notes,
@@ -49,6 +48,7 @@ if TYPE_CHECKING:
     from cryptography import x509
 
     from sros_tool.errors import Note
+    from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.delivery.answer import ImportedEnclave
     from sros_tool.keystore.delivery.export import ExportSelection
     from sros_tool.keystore.delivery.request import Requested
@@ -517,19 +517,25 @@ def sign_request(
     print_notes(signed.notes)
 
 
-def _policy(file: Path | None, fleet_file: Path | None) -> Policy | None:
+def _policy(file: Path | None, fleet_file: Path | None) -> Policy | FleetPolicy | None:
     """Return the policy in a file, for the robots of a fleet if one is named."""
+    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.policy.document import read_policy
+
     if file is None:
         if fleet_file is not None:
             raise UsageError("--fleet is for the placeholders of a policy: add -p POLICY_FILE")
         return None
-    return policy_for(file, fleet_file)
+    if fleet_file is None:
+        return read_policy(file)
+    return FleetPolicy(read_policy(file, placeholders=True), read_fleet(fleet_file))
 
 
 def _certify(
     root: Path,
     request: Path,
-    policy: Policy | None,
+    policy: Policy | FleetPolicy | None,
     only: tuple[str, ...],
     *,
     renew: bool,

@@ -275,7 +275,7 @@ _WORDS = {
 }
 """How a state is called that is not called by its own name."""
 _MOST_LINES, _MOST_GROUPS = 50, 3
-"""How many files of a robot are listed, and how many groups of files are summed up."""
+"""How many files of a robot are listed, and how many groups or unrecorded enclaves."""
 
 
 def _lines(found: FleetStatus, moment: datetime, robots: Sequence[str]) -> Iterator[str]:
@@ -343,6 +343,14 @@ def _several(number: int, kind: str) -> str:
 def _details(robot: RobotStatus) -> Iterator[str]:
     """Yield the files of a robot: their number by kind and state, and those that differ."""
     yield f"{robot.robot}:"
+    where = ("in its folder", "elsewhere, with its name in the path")
+    for names, place in zip(robot.unrecorded, where, strict=True):
+        others = f" and {len(names) - _MOST_GROUPS} more, see --json"
+        if names:
+            yield (
+                f"  {_number(len(names), 'enclave')} that the fleet does not record {place}: "
+                f"{', '.join(names[:_MOST_GROUPS])}{others if len(names) > _MOST_GROUPS else ''}"
+            )
     for kind, states in robot.files.items():
         yield f"  {kind:14} {', '.join(f'{number} {state}' for state, number in states.items())}"
     for each in robot.pending[:_MOST_LINES]:
@@ -385,6 +393,8 @@ def _status_json(found: FleetStatus, moment: datetime) -> dict[str, Any]:
                 "state": each.state,
                 "enclaves": each.enclaves,
                 "revoked": list(each.revoked),
+                "unrecorded": list(each.unrecorded.below),
+                "sharing_name": list(each.unrecorded.naming),
                 "received": iso(each.received) if each.received else None,
                 "clock": iso(each.clock) if each.clock else None,
                 "stage": each.stage or None,

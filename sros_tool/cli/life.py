@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
+    check_chosen,
     chosen_enclaves,
     complete_keystore_and_enclave,
     dry_run_option,
@@ -226,9 +228,11 @@ def revoke(
     accepts this delay.
     """
     from sros_tool.keystore.lifecycle.revoke import revoke as work
+    from sros_tool.keystore.selection import select_to_revoke
 
     root, given = split_root(words)
-    names = chosen_enclaves(root, given, patterns, robots, every=every)
+    check_chosen(given, patterns, robots, every=every)
+    names, selection_notes = select_to_revoke(root, given, patterns, robots, every=every)
     words_of_rfc = reason.replace("-", "_").split("_")
     reason_text = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
     with progress("revoking"):
@@ -241,6 +245,7 @@ def revoke(
             until_retired=until_retired,
             dry_run=dry_run,
         )
+    result = replace(result, remarks=(*selection_notes, *result.remarks))
     if as_json:
         print_json(_revocation_json(result, reason_text, dry_run))
     elif dry_run:

@@ -7,7 +7,8 @@ enclaves.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from sros_tool.fleet.model import Fleet, Robot
 from sros_tool.names import check_enclave_name
 from sros_tool.policy.placeholders import (
     Parts,
+    Placeholder,
     check_path,
     fill,
     parts_of,
@@ -101,6 +103,72 @@ def left_robot_of(fleet: Fleet, enclave: str) -> str:
             if path_for(pattern.parts, robot) == enclave:
                 return robot.name
     return ""
+
+
+class Unrecorded(NamedTuple):
+    """Enclaves that belong to no robot by the paths of the fleet, and to this robot by their own.
+
+    ``below`` are in a folder that is the robot's alone, such as ``/r3``; ``naming`` have its name
+    as a part of their path elsewhere, such as ``/desk/r3``.
+    """
+
+    below: tuple[str, ...] = ()
+    naming: tuple[str, ...] = ()
+
+
+def unrecorded_enclaves(
+    fleet: Fleet, names: Iterable[str], robots: Collection[str]
+) -> dict[str, Unrecorded]:
+    """Map each of ``robots`` to those of the enclaves ``names`` that it has only by their paths."""
+    folders = _folders(fleet)
+    below: dict[str, list[str]] = {robot: [] for robot in robots}
+    naming: dict[str, list[str]] = {robot: [] for robot in robots}
+    for name in names:
+        owners = next((folders[each] for each in _upwards(name) if each in folders), frozenset())
+        named = owners | set(name.split("/")[1:])
+        if named.isdisjoint(below) or robot_of(fleet, name):
+            continue
+        for robot in named & below.keys():
+            (below if owners == {robot} else naming)[robot].append(name)
+    return {
+        robot: Unrecorded(tuple(sorted(below[robot])), tuple(sorted(naming[robot])))
+        for robot in robots
+    }
+
+
+def _upwards(name: str) -> Iterator[str]:
+    """Yield an enclave's path and the folders that it is in, up to the root, which is left out."""
+    while name:
+        yield name
+        name = name.rpartition("/")[0]
+
+
+def _folders(fleet: Fleet) -> Mapping[str, frozenset[str]]:
+    """Map the folders of robots to their names, usually one.
+
+    They are the paths of the fleet down to the part with the first placeholder.
+    """
+    found: dict[str, set[str]] = {}
+    for begin in dict.fromkeys(_begin(parts_of(path)) for path in fleet.enclaves):
+        for robot in fleet.robots.values():
+            if len(folder := path_for(begin, robot)) > 1:
+                found.setdefault(folder, set()).add(robot.name)
+    return {folder: frozenset(robots) for folder, robots in found.items()}
+
+
+def _begin(path: Parts) -> Parts:
+    """Return the parts of a path to the end of its folder with the first placeholder."""
+    begin: list[str | Placeholder] = []
+    inside = False
+    for part in path:
+        if inside and isinstance(part, str) and "/" in part:
+            begin.append(part[: part.index("/")])
+            break
+        if inside and isinstance(part, Placeholder) and part.value == "namespace":
+            break
+        begin.append(part if isinstance(part, str) else replace(part, group=""))
+        inside = inside or isinstance(part, Placeholder)
+    return tuple(part for part in begin if part != "")
 
 
 def _fitting(fleet: Fleet, enclave: str) -> Iterator[_Pattern]:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sros_tool.errors import SrosError
-from sros_tool.fleet.enclaves import enclaves_of, robot_of
+from sros_tool.fleet.enclaves import Unrecorded, enclaves_of, robot_of, unrecorded_enclaves
 from sros_tool.fleet.model import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
@@ -116,15 +116,17 @@ class RobotStatus:
 
     ``received`` is when, by the clock at home; ``clock`` is the time of the robot's clock in it.
     ``revoked`` are its enclaves that were revoked and are not in the keystore, whatever the robot
-    confirmed.  ``stage`` is the stage of a CA rotation that its CA files are of: the one of the CA
-    that is behind.  ``files`` counts the files of its enclaves by kind and state; ``pending`` are
-    those that are not current.
+    confirmed; ``unrecorded`` are those of the keystore that the fleet does not record.  ``stage``
+    is the stage of a CA rotation that its CA files are of: the one of the CA that is behind.
+    ``files`` counts the files of its enclaves by kind and state; ``pending`` are those that are not
+    current.
     """
 
     robot: str
     state: State
     enclaves: int
     revoked: tuple[str, ...]
+    unrecorded: Unrecorded
     received: datetime | None
     clock: datetime | None
     stage: str
@@ -182,10 +184,10 @@ def fleet_status(root: Path, names: Sequence[str] = ()) -> FleetStatus:
     compared = _compare_robots(root, fleet, robots)
     stages = _Stages(root)
     known = _Known(root, fleet, compared)
-    unassigned = 0
-    if not names:
-        unassigned = len(enclave_names(root)) - sum(len(each.enclaves) for each in compared)
-    found = tuple(_status(each, known, stages) for each in compared)
+    existing = enclave_names(root)
+    unassigned = 0 if names else len(existing) - sum(len(each.enclaves) for each in compared)
+    unrecorded = unrecorded_enclaves(fleet, existing, {each.name for each in robots})
+    found = tuple(_status(each, known, stages, unrecorded[each.robot.name]) for each in compared)
     return FleetStatus(root, stages.at_home, found, unassigned)
 
 
@@ -362,13 +364,16 @@ class _Known:
                 self._revoked_serials.add(entry.serial)
                 if entry.reason != SUPERSEDED:
                     self._revoked.add(entry.enclave)
+        robots = {each.robot.name for each in compared}
+        self._unrecorded = unrecorded_enclaves(fleet, self._revoked, robots)
 
     def revoked(self, robot: Robot) -> tuple[str, ...]:
         """Return the enclaves of a robot that were revoked and are not in the keystore."""
         if not self._revoked:
             return ()
-        names = (name for name in enclaves_of(self._fleet, robot) if name in self._revoked)
-        return tuple(name for name in names if not has_enclave(self._root, name))
+        names = {name for name in enclaves_of(self._fleet, robot) if name in self._revoked}
+        names.update(self._unrecorded[robot.name].below)
+        return tuple(sorted(name for name in names if not has_enclave(self._root, name)))
 
     def file(self, robot: Robot, each: _Difference) -> ConfirmedFile:
         """Return what a robot has instead of the file at home."""
@@ -416,7 +421,9 @@ class _Known:
         return State.EARLIER, entry.time, ""
 
 
-def _status(compared: _ComparedRobot, known: _Known, stages: _Stages) -> RobotStatus:
+def _status(
+    compared: _ComparedRobot, known: _Known, stages: _Stages, unrecorded: Unrecorded
+) -> RobotStatus:
     different = tuple(known.file(compared.robot, each) for each in compared.different)
     counts: dict[str, Counter[State]] = {}
     for kind, number in compared.current.items():
@@ -434,6 +441,7 @@ def _status(compared: _ComparedRobot, known: _Known, stages: _Stages) -> RobotSt
         state,
         len(compared.enclaves),
         known.revoked(compared.robot),
+        unrecorded,
         compared.received,
         compared.clock,
         stages.of(compared),

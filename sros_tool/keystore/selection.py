@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from shlex import quote
 
-from sros_tool.errors import KeystoreError
+from sros_tool.errors import KeystoreError, Note
+from sros_tool.fleet.enclaves import Unrecorded, unrecorded_enclaves
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_fleet, words_for
 from sros_tool.keystore.layout import PRIVATE, SETTINGS, check_keystore, list_enclaves
 
@@ -45,10 +46,56 @@ def select_enclaves(
                 f"See `sros list_enclaves {quote(str(root))}`.",
             )
         chosen |= dict.fromkeys(fitting)
-    return tuple(chosen | dict.fromkeys(_of_robots(root, robots, checked)))
+    return tuple(chosen | dict.fromkeys(_of_robots(root, robots, checked, {})))
 
 
-def _of_robots(root: Path, robots: Sequence[str], checked: bool) -> list[str]:
+def select_to_revoke(
+    root: Path, names: Sequence[str], patterns: Sequence[str], robots: Sequence[str], *, every: bool
+) -> tuple[tuple[str, ...], tuple[Note, ...]]:
+    """Return the enclaves to revoke, and notes on what the fleet does not record of ``robots``.
+
+    As `select_enclaves`, but a robot also has what lies in its folder, such as ``/r3/spare``.
+
+    Raises:
+        KeystoreError: as `select_enclaves`.
+        DocumentError: as `select_enclaves`.
+    """
+    if not (patterns or robots or every):
+        return tuple(names), ()  # the verb says what is wrong with a name
+    chosen = dict.fromkeys(select_enclaves(root, names, patterns, every=every))
+    unrecorded: dict[str, Unrecorded] = {}
+    if fleet := checked_fleet(root) if robots else None:
+        unrecorded = unrecorded_enclaves(fleet, list_enclaves(root), set(robots))
+    chosen |= dict.fromkeys(_of_robots(root, robots, True, unrecorded))
+    below = [name for each in unrecorded.values() for name in each.below]
+    left = {name for each in unrecorded.values() for name in each.naming} - chosen.keys()
+    return tuple(chosen), tuple(_unrecorded_notes(root, sorted(below), sorted(left)))
+
+
+def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator[Note]:
+    if below:
+        yield Note(
+            "fleet.revoked-unrecorded",
+            f"The fleet does not record {_some(below)}: revoked, too, as in the folder of a robot "
+            "that you revoke.",
+        )
+    if left:
+        yield Note(
+            "fleet.unrecorded-enclaves",
+            f"The fleet does not record whose {_some(left)} is: still valid, with the name of a "
+            "robot that you revoke in the path. If the key was on that robot, run `sros revoke "
+            f"{quote(str(root))} {words_for(root, left)}`.",
+        )
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return f"{', '.join(names[:_SHOWN])}{more}"
+
+
+def _of_robots(
+    root: Path, robots: Sequence[str], checked: bool, unrecorded: Mapping[str, Unrecorded]
+) -> list[str]:
     if not robots:
         return []
     fleet = checked_fleet(root) if checked else load_fleet(root)
@@ -68,13 +115,12 @@ def _of_robots(root: Path, robots: Sequence[str], checked: bool) -> list[str]:
     found: list[str] = []
     for name in robots:
         own = enclaves_of_robot(root, fleet, fleet.robots[name]) if name in fleet.robots else ()
+        own += unrecorded[name].below if name in unrecorded else ()
         if not own:
             if left := _named_after(root, name):
                 raise KeystoreError(
                     f"by its fleet, keystore '{root}' has no enclave of a robot {name}",
-                    f"It has {', '.join(left[:_SHOWN])}"
-                    f"{' and others' if len(left) > _SHOWN else ''}: perhaps the robot left the "
-                    "fleet, or a group.",
+                    f"It has {_some(left)}: perhaps the robot left the fleet, or a group.",
                     f"Name the enclaves themselves: {words_for(root, left)}.",
                 )
             fleet.robot(name)

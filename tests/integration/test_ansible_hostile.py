@@ -177,15 +177,18 @@ def test_robots_that_lie_in_many_ways(tmp_path: Path) -> None:
     own: dict[str, Any] = {"sros_keystore": str(keystore), "sros_program": program}
     words = ("--diff", "-vvv")
     own |= {"sros_revoke": ["r4"], "sros_confirm": False}
+    sros("create_enclave", keystore, "/r4/spare", "/dispatcher/r4").ok()
     text = play(tmp_path, "revoke", hosts, *words, pinged=["r4", "r5"], **own)
     left = [f"/{name}/a" for name in ("r1", "r2", "r3", "r5", "r6", "r7")]
-    assert enclaves(keystore) == ["/dispatcher", *left], text
+    assert enclaves(keystore) == ["/dispatcher", "/dispatcher/r4", *left], text
     assert not trace.exists(), text
     odd = {each for each in text if not each.isprintable() and each != "\n"}
     assert not odd, (odd, text)
     assert text.count("\nPLAY RECAP") == 2, text  # of each playbook
     flat = " ".join(text.split())
-    assert "Revoked: /r4/a." in flat and "processes: /dispatcher." in flat, text
+    assert "Revoked: /r4/a, /r4/spare. Still valid, with the name" in flat, text
+    assert "in the path: /dispatcher/r4. If" in flat, text
+    assert "processes: /dispatcher, /dispatcher/r4." in flat, text
     assert "The revocation list did not get to r2, r3, r5, r6, r7," in flat, text
     assert "This robot has facts that take the place of variables (sros_robot)" in flat, text
 

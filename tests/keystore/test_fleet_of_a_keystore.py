@@ -91,3 +91,89 @@ def test_enclaves_that_are_left_are_found_in_one_pass(
     (note,) = left_enclaves(made / "ks", before, Fleet.of([Robot("b", "/b")], enclaves=paths))
     assert "the robot a is no longer in the fleet: /a stay" in note.text
     assert looked <= 2 * len(before.enclaves)
+
+
+@pytest.fixture(scope="module")
+def unknown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a keystore whose fleet does not record all enclaves of the robot r3."""
+    folder = tmp_path_factory.mktemp("unknown")
+    (folder / "fleet.toml").write_text("[robots.r3]\n[robots.r30]\n")
+    (folder / "policy.xml").write_text(policy_text({"/{robot}/a": publish("x")}))
+    words = ("-p", folder / "policy.xml", "--fleet", folder / "fleet.toml")
+    sros("generate_artifacts", "-k", folder / "ks", *words).ok()
+    others = ("/r3", "/r3/deep/er", "/desk/r3", "/desk", "/r30/b", "/r3_b")
+    sros("create_enclave", folder / "ks", *others).ok()
+    return folder
+
+
+def of_robot(root: Path, robot: str) -> dict[str, Any]:
+    said = sros("fleet", "status", root, "--robot", robot, "--json").out
+    (found,) = json.loads(said)["robots"]
+    return dict(found)
+
+
+def test_what_lies_below_a_robot_is_revoked_with_it(unknown: Path, tmp_path: Path) -> None:
+    """No enclave of a stolen robot goes on in silence because no policy of the fleet has it."""
+    root = tmp_path / "ks"
+    shutil.copytree(unknown / "ks", root, symlinks=True)
+    before = of_robot(root, "r3")
+    assert before["enclaves"] == 1
+    assert before["unrecorded"] == ["/r3", "/r3/deep/er"]
+    assert before["sharing_name"] == ["/desk/r3"]
+    ended = sros("revoke", root, "--robot", "r3").ok()
+    gone = {line for line in ended.out.splitlines() if line.startswith("revoked enclave ")}
+    assert gone == {f"revoked enclave {name}" for name in ("/r3", "/r3/a", "/r3/deep/er")}
+    assert "does not record /r3, /r3/deep/er: revoked, too" in ended.err, ended
+    assert "does not record whose /desk/r3 is: still valid" in ended.err, ended
+    assert f"sros revoke {root} /desk/r3`" in ended.err, ended
+    left = json.loads(sros("list_enclaves", root, "--json").out)["enclaves"]
+    assert left == ["/desk", "/desk/r3", "/r30/a", "/r30/b", "/r3_b"]
+    after = of_robot(root, "r3")
+    assert after["revoked"] == ["/r3", "/r3/a", "/r3/deep/er"]
+    assert (after["enclaves"], after["unrecorded"]) == (0, [])
+    assert after["sharing_name"] == ["/desk/r3"]
+    said = sros("fleet", "status", root, "--robot", "r3").out
+    assert "1 enclave that the fleet does not record elsewhere" in said, said
+
+
+def test_what_is_left_below_a_robot_is_revoked_later(unknown: Path, tmp_path: Path) -> None:
+    """Also when all enclaves that the fleet records are revoked already."""
+    root = tmp_path / "ks"
+    shutil.copytree(unknown / "ks", root, symlinks=True)
+    sros("revoke", root, "/r3/a").ok()
+    assert "revoked enclave /r3/deep/er" in sros("revoke", root, "--robot", "r3").ok().out
+    ended = sros("revoke", root, "--robot", "r3")
+    assert (ended.status, "/desk/r3" in ended.err) == (2, True), ended
+
+
+@pytest.mark.parametrize("no_answer", [False, True], ids=["answer", "no answer"])
+def test_a_request_that_is_signed_for_a_fleet_is_recorded(
+    made: Path, no_answer: bool, tmp_path: Path
+) -> None:
+    """The enclave is that of its robot from then on, in its domain."""
+    root = tmp_path / "ks"
+    shutil.copytree(made / "ks", root, symlinks=True)
+    sros("create_request", "/cams/a", tmp_path / "robot").ok()
+    (tmp_path / "fleet.toml").write_text(FLEET)
+    (tmp_path / "policy.xml").write_text(policy_text({"/cams/{robot}": publish("x")}))
+    words = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
+    request = tmp_path / "robot/enclaves/cams/a/request.pem"
+    how = ("--no-answer",) if no_answer else ("-o", tmp_path / "answer.tgz")
+    sros("sign_request", root, request, *words, *how).ok()
+    assert sros("list_enclaves", root, "--robot", "a").ok().out.split() == ["/a", "/cams/a"]
+    assert of_robot(root, "a")["unrecorded"] == []
+    sros("revoke", root, "--robot", "a").ok()
+    assert not (root / "enclaves/cams/a").exists()
+
+
+def test_a_request_for_robots_that_the_keystore_does_not_know(made: Path, tmp_path: Path) -> None:
+    """It is signed, and the user hears that no `--robot` chooses the enclave."""
+    root = tmp_path / "ks"
+    shutil.copytree(made / "ks", root, symlinks=True)
+    sros("create_request", "/new", tmp_path / "robot").ok()
+    (tmp_path / "fleet.toml").write_text("[robots.new]\n")
+    (tmp_path / "policy.xml").write_text(policy_text({"/{robot}": publish("x")}))
+    words = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
+    request = tmp_path / "robot/enclaves/new/request.pem"
+    ended = sros("sign_request", root, request, *words, "-o", tmp_path / "answer.tgz").ok()
+    assert "its fleet does not have the robot of enclave /new" in ended.err, ended

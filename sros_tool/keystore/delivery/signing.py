@@ -9,18 +9,27 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 
 from cryptography import x509
 
 from sros_tool.dds.portable import name_notes
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
+from sros_tool.fleet.enclaves import robot_of
+from sros_tool.fleet.expansion import FleetPolicy
+from sros_tool.fleet.model import Fleet
 from sros_tool.folders import Folder
 from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack
-from sros_tool.keystore.fleet import EnclaveDomains, checked_fleet
+from sros_tool.keystore.fleet import (
+    EnclaveDomains,
+    checked_fleet,
+    refuse_stale_domains,
+    write_fleet,
+)
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -76,6 +85,7 @@ from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import holds_private_key, load_key
 from sros_tool.pki.requests import SigningRequest, key_digest, load_request
 from sros_tool.policy.model import Enclave, Policy
+from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.policy.stated import stated_protections
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
@@ -103,7 +113,7 @@ def sign_request(
     data: bytes,
     *,
     now: datetime,
-    policy: Policy | None = None,
+    policy: Policy | FleetPolicy | None = None,
     only: Sequence[str] = (),
     renew: bool = False,
     answer: Path | None = None,
@@ -116,7 +126,7 @@ def sign_request(
 
     The keystore gets all files of the enclave except the key.  The rights come from ``policy``.
     Without a policy they come from the present permissions if ``renew`` is set, otherwise from the
-    keystore's template.
+    keystore's template.  If the policy is for a fleet, that of the keystore records the path.
 
     Args:
         data: the request (PEM).
@@ -136,15 +146,15 @@ def sign_request(
     if only:
         _check_asked([request], only)
     name = check_enclave_name(request.name)
-    stated = stated_enclave(policy, name) if policy else None
+    stated = _stated(policy, [name])
     if answer is not None:
         _check_free(answer, force)
     if not dry_run:
         tidy(root)
     list_enclaves(root)
     with Transaction(root, dry_run=dry_run) as transaction:
-        signer = _Signer(transaction, keyring, domain, now)
-        issued = signer.certify(request, stated, renew=renew, named=bool(only))
+        signer = _Signer(transaction, keyring, domain, now, stated)
+        issued = signer.certify(request, renew=renew, named=bool(only))
         kept = signer.keep_zenoh()
         files = _answer_files(root, issued, kept)
         number = read_ledger(root, having=("what", "answer")).next_number()
@@ -169,6 +179,28 @@ def sign_request(
     )
 
 
+class _Stated(NamedTuple):
+    """What a policy states for an enclave; ``path`` has its placeholders, or is ""."""
+
+    enclave: Enclave | None = None
+    path: str = ""
+
+
+def _stated(policy: Policy | FleetPolicy | None, names: Sequence[str]) -> dict[str, _Stated]:
+    """Map enclaves to what a policy states for them; raise `PolicyError` if it lacks one."""
+    if policy is None:
+        return dict.fromkeys(names, _Stated())
+    expanded = policy.policy() if isinstance(policy, FleetPolicy) else policy
+    found = {name: _Stated(stated_enclave(expanded, name)) for name in names}
+    if isinstance(policy, FleetPolicy):
+        paths = {name: policy.stated(name)[0].path for name in names}
+        found = {
+            name: each._replace(path=paths[name] if has_placeholder(paths[name]) else "")
+            for name, each in found.items()
+        }
+    return found
+
+
 @dataclass(frozen=True, slots=True)
 class Certified:
     """Requests that were certified without answers.
@@ -189,7 +221,7 @@ def certify_requests(
     data: bytes,
     *,
     now: datetime,
-    policy: Policy | None = None,
+    policy: Policy | FleetPolicy | None = None,
     only: Sequence[str] = (),
     renew: bool = False,
     domain: int | None = None,
@@ -214,10 +246,7 @@ def certify_requests(
     if only:
         _check_asked(requests, only)
     _check_distinct(requests)
-    stated = {
-        each.name: stated_enclave(policy, check_enclave_name(each.name)) if policy else None
-        for each in requests
-    }
+    stated = _stated(policy, [check_enclave_name(each.name) for each in requests])
     if not dry_run:
         tidy(root)
     list_enclaves(root)
@@ -226,10 +255,10 @@ def certify_requests(
         if not renew:
             existing = set(list_enclaves(root))
             kept = tuple(each.name for each in requests if _is_certified(root, each, existing))
-        signer = _Signer(transaction, keyring, domain, now)
+        signer = _Signer(transaction, keyring, domain, now, stated)
         for request in requests:
             if request.name not in kept:
-                signer.certify(request, stated[request.name], renew=renew, named=bool(only))
+                signer.certify(request, renew=renew, named=bool(only))
         if len(kept) < len(requests):
             signer.keep_zenoh()
             signer.record()
@@ -296,7 +325,12 @@ class _Signer:
     """The certification of requests in one transaction."""
 
     def __init__(
-        self, transaction: Transaction, keyring: Keyring, domain: int | None, now: datetime
+        self,
+        transaction: Transaction,
+        keyring: Keyring,
+        domain: int | None,
+        now: datetime,
+        stated: Mapping[str, _Stated],
     ) -> None:
         root = transaction.root
         self._transaction = transaction
@@ -309,7 +343,9 @@ class _Signer:
         self._governance = load_governance(root, self.authorities.permissions.certificate)
         self._domains = self._governance.domains().closed()
         check_domain(self._domains, domain, root)
-        self._enclave_domains = EnclaveDomains(self._domains, checked_fleet(root))
+        self._notes: list[Note] = []
+        fleet, self._fleet_entries = self._recorded(stated)
+        self._enclave_domains = EnclaveDomains(self._domains, fleet)
         self._writer = EnclaveWriter(
             transaction,
             self._template,
@@ -317,18 +353,44 @@ class _Signer:
             identity=self.authorities.identity,
             permissions=self.authorities.permissions,
         )
-        self._stated: dict[str, Enclave | None] = {}
+        self._stated = stated
+        self._certified: dict[str, Enclave | None] = {}
         self._new: list[str] = []
-        self._notes: list[Note] = []
 
-    def certify(
-        self, request: SigningRequest, stated: Enclave | None, *, renew: bool, named: bool
-    ) -> Issued:
-        """Write all files of an enclave except its key; its rights are ``stated``, or kept.
+    def _recorded(self, stated: Mapping[str, _Stated]) -> tuple[Fleet | None, tuple[Entry, ...]]:
+        """Return the fleet of the keystore with the paths of what is stated, and ledger entries.
+
+        Its robots stay the same, whatever fleet the policy was filled in for.
+        """
+        root = self._root
+        fleet = checked_fleet(root)
+        paths = {each.path for each in stated.values() if each.path}
+        entries: tuple[Entry, ...] = ()
+        if fleet and not paths <= set(fleet.enclaves):
+            before = EnclaveDomains(self._domains, fleet)
+            fleet, entries = write_fleet(self._transaction, fleet, paths, self._now)
+            refuse_stale_domains(root, before, fleet, stated)
+        for name, each in stated.items():
+            if each.path and not (fleet and robot_of(fleet, name)):
+                lacks = "its fleet does not have the robot" if fleet else "it has no fleet for that"
+                self._notes.append(
+                    Note(
+                        "fleet.unrecorded-enclaves",
+                        f"The keystore does not record whose enclave {name} is: {lacks} of enclave "
+                        f"{name}. `--robot` chooses it, and revokes it, after `sros "
+                        f"generate_artifacts -k {quote(str(root))} -p POLICY_FILE --fleet "
+                        "FLEET_FILE`.",
+                    )
+                )
+        return fleet, entries
+
+    def certify(self, request: SigningRequest, *, renew: bool, named: bool) -> Issued:
+        """Write all files of an enclave except its key; its rights are stated, or kept.
 
         ``named`` is whether the enclave was named at home, and not by the request alone.
         """
         root, name = self._root, request.name
+        stated = self._stated[name].enclave
         _check_name(root, name, renew, name in self._existing)
         if stated is not None:
             refuse_less_protected(root, self._governance, stated_protections([stated]))
@@ -363,7 +425,7 @@ class _Signer:
         self._transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
         link_shared_files(self._transaction, name, present_files(root, name))
         self._notes += issued.notes()
-        self._stated[name] = stated
+        self._certified[name] = stated
         return issued
 
     def keep_zenoh(self) -> KeptZenoh:
@@ -377,14 +439,14 @@ class _Signer:
             permissions.certificate,
             lambda: permissions,
             self._now,
-            ZenohChange(self._writer.grants, stated=self._stated),
+            ZenohChange(self._writer.grants, stated=self._certified),
         )
         self._notes += kept.notes
         return kept
 
     def record(self, *more: Entry) -> None:
         """Write the ledger."""
-        entries = [*self._writer.entries, *more]
+        entries = [*self._fleet_entries, *self._writer.entries, *more]
         append(self._transaction, entries, self.authorities.identity, self._now)
 
     def all_notes(self) -> tuple[Note, ...]:
