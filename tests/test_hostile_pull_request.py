@@ -285,11 +285,12 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Origin:
         lie.plant(origin, origin.folder / LIES / lie.name)
     origin.git("add", "--all", "--force", ":!*/submodule/*")
     origin.git("commit", "--quiet", "--message", "Improve the documentation")
+    origin.merge("hostile", origin.base)
     return origin
 
 
 def clone_of(hostile: Origin, folder: Path) -> Path:
-    clone = hostile.clone(folder, "hostile")
+    clone = hostile.clone(folder, "merged/hostile")
     for trap in TRAPS:
         for key, value in trap.settings.items():
             hostile.git("config", key, value, cwd=clone)

@@ -49,10 +49,12 @@ def origin(tmp_path_factory: pytest.TempPathFactory) -> Origin:
     return made
 
 
-def run_action(origin: Origin, clone: Path, **inputs: str) -> tuple[int, str, dict[str, str]]:
+def run_action(
+    origin: Origin, clone: Path, *, event_base: str = "", **inputs: str
+) -> tuple[int, str, dict[str, str]]:
     """Run the steps of the action but the installation; return status, summary and outputs."""
     shutil.rmtree(clone.with_name(f"{clone.name}.temp"), ignore_errors=True)
-    job = action_job(origin, clone, **inputs)
+    job = action_job(origin, clone, event_base=event_base, **inputs)
     ended = job.run()
     begin, *_, end = ended.stdout.splitlines()
     mark = begin.removeprefix("::stop-commands::")
@@ -73,12 +75,13 @@ def run_action(origin: Origin, clone: Path, **inputs: str) -> tuple[int, str, di
 
 
 def test_the_action_on_pull_requests(origin: Origin, tmp_path: Path) -> None:
-    status, said, _ = run_action(origin, origin.clone(tmp_path / "same", "same"), **ALL)
+    status, said, _ = run_action(origin, origin.clone(tmp_path / "same", "merged/same"), **ALL)
     assert status == 0, said
     assert said.startswith("## Review: nothing found\n")
     assert "nobody gets more access" in said
 
-    status, said, outputs = run_action(origin, origin.clone(tmp_path / "wider", "wider"), **ALL)
+    clone = origin.clone(tmp_path / "wider", "merged/wider")
+    status, said, outputs = run_action(origin, clone, **ALL)
     assert status == 1, said
     assert "`/web ALLOW publish topic /cmd_vel`" in said
     assert "```mermaid" in said
@@ -91,7 +94,7 @@ def test_the_action_on_pull_requests(origin: Origin, tmp_path: Path) -> None:
     assert str(tmp_path) not in said
 
     words = {**ALL, "requirements": ""}
-    clone = origin.clone(tmp_path / "allowed", "wider")
+    clone = origin.clone(tmp_path / "allowed", "merged/wider")
     status, said, _ = run_action(origin, clone, **words)
     assert status == 1, "new access alone is enough"
     assert "no requirements are named" in said
@@ -100,12 +103,12 @@ def test_the_action_on_pull_requests(origin: Origin, tmp_path: Path) -> None:
     assert "/web ALLOW publish topic /cmd_vel" in said
     assert "new access does not fail the review, as asked" in said
 
-    status, said, _ = run_action(origin, origin.clone(tmp_path / "broken", "broken"), **ALL)
+    status, said, _ = run_action(origin, origin.clone(tmp_path / "broken", "merged/broken"), **ALL)
     assert status != 0, said
 
 
 def test_requirements_that_a_pull_request_drops_are_decided(origin: Origin, tmp_path: Path) -> None:
-    clone = origin.clone(tmp_path / "dropped", "dropped")
+    clone = origin.clone(tmp_path / "dropped", "merged/dropped")
     status, said, _ = run_action(origin, clone, **ALL)
     assert status == 1, said
     assert "The requirements change" in said
@@ -160,7 +163,7 @@ def test_what_cannot_be_compared_fails_in_the_action(origin: Origin, tmp_path: P
 
 
 def test_a_checkout_below_the_workspace_is_reviewed(origin: Origin, tmp_path: Path) -> None:
-    origin.clone(tmp_path / "workspace/robot-sources", "wider")
+    origin.clone(tmp_path / "workspace/robot-sources", "merged/wider")
     job = action_job(origin, tmp_path / "workspace", **ALL, checkout="robot-sources")
     ended = job.run()
     assert (ended.returncode, "requirement" in ended.stdout) == (1, True), ended
@@ -202,6 +205,29 @@ def test_no_comparison_is_asked_for_by_name(origin: Origin, tmp_path: Path) -> N
     assert status == 0
     assert "but 2 things were left out" in said.splitlines()[0]
     assert "nothing is compared with an earlier commit, as asked" in said
+
+
+def test_the_action_compares_with_what_is_merged_into(origin: Origin, tmp_path: Path) -> None:
+    """The base of the event is older than what main has lost, and the merge brings it back."""
+    began = origin.git("commit-tree", "wider^{tree}", "-m", "Before main lost the right")
+    clone = origin.clone(tmp_path / "clone", "merged/wider")
+    status, said, _ = run_action(origin, clone, policy=POLICY, event_base=began)
+    assert status == 1, said
+    assert "`/web ALLOW publish topic /cmd_vel`" in said
+    assert f"compared with `{origin.base}`" in said
+    words = ("--base", began, "--fetch", "origin", "--policy", POLICY)
+    older = sros("review", *words, cwd=clone)
+    assert (older.status, "have lost since BASE" in older.out) == (0, True), "asked by its id"
+
+
+def test_only_a_merge_says_what_it_is_merged_into(origin: Origin) -> None:
+    """A commit of the pull request would name its own parent as the base."""
+    for name, said in (
+        (f"{origin.git('rev-parse', 'wider')}^1", "is no merge"),
+        ("refs/heads/merged/wider^1", "is not the full id of a commit"),
+    ):
+        ended = sros("review", "--base", name, "--policy", POLICY, cwd=origin.folder)
+        assert (ended.status, said in ended.err) == (2, True), ended
 
 
 def test_the_job_of_gitlab(origin: Origin, tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from sros_tool.proof.review import Review, ReviewRequest, ReviewStep
 
 _NO_BASE = "none"
+_FIRST_PARENT = "^1"
 _MOST = 60_000
 """Characters of the Markdown: a comment on GitHub has at most 65,536."""
 _SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
@@ -96,7 +97,8 @@ decided.""",
     required=True,
     metavar="COMMIT|none",
     help="The commit with the access of before: its full id, or a full reference such as "
-    "refs/remotes/origin/main. Without a comparison: none.",
+    "refs/remotes/origin/main; for what a merge was made into, the full id of the merge with ^1. "
+    "Without a comparison: none.",
 )
 @click.option(
     "--head",
@@ -238,6 +240,10 @@ def _base_commit(repository: Repository, name: str, remote: str | None) -> str:
     """Return the commit of BASE, fetched if it has to be, or "" for none."""
     if name == _NO_BASE:
         return ""
+    if (merge := name.removesuffix(_FIRST_PARENT)) != name:
+        if remote:
+            repository.fetch_missing(merge, remote)
+        name = repository.merged_into(merge)
     if remote and not name.startswith("refs/") and len(name) in (40, 64):
         repository.fetch_missing(name, remote)
     return repository.exact_commit(name)

@@ -220,6 +220,24 @@ class Repository:
         lines = head.decode(errors="replace").split("\n")
         return tuple(each.removeprefix("parent ") for each in lines if each.startswith("parent "))
 
+    def merged_into(self, merge: str) -> str:
+        """Return the id of the first parent of a merge commit: what its others were merged into.
+
+        Raises:
+            UsageError: ``merge`` is not a full id.
+            DocumentError: it is no merge, or not in the repository.
+        """
+        if not _HASH.match(merge):
+            raise UsageError(f"'{merge}' is not the full id of a commit")
+        parents = self.parents(self._peeled(merge, merge))
+        if len(parents) < 2:
+            raise DocumentError(
+                f"the commit {merge} is no merge",
+                "Only a merge says what it is merged into.",
+                "Name the base itself, or check out the merge commit of the code host.",
+            )
+        return parents[0]
+
     def folders(self, ids: Iterable[str]) -> dict[str, dict[str, TreeEntry]]:
         """Return the entries of folders by id and name.
 

@@ -88,7 +88,10 @@ class Origin:
         return ended.stdout.strip()
 
     def commit(self, files: Mapping[str, str | None], branch: str = "main") -> str:
-        """Commit files, None to delete, on a branch that begins at the base; return the commit."""
+        """Commit files, None to delete, on a branch that begins at the base; return the commit.
+
+        The branch merged/BRANCH is what GitHub checks out for a pull request: a merge into main.
+        """
         if branch != "main":
             self.git("checkout", "--quiet", "-B", branch, self.base)
         for path, text in files.items():
@@ -100,7 +103,15 @@ class Origin:
                 place.write_text(text)
         self.git("add", "--all", "--force")
         self.git("commit", "--quiet", "--allow-empty", "--message", "Change the policy")
+        if branch != "main":
+            self.merge(branch, self.base)
         return self.git("rev-parse", "HEAD")
+
+    def merge(self, branch: str, into: str) -> None:
+        """Make the branch merged/BRANCH, a merge into a commit with all that the branch has."""
+        words = (f"{branch}^{{tree}}", "-p", into, "-p", branch, "-m", "Merge")
+        merged = self.git("commit-tree", *words)
+        self.git("update-ref", f"refs/heads/merged/{branch}", merged)
 
     def clone(self, folder: Path, branch: str, *, depth: int = 1) -> Path:
         """Return a shallow clone of a branch, as `actions/checkout` and GitLab make them."""
@@ -151,8 +162,11 @@ def _named(inputs: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, str
     return found
 
 
-def action_job(origin: Origin, clone: Path, **inputs: str) -> Job:
-    """Return the step of the action after the installation."""
+def action_job(origin: Origin, clone: Path, *, event_base: str = "", **inputs: str) -> Job:
+    """Return the step of the action after the installation, for a pull request.
+
+    ``event_base`` is the base that the event has, which can be older than the target branch.
+    """
     found = action()
     temp = clone.with_name(f"{clone.name}.temp")
     (temp / "sros" / "bin").mkdir(parents=True)
@@ -161,7 +175,12 @@ def action_job(origin: Origin, clone: Path, **inputs: str) -> Job:
     for file in files.values():
         file.touch()
     given = _named(inputs, found["inputs"])
-    values = {"github.event.pull_request.base.sha": origin.base, "runner.temp": str(temp)}
+    values = {
+        "github.event.pull_request.base.sha": event_base or origin.base,
+        "github.event_name": "pull_request",
+        "github.sha": origin.git("rev-parse", "HEAD", cwd=clone / inputs.get("checkout", "")),
+        "runner.temp": str(temp),
+    }
     for name, spec in found["inputs"].items():
         values[f"inputs.{name}"] = given.get(name, expanded(spec["default"], values))
     install, review = found["runs"]["steps"]
