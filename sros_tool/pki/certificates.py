@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import secrets
-from functools import lru_cache
+from functools import cache, lru_cache
 from hashlib import sha256
 from typing import TypeVar
 
@@ -15,6 +15,7 @@ from cryptography.x509.oid import NameOID
 
 from sros_tool.pki import der
 from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm, is_weak
+from sros_tool.pki.object_names import short_names
 from sros_tool.pki.reading import read_name, reading
 from sros_tool.validity import Window
 
@@ -42,47 +43,14 @@ _LEAF_USAGE = x509.KeyUsage(
 )
 Extension = TypeVar("Extension", bound=x509.ExtensionType)
 
-_SHORT_NAMES = {
-    oid.dotted_string: name
-    for name, oid in {
-        "C": NameOID.COUNTRY_NAME,
-        "CN": NameOID.COMMON_NAME,
-        "DC": NameOID.DOMAIN_COMPONENT,
-        "GN": NameOID.GIVEN_NAME,
-        "INN": NameOID.INN,
-        "L": NameOID.LOCALITY_NAME,
-        "O": NameOID.ORGANIZATION_NAME,
-        "OGRN": NameOID.OGRN,
-        "OU": NameOID.ORGANIZATIONAL_UNIT_NAME,
-        "SN": NameOID.SURNAME,
-        "SNILS": NameOID.SNILS,
-        "ST": NameOID.STATE_OR_PROVINCE_NAME,
-        "UID": NameOID.USER_ID,
-        "businessCategory": NameOID.BUSINESS_CATEGORY,
-        "dnQualifier": NameOID.DN_QUALIFIER,
-        "emailAddress": NameOID.EMAIL_ADDRESS,
-        "generationQualifier": NameOID.GENERATION_QUALIFIER,
-        "initials": NameOID.INITIALS,
-        "jurisdictionC": NameOID.JURISDICTION_COUNTRY_NAME,
-        "jurisdictionL": NameOID.JURISDICTION_LOCALITY_NAME,
-        "jurisdictionST": NameOID.JURISDICTION_STATE_OR_PROVINCE_NAME,
-        "organizationIdentifier": NameOID.ORGANIZATION_IDENTIFIER,
-        "postalAddress": NameOID.POSTAL_ADDRESS,
-        "postalCode": NameOID.POSTAL_CODE,
-        "pseudonym": NameOID.PSEUDONYM,
-        "serialNumber": NameOID.SERIAL_NUMBER,
-        "street": NameOID.STREET_ADDRESS,
-        "title": NameOID.TITLE,
-        "unstructuredName": NameOID.UNSTRUCTURED_NAME,
-        "x500UniqueIdentifier": NameOID.X500_UNIQUE_IDENTIFIER,
-    }.items()
+_ENCODINGS = {
+    0x0C: "utf-8",
+    **dict.fromkeys((0x12, 0x13, 0x14, 0x16, 0x17, 0x18, 0x1A), "latin-1"),
+    0x1C: "utf-32-be",
+    0x1E: "utf-16-be",
 }
-"""OpenSSL's short names of subject attributes, by OID.
-
-OpenSSL prints the value of any other attribute in hexadecimal.
-"""
-_OIDS = {name: x509.ObjectIdentifier(oid) for oid, name in _SHORT_NAMES.items()}
-_ESCAPED = re.compile(r'[,+"\\<>;]|^[# ]|(?<!^) \Z')
+"""The encodings that OpenSSL takes texts to have, by their ASN.1 type (a_strex.c, tag2nbyte)."""
+_ESCAPED = re.compile(r'[,+"\\<>;]|^[# ](?!\Z)| \Z')
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 _NOT_A_CA = x509.BasicConstraints(ca=False, path_length=None)
@@ -319,19 +287,31 @@ def subject_text(name: x509.Name) -> str:
 
     RDNs, and the attributes within an RDN, are in reverse order; non-ASCII characters are kept.
     """
+    if all(len(rdn) == 1 for rdn in name.rdns):
+        return _name_text(name.public_bytes())
+    # In DER, the attributes within an RDN are in the order of DER.
     return ",".join(
-        "+".join(map(_attribute_text, reversed(list(rdn)))) for rdn in reversed(name.rdns)
+        "+".join(_name_text(x509.Name([each]).public_bytes()) for each in reversed(list(rdn)))
+        for rdn in reversed(name.rdns)
     )
 
 
-def _attribute_text(attribute: x509.NameAttribute[str | bytes]) -> str:
-    known = _SHORT_NAMES.get(attribute.oid.dotted_string)
-    if known is None or isinstance(attribute.value, bytes):
-        (rdn,) = der.children(der.first(x509.Name([attribute]).public_bytes()).content)
-        (pair,) = der.children(rdn.content)
-        value = der.children(pair.content)[1].whole
-        return f"{known or attribute.oid.dotted_string}=#{value.hex().upper()}"
-    text = _ESCAPED.sub(lambda found: f"\\{found[0]}", attribute.value)
+@lru_cache(maxsize=1024)  # the subjects of a keystore are asked for repeatedly
+def _name_text(name: bytes) -> str:
+    """Return a name (DER) that has one attribute in each RDN, as OpenSSL prints it."""
+    rdns = der.children(der.first(name).content)
+    return ",".join(_attribute_text(der.first(rdn.content)) for rdn in reversed(rdns))
+
+
+def _attribute_text(attribute: der.Value) -> str:
+    """Return an attribute; its value is in hexadecimal if the attribute is unknown, or no text."""
+    oid, value = der.children(attribute.content)
+    dotted = der.decode_oid(oid.content)
+    known = short_names().get(dotted)
+    encoding = _ENCODINGS.get(value.tag)
+    if known is None or encoding is None:
+        return f"{known or dotted}=#{value.whole.hex().upper()}"
+    text = _ESCAPED.sub(lambda found: f"\\{found[0]}", value.content.decode(encoding))
     return f"{known}={_CONTROL.sub(lambda found: f'{chr(92)}{ord(found[0]):02X}', text)}"
 
 
@@ -341,7 +321,12 @@ def parse_subject(text: str) -> x509.Name:
     Raises:
         ValueError: the text is not a distinguished name.
     """
-    return x509.Name.from_rfc4514_string(text, _OIDS)
+    return x509.Name.from_rfc4514_string(text, _oids())
+
+
+@cache
+def _oids() -> dict[str, x509.ObjectIdentifier]:
+    return {name: x509.ObjectIdentifier(oid) for oid, name in short_names().items()}
 
 
 def common_name_of(name: x509.Name) -> str:

@@ -94,3 +94,14 @@ def encode_oid(dotted: str) -> bytes:
             part.append(number & 0x7F | 0x80)
         content += bytes(reversed(part))
     return bytes(content)
+
+
+def decode_oid(content: bytes) -> str:
+    """Return the dotted form of an object identifier, given as the content of a DER value."""
+    numbers = [0]
+    for octet in content:
+        numbers[-1] = numbers[-1] << 7 | octet & 0x7F
+        if not octet & 0x80:
+            numbers.append(0)
+    first = min(numbers[0] // 40, 2)
+    return ".".join(map(str, (first, numbers[0] - 40 * first, *numbers[1:-1])))

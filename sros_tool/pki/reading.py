@@ -10,8 +10,9 @@ from cryptography import x509
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
 
-_TEXTS = (0x0C, 0x12, 0x13, 0x14, 0x16, 0x1C, 0x1E)
-"""The ASN.1 types of text that OpenSSL reads in names (B_ASN1_PRINTABLE, without BIT STRING)."""
+_BMP_STRING = 0x1E
+_IN_NAMES = (0x03, 0x0C, 0x12, 0x13, 0x14, 0x16, 0x1C, _BMP_STRING)
+"""The ASN.1 types that OpenSSL reads in names (B_ASN1_PRINTABLE)."""
 
 
 @contextmanager
@@ -40,5 +41,8 @@ def read_name(name: x509.Name) -> None:
     for part in der.children(der.first(name.public_bytes()).content):
         for attribute in der.children(part.content):
             _, value = der.children(attribute.content)
-            if value.tag not in _TEXTS:
+            if value.tag not in _IN_NAMES:
                 raise ValueError(f"a value of a name has the ASN.1 type {value.tag}")
+            characters = value.content.decode("utf-16-be") if value.tag == _BMP_STRING else ""
+            if max(characters, default="") > "\uffff":
+                raise ValueError("a BMPString has a character of more than 16 bits")

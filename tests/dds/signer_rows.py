@@ -117,13 +117,13 @@ class Row:
 
 
 def write_enclave(
-    row: Row, folder: Path, subject: str, governance: bytes, permissions: bytes
+    row: Row, folder: Path, subject: str | x509.Name, governance: bytes, permissions: bytes
 ) -> None:
     """All files of an enclave as the row has them made."""
     made = row.made
     issuer = made.issuer or ROOT
     key = generate_key()
-    name = parse_subject(subject)
+    name = parse_subject(subject) if isinstance(subject, str) else subject
     certificate = (
         x509.CertificateBuilder(
             issuer[0].subject,

@@ -348,6 +348,9 @@ def subjects() -> list[Row]:
         ("STREET=s,CN=/t", street, REFUSED, REFUSED, ""),
         (beyond, beyond, YES, REFUSED, ""),
         ("CN=/gr\\C3\\B6\\C3\\9Fe", beyond, REFUSED, YES, ""),
+        ("CN=a\\,b", "CN=a\\, b", REFUSED, REFUSED, ""),
+        ("CN=a\\,  b", "CN=a\\, b", YES, REFUSED, REFUSED),
+        ("CN=/t, ", "CN=/t,O=x", CRASHES, REFUSED, REFUSED),
     ]
     return [
         Row(

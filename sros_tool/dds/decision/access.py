@@ -21,7 +21,7 @@ from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome, Refusa
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.matching import ExpressionIndex, matches, names_of
 from sros_tool.dds.decision.moments import read_moment
-from sros_tool.dds.decision.subjects import escaped, same_subject
+from sros_tool.dds.decision.subjects import ComparisonCrash, certified_text, same_subject
 from sros_tool.dds.decision.vendors import (
     DenyPartitions,
     Moments,
@@ -39,9 +39,12 @@ def _choose_grant(
     traits: VendorTraits, permissions: Permissions, subject: str, *, at: datetime, zone: tzinfo
 ) -> int | Refusal:
     """Return the index of the grant that decides, or a refusal if there is none."""
+    if not subject and traits.crashes_on_empty_subject:
+        text = f"{traits.title} ends with an error at a certificate with an empty subject."
+        return Refusal("empty-subject", text, Outcome.CRASHES)
     now = at.timestamp()
     outdated: Refusal | None = None
-    certified = escaped(subject) if traits.escapes_subjects else subject
+    certified = certified_text(traits, subject)
     states = [
         _state(traits, index, grant, now, zone) for index, grant in enumerate(permissions.grants)
     ]
@@ -50,8 +53,17 @@ def _choose_grant(
             return state
     for index, (grant, state) in enumerate(zip(permissions.grants, states, strict=True)):
         granted = grant.subject.strip() if traits.trims_texts else grant.subject
-        if not same_subject(traits.subjects, granted, certified):
-            continue
+        try:
+            if not same_subject(traits.subjects, granted, certified):
+                continue
+        except ComparisonCrash:
+            if state:  # not compared
+                continue
+            text = (
+                f"{traits.title} ends with an error where it compares the grant for {granted!r} "
+                f"with the subject {subject!r}."
+            )
+            return Refusal("blank-subject", text, Outcome.CRASHES)
         if state is None:
             return index
         if not traits.passes_over_outdated_grants:

@@ -70,6 +70,8 @@ _REASONS = {
     "domain-not-in-governance": "no domain rule of the governance lists the domain",
     "peer-refuses-participant": "peers do not accept the participant on this domain",
     "no-grant": "no grant names the subject",
+    "empty-subject": "a certificate with an empty subject crashes the process",
+    "blank-subject": "a grant whose subject has a part of blanks crashes the process",
     "not-yet-valid": "the grant of the subject is not valid yet",
     "expired": "the grant of the subject has expired",
     "malformed": "the vendor does not accept a document",

@@ -8,15 +8,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping
-from itertools import takewhile
 
 from sros_tool.dds.decision.vendors import Subjects, VendorTraits
 
+_BLANK = ord(" ")
 _MOST_PARTS = 20  # Cyclone DDS 0.10 refuses a grant's subject of more
 
 
+class ComparisonCrash(Exception):  # noqa: N818
+    """A comparison of subjects ends the vendor's process."""
+
+
 def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
-    """Return whether a grant for ``granted`` applies to the certificate subject ``certified``."""
+    """Return whether a grant for ``granted`` applies to the certificate subject ``certified``.
+
+    Raises:
+        ComparisonCrash: the vendor's process ends.
+    """
     return _COMPARE[rule](granted, certified)
 
 
@@ -35,7 +43,7 @@ def also_fitting(
             having.setdefault(part, set()).add(name)
     found = {}
     for name, subject in certified.items():
-        own = escaped(subject) if traits.escapes_subjects else subject
+        own = certified_text(traits, subject)
         several = [having.get(part, set()) for part in _SEPARATORS.split(own) if part]
         fitting = set.intersection(*sorted(several, key=len)) if several else set()
         others = tuple(
@@ -48,13 +56,16 @@ def also_fitting(
     return found
 
 
-def escaped(certified: str) -> str:
-    """Return the subject of a certificate with every non-ASCII byte as ``\\C3``."""
-    parts = (
-        each if each.isascii() else "".join(f"\\{b:02X}" for b in each.encode())
-        for each in certified
-    )
-    return "".join(parts)
+def certified_text(traits: VendorTraits, subject: str) -> str:
+    """Return the subject of a certificate as the vendor compares it."""
+    if traits.escapes_subjects:
+        return "".join(
+            each if each.isascii() else "".join(f"\\{octet:02X}" for octet in each.encode())
+            for each in subject
+        )
+    if traits.longest_subject is None:
+        return subject
+    return subject.encode()[: traits.longest_subject].decode(errors="surrogateescape")
 
 
 def _exact(granted: str, certified: str) -> bool:
@@ -62,13 +73,43 @@ def _exact(granted: str, certified: str) -> bool:
 
 
 def _whole_attributes(granted: str, certified: str) -> bool:
-    # Fast DDS 2.9 splits at every comma, also at an escaped one.
-    return _stripped(granted) == _stripped(certified)
+    """Compare part by part, between commas, also escaped ones, and without outer blanks.
+
+    Source: Fast DDS 2.9.1, Permissions.cpp (rfc2253_string_compare).  A part of less than three
+    bytes keeps some of its blanks, and what stands behind an empty part does not count.
+    """
+    ours, theirs = granted.encode(), certified.encode(errors="surrogateescape")
+    our_start = their_start = 0
+    our_end, their_end = _part_end(ours, 0), _part_end(theirs, 0)
+    while our_start < our_end and their_start < their_end:
+        if _trimmed(ours, our_start, our_end) != _trimmed(theirs, their_start, their_end):
+            return False
+        our_start, their_start = our_end + 1, their_end + 1
+        our_end, their_end = _part_end(ours, our_start), _part_end(theirs, their_start)
+    return our_start >= our_end and their_start >= their_end
 
 
-def _stripped(name: str) -> list[str]:
-    # It stops at the first empty part: text after two commas does not count.
-    return [part.strip(" ") for part in takewhile(bool, name.split(","))]
+def _trimmed(text: bytes, start: int, end: int) -> bytes:
+    """Return the part from ``start`` to ``end`` without outer blanks, as far as they are removed.
+
+    Each side stops where the part would have one byte left, and not at the end of a shorter part.
+    """
+    last = end - 1
+    try:
+        while text[start] == _BLANK and start + 1 != last:
+            start += 1
+        while text[last] == _BLANK and last - 1 != start:
+            last -= 1
+            if last < 0:
+                raise IndexError
+    except IndexError as error:
+        raise ComparisonCrash from error
+    return text[start : last + 1] if last + 1 >= start else text[start:]
+
+
+def _part_end(text: bytes, start: int) -> int:
+    comma = text.find(b",", start)
+    return len(text) if comma < 0 else comma
 
 
 _MOST_ATTRIBUTES = 20  # the ones that Fast DDS 2.14 uses

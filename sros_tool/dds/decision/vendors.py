@@ -26,7 +26,7 @@ class Subjects(Enum):
     EXACT = auto()
     """The same attributes in the same order; spaces around them do not count."""
     WHOLE_ATTRIBUTES = auto()
-    """The same, but spaces around ``=`` count (Fast DDS 2.9)."""
+    """The same texts between commas, escaped or not, without blanks (Fast DDS 2.9)."""
     ANY_ORDER = auto()
     """The same attributes in any order (Fast DDS 2.14)."""
     SUBSET = auto()
@@ -127,6 +127,10 @@ class VendorTraits:
     subjects: Subjects = Subjects.EXACT
     escapes_subjects: bool = False
     """A character beyond ASCII in a certificate's subject is compared as ``\\C3\\B6``."""
+    longest_subject: int | None = None
+    """The subject of a certificate is cut to so many bytes before it is compared."""
+    crashes_on_empty_subject: bool = False
+    """A certificate without any attribute in its subject crashes the process, and its peers'."""
     moments: Moments = Moments.STANDARD
     passes_over_outdated_grants: bool = False
     """A later grant is used if the first grant of the subject is not valid now."""
@@ -177,6 +181,8 @@ _FAST_2_14 = VendorTraits(
     reader=DocumentReader.FAST,
     governance_both_ways=True,
     subjects=Subjects.ANY_ORDER,
+    longest_subject=1024,
+    crashes_on_empty_subject=True,
     moments=Moments.LOCAL,
     longest_topic_name=251,
     passes_over_outdated_grants=True,
