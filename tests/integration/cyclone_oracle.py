@@ -3,7 +3,8 @@
 Reads a JSON list of cases from standard input: {"identity", "documents", "domain", "zone",
 "questions": [[verb, topic, [partition...]]...], "peer": null or [identity, documents], "seconds"},
 where identity and documents are folders.  Prints an answer for each as a line of JSON:
-{"end": "refused" | "joined" | "crashed" | "hung" | "peer refused" | "failed", "answers", "log"};
+{"end": "refused" | "joined" | "crashed" | "hung" | "failed" | "peer refused" | "peer crashed" |
+"peer hung", "answers", "log"};
 the answers are denied, invalid (the name), created, and with a peer: matched (and heard), unmatched
 or peer denied.
 
@@ -97,11 +98,15 @@ def run(library: CycloneLibrary, case: Case) -> Report:
             "again": True,
         }
         with Process(lambda say: take_part(library, other, say)) as peer:
-            opened, found = peer.report(), peer.report()
+            opened = peer.report()
+            if opened is not None and opened["end"] != "joined":
+                return {"end": "peer refused", "answers": [], "log": opened["log"]}
+            found = peer.report() if opened else None
             if opened is None or found is None:
-                log = opened["log"] if opened else ""
-                return {"end": "peer refused", "answers": [], "log": log}
-            both = own.report() or {"answers": [False] * len(wanted)}
+                return {"end": f"peer {peer.ended()}", "answers": [], "log": ""}
+            both = own.report()
+            if both is None:
+                return {"end": own.ended(), "answers": [], "log": ""}
         for i, answer, mine, others in zip(
             wanted, opened["answers"], both["answers"], found["answers"], strict=True
         ):

@@ -55,7 +55,8 @@ class Case:
 class Reply:
     """What a vendor does.
 
-    ``end`` is joined, refused, crashed, hung or "peer refused"; ``answers`` has for each question
+    ``end`` is joined, refused, crashed, hung, or "peer refused", "peer crashed" (Cyclone DDS, whose
+    participants are processes of their own); ``answers`` has for each question
     denied, created, or with a peer matched, unmatched, "peer denied"; ``log`` is the vendor's.
     """
 
@@ -269,6 +270,7 @@ def ask_fastdds_folders(
     *,
     domain: int = 0,
     seconds: float = MATCH_SECONDS,
+    at_once: int = 6,
 ) -> list[Reply]:
     """What Fast DDS does with each pair of enclaves."""
     program = build("fastdds_oracle.cpp", program_folder)
@@ -276,7 +278,7 @@ def ask_fastdds_folders(
         f"{own}\t{own}\t{domain}\t{zone}\t{peer}\t{peer}\t{int(seconds * 1000)}\tpublish\x1f{topic}"
         for own, peer, zone in pairs
     ]
-    return _spread(lines, 6, lambda some: _ask_one_program(program, some))
+    return _spread(lines, at_once, lambda some: _ask_one_program(program, some))
 
 
 def ask_cyclone_folders(
@@ -286,6 +288,7 @@ def ask_cyclone_folders(
     *,
     domain: int = 0,
     seconds: float = MATCH_SECONDS,
+    at_once: int = 6,
 ) -> list[Reply]:
     """What Cyclone DDS does with each pair of enclaves; ``whole`` is one that lacks nothing."""
     records = [
@@ -301,7 +304,7 @@ def ask_cyclone_folders(
         }
         for own, peer, zone in pairs
     ]
-    return _spread(records, 6, ask_cyclone_records)
+    return _spread(records, at_once, ask_cyclone_records)
 
 
 def _spread(items: Sequence[Any], at_once: int, ask: Any) -> list[Reply]:
