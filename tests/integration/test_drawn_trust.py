@@ -43,8 +43,8 @@ def test_the_engine_says_what_vendors_were_observed_to_do(tmp_path: Path) -> Non
     assert not wrong, "\n".join(wrong)
     assert {family for case in kept for family, _ in case.oddities} == set(FAMILIES)
     for vendor in (Vendor.FAST_2_9, Vendor.FAST, Vendor.CYCLONE):
-        said = Counter(words[vendor] for words in kept.values())
-        assert min(said["matched"], said["refused"]) > len(kept) / 5, (vendor, said)
+        observed_words = Counter(words[vendor] for words in kept.values())
+        assert min(observed_words["matched"], observed_words["refused"]) > len(kept) / 5
 
 
 @pytest.mark.dds
@@ -68,7 +68,9 @@ def test_drawn_enclaves(asked: str, tmp_path: Path) -> None:
             continue
         done = start + len(cases[start : start + AT_ONCE])
         rate = done / (monotonic() - begin)
-        print(f"{vendor.title}: {done} enclaves, {rate:.1f} a second, {len(wrong)} differ", flush=True)
+        print(
+            f"{vendor.title}: {done} enclaves, {rate:.1f} a second, {len(wrong)} differ", flush=True
+        )
     print(f"{vendor.title}, seed {SEED}: {len(cases)} enclaves, {dict(count)}; {len(wrong)} differ")
     assert not wrong, "\n".join(map(_shown, wrong[:5]))
     assert count["matched"] and count["refused"]
