@@ -18,11 +18,11 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     """Measure ``sros explain --who`` and ``--reach``, and the proof of permissions to sign."""
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.dds.domains import DomainSet
-    from sros_tool.explain.evaluator import JoinContext
     from sros_tool.explain.question import ask
     from sros_tool.explain.who import who
     from sros_tool.keystore.issuing.proof import prove
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
+    from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.rights import load_rights
     from sros_tool.keystore.template import load_template
     from sros_tool.policy.document import read_policy

@@ -354,10 +354,11 @@ def explain_access(
         (True, 'rule 1 allows publish rt/chatter by rt/chatter')
     """
     from sros_tool.dds.decision.vendors import Vendor
-    from sros_tool.explain.evaluator import Evaluator, JoinContext, action_meant, load_enclave
+    from sros_tool.explain.evaluator import Evaluator, action_meant
     from sros_tool.explain.question import ask
     from sros_tool.keystore.layout import check_keystore, enclave_path, has_enclave, list_enclaves
     from sros_tool.keystore.missing import no_such_enclave
+    from sros_tool.keystore.participant import JoinContext, load_enclave
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.rights import policy_rights
     from sros_tool.runtime.environment import choose_domain

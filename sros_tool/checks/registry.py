@@ -23,13 +23,14 @@ from sros_tool.checks.keystores import (
     enclaves,
     files,
     issued,
+    vendors,
     zenoh_files,
 )
 from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, Severity, by_id
 from sros_tool.errors import UsageError
 
 _MODULES = (
-    *(policies, requirements, files, authorities, enclaves, documents, issued),
+    *(policies, requirements, files, authorities, enclaves, vendors, documents, issued),
     *(zenoh_files, zenoh, zenoh_environment, environment, runtime, processes, process_files),
 )
 
@@ -85,7 +86,7 @@ class FindingFilter:
         included = not self.include or any(_matches(kind, each) for each in self.include)
         if self.vendor and kind.vendors and self.vendor not in kind.vendors:
             return False
-        if self.vendor and kind is documents.DIFFER:
+        if self.vendor and kind is vendors.DIFFER:
             return False
         return included and not any(_matches(kind, each) for each in self.exclude)
 

@@ -33,6 +33,7 @@ class Circumstances:
     """The moment, time zone and other conditions of a check; see `keystore_findings`.
 
     ``distribution`` is the ROS 2 distribution of the nodes of policies; "" is the latest.
+    ``vendor`` is the DDS vendor of the nodes, or ``zenoh``; "" if they may use any.
     ``fleet`` has the robots that placeholders in policies stand for.
     """
 
@@ -41,6 +42,7 @@ class Circumstances:
     domain: int | None = None
     policies: tuple[Policy, ...] = ()
     distribution: str = ""
+    vendor: str = ""
     fleet: Fleet | None = None
 
 
@@ -94,5 +96,6 @@ def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:
         domain=at.domain,
         policies=at.policies,
         distribution=at.distribution,
+        vendor=at.vendor,
         only=None if only is None else (only,),
     )

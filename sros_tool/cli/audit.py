@@ -39,8 +39,8 @@ from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
     from sros_tool.explain.audit import Audit, AuditedEnclaves
-    from sros_tool.explain.evaluator import JoinContext
     from sros_tool.graph.observation import Observation
+    from sros_tool.keystore.participant import JoinContext
 
 
 @click.command(
@@ -181,10 +181,10 @@ def _enclaves(
     """
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.audit import keystore_enclaves, policy_enclaves
-    from sros_tool.explain.evaluator import JoinContext
     from sros_tool.fleet.document import read_fleet
     from sros_tool.fleet.expansion import read_policy_for
     from sros_tool.keystore.layout import enclave_names
+    from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.rights import load_rights
     from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
     from sros_tool.runtime.rmw import vendor_here

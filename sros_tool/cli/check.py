@@ -263,7 +263,7 @@ def check(
         watch_processes(_environment(domain_of(domain)), selection, as_json=form == "json")
         return 0
     at = _circumstances(domain, moment, policies, fleet_file)
-    at = replace(at, distribution=_distribution(distribution))
+    at = replace(at, distribution=_distribution(distribution), vendor=vendor or "")
     if suggest:
         if form != "text" or requirements or earlier:
             raise UsageError("--suggest prints TOML", "", "Give it alone.")
@@ -422,6 +422,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
                 domain=at.domain,
                 policies=at.policies,
                 distribution=at.distribution,
+                vendor=at.vendor,
             )
         ]
     if paths:

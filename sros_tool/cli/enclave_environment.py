@@ -176,8 +176,9 @@ def _check_dates_here(name: str, folder: Path, domain: int, rmw: str | None) -> 
     Fast DDS reads their dates, which are in UTC, as local time.
     """
     from sros_tool.cli.common import local_zone
-    from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
+    from sros_tool.explain.evaluator import Evaluator
     from sros_tool.explain.question import ask
+    from sros_tool.keystore.participant import JoinContext, load_enclave
     from sros_tool.runtime.rmw import chosen_rmw, vendor_here, vendor_of
 
     zone, moment = local_zone(os.environ), now()

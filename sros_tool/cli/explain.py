@@ -53,12 +53,13 @@ if TYPE_CHECKING:
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.answer import Answer
     from sros_tool.explain.change import PolicyChange
-    from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave
+    from sros_tool.explain.evaluator import Evaluator
     from sros_tool.explain.log import LogFinding
     from sros_tool.explain.question import Part, Question
     from sros_tool.explain.who import EnclaveOutcome
     from sros_tool.explain.zenoh import ZenohAnswer
     from sros_tool.fleet.model import Fleet
+    from sros_tool.keystore.participant import JoinContext, LoadedEnclave
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.model import Enclave, Source
     from sros_tool.policy.rights import Right
@@ -327,7 +328,7 @@ class _ContextOptions:
 
     def context(self, domains: DomainSet | None) -> JoinContext:
         """Return the domain, time and zone to decide for, if an enclave may join ``domains``."""
-        from sros_tool.explain.evaluator import JoinContext
+        from sros_tool.keystore.participant import JoinContext
         from sros_tool.runtime.environment import choose_domain
 
         chosen = self._domain
@@ -523,8 +524,8 @@ def _signed_enclave(
     Returns None if there is neither keystore nor folder, or, with ``planned``, if the keystore does
     not have the enclave yet.
     """
-    from sros_tool.explain.evaluator import load_enclave
     from sros_tool.keystore.layout import check_keystore, enclave_path, has_enclave, list_enclaves
+    from sros_tool.keystore.participant import load_enclave
 
     if root is None:
         folder = Path(name)
@@ -565,7 +566,7 @@ def _planned_enclave(policy: Enclave, root: Path | None, options: _ContextOption
     Without a keystore, the governance is that of the default template, raised as the enclave says.
     """
     from sros_tool.dds.domains import DomainSet
-    from sros_tool.explain.evaluator import plan_enclave
+    from sros_tool.keystore.participant import plan_enclave
     from sros_tool.keystore.protection import with_stated
     from sros_tool.keystore.reader import governance_of
     from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template

@@ -17,7 +17,8 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer, lines_of_right
 from sros_tool.explain.denials import nodes_served
-from sros_tool.explain.evaluator import Evaluator, LoadedEnclave, plan_enclave
+from sros_tool.explain.evaluator import Evaluator
+from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
 from sros_tool.names import NODE_SERVICES, is_expression
 from sros_tool.policy.document import write_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source

@@ -21,13 +21,14 @@ from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer
 from sros_tool.explain.change import likely_names
 from sros_tool.explain.denials import Denial, nodes_served, read_denials, serving_node
-from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave
+from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import Part, Question, ask
 from sros_tool.explain.remedy import remedy
 from sros_tool.faults import Fault
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.rights import load_rights
 from sros_tool.names import ACTION_SEPARATOR
 from sros_tool.pki.certificates import IDENTITY_DIGITS

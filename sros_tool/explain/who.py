@@ -10,9 +10,10 @@ from pathlib import Path
 from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
+from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import Question
 from sros_tool.keystore.layout import enclave_names, enclave_path
+from sros_tool.keystore.participant import JoinContext, load_enclave
 from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices, tick
 

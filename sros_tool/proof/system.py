@@ -20,7 +20,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave, load_enclave
+from sros_tool.explain.evaluator import Evaluator
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.layout import (
@@ -32,6 +32,7 @@ from sros_tool.keystore.layout import (
     has_zenoh_files,
     is_keystore,
 )
+from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave
 from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template

@@ -71,6 +71,18 @@ class Bench:
     def trust(self, role: str, certificate: x509.Certificate) -> None:
         self.path(f"public/{role}_ca.cert.pem").write_bytes(pem(certificate))
 
+    def adopt(self, role: str, authority: tuple[x509.Certificate, PrivateKey]) -> None:
+        """Take another CA, and issue or sign everything again with it."""
+        certificate, key = authority
+        self.trust(role, certificate)
+        self.path(f"private/{role}_ca.key.pem").write_bytes(key_pem(key, SECRET))
+        if role == "identity":
+            for serial, name in enumerate(("base", "arm"), start=12345):
+                self.issue(name, by=authority, serial=serial)
+            return
+        for path in (self.path("enclaves/governance.p7s"), *self.root.glob("enclaves/*/perm*.p7s")):
+            self.sign(str(path.relative_to(self.root)), lambda text: text, xml=False)
+
     # ── signed documents ───────────────────────────────────────────────────────────────────
 
     def document(self, file: str) -> str:

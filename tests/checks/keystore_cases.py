@@ -358,6 +358,10 @@ CASES |= {
     "permissions.unreachable-rule": lambda b: b.permissions((ALLOW, DENY_ALL + ALLOW)),
     "enclave.permissions-domains": lambda b: b.permissions(("<id>0</id>", "<id>0</id><id>1</id>")),
     "enclave.fewer-domains": _fewer_domains,
+    "enclave.refused": lambda b: b.governance(
+        ("data_protection_kind>ENCRYPT", "data_protection_kind>ENCRYPT_WITH_ORIGIN_AUTHENTICATION")
+    ),
+    "portable.refused": lambda b: b.permissions(("<id>0</id>", "<id><!-- -->0</id>")),
     "portable.vendors-differ": lambda b: b.permissions(("<default>DENY", "<default>ALLOW")),
 }
 

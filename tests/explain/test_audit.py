@@ -19,11 +19,11 @@ from sros_tool.explain.audit import (
     keystore_enclaves,
     policy_enclaves,
 )
-from sros_tool.explain.evaluator import JoinContext
 from sros_tool.graph.document import render
 from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
 from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.lifecycle.create import generate_artifacts
+from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy

@@ -18,8 +18,9 @@ from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.change import policy_of
-from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave, plan_enclave
+from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import Question, ask
+from sros_tool.keystore.participant import JoinContext, LoadedEnclave, plan_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.names import is_expression
 from sros_tool.policy.document import read_policy

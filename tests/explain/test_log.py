@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.explain import evaluator
-from sros_tool.explain.evaluator import LoadedEnclave, load_enclave
 from sros_tool.explain.log import LogFinding, explain_log
+from sros_tool.keystore import participant
 from sros_tool.keystore.ledger import Ledger
+from sros_tool.keystore.participant import LoadedEnclave, load_enclave
 from sros_tool.pki.certificates import identity_of, load_certificate
 from sros_tool.resources import policies_dir
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
@@ -826,7 +826,7 @@ def test_how_often_files_are_read_is_not_for_the_log_to_choose(
     def refuse(_root: Path) -> Ledger:
         raise AssertionError("the ledger was read")
 
-    monkeypatch.setattr(evaluator, "load_enclave", opened)
+    monkeypatch.setattr(participant, "load_enclave", opened)
     monkeypatch.setattr("sros_tool.keystore.ledger.read_ledger", refuse)
     monkeypatch.setattr("sros_tool.keystore.missing.read_ledger", refuse)
     findings = json.loads(sros("explain", keystore, "--log", tmp_path / "log", "--json").out)

@@ -20,7 +20,6 @@ from sros_tool.dds.permissions import parse_permissions
 from sros_tool.demo.scenarios.custom import read_scenario
 from sros_tool.errors import SrosError
 from sros_tool.explain.denials import propose, read_denials
-from sros_tool.explain.evaluator import JoinContext
 from sros_tool.explain.log import explain_log
 from sros_tool.keystore.authorities.imported import check_imported
 from sros_tool.keystore.confirmation import keep, last_confirmation, receive
@@ -32,6 +31,7 @@ from sros_tool.keystore.history import history
 from sros_tool.keystore.ledger import certificate_entry, read_ledger
 from sros_tool.keystore.lifecycle.adopt import adopt_keystore
 from sros_tool.keystore.lifecycle.rotation.state import read_rotation, rotation_status
+from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.template import parse_template, read_template, render_template
 from sros_tool.names import check_enclave_name

@@ -13,8 +13,8 @@ import pytest
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.audit import audit, policy_enclaves
-from sros_tool.explain.evaluator import JoinContext
 from sros_tool.graph.observation import from_json
+from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import Policy

@@ -11,7 +11,7 @@ import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import PkiError
-from sros_tool.explain.evaluator import load_enclave
+from sros_tool.keystore.participant import load_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
+from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import ask
+from sros_tool.keystore.participant import JoinContext, load_enclave
 from tests.dds.decision_documents import allow, governance, grant, permissions, publish, subscribe
 from tests.dds.signer_rows import NOW, YES, Row, rows, write_enclave
 

@@ -488,7 +488,9 @@ def shared_ca_findings(
     """Yield a finding if the identity CA and the permissions CA have the same key."""
     if identity.public_key() == permissions.public_key():
         text = f"{authority_text(identity)} is identity CA and permissions CA"
-        accepted = keystore.accepts(lambda settings: not settings.separate_authorities)
+        accepted = keystore.accepts(
+            ONE_AUTHORITY, lambda settings: not settings.separate_authorities
+        )
         remedy = _separation(keystore) if keystore.is_home else ""
         yield ONE_AUTHORITY.found("the CAs", text, file, remedy=remedy, accepted=accepted)
 

@@ -18,21 +18,17 @@ from sros_tool.checks.keystores.enclaves import grant_of, plain
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.policies import outside_findings
-from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import AccessVerb, Refusal
 from sros_tool.dds.decision.moments import read_moment
-from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, Moments, Vendor
+from sros_tool.dds.decision.vendors import FAST_DDS, Moments
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
-from sros_tool.dds.permissions import Criteria, Grant, Rule, render_permissions
+from sros_tool.dds.permissions import Criteria, Grant, Rule
 from sros_tool.errors import SrosError
 from sros_tool.keystore.fleet import EnclaveDomains
-from sros_tool.keystore.layout import GOVERNANCE_XML
+from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_XML
 from sros_tool.keystore.settings import edit_remedy
 from sros_tool.keystore.template import Template
-from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import subject_text
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso
@@ -481,23 +477,20 @@ _SIGNING = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
 _NONE = (ProtectionKind.NONE,)
 
 
-def check_governance(enclave: CheckedEnclave, *, only_differing: bool) -> Iterator[Finding]:
-    """Yield findings about the governance that an enclave loads.
+def check_governance(enclave: CheckedEnclave, common: bytes) -> Iterator[Finding]:
+    """Yield findings if an enclave loads another governance than the signed document ``common``.
 
-    All findings are reported once for a keystore, for the first enclave.  For the other enclaves,
-    ``only_differing`` is true, and only a copy that differs from the shared governance is reported.
+    That is the governance of the keystore, or of the first enclave of an export.
     """
     governance = enclave.state.governance
     if governance is None:
         return
-    file = enclave.file("governance.p7s")
-    if only_differing:
-        own, common = enclave.state.files["governance.p7s"], enclave.keystore.governance
-        if common and own != common and _content(own) != _content(common):
-            text = f"'{file}' differs from the governance of the keystore"
-            yield DIFFERS.found(enclave.name, text, file)
-        return
-    yield from governance_findings(enclave.keystore, governance, file)
+    own = enclave.state.files[GOVERNANCE_FILE]
+    if own != common and _content(own) != _content(common):
+        file = enclave.file(GOVERNANCE_FILE)
+        of = "the keystore" if enclave.keystore.governance else "other enclaves"
+        yield DIFFERS.found(enclave.name, f"'{file}' differs from the governance of {of}", file)
+        yield from governance_findings(enclave.keystore, governance, file)
 
 
 @dataclass(frozen=True, slots=True)
@@ -531,11 +524,10 @@ def governance_findings(
             # A template may choose open topics; no template chooses to lose messages, or a rule
             # that does nothing.
             own = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
-            by = "" if own else keystore.accepts(_Chosen(kind, text, domains))
+            by = "" if own else keystore.accepts(kind, _Chosen(kind, text, domains))
             yield kind.found(subject, text, file, accepted=by)
         for problem in _domain_problems(rule.domains):
             yield GOVERNANCE_DOMAIN_RANGE.found(subject, f"the range {problem}", file)
-    yield from _copy(keystore)
 
 
 def _reach_of_unauthenticated(rule: DomainRule) -> str:
@@ -619,7 +611,8 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[FindingKin
         yield _OPEN[each], f"{text} for {name}"
 
 
-def _copy(keystore: CheckedKeystore) -> Iterator[Finding]:
+def governance_copy_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
+    """Yield a finding if somebody changed the readable copy of the governance."""
     xml = keystore.root / GOVERNANCE_XML
     if keystore.edits.governance:
         text = "governance.xml differs from the content of governance.p7s"
@@ -632,106 +625,3 @@ def _content(message: bytes) -> bytes:
         return plain(smime.parse(message).document)
     except SrosError:
         return b""
-
-
-DIFFER = FindingKind(
-    "portable.vendors-differ",
-    WARNING,
-    "vendors that decide differently on the same permissions",
-    "An access that works with one RMW is denied, or open to everybody, with another.",
-    "sros: its decision engine, compared with Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2.",
-    "Stay inside the portable profile; `sros explain --all-vendors` shows the decision of each "
-    "vendor.",
-)
-
-_UNNAMED_TOPIC = "rt/sros_nobody_has_this"
-_SHOWN = 3
-
-
-def check_vendors(enclave: CheckedEnclave, *, outside: bool) -> Iterator[Finding]:
-    """Yield a finding if vendors decide differently on a topic that the permissions name.
-
-    Vendors decide alike on a document as sros writes it, with nothing ``outside`` of the portable
-    profile.  Such a document is skipped, because deciding every topic takes long.
-    """
-    state = enclave.state
-    if not (state.certificate and state.governance and state.permissions_document):
-        return
-    if not outside and _is_as_sros_writes(enclave):
-        return
-    governance = smime.parse(state.files["governance.p7s"]).document
-    domain = next(iter(state.governance.domains().closed()), 0)
-    answers = {
-        vendor: Access.of_documents(
-            vendor,
-            governance,
-            state.permissions_document,
-            subject_text(state.certificate.subject),
-            domain=domain,
-            at=enclave.keystore.now,
-            zone=enclave.keystore.zone,
-        )
-        for vendor in MEASURED
-    }
-    differing = list(_differences(answers, _topics_to_ask(enclave)))
-    if differing:
-        more = f"; and {len(differing) - _SHOWN} more" if len(differing) > _SHOWN else ""
-        text = f"on domain {domain}, {'; '.join(differing[:_SHOWN])}{more}"
-        yield DIFFER.found(enclave.name, text, enclave.file("permissions.p7s"))
-
-
-def _is_as_sros_writes(enclave: CheckedEnclave) -> bool:
-    permissions = enclave.state.permissions
-    written = enclave.state.permissions_document.replace(b"\r\n", b"\n").strip()
-    return permissions is not None and render_permissions(permissions).strip() == written
-
-
-def _differences(answers: dict[Vendor, Access | Refusal], topics: list[str]) -> Iterator[str]:
-    questions = [(AccessVerb.JOIN, "")]
-    questions += [
-        (verb, topic) for topic in topics for verb in (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
-    ]
-    for verb, topic in questions:
-        said = {
-            vendor.title: (
-                answer.decision() if isinstance(answer, Refusal) else answer.decide(verb, topic)
-            )
-            for vendor, answer in answers.items()
-        }
-        if len({each.outcome.ok for each in said.values()}) > 1:
-            answers_text = ", ".join(
-                f"{title}: {each.outcome.value}" for title, each in said.items()
-            )
-            yield f"{f'{verb.value} {topic}'.strip()} ({answers_text})"
-            if verb is AccessVerb.JOIN:
-                return  # then every other access differs too
-
-
-def _topics_to_ask(enclave: CheckedEnclave) -> list[str]:
-    """Return the named topics, an example for each wildcard, and a topic that no rule names."""
-    grant = grant_of(enclave)
-    named: dict[str, None] = {ROS_DISCOVERY_TOPIC: None}
-    for rule in grant.rules if grant else ():
-        for criteria in (*rule.publish, *rule.subscribe):
-            for topic in criteria.topics:
-                named[_example(topic)] = None
-    return [*named, _UNNAMED_TOPIC]
-
-
-def _example(expression: str) -> str:
-    """Return an example name for a wildcard; a set of characters becomes its first one."""
-    if not is_expression(expression):
-        return expression
-    name, index = "", 0
-    while index < len(expression):
-        letter = expression[index]
-        end = expression.find("]", index + 2) if letter == "[" else -1
-        if end > 0:
-            members = expression[index + 1 : end].lstrip("!^")
-            negated = expression[index + 1] in "!^"
-            name += "x" if negated or not members[:1].isalnum() else members[0]
-            index = end
-        else:
-            name += "x" if letter in "*?" else letter
-        index += 1
-    return name

@@ -79,20 +79,27 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
         kind = _LOADING_KINDS[f"enclave.{problem.fault.id}"]
         text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
         file = enclave.file(problem.file)
-        if enclave.keystore.is_home:
-            remedy, root, path = problem.fault.remedy_in(problem.file), "ROOT", quote(file)
-            missing = _SHARED.get(problem.file, "")
-            if missing and not (enclave.keystore.root / missing).exists():
-                remedy = (
-                    f"Restore {missing} from a backup; every exported enclave has a copy of it."
-                )
-        else:
-            remedy, root = problem.fault.remedy_in_export(problem.file), "KEYSTORE"
-            there = f"KEYSTORE/enclaves{quote(enclave.name)}/{problem.file}"
-            path = there if "`" in remedy else quote(file)
-        remedy = remedy.format(root=root, enclave="NAME", path=path)
+        remedy = fault_remedy(enclave, problem.fault, problem.file)
         accepted = enclave.accepts_expiry if problem.fault in _EXPIRED else ""
         yield kind.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
+
+
+def fault_remedy(enclave: CheckedEnclave, fault: Fault, name: str) -> str:
+    """Return what to do about a fault in the file ``name`` of an enclave.
+
+    ``ROOT`` and ``NAME`` in it stand for the keystore and the enclave.
+    """
+    file = enclave.file(name)
+    if enclave.keystore.is_home:
+        remedy, root, path = fault.remedy_in(name), "ROOT", quote(file)
+        missing = _SHARED.get(name, "")
+        if missing and not (enclave.keystore.root / missing).exists():
+            remedy = f"Restore {missing} from a backup; every exported enclave has a copy of it."
+    else:
+        remedy, root = fault.remedy_in_export(name), "KEYSTORE"
+        there = f"KEYSTORE/enclaves{quote(enclave.name)}/{name}"
+        path = there if "`" in remedy else quote(file)
+    return remedy.format(root=root, enclave="NAME", path=path)
 
 
 _SHARED = {
@@ -340,14 +347,16 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
     file, keystore = enclave.file("permissions.p7s"), enclave.keystore
     if allows_everything(grant):
         # No template accepts it: whoever checks a keystore asks whether its robot is closed.
-        accepted = keystore.accepts(lambda _: False)
+        accepted = keystore.accepts(EVERYTHING, lambda _: False)
         text = "the permissions allow publishing and subscribing every topic"
         yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
     unique = "," in grant.subject or "+" in grant.subject
     window = grant.validity
     length = window.not_after - window.not_before
     if length > _LONG and not unique:
-        accepted = keystore.accepts(lambda s: _is_as_long(s.permissions_validity, length))
+        accepted = keystore.accepts(
+            LONG_PERMISSIONS, lambda s: _is_as_long(s.permissions_validity, length)
+        )
         text = f"they are valid from {iso(window.not_before)} to {iso(window.not_after)}"
         yield LONG_PERMISSIONS.found(enclave.name, text, file, accepted=accepted)
 

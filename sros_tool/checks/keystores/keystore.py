@@ -13,9 +13,10 @@ from shlex import quote
 
 from sros_tool.checks.keystores.authorities import check_authorities
 from sros_tool.checks.keystores.documents import (
+    DIFFERS,
     check_documents,
     check_governance,
-    check_vendors,
+    governance_copy_findings,
     governance_findings,
 )
 from sros_tool.checks.keystores.enclaves import (
@@ -35,22 +36,31 @@ from sros_tool.checks.keystores.issued import (
 )
 from sros_tool.checks.keystores.of_ros2 import with_cause_of_ros2
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
+from sros_tool.checks.keystores.vendors import REFUSED, SOME_REFUSE, asked_vendors, check_vendors
 from sros_tool.checks.keystores.zenoh_files import check_network, check_own_zenoh
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import findings_in
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
-from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_P7S, enclave_path
+from sros_tool.keystore.layout import (
+    GOVERNANCE_FILE,
+    GOVERNANCE_P7S,
+    enclave_path,
+    waits_for_answer,
+)
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.unchanged import of_one_state
 from sros_tool.parallel import map_slices, tick
 from sros_tool.pki import smime
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right
+from sros_tool.xml import read_bytes
 
 _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
 """Ids of the kinds that follow from a choice of the keystore, and so affect all enclaves."""
+_OF_SEVERAL_FILES = frozenset({REFUSED.id, SOME_REFUSE.id})
+"""Ids of the kinds with one cause wherever their text is the same, such as a shared CA."""
 
 
 @of_one_state
@@ -64,6 +74,7 @@ def keystore_findings(
     only: Sequence[str] | None = None,
     on_robot: bool = False,
     distribution: str = "",
+    vendor: str = "",
 ) -> list[Finding]:
     """Return all findings in a keystore, or in some of its enclaves.
 
@@ -76,6 +87,7 @@ def keystore_findings(
         only: the enclaves to check; None for all of them and the keystore itself.
         on_robot: whether it is on a robot, where no CA key may be.
         distribution: the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
+        vendor: the DDS vendor of its nodes, or ``zenoh``; "" if they may use any.
 
     Raises:
         KeystoreError: ``root`` is no keystore.
@@ -90,9 +102,10 @@ def keystore_findings(
     )
     names = keystore.names if only is None else tuple(only)
     wanted = wanted_rights(keystore)
-    first = next(
-        (name for name in names if (enclave_path(root, name) / GOVERNANCE_FILE).exists()), ""
-    )
+    vendors = asked_vendors(vendor)
+    about_authorities = list(check_authorities(keystore))
+    first, common = _governing(keystore, names)
+    about_governance = list(_governance(keystore, first))
 
     def work(share: Sequence[str]) -> tuple[list[Finding], list[EnclaveSummary]]:
         found: list[Finding] = []
@@ -100,22 +113,25 @@ def keystore_findings(
         for name in share:
             state = open_enclave(enclave_path(root, name), now=now, domain=domain)
             enclave = CheckedEnclave(keystore, name, state)
-            found += _enclave_findings(enclave, wanted, only_differing=name != first)
+            own = list(_enclave_findings(enclave, wanted, common))
+            if not waits_for_answer(enclave.folder):
+                shared = [] if any(each.kind is DIFFERS for each in own) else about_governance
+                known = [*about_authorities, *shared, *own]
+                own += check_vendors(enclave, vendors, known, domain=domain)
             if not on_robot and name not in wanted:  # a policy knows more exactly of its nodes
-                found += check_starting(enclave)
+                own += check_starting(enclave)
+            found += own
             if each := summary_of(enclave):
                 issued.append(each)
             tick()
         return found, issued
 
     outcomes = [outcome for _, outcome in map_slices(names, work)]
-    found = [finding for findings, _ in outcomes for finding in findings]
+    found = [*about_governance, *(finding for findings, _ in outcomes for finding in findings)]
     if only is None:
         issued = [each for _, share in outcomes for each in share]
-        common = [*check_files(keystore), *check_authorities(keystore)]
-        if not first and keystore.governance:
-            common += _governance_alone(keystore)
-        found = [*common, *check_issued(keystore, issued), *found]
+        of_keystore = [*check_files(keystore), *about_authorities]
+        found = [*of_keystore, *check_issued(keystore, issued), *found]
     else:
         found = [*check_files(keystore, names), *found]
     found += check_network(keystore, only)
@@ -129,14 +145,15 @@ def keystore_findings(
 
 
 def _enclave_findings(
-    enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]], *, only_differing: bool
+    enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]], governance: bytes
 ) -> Iterator[Finding]:
-    """Yield all findings in one enclave."""
+    """Yield all findings in one enclave, except for what vendors refuse.
+
+    ``governance`` is the signed document of which the findings are known.
+    """
     yield from check_enclave(enclave)
-    documents = list(check_documents(enclave))
-    yield from documents
-    yield from check_governance(enclave, only_differing=only_differing)
-    yield from check_vendors(enclave, outside=bool(documents))
+    yield from check_documents(enclave)
+    yield from check_governance(enclave, governance)
     yield from check_policy(enclave, wanted)
     yield from check_own_zenoh(enclave)
 
@@ -146,13 +163,36 @@ def joined(findings: Sequence[Finding]) -> list[Finding]:
     together: dict[tuple[object, ...], list[Finding]] = {}
     for each in findings:
         one = each.accepted or each.id in _OF_THE_KEYSTORE
-        place = (each.accepted,) if one else (each.file, each.line, each.text)
+        file = "" if each.id in _OF_SEVERAL_FILES else each.file
+        place = (each.accepted,) if one else (file, each.line, each.text)
         together.setdefault((each.id, *place), []).append(each)
     return [_one_of(group) for group in together.values()]
 
 
-def _governance_alone(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """Yield the findings in the governance of a keystore that has no enclave yet."""
+def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
+    """Return the first enclave with the signed governance of most enclaves, and this document.
+
+    That is the governance of the keystore, or in an export the one of the first enclave.
+    """
+    common = keystore.governance
+    for name in names:
+        own = b""
+        with suppress(SrosError):  # it is a finding
+            own = read_bytes(enclave_path(keystore.root, name) / GOVERNANCE_FILE, "file")
+        if own and own == (common or own):
+            return name, own
+    return "", common
+
+
+def _governance(keystore: CheckedKeystore, enclave: str) -> Iterator[Finding]:
+    """Yield the findings in the governance of an enclave, or of a keystore without enclaves."""
+    yield from governance_copy_findings(keystore)
+    if enclave:
+        state = open_enclave(enclave_path(keystore.root, enclave), now=keystore.now)
+        if state.governance:
+            file = CheckedEnclave(keystore, enclave, state).file(GOVERNANCE_FILE)
+            yield from governance_findings(keystore, state.governance, file)
+        return
     with suppress(SrosError):  # `sros create_enclave` reports it
         document = smime.parse(keystore.governance).document
         governance = parse_governance(document, GOVERNANCE_P7S)

@@ -13,6 +13,7 @@ from typing import TypeVar
 
 from cryptography import x509
 
+from sros_tool.checks.kind import ERROR, FindingKind
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import SrosError
 from sros_tool.fleet.model import Fleet
@@ -39,10 +40,12 @@ from sros_tool.xml import read_bytes
 _Part = TypeVar("_Part")
 
 
-@cache
+_load_shipped = cache(load_template)
+
+
 def _shipped(name: str) -> Template | None:
     """Return the template with this name that ships with sros, or None."""
-    return load_template(name) if name in template_names() else None
+    return _load_shipped(name) if name in template_names() else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,18 +88,26 @@ class CheckedKeystore:
     fleet_edited: str = ""
     distribution: str = ""
 
-    def accepts(self, chosen: Callable[[Template], bool]) -> str:
+    def accepts(self, kind: FindingKind, chosen: Callable[[Template], bool]) -> str:
         """Return text naming the template or keystore that accepts a weakness; "" if none does.
 
         ``chosen`` returns whether settings choose the weakness.  It is asked of the template as it
         ships with sros: what the settings of this keystore changed, the template never accepted.
         Without settings (ros2/sros2) nothing accepts it.
+
+        An export has no settings, so it is compared with all templates.  What none of them chooses
+        was chosen where the CA is; an error stays an error nevertheless.
         """
         if self.settings:
             name = self.settings.name
             template = _shipped(name) or self.settings
             return f"template {name}" if chosen(template) else ""
-        return "" if self.is_home else "keystore that it was exported from"
+        if self.is_home:
+            return ""
+        for name in template_names():
+            if chosen(_load_shipped(name)):
+                return f"template {name}"
+        return "" if kind.severity is ERROR else "keystore whose CA signed it"
 
     def shown(self, path: str | Path) -> str:
         """Return a path below the root as findings show it."""

@@ -525,6 +525,16 @@ class Access:
         """Return the decision on a DataReader: whether it is created, and peers match it."""
         return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
 
+    def governed(self, topic: str) -> Decision | None:
+        """Return why the governance lets no endpoint of ``topic`` be created; None if it may."""
+        rule = self._governed.topic_rule(topic)
+        if rule is None:
+            return self._without_topic_rule(topic)
+        if self._traits.crashes_on_empty_texts and not rule.topic_expression.strip():
+            text = "a topic rule of the governance is empty, which crashes the process"
+            return self._answer(Outcome.CRASHES, "empty-topic", text)
+        return None
+
     def topics(self, verb: AccessVerb) -> NameSet:
         """Return the topics without wildcard characters on which `decide` allows ``verb``.
 
@@ -616,11 +626,9 @@ class Access:
         """Return the decision of governance and grant for a participant that starts."""
         join, traits = self._join, self._traits
         rule = self._governed.topic_rule(topic)
-        if rule is None:
-            return self._without_topic_rule(topic)
-        if traits.crashes_on_empty_texts and not rule.topic_expression.strip():
-            text = "a topic rule of the governance is empty, which crashes the process"
-            return self._answer(Outcome.CRASHES, "empty-topic", text)
+        if stopped := self.governed(topic):
+            return stopped
+        assert rule is not None
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
         asked = f"{verb} {topic}"
         if traits.creates_topics and writes and reads:

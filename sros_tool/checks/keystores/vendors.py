@@ -1,0 +1,317 @@
+"""Checks of what each DDS vendor makes of an enclave: whether a process starts, and its rights.
+
+They ask what `sros explain` asks.  A refusal whose cause another finding names is not reported
+again by vendor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from sros_tool.checks.keystores.enclaves import fault_remedy, grant_of
+from sros_tool.checks.keystores.opened import CheckedEnclave
+from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome
+from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.domains import DomainSet
+from sros_tool.faults import FAULTS, Fault
+from sros_tool.keystore.layout import GOVERNANCE_FILE, PERMISSIONS_FILE
+from sros_tool.keystore.participant import JoinContext, VendorParticipant, loaded
+from sros_tool.keystore.reader import OpenedEnclave
+from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
+
+_ENGINE = (
+    "sros: its decision engine, compared with Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2."
+)
+_SEE = "`sros explain --all-vendors` shows the answer of each vendor."
+
+REFUSED = FindingKind(
+    "enclave.refused",
+    ERROR,
+    "an enclave that no DDS vendor accepts",
+    "Every vendor that is asked refuses it, or its peers do, so no node can run in it. With "
+    "--vendor only that vendor is asked.",
+    _ENGINE,
+    f"Replace what the vendors refuse. {_SEE}",
+)
+SOME_REFUSE = FindingKind(
+    "portable.refused",
+    WARNING,
+    "an enclave that some DDS vendors refuse",
+    "A node runs in it with one RMW, and fails, or finds no peer, with another.",
+    _ENGINE,
+    f"Use an RMW of a vendor that accepts it, or replace what the others refuse. {_SEE}",
+)
+DIFFER = FindingKind(
+    "portable.vendors-differ",
+    WARNING,
+    "vendors that decide differently on the same permissions",
+    "An access that works with one RMW is denied, or open to everybody, with another.",
+    _ENGINE,
+    "Stay inside the portable profile; `sros explain --all-vendors` shows the decision of each "
+    "vendor.",
+)
+
+_NAMED_BY: Mapping[str, frozenset[str]] = {
+    reason: frozenset(ids)
+    for reason, ids in {
+        Fault.SIGNATURE_HASH.id: ("portable.signature-hash",),
+        Fault.KEY_ALGORITHM.id: ("portable.key-algorithm",),
+        Fault.KEY_ON_TOKEN.id: ("portable.key-on-token",),
+        Fault.DOCUMENT_SIZE.id: ("portable.document-size",),
+        Fault.CA_CHAIN.id: ("portable.intermediate", "keystore.not-a-ca"),
+        Fault.CERTIFICATE_ISSUER.id: ("portable.intermediate", "keystore.not-a-ca"),
+        Fault.SIGNATURE.id: ("portable.ca-purpose", "portable.intermediate"),
+        Fault.GOVERNANCE_MALFORMED.id: ("governance.domain-range",),
+        Fault.PERMISSIONS_MALFORMED.id: (
+            *("portable.domain-range", "portable.empty-topic", "portable.grant-name"),
+            "portable.time-format",
+        ),
+        "domain-not-in-governance": ("enclave.governance-domain", "enclave.permissions-domains"),
+        "empty-default": ("portable.empty-default",),
+        "empty-topic": ("portable.empty-topic",),
+        "expired": (
+            *("enclave.permissions-expired", "enclave.permissions-local-time"),
+            *("enclave.permissions-malformed", "portable.time-format", "portable.several-grants"),
+        ),
+        "malformed": ("portable.time-format",),
+        "no-grant": ("enclave.permissions-subject", "portable.subject"),
+        "no-rule": ("enclave.permissions-domain", "enclave.permissions-domains"),
+        "no-topic-rule": ("governance.no-topic-rule",),
+        "not-yet-valid": (
+            *("enclave.permissions-not-yet-valid", "enclave.permissions-local-time"),
+            *("enclave.permissions-malformed", "portable.time-format", "portable.several-grants"),
+        ),
+        "open-range": ("portable.domain-range",),
+        "unauthenticated-with-rtps-protection": ("governance.unauthenticated",),
+    }.items()
+}
+"""The ids of the findings that name the cause of a vendor's refusal, by its reason."""
+
+_OF_GOVERNANCE = {
+    *(Fault.GOVERNANCE_MALFORMED.id, "domain-not-in-governance", "no-topic-rule"),
+    "unauthenticated-with-rtps-protection",
+}
+"""The reasons that lie in the governance, where no fault names the file."""
+
+_SAYS = {
+    Outcome.CRASHES: ("crash on it", "crashes on it"),
+    Outcome.PEER_DENIES: ("start, and its peers refuse it", "starts, and its peers refuse it"),
+}
+_REFUSES = ("refuse it", "refuses it")
+
+
+@dataclass(frozen=True, slots=True)
+class _Cause:
+    """Why a vendor refuses an enclave, and what then happens to its process."""
+
+    outcome: Outcome
+    reason: str
+    file: str
+    text: str
+
+
+def asked_vendors(vendor: str) -> tuple[Vendor, ...]:
+    """Return the measured vendors that ``vendor`` chooses: "" all, ``zenoh`` none."""
+    return tuple(each for each in MEASURED if vendor in ("", each.value))
+
+
+def check_vendors(
+    enclave: CheckedEnclave,
+    vendors: Sequence[Vendor],
+    known: Collection[Finding],
+    *,
+    domain: int | None,
+) -> Iterator[Finding]:
+    """Yield what the vendors refuse, and decide differently.
+
+    Args:
+        enclave: the enclave.
+        vendors: the vendors that its nodes may use.
+        known: the findings about the enclave and its CAs.
+        domain: the ROS domain to join; None for those of its documents.
+    """
+    keystore = enclave.keystore
+    there = loaded(enclave.name, enclave.folder, enclave.state, at=keystore.now)
+    for number in (domain,) if domain is not None else _domains(enclave.state):
+        context = JoinContext(number, keystore.now, keystore.zone)
+        made = {vendor: VendorParticipant(vendor, there, context) for vendor in vendors}
+        if found := list(_refusals(enclave, made, known)):
+            yield from found
+            return
+        # Vendors decide alike on a document as sros writes it, and every topic takes long.
+        if there.portable and all(_file(each) != PERMISSIONS_FILE for each in known):
+            continue
+        if found := list(_different_rights(enclave, made, number)):
+            yield from found
+            return
+
+
+def _domains(state: OpenedEnclave) -> tuple[int, ...]:
+    """Return domains of an enclave of which each is in other rules of its documents."""
+    if state.governance is None:
+        return (0,)
+    rules = [each.domains for each in state.governance.domain_access_rules]
+    granted = [each.domains for each in state.grant.rules] if state.grant else []
+    if len(sets := {*rules, *granted}) == 1:
+        (only,) = sets
+        return (next(iter(only.closed()), 0),)
+    joined = state.joined_domains() or DomainSet(())
+    kinds = DomainSet.one_of_each_kind([joined], [*rules, *granted])
+    return tuple(each for each in kinds if each in joined)[:_MOST_DOMAINS] or (0,)
+
+
+_MOST_DOMAINS = 8
+
+
+# ── who refuses it ─────────────────────────────────────────────────────────────────────────
+
+
+def _refusals(
+    enclave: CheckedEnclave,
+    made: Mapping[Vendor, VendorParticipant],
+    known: Collection[Finding],
+) -> Iterator[Finding]:
+    """Yield an error if all vendors refuse it, or else what some of them refuse.
+
+    Nothing is yielded if an error in ``known`` names a cause for each of them; what only some
+    refuse is left out where a finding in ``known`` names it.
+    """
+    causes = {vendor: tuple(_causes(each)) for vendor, each in made.items()}
+    by_cause: dict[_Cause, list[Vendor]] = {}
+    for vendor, some in causes.items():
+        for each in some:
+            by_cause.setdefault(each, []).append(vendor)
+    if not by_cause:
+        return
+    all_refuse = all(causes.values())
+    if all_refuse:
+        errors = [each for each in known if each.severity is ERROR]
+        if all(any(_is_named(each, errors) for each in some) for some in causes.values()):
+            return
+    else:
+        by_cause = {each: some for each, some in by_cause.items() if not _is_named(each, known)}
+        if not by_cause:
+            return
+    clauses = [_clause(cause, some) for cause, some in by_cause.items()]
+    accepting = [vendor.title for vendor, some in causes.items() if not some]
+    if accepting:
+        clauses.append(f"{_listed(accepting)} {'accepts' if len(accepting) == 1 else 'accept'} it")
+    first = next(iter(by_cause))
+    fault = FAULTS.get(first.reason)
+    yield (REFUSED if all_refuse else SOME_REFUSE).found(
+        enclave.name,
+        "; ".join(clauses),
+        enclave.file(first.file),
+        remedy=fault_remedy(enclave, fault, first.file) if fault else "",
+    )
+
+
+def _is_named(cause: _Cause, known: Iterable[Finding]) -> bool:
+    """Return whether a finding names the cause."""
+    wanted = _NAMED_BY.get(cause.reason, frozenset())
+    own = f"enclave.{cause.reason}"
+    return any(
+        each.id in wanted or (each.id == own and _file(each) == cause.file) for each in known
+    )
+
+
+def _file(finding: Finding) -> str:
+    """Return the name of the file that a finding is about."""
+    return finding.file.rpartition("/")[2]
+
+
+def _causes(participant: VendorParticipant) -> Iterator[_Cause]:
+    """Yield why a vendor, or all peers, refuse the participant; nothing if they accept it."""
+    join = participant.join()
+    if participant.problems:
+        for each in participant.problems:
+            yield _Cause(join.outcome, each.fault.id, each.file, str(each))
+        return
+    if not join.outcome.ok:
+        yield _cause_of(join)
+    elif participant.access is not None:
+        governed = participant.access.governed(ROS_DISCOVERY_TOPIC)
+        if governed is not None:
+            yield _cause_of(governed)
+
+
+def _cause_of(decision: Decision) -> _Cause:
+    file = GOVERNANCE_FILE if decision.reason in _OF_GOVERNANCE else PERMISSIONS_FILE
+    return _Cause(decision.outcome, decision.reason, file, f"{file}: {decision.clause}")
+
+
+def _clause(cause: _Cause, vendors: Sequence[Vendor]) -> str:
+    several, one = _SAYS.get(cause.outcome, _REFUSES)
+    says = one if len(vendors) == 1 else several
+    return f"{_listed([each.title for each in vendors])} {says} ({cause.text})"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+# ── what they decide differently ───────────────────────────────────────────────────────────
+
+_UNNAMED_TOPIC = "rt/sros_nobody_has_this"
+_SHOWN = 3
+
+
+def _different_rights(
+    enclave: CheckedEnclave, made: Mapping[Vendor, VendorParticipant], domain: int
+) -> Iterator[Finding]:
+    """Yield a finding if vendors decide differently on a topic that the permissions name."""
+    answers = {vendor: each.access for vendor, each in made.items() if each.access is not None}
+    differing = list(_differences(answers, _topics_to_ask(enclave)))
+    if differing:
+        more = f"; and {len(differing) - _SHOWN} more" if len(differing) > _SHOWN else ""
+        text = f"on domain {domain}, {'; '.join(differing[:_SHOWN])}{more}"
+        yield DIFFER.found(enclave.name, text, enclave.file(PERMISSIONS_FILE))
+
+
+def _differences(answers: Mapping[Vendor, Access], topics: list[str]) -> Iterator[str]:
+    questions = [(AccessVerb.JOIN, "")]
+    questions += [
+        (verb, topic) for topic in topics for verb in (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
+    ]
+    for verb, topic in questions:
+        said = {vendor.title: answer.decide(verb, topic) for vendor, answer in answers.items()}
+        if len({each.outcome.ok for each in said.values()}) > 1:
+            answers_text = ", ".join(
+                f"{title}: {each.outcome.value}" for title, each in said.items()
+            )
+            yield f"{f'{verb.value} {topic}'.strip()} ({answers_text})"
+            if verb is AccessVerb.JOIN:
+                return  # then every other access differs too
+
+
+def _topics_to_ask(enclave: CheckedEnclave) -> list[str]:
+    """Return the named topics, an example for each wildcard, and a topic that no rule names."""
+    grant = grant_of(enclave)
+    named: dict[str, None] = {ROS_DISCOVERY_TOPIC: None}
+    for rule in grant.rules if grant else ():
+        for criteria in (*rule.publish, *rule.subscribe):
+            for topic in criteria.topics:
+                named[_example(topic)] = None
+    return [*named, _UNNAMED_TOPIC]
+
+
+def _example(expression: str) -> str:
+    """Return an example name for a wildcard; a set of characters becomes its first one."""
+    if not is_expression(expression):
+        return expression
+    name, index = "", 0
+    while index < len(expression):
+        letter = expression[index]
+        end = expression.find("]", index + 2) if letter == "[" else -1
+        if end > 0:
+            members = expression[index + 1 : end].lstrip("!^")
+            negated = expression[index + 1] in "!^"
+            name += "x" if negated or not members[:1].isalnum() else members[0]
+            index = end
+        else:
+            name += "x" if letter in "*?" else letter
+        index += 1
+    return name

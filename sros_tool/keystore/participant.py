@@ -1,0 +1,279 @@
+"""An enclave as DDS loads it, and the participant that each vendor makes of it.
+
+This is the only place that joins what a vendor decides: which files it refuses to load, how it
+reads the documents, and whether it and its peers then let the participant join.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta, tzinfo
+from functools import lru_cache
+from pathlib import Path
+
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import Decision, Outcome, Refusal
+from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
+from sros_tool.dds.decision.vendors import Vendor, VendorTraits
+from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
+from sros_tool.dds.governance import Governance, parse_governance, render_governance
+from sros_tool.dds.permissions import Permissions, render_permissions
+from sros_tool.errors import SrosError
+from sros_tool.faults import Fault
+from sros_tool.keystore.layout import KEY_FILE
+from sros_tool.keystore.loading import vendor_problems
+from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import subject_text, validity_of
+from sros_tool.policy.model import Enclave
+from sros_tool.xml import read_bytes
+
+# ── what DDS loads ─────────────────────────────────────────────────────────────────────────
+
+_LEFT_TO_THE_VENDOR = frozenset(
+    {
+        Fault.GOVERNANCE_DOMAIN,
+        Fault.GOVERNANCE_MALFORMED,
+        Fault.PERMISSIONS_DOMAIN,
+        Fault.PERMISSIONS_EXPIRED,
+        Fault.PERMISSIONS_MALFORMED,
+        Fault.PERMISSIONS_NOT_YET_VALID,
+        Fault.PERMISSIONS_SUBJECT,
+    }
+)
+"""Faults of documents that each vendor judges by its own rules."""
+_NO_KEY = (Fault.FILE_MISSING, KEY_FILE)
+
+_PLANNED = timedelta(days=365)
+"""The assumed validity of permissions for a policy that is not signed yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedEnclave:
+    """An enclave as DDS loads it.
+
+    ``governance`` and ``permissions`` are the XML in the signed documents; ``signed`` is the
+    signed permissions, b"" if they are not signed yet.  ``state`` is the state of the files in
+    ``folder`` at the time ``at``; None if they do not exist yet.  ``key_elsewhere`` says that the
+    key is on the robot that generated it.
+
+    ``root`` is its keystore and ``policy`` its part of the policy file, if known.
+    ``portable`` are its permissions if all vendors read them alike, because sros wrote them.
+    """
+
+    name: str
+    subject: str
+    governance: bytes
+    permissions: bytes
+    domains: DomainSet | None
+    signed: bytes = b""
+    folder: Path | None = None
+    state: OpenedEnclave | None = None
+    at: datetime | None = None
+    key_elsewhere: bool = False
+    root: Path | None = None
+    policy: Enclave | None = None
+    portable: Permissions | None = None
+
+    @property
+    def joined_domains(self) -> DomainSet | None:
+        """The domains of its permissions, too, if they exist: `sros run` takes one of these."""
+        return (self.state.joined_domains() if self.state else None) or self.domains
+
+    def expiries(self) -> tuple[tuple[str, datetime], ...]:
+        """Return the files that expire, apart from the permissions, with their expiry times."""
+        return tuple(_expiries(self.state, self.folder)) if self.state and self.folder else ()
+
+    def problems(self, traits: VendorTraits) -> tuple[Problem, ...]:
+        """Return the faults, except in documents, that keep a vendor's process from starting."""
+        if self.state is None or self.at is None:
+            return ()
+        return tuple(
+            each
+            for each in vendor_problems(traits, self.state, self.at)
+            if each.fault not in _LEFT_TO_THE_VENDOR
+            and not (self.key_elsewhere and (each.fault, each.file) == _NO_KEY)
+        )
+
+
+def load_enclave(name: str, folder: Path, *, at: datetime) -> LoadedEnclave:
+    """Return the enclave that DDS would load from a folder at the time ``at``."""
+    return loaded(name, folder, open_enclave(folder, now=at), at=at)
+
+
+def loaded(name: str, folder: Path, state: OpenedEnclave, *, at: datetime) -> LoadedEnclave:
+    """Return the enclave that DDS would load from a folder that was opened at the time ``at``."""
+    governance, permissions = (
+        _document(state.files.get(file, b"")) for file in ("governance.p7s", "permissions.p7s")
+    )
+    return LoadedEnclave(
+        name,
+        subject_text(state.certificate.subject) if state.certificate else "",
+        governance,
+        permissions,
+        state.domains() or _domains(governance),
+        state.files.get("permissions.p7s", b""),
+        folder,
+        state,
+        at,
+        key_elsewhere=state.key_on_robot,
+        portable=_portable(state.permissions, permissions),
+    )
+
+
+def plan_enclave(policy: Enclave, governance: Governance, *, at: datetime) -> LoadedEnclave:
+    """Return the enclave that DDS would load if the policy were signed at ``at``."""
+    from sros_tool.translate import permissions_for
+    from sros_tool.validity import window
+
+    subject = f"CN={policy.path}"
+    domains = governance.domains().closed()
+    permissions = permissions_for(
+        policy, subject=subject, validity=window(at, _PLANNED), domains=domains
+    )
+    return LoadedEnclave(
+        policy.path,
+        subject,
+        render_governance(governance),
+        render_permissions(permissions),
+        domains,
+    )
+
+
+def _portable(permissions: Permissions | None, document: bytes) -> Permissions | None:
+    """Return permissions whose document is as sros writes it, of names that are read in one way."""
+    if permissions is None or _ODD_TEXT.search(document):
+        return None
+    criteria = [
+        some
+        for grant in permissions.grants
+        for rule in grant.rules
+        for some in (*rule.publish, *rule.subscribe)
+    ]
+    ends = [
+        end
+        for grant in permissions.grants
+        for rule in grant.rules
+        for part in rule.domains.ranges
+        for end in (part.first, part.last)
+    ]
+    plain = (
+        all(each.topics and all(each.topics) and not each.partitions for each in criteria)
+        and all(end is not None and end <= MAX_DOMAIN for end in ends)
+        and all(rule.domains.ranges for grant in permissions.grants for rule in grant.rules)
+        and all(grant.name and grant.rules for grant in permissions.grants)
+    )
+    written = document.replace(b"\r\n", b"\n").strip()
+    return permissions if plain and render_permissions(permissions).strip() == written else None
+
+
+_ODD_TEXT = re.compile(rb"[^\x20-\x7e\r\n]|&|>[ \t]|\S[ \t]+</")
+"""Characters, references and blanks that a vendor may read in its own way."""
+
+
+def _document(message: bytes) -> bytes:
+    with suppress(SrosError):
+        return smime.parse(message).document
+    return b""
+
+
+def _domains(governance: bytes) -> DomainSet | None:
+    with suppress(SrosError):
+        return parse_governance(governance).domains().closed()
+    return None
+
+
+def _expiries(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetime]]:
+    certificates = {
+        "cert.pem": state.certificate,
+        "identity_ca.cert.pem": state.identity_ca,
+        "permissions_ca.cert.pem": state.permissions_ca,
+    }
+    for file, certificate in certificates.items():
+        if certificate:
+            yield file, validity_of(certificate).not_after
+    crl = folder / "crl.pem"
+    if crl.exists():
+        from sros_tool.pki.crl import load_crl
+
+        with suppress(SrosError):
+            yield "crl.pem", load_crl(read_bytes(crl, "revocation list"), "").next_update
+
+
+# ── what a vendor makes of it ──────────────────────────────────────────────────────────────
+
+_ONLY_PEERS_NOTICE = {
+    (Vendor.CYCLONE, Fault.KEY_MISMATCH),
+    (Vendor.FAST, Fault.KEY_ALGORITHM),
+    (Vendor.FAST_2_9, Fault.KEY_ALGORITHM),
+    (Vendor.FAST_2_9, Fault.DOCUMENT_SIZE),
+}
+"""Faults that a vendor does not notice in its own process, but all peers do."""
+
+# All enclaves of a keystore have the same governance.
+_governance_as = lru_cache(maxsize=16)(read_governance_as)
+
+
+@dataclass(frozen=True, slots=True)
+class JoinContext:
+    """The domain and time of joining; ``zone`` is the time zone of the host."""
+
+    domain: int
+    at: datetime
+    zone: tzinfo = UTC
+
+
+class VendorParticipant:
+    """The participant of one vendor in an enclave.
+
+    ``problems`` are the faults of files for which the vendor, or all peers, refuse it.
+    ``governance`` and ``permissions`` are the documents as the vendor reads them, None if it does
+    not.  ``refusal`` is the decision that keeps the process from running, None if nothing does.
+    """
+
+    def __init__(self, vendor: Vendor, enclave: LoadedEnclave, context: JoinContext) -> None:
+        self.vendor = vendor
+        self.governance: Governance | None = None
+        self.permissions: Permissions | None = None
+        self.problems = enclave.problems(vendor.traits)
+        made = self._make(enclave, context)
+        self.access = made if isinstance(made, Access) else None
+        """The access of the process; None if it does not run, or no peer accepts it."""
+        self.refusal = made if isinstance(made, Decision) else None
+
+    def join(self) -> Decision:
+        """Return whether the process starts, and its peers accept it."""
+        if self.access is not None:
+            return self.access.join()
+        assert self.refusal is not None
+        return self.refusal
+
+    def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
+        """Return the access of the vendor's process, or the decision that keeps it from running."""
+        if self.problems:
+            first = self.problems[0]
+            noticed_late = all(
+                (self.vendor, each.fault) in _ONLY_PEERS_NOTICE for each in self.problems
+            )
+            outcome = Outcome.PEER_DENIES if noticed_late else Outcome.REFUSED
+            return Decision(outcome, first.fault.id, f"{self.vendor.title}: {first}.")
+        governance = _governance_as(self.vendor, enclave.governance)
+        if isinstance(governance, Refusal):
+            return replace(governance.decision(), reason=Fault.GOVERNANCE_MALFORMED.id)
+        self.governance = governance
+        permissions = enclave.portable or read_permissions_as(self.vendor, enclave.permissions)
+        if isinstance(permissions, Refusal):
+            return replace(permissions.decision(), reason=Fault.PERMISSIONS_MALFORMED.id)
+        self.permissions = permissions
+        return Access(
+            self.vendor,
+            governance,
+            permissions,
+            enclave.subject,
+            domain=context.domain,
+            at=context.at,
+            zone=context.zone,
+        )
