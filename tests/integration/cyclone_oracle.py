@@ -51,6 +51,8 @@ IGNORE_OWN_PARTICIPANT = 1  # a reader and a writer of one process would else me
 
 def main() -> None:
     cases: list[Case] = json.load(sys.stdin)
+    with suppress(PermissionError):
+        os.setsid()  # OpenSSL asks on the terminal for the pass phrase of an encrypted part
     library = load_cyclone()
     declare(library.api)
     if try_isolation().isolated:

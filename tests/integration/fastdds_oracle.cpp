@@ -29,11 +29,15 @@
 #include <fastdds/rtps/transport/UDPv4TransportDescriptor.h>
 #include <fastrtps/xmlparser/XMLProfileManager.h>
 
+#include <stdio.h>
+#include <unistd.h>
+
 #include <chrono>
 #include <cstdint>
 #include <cstdlib>
 #include <ctime>
 #include <filesystem>
+#include <fstream>
 #include <functional>
 #include <iostream>
 #include <memory>
@@ -115,6 +119,14 @@ std::vector<std::string> split(const std::string& text, char mark)
     return parts;
 }
 
+// The key as rmw_fastrtps of ROS 2 Jazzy finds it: the PKCS#11 URI in key.p11, or else key.pem.
+std::string private_key(const std::string& folder)
+{
+    std::string uri;
+    std::ifstream named(folder + "/key.p11");
+    return named >> uri && uri.rfind("pkcs11:", 0) == 0 ? uri : "file://" + folder + "/key.pem";
+}
+
 struct Party
 {
     fast::DomainParticipant* participant = nullptr;
@@ -137,7 +149,7 @@ struct Party
         set("dds.sec.crypto.plugin", "builtin.AES-GCM-GMAC");
         set(authentication + "identity_ca", mine + "identity_ca.cert.pem");
         set(authentication + "identity_certificate", mine + "cert.pem");
-        set(authentication + "private_key", mine + "key.pem");
+        set(authentication + "private_key", private_key(identity));
         if (std::filesystem::exists(identity + "/crl.pem"))
         {
             set(authentication + "identity_crl", mine + "crl.pem");
@@ -303,9 +315,20 @@ int main()
     eprosima::fastrtps::LibrarySettingsAttributes settings;
     settings.intraprocess_delivery = eprosima::fastrtps::INTRAPROCESS_OFF;
     eprosima::fastrtps::xmlparser::XMLProfileManager::library_settings(settings);
-    std::string line;
-    while (std::getline(std::cin, line))
+    // OpenSSL asks for the pass phrase of an encrypted part on the terminal or from standard input,
+    // which is neither a question's answer nor a question: nobody is there to type one.
+    FILE* questions = fdopen(dup(0), "r");
+    setsid();
+    if (!questions || !freopen("/dev/null", "r", stdin))
     {
-        std::cout << answer(split(line, '\t')) << std::endl;
+        return 2;
+    }
+    char* line = nullptr;
+    std::size_t room = 0;
+    ssize_t size;
+    while ((size = getline(&line, &room, questions)) > 0)
+    {
+        const std::string asked(line, line[size - 1] == '\n' ? size - 1 : size);
+        std::cout << answer(split(asked, '\t')) << std::endl;
     }
 }

@@ -7,9 +7,11 @@ $SROS_FASTDDS_PREFIX.
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,13 +24,15 @@ from sros_tool.explain.question import ask as question
 from sros_tool.keystore.participant import JoinContext, load_enclave
 from tests.integration.fastdds import fastdds_vendor
 from tests.integration.trust.drawing import Case, make
-from tests.integration.trust.trusts import DOMAIN, TOPIC, own
+from tests.integration.trust.trusts import DOMAIN, LEAF, TOPIC, own
 from tests.integration.vendor_oracle import (
     MATCH_SECONDS,
     Reply,
     ask_cyclone_folders,
     ask_fastdds_folders,
 )
+from tests.support.children import run
+from tests.support.raw_pki import pem, private_der
 
 VENDORS = (Vendor.FAST_2_9, Vendor.FAST, Vendor.CYCLONE)
 WORDS = {
@@ -85,6 +89,31 @@ def kept_replies() -> dict[Case, dict[Vendor, str]]:
 # ── real replies ───────────────────────────────────────────────────────────────────────────
 
 
+MODULES = ("/usr/lib/softhsm/libsofthsm2.so", "/usr/lib/x86_64-linux-gnu/softhsm/libsofthsm2.so")
+MODULE = next((path for path in MODULES if Path(path).exists()), "")
+
+
+def set_up_token(folder: Path, keys: Iterable[str]) -> None:
+    """Have the processes to come find these keys on a token; without SoftHSM, they find none."""
+    if not MODULE:
+        return
+    tokens, configuration = folder / "tokens", folder / "softhsm2.conf"
+    os.environ |= {"SOFTHSM2_CONF": str(configuration), "PKCS11_MODULE_PATH": MODULE}
+    utility = ["softhsm2-util", "--pin", "1234"]
+    if not tokens.exists():
+        tokens.mkdir()
+        configuration.write_text(f"directories.tokendir = {tokens}\nobjectstore.backend = file\n")
+        run([*utility, "--init-token", "--free", "--label", "robot", "--so-pin", "5678"])
+    for label in keys:
+        file = folder / f"{label}.pem"
+        if not file.exists():
+            file.write_bytes(pem(*private_der(label)))
+            number = f"{zlib.crc32(label.encode()):08x}"
+            words = ["--token", "robot", "--label", label.replace(" ", "-"), "--id", number]
+            # A kind of key that SoftHSM does not take is a key that is not there.
+            run([*utility, "--import", file, *words], status=None)
+
+
 @dataclass(frozen=True)
 class Compared:
     """A case, what the engine says, and what a library did whenever it was asked."""
@@ -134,8 +163,13 @@ def compare(
     """
     now = datetime.now(UTC).replace(microsecond=0)
     folders = [folder / str(number) for number in range(len(cases))]
-    for each, case in zip(folders, cases, strict=True):
-        make(case)[0].write(each / "own", each / "peer", now)
+    trusts = [make(case)[0] for case in cases]
+    for each, trust in zip(folders, trusts, strict=True):
+        trust.write(each / "own", each / "peer", now)
+    on_token = [each for each in trusts if each.on_token]
+    if on_token:
+        keys = {each.key or each.certificates[LEAF].key for each in on_token}
+        set_up_token(program_folder, sorted({*keys, "p256 28"}))
     whole = folder / "whole"
     own().write(whole / "own", whole / "peer", now)
     said = [engine_says(each / "own", now)[vendor] for each in folders]

@@ -11,7 +11,14 @@ from functools import cache
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from tests.dds.decision_documents import allow, grant, permissions, publish, subscribe
+from tests.dds.decision_documents import (
+    allow,
+    grant,
+    permissions,
+    publish,
+    subscribe,
+    topic_rule,
+)
 from tests.integration.vendor_rows import domain_rule, governance
 from tests.support.raw_pki import (
     AUTHORITY_KEY,
@@ -93,6 +100,9 @@ class Trust:
     key: str = ""
     """The key in key.pem, where it is not that of the certificate."""
     aliases: dict[str, bytes] = field(default_factory=dict)
+    governance: bytes = GOVERNANCE
+    on_token: bool = False
+    """Whether key.p11 names the key, on the token "robot", in place of key.pem."""
     one_authority: bool = False
     """Whether one CA has both jobs."""
 
@@ -146,6 +156,10 @@ class Trust:
         peer.mkdir(parents=True)
         for file, data in written.items():
             (own / file).write_bytes(data)
+        if self.on_token:
+            (own / "key.p11").write_bytes(written["key.p11"].replace(b"{folder}", bytes(own)))
+            (own / "pin").write_text("1234")
+            (own / "pin").chmod(0o600)
         for file in (f"{IDENTITY}_ca.cert.pem", f"{PERMISSIONS}_ca.cert.pem", "crl.pem"):
             if file in written:
                 (peer / file).write_bytes(written[file])
@@ -153,7 +167,7 @@ class Trust:
         (peer / "cert.pem").write_bytes(pem("CERTIFICATE", certificate.der(now)))
         (peer / "key.pem").write_bytes(pem(*private_der(certificate.key)))
         for file, document in (
-            ("governance.p7s", GOVERNANCE),
+            ("governance.p7s", self.governance),
             ("permissions.p7s", _permissions([openssl_text(certificate.subject)])),
         ):
             (peer / file).write_bytes(self._signed(MessagePlan(), document, now))
@@ -165,10 +179,13 @@ class Trust:
             file: b"".join(self._part(file, place, part, now) for place, part in enumerate(parts))
             for file, parts in self.files.items()
         }
-        found["key.pem"] = pem(*private_der(self.key or leaf.key, self.key_form))
+        if self.on_token:
+            found["key.p11"] = token_uri(self.key or leaf.key).encode() + b"\n"
+        else:
+            found["key.pem"] = pem(*private_der(self.key or leaf.key, self.key_form))
         subjects = self.grants if self.grants is not None else [openssl_text(leaf.subject)]
         for file, document in (
-            ("governance.p7s", GOVERNANCE),
+            ("governance.p7s", self.governance),
             ("permissions.p7s", _permissions(subjects)),
         ):
             found[file] = self._signed(self.messages.get(file, MessagePlan()), document, now)
@@ -203,6 +220,15 @@ class Trust:
         inside = tuple(self.certificates[each] for each in plan.certificates)
         lists = tuple(self.lists[each] for each in plan.lists)
         return Message(signers, inside, lists, **plan.options).write(document, now)  # type: ignore[arg-type]
+
+
+def token_uri(key: str) -> str:
+    """Return where a key lies on the token that `tests.integration.trust.replies` makes.
+
+    `Trust.write` puts the enclave's folder in it, where the PIN lies.
+    """
+    named = f"object={key.replace(' ', '-')};type=private"
+    return f"pkcs11:token=robot;{named}?pin-source=file:{{folder}}/pin"
 
 
 def _permissions(subjects: Iterable[str]) -> bytes:
@@ -429,6 +455,20 @@ def with_list() -> Trust:
     return made
 
 
+def on_token() -> Trust:
+    made = own()
+    made.on_token = True
+    return made
+
+
+def free_topics() -> Trust:
+    """No access control: neither of the domain nor of topics."""
+    made = own()
+    rule = topic_rule(read=False, write=False)
+    made.governance = governance(domain_rule(rule, join=False))
+    return made
+
+
 BASES: dict[str, Callable[[], Trust]] = {
     "own": own,
     "sros2": sros2,
@@ -441,4 +481,6 @@ BASES: dict[str, Callable[[], Trust]] = {
     "renewed": renewed,
     "rotated": rotated,
     "with a list": with_list,
+    "on a token": on_token,
+    "free topics": free_topics,
 }
