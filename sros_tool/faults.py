@@ -300,6 +300,22 @@ class Fault(Enum):
         "DDS-Security 1.1, 9.4.1.3; measured.",
         f"Set ROS_DOMAIN_ID to a domain that the permissions name, or add this domain. {_SIGN}",
     )
+    CERTIFICATE_FILE = (
+        "certificate-file",
+        "a file of certificates that a vendor cannot read",
+        "Fast DDS reads a CA file to its end, and refuses it for any part that is damaged; Cyclone "
+        "DDS reads its first certificate, and no 'TRUSTED CERTIFICATE'.",
+        "OpenSSL 3.0 (pem_info.c); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+        "Keep only the certificates in the file, as '-----BEGIN CERTIFICATE-----'.",
+    )
+    CA_CRASH = (
+        "ca-crash",
+        "a CA file that crashes a vendor",
+        "Fast DDS 2.14 frees the first certificate of a CA file, if it is not signed with SHA-256, "
+        "and then verifies it.",
+        "Fast DDS 2.14.5 (FileProvider.cpp); measured.",
+        "Put a CA that is signed with SHA-256 first in the file.",
+    )
     CA_CHAIN = (
         "ca-chain",
         "a CA certificate that a vendor refuses",
@@ -310,7 +326,7 @@ class Fault(Enum):
     SIGNATURE_HASH = (
         "signature-hash",
         "a certificate that is not signed with SHA-256",
-        "Fast DDS refuses other digests in a CA and in an enclave's certificate.",
+        "Fast DDS refuses other digests, and RSA-PSS, in a CA and in an enclave's certificate.",
         "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp); measured.",
         "Issue the certificate again with SHA-256, which every vendor accepts.",
     )
@@ -380,6 +396,8 @@ FAULTS = {fault.id: fault for fault in Fault}
 """All faults, by id."""
 
 VENDOR_FAULTS = (
+    Fault.CERTIFICATE_FILE,
+    Fault.CA_CRASH,
     Fault.CA_CHAIN,
     Fault.SIGNATURE_HASH,
     Fault.KEY_ALGORITHM,

@@ -37,7 +37,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.chains import chain_fault
+from sros_tool.pki.chains import Checks, chain_fault
 from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
 from sros_tool.pki.keys import algorithm, holds_private_key, load_key
 from sros_tool.pki.token_uri import TokenUri, read_token_file
@@ -308,7 +308,7 @@ def _signature(path: Path, data: bytes, now: datetime, authority: Path | None) -
         certificates = load_certificates(read_bytes(found, "certificate"), f"'{found}'")
         try:
             signed.verify(certificates[0])
-            reason = chain_fault(certificates[0], certificates, at=now, for_documents=True)
+            reason = chain_fault(certificates[0], certificates, at=now, checks=Checks.DOCUMENTS)
         except SrosError as error:
             reason = str(error)
         verified = not reason

@@ -7,14 +7,13 @@ are found by `sros_tool.keystore.reader` and not checked here again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from datetime import datetime
 from functools import lru_cache
 from itertools import dropwhile
 
 from cryptography import x509
-from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
+from cryptography.x509.oid import SignatureAlgorithmOID
 
 from sros_tool.dds.decision.vendors import MEASURED, Hashes, Keys, Signers, Vendor, VendorTraits
 from sros_tool.errors import PkiError
@@ -32,10 +31,11 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedEnclave, Problem
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
+    load_certificate,
     load_certificates,
     subject_text,
 )
-from sros_tool.pki.chains import chain_fault
+from sros_tool.pki.chains import Checks, chain_fault
 from sros_tool.pki.keys import algorithm
 
 Certificates = tuple[x509.Certificate, ...]
@@ -48,8 +48,7 @@ _VENDOR_SPECIFIC = frozenset(
     {Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID, Fault.CERTIFICATE_ISSUER, Fault.SIGNATURE}
 )
 """Faults of `OpenedEnclave` for which only some vendors refuse an enclave."""
-
-_certificates = lru_cache(maxsize=16)(load_certificates)
+_UNREADABLE = (Fault.NOT_SIGNED, Fault.CERTIFICATE_MALFORMED)
 
 
 def vendor_problems(
@@ -60,39 +59,47 @@ def vendor_problems(
     Of governance and permissions, only signature and size are checked here; problems in their
     content are taken from ``state``.
     """
-    kept = [each for each in state.problems if each.fault not in _VENDOR_SPECIFIC]
+    specific = [each for each in state.problems if _is_specific(each, state)]
+    kept = [each for each in state.problems if each not in specific]
     if state.token and not traits.reads_tokens:
         text = f"{traits.title} does not read it, and there is no {KEY_FILE}"
         kept.append(Problem(KEY_URI_FILE, text, Fault.KEY_ON_TOKEN))
     # Files that every vendor refuses already: do not report a second problem.
     known = {
-        each.file
-        for each in kept
-        if each.file == CERTIFICATE_FILE or each.fault is Fault.NOT_SIGNED
+        each.file for each in kept if each.file == CERTIFICATE_FILE or each.fault in _UNREADABLE
     }
     faults = [each for each in _faults(traits, state, at) if each.file not in known]
     for side in _SIDES:
         of_side = [each for each in faults if each.file in side]
         files = {each.file for each in of_side} | ({side[0]} if of_side else set())
-        named = [
-            each for each in state.problems if each.fault in _VENDOR_SPECIFIC and each.file in files
-        ]
-        kept += named or of_side
+        crash = [each for each in of_side if each.fault is Fault.CA_CRASH]
+        kept += crash or [each for each in specific if each.file in files] or of_side
     return tuple(kept)
+
+
+def _is_specific(problem: Problem, state: OpenedEnclave) -> bool:
+    """Return whether only some vendors refuse an enclave for a problem."""
+    later = problem.file == IDENTITY_CA_FILE and state.identity_ca is not None
+    return problem.fault in _VENDOR_SPECIFIC or (
+        problem.fault is Fault.CERTIFICATE_MALFORMED and later
+    )
 
 
 def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterator[Problem]:
     read: dict[str, Certificates] = {}
-    for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
+    for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, CERTIFICATE_FILE):
         if file in state.files:
-            with suppress(PkiError):
-                read[file] = _certificates(state.files[file], file)
+            try:
+                read[file] = _certificates(traits, state.files[file], file)
+            except PkiError as error:
+                yield Problem(file, error.why.rstrip("."), Fault.CERTIFICATE_FILE)
+    identity = read.pop(CERTIFICATE_FILE, None)
     for file, certificates in read.items():
         if fault := _authority_fault(traits, certificates, at):
             yield Problem(file, *fault)
     authorities = read.get(IDENTITY_CA_FILE)
-    if authorities and state.certificate:
-        yield from _identity_faults(traits, state.certificate, authorities, at)
+    if authorities and identity:
+        yield from _identity_faults(traits, identity[0], authorities, at)
     signers = read.get(PERMISSIONS_CA_FILE)
     for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
         if not signers or file not in state.files:
@@ -103,6 +110,14 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
     if largest is not None and state.permissions_bytes > largest:
         text = f"it has {state.permissions_bytes} bytes, and from {largest + 1} on the "
         yield Problem(PERMISSIONS_FILE, f"{text}handshake may never finish", Fault.DOCUMENT_SIZE)
+
+
+@lru_cache(maxsize=32)
+def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
+    """Return the certificates that the vendor reads from a file; raise `PkiError` if it cannot."""
+    if traits.reads_first_authority or file == CERTIFICATE_FILE:
+        return (load_certificate(data, file, trusted=traits.reads_trusted_certificates),)
+    return load_certificates(data, file)
 
 
 @lru_cache(maxsize=8)
@@ -126,10 +141,13 @@ def _authority_fault(
     """
     trusted = _trusted(traits, certificates)
     if not trusted:
-        name = subject_text(certificates[0].subject)
-        return f"{name} is not signed with SHA-256", Fault.SIGNATURE_HASH
+        return _hash_fault(certificates[0]), Fault.SIGNATURE_HASH
+    if traits.verifies_authorities and certificates[0] not in trusted:
+        text = f"{_hash_fault(certificates[0])}, which crashes the process"
+        return text, Fault.CA_CRASH
     if traits.verifies_authorities:
-        fault = chain_fault(certificates[0], trusted, at=at, strict=True)
+        checks = _checks(traits) | Checks.STRICT
+        fault = chain_fault(certificates[0], trusted, at=at, checks=checks)
         if fault:
             return f"it is refused: {fault}", Fault.CA_CHAIN
     return None
@@ -147,12 +165,13 @@ def authority_refusals(role: str, certificates: Certificates, at: datetime) -> d
         if fault:
             refusals[vendor] = fault[0]
         elif role == IDENTITY:
-            below = chain_fault(certificates[0], _trusted(traits, certificates), at=at)
+            trusted = _trusted(traits, certificates)
+            below = chain_fault(certificates[0], trusted, at=at, checks=_checks(traits))
             key = "" if _key_fits(traits, certificates[0]) else "its key algorithm is not supported"
             refusals[vendor] = below or key
         elif traits.signers is Signers.CHAIN:
             trusted = _trusted(traits, certificates)
-            refusals[vendor] = chain_fault(certificates[0], trusted, at=at, for_documents=True)
+            refusals[vendor] = chain_fault(certificates[0], trusted, at=at, checks=Checks.DOCUMENTS)
     return {vendor: text for vendor, text in refusals.items() if text}
 
 
@@ -196,7 +215,7 @@ def _signer_fault(
         return "its signature does not match its content"
     if listed:
         return ""
-    fault = chain_fault(signer, trusted, signed.certificates, at=at, for_documents=True)
+    fault = chain_fault(signer, trusted, signed.certificates, at=at, checks=Checks.DOCUMENTS)
     return f"its signer is not accepted: {fault}" if fault else ""
 
 
@@ -207,25 +226,39 @@ def _trusted(traits: VendorTraits, certificates: Certificates) -> Certificates:
 
 
 def _hash_fits(traits: VendorTraits, certificate: x509.Certificate) -> bool:
-    digest = certificate.signature_hash_algorithm
-    if traits.hashes is Hashes.ANY or isinstance(digest, hashes.SHA256):
-        return True
-    return isinstance(digest, hashes.SHA1) and certificate.signature_algorithm_oid in _RSA_SHA1
+    return traits.hashes is Hashes.ANY or certificate.signature_algorithm_oid in _SHA256
 
 
-_RSA_SHA1 = {x509.SignatureAlgorithmOID.RSA_WITH_SHA1}
+_SHA256 = {
+    SignatureAlgorithmOID.ECDSA_WITH_SHA256,
+    SignatureAlgorithmOID.RSA_WITH_SHA256,
+    SignatureAlgorithmOID.RSA_WITH_SHA1,
+}
+
+
+def _hash_fault(certificate: x509.Certificate) -> str:
+    if certificate.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS:
+        return f"{subject_text(certificate.subject)} is signed with RSA-PSS"
+    return f"{subject_text(certificate.subject)} is not signed with SHA-256"
+
+
+def _checks(traits: VendorTraits) -> Checks:
+    return Checks.ROOT_SIGNATURE | Checks.POLICIES if traits.verifies_policies else Checks.NONE
 
 
 def _identity_faults(
     traits: VendorTraits, certificate: x509.Certificate, authorities: Certificates, at: datetime
 ) -> Iterator[Problem]:
     if not _hash_fits(traits, certificate):
-        yield Problem(CERTIFICATE_FILE, "it is not signed with SHA-256", Fault.SIGNATURE_HASH)
+        pss = certificate.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
+        text = "it is signed with RSA-PSS" if pss else "it is not signed with SHA-256"
+        yield Problem(CERTIFICATE_FILE, text, Fault.SIGNATURE_HASH)
     for file, each in ((CERTIFICATE_FILE, certificate), (IDENTITY_CA_FILE, authorities[0])):
         if not _key_fits(traits, each):
             text = f"it has a key of {algorithm(each.public_key())}"
             yield Problem(file, text, Fault.KEY_ALGORITHM)
-    if fault := chain_fault(certificate, _trusted(traits, authorities), at=at):
+    trusted = _trusted(traits, authorities)
+    if fault := chain_fault(certificate, trusted, at=at, checks=_checks(traits)):
         yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)
 
 

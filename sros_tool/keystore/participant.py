@@ -7,7 +7,7 @@ reads the documents, and whether it and its peers then let the participant join.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
@@ -23,7 +23,7 @@ from sros_tool.dds.governance import Governance, parse_governance, render_govern
 from sros_tool.dds.permissions import Permissions, render_permissions
 from sros_tool.errors import SrosError
 from sros_tool.faults import Fault
-from sros_tool.keystore.layout import KEY_FILE
+from sros_tool.keystore.layout import CERTIFICATE_FILE, IDENTITY_CA_FILE, KEY_FILE
 from sros_tool.keystore.loading import vendor_problems
 from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
 from sros_tool.pki import smime
@@ -205,6 +205,8 @@ def _expiries(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetim
 
 # ── what a vendor makes of it ──────────────────────────────────────────────────────────────
 
+_IDENTITY = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
+"""The files that are read before those of the permissions."""
 _ONLY_PEERS_NOTICE = {
     (Vendor.CYCLONE, Fault.KEY_MISMATCH),
     (Vendor.FAST, Fault.KEY_ALGORITHM),
@@ -224,6 +226,16 @@ class JoinContext:
     domain: int
     at: datetime
     zone: tzinfo = UTC
+
+
+def _crash(problems: Sequence[Problem]) -> Problem | None:
+    """Return the problem that crashes the process, unless another one stops it before."""
+    for each in problems:
+        if each.fault is Fault.CA_CRASH and (
+            each.file == IDENTITY_CA_FILE or not any(other.file in _IDENTITY for other in problems)
+        ):
+            return each
+    return None
 
 
 class VendorParticipant:
@@ -254,6 +266,10 @@ class VendorParticipant:
     def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
         """Return the access of the vendor's process, or the decision that keeps it from running."""
         if self.problems:
+            crash = _crash(self.problems)
+            if crash:
+                text = f"{self.vendor.title}: {crash}."
+                return Decision(Outcome.CRASHES, crash.fault.id, text)
             first = self.problems[0]
             noticed_late = all(
                 (self.vendor, each.fault) in _ONLY_PEERS_NOTICE for each in self.problems

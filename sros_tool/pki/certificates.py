@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import secrets
+from collections.abc import Iterator
 from functools import cache, lru_cache
 from hashlib import sha256
 from typing import TypeVar
@@ -11,10 +12,14 @@ from typing import TypeVar
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.x509.oid import NameOID
+from cryptography.hazmat.primitives.asymmetric import ec, ed448, ed25519, rsa
+from cryptography.x509.oid import NameOID, SignatureAlgorithmOID
 
+from sros_tool.errors import PkiError
 from sros_tool.pki import der
+from sros_tool.pki import pem as pem_file
 from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm, is_weak
+from sros_tool.pki.names import same_name
 from sros_tool.pki.object_names import short_names
 from sros_tool.pki.reading import read_name, reading
 from sros_tool.validity import Window
@@ -52,6 +57,17 @@ _ENCODINGS = {
 """The encodings that OpenSSL takes texts to have, by their ASN.1 type (a_strex.c, tag2nbyte)."""
 _ESCAPED = re.compile(r'[,+"\\<>;]|^[# ](?!\Z)| \Z')
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+
+_SIGNING_KEYS: dict[x509.ObjectIdentifier, type] = {
+    SignatureAlgorithmOID.ED25519: ed25519.Ed25519PublicKey,
+    SignatureAlgorithmOID.ED448: ed448.Ed448PublicKey,
+    **{
+        oid: ec.EllipticCurvePublicKey if name.startswith("ECDSA") else rsa.RSAPublicKey
+        for name, oid in vars(SignatureAlgorithmOID).items()
+        if name.startswith(("RSA", "ECDSA", "_RSA")) and not name.startswith("ECDSA_WITH_SHA3_")
+    },
+}
+"""The kind of key that makes a signature, by its algorithm; OpenSSL 3.0 has no ECDSA with SHA-3."""
 
 _NOT_A_CA = x509.BasicConstraints(ca=False, path_length=None)
 _A_CA = x509.BasicConstraints(ca=True, path_length=1)
@@ -156,34 +172,59 @@ def pem(certificate: x509.Certificate) -> bytes:
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
-def load_certificate(data: bytes, name: str) -> x509.Certificate:
+def load_certificate(data: bytes, name: str, *, trusted: bool = True) -> x509.Certificate:
     """Return the first certificate of a PEM file; ``name`` names the file in errors.
 
+    Without ``trusted``, pass over blocks ``TRUSTED CERTIFICATE``, as Cyclone DDS does.
+
     Raises:
-        PkiError: the certificate cannot be read.
+        PkiError: the certificate cannot be read, here or by OpenSSL.
     """
-    with reading(
-        f"the certificate {name} cannot be read",
-        "It is not a PEM certificate, it is damaged, or its key algorithm is unknown.",
-        "Restore it from a backup, or issue it again.",
-    ):
-        return _read_in_full(x509.load_pem_x509_certificate(data))
+    what = f"the certificate {name} cannot be read"
+    labels = pem_file.CERTIFICATES if trusted else pem_file.CERTIFICATES[:-1]
+    for block in _blocks(data, what):
+        if block.label in labels:
+            return _certificate_in(block, what)
+    why = f"It is not a PEM certificate: {pem_file.missing(data, 'CERTIFICATE')}."
+    raise PkiError(what, why, _RESTORE)
 
 
 def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
     """Return all certificates of a PEM file, at least one; ``name`` names the file in errors.
 
     Raises:
-        PkiError: the file has no certificate, or one of them cannot be read.
+        PkiError: the file has no certificate, or a part of it cannot be read, here or by OpenSSL.
     """
     first = load_certificate(data, name)
-    with reading(
-        f"the certificates {name} cannot be read",
-        "A certificate after the first one is damaged.",
-        "Restore the file from a backup, or remove the damaged certificate.",
-    ):
-        others = [_read_in_full(each) for each in x509.load_pem_x509_certificates(data)[1:]]
-        return (first, *others)
+    what = f"the certificates {name} cannot be read"
+    blocks = [each for each in _blocks(data, what) if each.label in pem_file.CERTIFICATES]
+    later = "A certificate after the first one is damaged."
+    return (first, *(_certificate_in(each, what, later) for each in blocks[1:]))
+
+
+_RESTORE = "Restore it from a backup, or issue it again."
+_UNREADABLE = "It is not a PEM certificate, it is damaged, or its key algorithm is unknown."
+
+
+def _blocks(data: bytes, what: str) -> Iterator[pem_file.Block]:
+    try:
+        yield from pem_file.blocks(data)
+    except PkiError as error:
+        raise PkiError(what, _sentence(error.what), _RESTORE) from error
+
+
+def _certificate_in(block: pem_file.Block, what: str, why: str = _UNREADABLE) -> x509.Certificate:
+    if block.headers:
+        why = f"It has PEM headers ('{block.headers.splitlines()[0].decode('ascii', 'replace')}')."
+        raise PkiError(what, why, "Remove the lines between '-----BEGIN' and the certificate.")
+    with reading(what, why, _RESTORE):
+        # OpenSSL ignores what follows; in a trusted certificate, it says what for.
+        certificate, _ = der.split(block.content)
+        return _read_in_full(x509.load_der_x509_certificate(certificate))
+
+
+def _sentence(clause: str) -> str:
+    return f"{clause[:1].upper()}{clause[1:]}."
 
 
 def load_der_certificate(data: bytes) -> x509.Certificate:
@@ -230,13 +271,24 @@ def weakness(certificate: x509.Certificate) -> str:
 
 @lru_cache(maxsize=256)  # the same few certificates are checked repeatedly
 def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-    """Return whether ``authority`` issued and signed ``certificate``; ignore their validity.
+    """Return whether ``authority`` issued and signed ``certificate``; ignore their validity."""
+    return likely_issued(certificate, authority) and signature_matches(certificate, authority)
 
-    As OpenSSL (``X509_check_issued``), also compare the key identifiers where both have one.
+
+@lru_cache(maxsize=256)
+def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+    """Return whether ``authority`` may have issued ``certificate``; ignore key and validity.
+
+    As OpenSSL 3.0 (``X509_check_issued``), compare the names, the kind of the key, and the key
+    identifiers where both have one.
     """
-    try:
-        certificate.verify_directly_issued_by(authority)
-    except (InvalidSignature, UnsupportedAlgorithm, ValueError, TypeError):
+    kind = _SIGNING_KEYS.get(certificate.signature_algorithm_oid)
+    if not (
+        same_name(certificate.issuer, authority.subject)
+        and _names_one_algorithm(certificate)
+        and kind
+        and isinstance(authority.public_key(), kind)
+    ):
         return False
     named = extension(certificate, x509.AuthorityKeyIdentifier)
     if named is None:
@@ -250,8 +302,43 @@ def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> boo
     return (
         (not own or named.key_identifier in (None, own.digest))
         and named.authority_cert_serial_number in (None, authority.serial_number)
-        and (not issuers or issuers[0] == authority.issuer)
+        and (not issuers or same_name(issuers[0], authority.issuer))
     )
+
+
+@lru_cache(maxsize=256)
+def _names_one_algorithm(certificate: x509.Certificate) -> bool:
+    """Return whether the signed part names the algorithm of the signature (RFC 5280, 4.1.1.2)."""
+    whole = der.first(certificate.public_bytes(serialization.Encoding.DER))
+    signed, outer, _ = der.children(whole.content)
+    parts = der.children(signed.content)
+    return outer.whole == parts[2 if parts[0].tag == der.CONTEXT_0 else 1].whole
+
+
+def is_self_issued(certificate: x509.Certificate) -> bool:
+    """Return whether the subject and the issuer of a certificate are equal."""
+    return same_name(certificate.subject, certificate.issuer)
+
+
+@lru_cache(maxsize=256)
+def signature_matches(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+    """Return whether the key of ``authority`` made the signature of ``certificate``."""
+    key, signature = authority.public_key(), certificate.signature
+    signed = certificate.tbs_certificate_bytes
+    try:
+        how = certificate.signature_algorithm_parameters
+        if isinstance(key, ec.EllipticCurvePublicKey) and isinstance(how, ec.ECDSA):
+            key.verify(signature, signed, how)
+        elif isinstance(key, rsa.RSAPublicKey) and certificate.signature_hash_algorithm:
+            digest = certificate.signature_hash_algorithm
+            key.verify(signature, signed, how, digest)  # type: ignore[arg-type]
+        elif isinstance(key, (ed25519.Ed25519PublicKey, ed448.Ed448PublicKey)):
+            key.verify(signature, signed)
+        else:
+            return False
+    except (InvalidSignature, UnsupportedAlgorithm, ValueError, TypeError):
+        return False
+    return True
 
 
 def extension(certificate: x509.Certificate, kind: type[Extension]) -> Extension | None:

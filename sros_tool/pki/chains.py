@@ -1,34 +1,75 @@
-"""Verification of certificate chains as OpenSSL 3 does it for the DDS vendors (x509_vfy.c)."""
+"""Verification of certificate chains as OpenSSL 3.0 does it for the DDS vendors (x509_vfy.c).
+
+It is not OpenSSL itself that is asked: the one that Python brings may be a newer one, which accepts
+chains that the vendors' refuses.  tests/integration/test_forged_chains.py compares both.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from datetime import datetime
+from enum import Flag, auto
+from itertools import pairwise
 
 from cryptography import x509
-from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID
+from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID, ObjectIdentifier
 
-from sros_tool.pki.certificates import extension, issued_by, subject_text, validity_of
+from sros_tool.errors import PkiError
+from sros_tool.pki import der
+from sros_tool.pki.certificates import (
+    extension,
+    is_self_issued,
+    likely_issued,
+    signature_matches,
+    subject_text,
+    validity_of,
+)
+from sros_tool.pki.name_constraints import name_faults
 from sros_tool.validity import iso
 
+_NETSCAPE_TYPE = ObjectIdentifier("2.16.840.1.113730.1.1")
 _CRITICAL = frozenset(
     {
         ExtensionOID.BASIC_CONSTRAINTS,
         ExtensionOID.KEY_USAGE,
         ExtensionOID.EXTENDED_KEY_USAGE,
         ExtensionOID.SUBJECT_ALTERNATIVE_NAME,
+        ExtensionOID.CERTIFICATE_POLICIES,
+        ExtensionOID.POLICY_CONSTRAINTS,
+        ExtensionOID.POLICY_MAPPINGS,
+        ExtensionOID.INHIBIT_ANY_POLICY,
+        ExtensionOID.NAME_CONSTRAINTS,
+        ExtensionOID.CRL_DISTRIBUTION_POINTS,
+        ExtensionOID.OCSP_NO_CHECK,
+        _NETSCAPE_TYPE,
     }
 )
-"""The critical extensions that are taken; with any other, the chain is refused."""
+"""The critical extensions that are accepted (X509_supported_extension); any other is refused."""
 _NO_USAGE = x509.KeyUsage(*[False] * 9)
 _RESTRICTING = {
-    ExtensionOID.NAME_CONSTRAINTS.dotted_string: "nameConstraints",
     "1.3.6.1.5.5.7.1.7": "sbgp-ipAddrBlock",
     "1.3.6.1.5.5.7.1.8": "sbgp-autonomousSysNum",
     "1.3.6.1.5.5.7.1.14": "proxyCertInfo",
-    "2.16.840.1.113730.1.1": "nsCertType",
 }
 """Extensions by which OpenSSL may refuse a chain, and which sros does not decide."""
+_SSL_CLIENT, _SMIME, _SMIME_CA, _ANY_NETSCAPE_CA = 0x80, 0x20, 0x02, 0x07
+_ANY_POLICY = ObjectIdentifier("2.5.29.32.0")
+_DEEPEST = 100
+
+
+class Checks(Flag):
+    """What is checked of a chain besides its signatures, validities and critical extensions."""
+
+    NONE = 0
+    ROOT_SIGNATURE = auto()
+    """The signature of the self-signed CA, too (``X509_V_FLAG_CHECK_SS_SIGNATURE``)."""
+    POLICIES = auto()
+    """Certificate policies (``X509_V_FLAG_POLICY_CHECK``)."""
+    STRICT = auto()
+    """The rules of RFC 5280 for chains (``X509_V_FLAG_X509_STRICT``)."""
+    DOCUMENTS = auto()
+    """Whether the first certificate may sign S/MIME messages (``smime_sign``)."""
 
 
 def chain_fault(
@@ -37,45 +78,82 @@ def chain_fault(
     others: Iterable[x509.Certificate] = (),
     *,
     at: datetime,
-    for_documents: bool = False,
-    strict: bool = False,
+    checks: Checks = Checks.NONE,
 ) -> str:
     """Return why ``start`` has no valid chain to a self-signed CA of ``authorities``, or "".
 
     ``others`` are possible intermediate certificates; validities are checked at the time ``at``.
-    ``for_documents`` also checks the purpose S/MIME, and ``strict`` the rules of RFC 5280 for
-    chains (OpenSSL's ``X509_V_FLAG_X509_STRICT`` with ``X509_V_FLAG_CHECK_SS_SIGNATURE``).
     """
-    chain = [start]
-    while not issued_by(chain[-1], chain[-1]):
-        issuer = _issuer(chain[-1], [*authorities, *others], at)
-        if issuer is None or issuer in chain:
-            return f"the issuer {subject_text(chain[-1].issuer)} is not a trusted certificate"
-        chain.append(issuer)
-    # Of several CA certificates with the same name and key, OpenSSL tries only the first.
-    root = next((each for each in authorities if issued_by(chain[-1], each)), None)
-    if root != chain[-1]:
-        return f"the self-signed {subject_text(chain[-1].subject)} is not a trusted certificate"
+    chain, missing = _build_chain(start, tuple(dict.fromkeys(authorities)), tuple(others), at)
+    if missing:
+        return missing
     faults = (
         *_extension_faults(chain),
-        *(purpose_faults(chain) if for_documents else ()),
-        *(_strict_faults(chain) if strict else ()),
+        *_authority_faults(chain, checks),
+        *(purpose_faults(chain) if Checks.DOCUMENTS in checks else ()),
+        *(_strict_faults(chain) if Checks.STRICT in checks else ()),
         *_time_faults(chain, at),
+        *_signature_faults(chain, checks),
+        *name_faults(chain),
+        *(_policy_faults(chain) if Checks.POLICIES in checks else ()),
     )
     return next(iter(faults), "")
 
 
+def _build_chain(
+    start: x509.Certificate,
+    authorities: Sequence[x509.Certificate],
+    others: Sequence[x509.Certificate],
+    at: datetime,
+) -> tuple[list[x509.Certificate], str]:
+    """Return the chain from ``start`` to a trusted CA, or why there is none (build_chain).
+
+    OpenSSL takes the first certificate whose name and identifiers fit, whether or not its key made
+    the signature.
+    """
+    chain = [start]
+    only_others = 1  # the certificates at the start of the chain that come from ``others``
+    ask_others = True
+    while len(chain) <= _DEEPEST:
+        last = chain[-1]
+        complete = _is_self_signed(last)
+        issuer = _issuer(last, authorities, at)
+        if issuer is not None and not complete:
+            chain.append(issuer)
+        elif issuer is not None and len(chain) == only_others:
+            if issuer == last:
+                only_others -= 1
+            else:  # another certificate with the name of a trusted CA
+                issuer = None
+        if issuer is not None:
+            ask_others = False
+            if any(map(_is_self_signed, chain[only_others:])):
+                return chain, ""
+            continue
+        below = None if complete or not ask_others else _issuer(last, others, at, chain)
+        if below is None:
+            kind = "self-signed" if complete else "issuer"
+            name = subject_text(last.subject if complete else last.issuer)
+            return chain, f"the {kind} {name} is not a trusted certificate"
+        chain.append(below)
+        only_others += 1
+    return chain, "the chain is too long"
+
+
+def _is_self_signed(certificate: x509.Certificate) -> bool:
+    return likely_issued(certificate, certificate)
+
+
 def _issuer(
-    certificate: x509.Certificate, among: Iterable[x509.Certificate], at: datetime
+    certificate: x509.Certificate,
+    among: Sequence[x509.Certificate],
+    at: datetime,
+    chain: Sequence[x509.Certificate] = (),
 ) -> x509.Certificate | None:
-    found = [
-        each
-        for each in among
-        if each.subject == certificate.issuer
-        and _may_sign_certificates(each)
-        and issued_by(certificate, each)
-    ]
-    return next((each for each in found if validity_of(each).contains(at)), next(iter(found), None))
+    """Return the first possible issuer that is valid now; else the one that expires last."""
+    found = [each for each in among if likely_issued(certificate, each) and each not in chain]
+    valid = (each for each in found if validity_of(each).contains(at))
+    return next(valid, max(found, key=lambda each: each.not_valid_after_utc, default=None))
 
 
 def _may_sign_certificates(certificate: x509.Certificate) -> bool:
@@ -87,18 +165,71 @@ def _extension_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     for each in chain:
         if extension(each, x509.KeyUsage) == _NO_USAGE:
             yield f"the keyUsage of {subject_text(each.subject)} is empty"
+        if _netscape_type(each) == -1:
+            yield f"the nsCertType of {subject_text(each.subject)} cannot be read"
         for found in each.extensions:
             oid = found.oid.dotted_string
             if oid in _RESTRICTING:
                 yield f"{subject_text(each.subject)} has {_RESTRICTING[oid]}, not known to sros"
             elif found.critical and found.oid not in _CRITICAL:
                 yield f"{subject_text(each.subject)} has the unknown critical extension {oid}"
-    for below, each in enumerate(chain[1:]):
+
+
+class _Authority(Flag):
+    """Whether OpenSSL takes a certificate for that of a CA (X509_check_ca)."""
+
+    NO = 0
+    YES = auto()
+    OLD = auto()
+    """It has no basicConstraints; taken for a root, unless strictly checked."""
+    NETSCAPE = auto()
+
+
+def _authority(certificate: x509.Certificate) -> _Authority:
+    if not _may_sign_certificates(certificate):
+        return _Authority.NO
+    constraints = extension(certificate, x509.BasicConstraints)
+    if constraints is not None:
+        return _Authority.YES if constraints.ca else _Authority.NO
+    first_version = certificate.version is x509.Version.v1 and _is_self_signed(certificate)
+    if first_version or extension(certificate, x509.KeyUsage) is not None:
+        return _Authority.OLD
+    if (_netscape_type(certificate) or 0) & _ANY_NETSCAPE_CA:
+        return _Authority.OLD | _Authority.NETSCAPE
+    return _Authority.NO
+
+
+def _netscape_type(certificate: x509.Certificate) -> int | None:
+    """Return the bits of the extension nsCertType, or None without it; -1 for unreadable ones."""
+    for each in certificate.extensions:
+        if each.oid == _NETSCAPE_TYPE:
+            with suppress(PkiError):
+                value = der.first(each.value.public_bytes())
+                if value.tag == der.BIT_STRING and len(value.content) in (1, 2):
+                    return (value.content + b"\0")[1]
+            return -1
+    return None
+
+
+def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iterator[str]:
+    strict = Checks.STRICT in checks
+    if strict and _Authority.OLD in _authority(chain[0]):
+        yield f"{subject_text(chain[0].subject)} has no basicConstraints, so it is not a CA"
+    below = 0
+    for place, each in enumerate(chain):
+        name = subject_text(each.subject)
         constraints = extension(each, x509.BasicConstraints)
-        if constraints is None or not constraints.ca:
-            yield f"{subject_text(each.subject)} is not a CA"
-        elif constraints.path_length is not None and below > constraints.path_length:
-            yield f"the chain is longer than the pathlen of {subject_text(each.subject)} allows"
+        if place:
+            kind = _authority(each)
+            root = place == len(chain) - 1
+            if not kind or (_Authority.OLD in kind and (strict or not root)):
+                why = "" if constraints else ": it has no basicConstraints"
+                yield f"{name} is not a CA{why}"
+        longest = constraints.path_length if constraints else None
+        if place > 1 and longest is not None and below > longest:
+            yield f"the chain is longer than the pathlen of {name} allows"
+        if not place or not is_self_issued(each):
+            below += 1
 
 
 def purpose_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
@@ -113,20 +244,21 @@ def purpose_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
             "signed documents need"
         )
     for each in chain:
+        name = subject_text(each.subject)
         purposes = extension(each, x509.ExtendedKeyUsage)
         if purposes and ExtendedKeyUsageOID.EMAIL_PROTECTION not in purposes:
-            name = subject_text(each.subject)
             yield (
                 f"the extendedKeyUsage of {name} lacks emailProtection, which signed documents need"
             )
+        kinds = _netscape_type(each)
+        if kinds is None:
+            continue
+        needed = _SMIME_CA if each is not chain[0] else _SMIME | _SSL_CLIENT
+        if not kinds & needed and (each is chain[0] or _Authority.NETSCAPE in _authority(each)):
+            yield f"the nsCertType of {name} has no S/MIME, which signed documents need"
 
 
 def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
-    if not _may_sign_certificates(chain[-1]):
-        yield f"the keyUsage of {subject_text(chain[-1].subject)} lacks keyCertSign"
-    usage = extension(chain[0], x509.KeyUsage)
-    if usage and usage.key_cert_sign and extension(chain[0], x509.BasicConstraints) is None:
-        yield f"{subject_text(chain[0].subject)} has keyCertSign but no basicConstraints"
     if len(chain) == 1:
         return
     for each in chain:
@@ -134,8 +266,7 @@ def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         usage = extension(each, x509.KeyUsage)
         constraints = extension(each, x509.BasicConstraints)
         if constraints and constraints.ca:
-            found = each.extensions.get_extension_for_class(x509.BasicConstraints)
-            if not found.critical:
+            if ExtensionOID.BASIC_CONSTRAINTS not in _critical(each):
                 yield f"the basicConstraints of {name} are not critical"
             if usage is None:
                 yield f"{name} is a CA without keyUsage"
@@ -151,10 +282,19 @@ def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         names = extension(each, x509.SubjectAlternativeName)
         if names is not None and not list(names):
             yield f"the subjectAltName of {name} is empty"
+        if _IDENTIFIERS & _critical(each):
+            yield f"a key identifier of {name} is critical"
         if each is not chain[-1]:
-            identifier = extension(each, x509.AuthorityKeyIdentifier)
-            if identifier is None or identifier.key_identifier is None:
+            authority = extension(each, x509.AuthorityKeyIdentifier)
+            if authority is None or authority.key_identifier is None:
                 yield f"{name} lacks an authorityKeyIdentifier"
+
+
+_IDENTIFIERS = {ExtensionOID.SUBJECT_KEY_IDENTIFIER, ExtensionOID.AUTHORITY_KEY_IDENTIFIER}
+
+
+def _critical(certificate: x509.Certificate) -> set[ObjectIdentifier]:
+    return {each.oid for each in certificate.extensions if each.critical}
 
 
 def _time_faults(chain: Sequence[x509.Certificate], at: datetime) -> Iterator[str]:
@@ -164,3 +304,45 @@ def _time_faults(chain: Sequence[x509.Certificate], at: datetime) -> Iterator[st
             yield f"{subject_text(each.subject)} expired at {iso(validity.not_after)}"
         elif at < validity.not_before:
             yield f"{subject_text(each.subject)} is not valid before {iso(validity.not_before)}"
+
+
+def _signature_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iterator[str]:
+    pairs = list(pairwise(chain))
+    if Checks.ROOT_SIGNATURE in checks:
+        pairs.append((chain[-1], chain[-1]))
+    for below, issuer in pairs:
+        name = subject_text(issuer.subject)
+        constraints = extension(issuer, x509.BasicConstraints)
+        authority = below is not issuer or (constraints is not None and constraints.ca)
+        if authority and not _may_sign_certificates(issuer):
+            yield f"the keyUsage of {name} lacks keyCertSign"
+        elif not signature_matches(below, issuer):
+            yield f"the signature of {subject_text(below.subject)} is not by the key of {name}"
+
+
+def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
+    """Yield why no policy holds for the whole chain, if its certificates demand one (pcy_tree.c).
+
+    Also where a certificate has a policy twice, or translates policies, which sros does not follow.
+    """
+    demanded = len(chain)
+    valid: set[ObjectIdentifier] = {_ANY_POLICY}
+    for each in reversed(chain[:-1]):
+        name = subject_text(each.subject)
+        found = extension(each, x509.CertificatePolicies)
+        named = [policy.policy_identifier for policy in found or ()]
+        if len(named) != len(set(named)):
+            yield f"{name} has a certificate policy twice"
+        if any(other.oid == ExtensionOID.POLICY_MAPPINGS for other in each.extensions):
+            yield f"{name} has policyMappings, not known to sros"
+        constraints = extension(each, x509.PolicyConstraints)
+        after = constraints.require_explicit_policy if constraints else None
+        if demanded:
+            demanded -= not is_self_issued(each)
+            demanded = min(demanded, demanded if after is None else after)
+        kept = valid if _ANY_POLICY in named else set()
+        valid = kept | (set(named) if _ANY_POLICY in valid else valid & set(named))
+        if extension(each, x509.InhibitAnyPolicy) is not None:
+            valid -= {_ANY_POLICY}
+    if not demanded and not valid:
+        yield "a certificate demands a policy that the others do not have"

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from sros_tool.errors import PkiError
 
-INTEGER, OCTET_STRING, OID, SEQUENCE, SET = 0x02, 0x04, 0x06, 0x30, 0x31
+INTEGER, BIT_STRING, OCTET_STRING, OID, SEQUENCE, SET = 0x02, 0x03, 0x04, 0x06, 0x30, 0x31
 UTC_TIME, GENERALIZED_TIME = 0x17, 0x18
 CONTEXT_0 = 0xA0
 
@@ -60,6 +60,18 @@ def first(data: bytes) -> Value:
     if not values:
         raise PkiError("a DER value is missing")
     return values[0]
+
+
+def split(data: bytes) -> tuple[bytes, bytes]:
+    """Return the first value in ``data``, encoded, and the bytes after it.
+
+    Raises:
+        PkiError: the value is truncated, or has a form that this reader does not support.
+    """
+    size = data[1] & 0x7F if len(data) > 1 and data[1] >= 0x80 else 0
+    length = int.from_bytes(data[2 : 2 + size], "big") if size else (data[1:2] or b"\0")[0]
+    value = first(data[: 2 + size + length]).whole
+    return value, data[len(value) :]
 
 
 def integer(value: Value) -> int:

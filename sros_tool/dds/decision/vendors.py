@@ -78,11 +78,11 @@ class Signers(Enum):
 
 
 class Hashes(Enum):
-    """The hashes that may sign CAs and identities."""
+    """The signatures that CAs and identities may have."""
 
     ANY = auto()
     SHA256 = auto()
-    """SHA-256, and SHA-1 with RSA (Fast DDS)."""
+    """SHA-256 with EC or RSA (not RSA-PSS), and SHA-1 with RSA (Fast DDS)."""
 
 
 class Keys(Enum):
@@ -164,7 +164,14 @@ class VendorTraits:
     reads_first_authority: bool = False
     """Only the first CA of a file is trusted."""
     verifies_authorities: bool = False
-    """The first certificate of a CA file is verified, strictly, when it is loaded."""
+    """The first certificate of a CA file is verified, strictly, when it is loaded.
+
+    If its hash is one that the vendor does not take, the process crashes, because it was freed.
+    """
+    verifies_policies: bool = False
+    """Of a chain, the policies and the CA's own signature are verified, too (Fast DDS)."""
+    reads_trusted_certificates: bool = True
+    """A certificate may be in a PEM block ``TRUSTED CERTIFICATE``."""
     hashes: Hashes = Hashes.ANY
     keys: Keys = Keys.ANY
     reads_tokens: bool = True
@@ -197,6 +204,7 @@ _FAST_2_14 = VendorTraits(
     refuses_open_rtps=True,
     signers=Signers.LISTED,
     verifies_authorities=True,
+    verifies_policies=True,
     hashes=Hashes.SHA256,
     keys=Keys.EC_AND_RSA,
 )
@@ -254,6 +262,7 @@ class Vendor(StrEnum):
             reads_first_authority=True,
             keys=Keys.SMALL,
             reads_tokens=False,
+            reads_trusted_certificates=False,
         ),
     )
     OPENDDS = "opendds", VendorTraits("OpenDDS", product="OpenDDS", reads_tokens=False)
