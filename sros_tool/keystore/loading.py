@@ -207,16 +207,19 @@ def _signer_fault(
             return str(error)
         return ""
     listed = traits.signers is Signers.LISTED
-    signer = signed.signer_among(trusted if listed else signed.certificates)
-    if signer is None:
-        where = "in the file of the permissions CA" if listed else "in the message"
-        return f"the certificate of its signer is not {where}"
-    if not signed.is_intact(signer):
-        return "its signature does not match its content"
-    if listed:
-        return ""
-    fault = chain_fault(signer, trusted, signed.certificates, at=at, checks=Checks.DOCUMENTS)
-    return f"its signer is not accepted: {fault}" if fault else ""
+    for signature in signed.signatures:
+        signer = signature.signer_among(trusted if listed else signed.certificates)
+        if signer is None:
+            where = "in the file of the permissions CA" if listed else "in the message"
+            return f"the certificate of its signer is not {where}"
+        if not signature.is_intact(signed.content, signer):
+            return "its signature does not match its content"
+        if listed:
+            continue
+        fault = chain_fault(signer, trusted, signed.certificates, at=at, checks=Checks.DOCUMENTS)
+        if fault:
+            return f"its signer is not accepted: {fault}"
+    return ""
 
 
 def _trusted(traits: VendorTraits, certificates: Certificates) -> Certificates:

@@ -12,7 +12,7 @@ from sros_tool.errors import PkiError
 
 INTEGER, BIT_STRING, OCTET_STRING, OID, SEQUENCE, SET = 0x02, 0x03, 0x04, 0x06, 0x30, 0x31
 UTC_TIME, GENERALIZED_TIME = 0x17, 0x18
-CONTEXT_0 = 0xA0
+CONTEXT_0, CONTEXT_1 = 0xA0, 0xA1
 
 
 class Value(NamedTuple):

@@ -17,13 +17,14 @@ import secrets
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, pkcs7
+from cryptography.x509.oid import PublicKeyAlgorithmOID
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
@@ -52,34 +53,36 @@ _SIGNATURE = (b"application/pkcs7-signature", b"application/x-pkcs7-signature")
 _SHORT = 1024
 _PARTS = 4
 """What the marks of a signed message separate: a preamble, two parts, and an epilogue."""
-_VERSION = b"\x02\x01\x01"
-_NULL = b"\x05\x00"
 _SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
 _DATA = der.encode_oid("1.2.840.113549.1.7.1")
-_CONTENT_TYPE = der.encode_oid("1.2.840.113549.1.9.3")
 _MESSAGE_DIGEST = der.encode_oid("1.2.840.113549.1.9.4")
-_RSA = der.encode_oid("1.2.840.113549.1.1.1")
-_ATTRIBUTE_VALUES = (der.SEQUENCE, der.OCTET_STRING, der.OID, der.UTC_TIME, der.GENERALIZED_TIME)
+_NULL = 0x05
+_ANY_VALUES = (
+    der.SEQUENCE, der.OCTET_STRING, der.OID, der.UTC_TIME, der.GENERALIZED_TIME, _NULL
+)  # fmt: skip
+"""The types of attributes and parameters that OpenSSL writes again as it read them."""
 _OID = re.compile(rb"(?:(?:[\x81-\xff][\x80-\xff]*)?[\x00-\x7f])+")
 
 
-class _Digest(NamedTuple):
-    """A hash algorithm, and the OIDs of the signatures with it by RSA and by ECDSA keys."""
-
-    algorithm: hashes.HashAlgorithm
-    rsa: bytes
-    ecdsa: bytes
-
-
-_DIGESTS = {
-    der.encode_oid(digest): _Digest(algorithm, der.encode_oid(by_rsa), der.encode_oid(by_ecdsa))
-    for digest, algorithm, by_rsa, by_ecdsa in (
-        ("2.16.840.1.101.3.4.2.1", hashes.SHA256(), "1.2.840.113549.1.1.11", "1.2.840.10045.4.3.2"),
-        ("2.16.840.1.101.3.4.2.2", hashes.SHA384(), "1.2.840.113549.1.1.12", "1.2.840.10045.4.3.3"),
-        ("2.16.840.1.101.3.4.2.3", hashes.SHA512(), "1.2.840.113549.1.1.13", "1.2.840.10045.4.3.4"),
-        # Read, never written.
-        ("1.3.14.3.2.26", hashes.SHA1(), "1.2.840.113549.1.1.5", "1.2.840.10045.4.1"),  # noqa: S303
+_DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
+    der.encode_oid(oid): algorithm
+    for algorithm, *oids in (
+        # The second one is of signatures with RSA, which OpenSSL takes for the same hash.
+        (hashes.SHA256(), "2.16.840.1.101.3.4.2.1", "1.2.840.113549.1.1.11"),
+        (hashes.SHA384(), "2.16.840.1.101.3.4.2.2", "1.2.840.113549.1.1.12"),
+        (hashes.SHA512(), "2.16.840.1.101.3.4.2.3", "1.2.840.113549.1.1.13"),
+        (hashes.SHA512_256(), "2.16.840.1.101.3.4.2.6", "1.2.840.113549.1.1.16"),
+        (hashes.SHA3_256(), "2.16.840.1.101.3.4.2.8", "2.16.840.1.101.3.4.3.14"),
+        (hashes.SHA3_384(), "2.16.840.1.101.3.4.2.9", "2.16.840.1.101.3.4.3.15"),
+        (hashes.SHA3_512(), "2.16.840.1.101.3.4.2.10", "2.16.840.1.101.3.4.3.16"),
+        # Read, never written: weak.
+        (hashes.SHA224(), "2.16.840.1.101.3.4.2.4", "1.2.840.113549.1.1.14"),
+        (hashes.SHA512_224(), "2.16.840.1.101.3.4.2.5", "1.2.840.113549.1.1.15"),
+        (hashes.SHA3_224(), "2.16.840.1.101.3.4.2.7", "2.16.840.1.101.3.4.3.13"),
+        (hashes.SHA1(), "1.3.14.3.2.26", "1.2.840.113549.1.1.5"),  # noqa: S303
+        (hashes.MD5(), "1.2.840.113549.2.5", "1.2.840.113549.1.1.4"),  # noqa: S303
     )
+    for oid in oids
 }
 
 
@@ -110,103 +113,130 @@ def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> byt
 
 
 @dataclass(frozen=True, slots=True)
+class Signature:
+    """A signature in a message; ``digest`` is its hash algorithm."""
+
+    digest: hashes.HashAlgorithm
+    _signed_attributes: bytes
+    _message_digest: bytes
+    _value: bytes
+    _issuer_and_serial: tuple[bytes, int]
+
+    def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
+        """Return the signer's certificate by issuer and serial number, or None.
+
+        OpenSSL compares the issuers' names in a looser way, and takes the first that fits: where
+        another one with this serial number comes first, none is the signer's.
+        """
+        issuer, serial = self._issuer_and_serial
+        first = next((each for each in certificates if each.serial_number == serial), None)
+        return first if first and first.issuer.public_bytes() == issuer else None
+
+    def digest_matches(self, content: bytes) -> bool:
+        """Return whether the messageDigest attribute is the digest of ``content``."""
+        digest = hashes.Hash(self.digest)
+        digest.update(content)
+        return digest.finalize() == self._message_digest
+
+    def is_intact(self, content: bytes, signer: x509.Certificate) -> bool:
+        """Return whether the signature of ``content`` verifies with the key of ``signer``.
+
+        The kind of the key says how: OpenSSL ignores the algorithm that the message names, and so
+        accepts RSA-PSS of keys for nothing else only, and no Ed25519 (pk7_doit.c,
+        PKCS7_signatureVerify).
+        """
+        if self._signed_attributes and not self.digest_matches(content):
+            return False
+        signed = self._signed_attributes or content
+        key = _public_key(signer)
+        try:
+            if isinstance(key, ec.EllipticCurvePublicKey):
+                key.verify(self._value, signed, ec.ECDSA(self.digest))
+            elif isinstance(key, rsa.RSAPublicKey):
+                key.verify(self._value, signed, _padding(signer, self.digest), self.digest)
+            else:
+                return False
+        except (InvalidSignature, UnsupportedAlgorithm, ValueError):
+            return False
+        return True
+
+
+@dataclass(frozen=True, slots=True)
 class SignedDocument:
     """A parsed ``.p7s``; do not trust its content before `verify`.
 
     ``content`` is the signed part, with CRLF line ends and the MIME header; ``document`` is the
-    same without the header.  ``certificates`` are the embedded certificates.  ``digest`` is the
-    name of the hash algorithm.
+    same without the header.  ``certificates`` are the embedded certificates.  OpenSSL, and with it
+    every vendor, verifies all of its ``signatures``; mostly there is one.
     """
 
     content: bytes
     document: bytes
     certificates: tuple[x509.Certificate, ...]
-    digest: str
-    _digest_algorithm: _Digest
-    _signature_algorithm: der.Value
-    _signed_attributes: bytes
-    _message_digest: bytes
-    _signature: bytes
-    _issuer_and_serial: tuple[bytes, int]
+    signatures: tuple[Signature, ...]
 
     @property
     def text(self) -> bytes:
         """The document with LF line ends, as it was before it was signed: S/MIME has CRLF."""
         return self.document.replace(b"\r\n", b"\n")
 
+    @property
+    def digest(self) -> str:
+        """The name of the weakest hash algorithm of its signatures."""
+        return min((each.digest for each in self.signatures), key=_bits).name
+
     def signer(self) -> x509.Certificate | None:
-        """Return the signer's certificate, or None if it is not embedded."""
-        return self.signer_among(self.certificates)
-
-    def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
-        """Return the signer's certificate by issuer and serial number, or None.
-
-        OpenSSL compares the issuers' names in a looser way, and takes the first that fits: where
-        several certificates have the serial number, none is the signer's.
-        """
-        issuer, serial = self._issuer_and_serial
-        found = {each for each in certificates if each.serial_number == serial}
-        if len(found) != 1 or (signer := found.pop()).issuer.public_bytes() != issuer:
-            return None
-        return signer
+        """Return the certificate of the first signer, or None if it is not embedded."""
+        return self.signatures[0].signer_among(self.certificates)
 
     def verify(self, authority: x509.Certificate) -> None:
-        """Verify that ``authority`` itself signed this document.
+        """Verify that ``authority`` itself signed this document, and nobody else.
 
         Stricter than Cyclone DDS 0.10.2 and Fast DDS 2.9.1, which accept any signer with a chain to
         the authority (the CVE-2023-24011 class; both measured).
 
         Raises:
-            PkiError: another certificate signed it, or its signature does not match its content.
+            PkiError: another certificate signed it, too, its signature does not match its content,
+                or it is signed with MD5.
         """
-        signer = self.signer()
-        if signer is None or signer != authority:
-            who = (
-                f"by {signer.subject.rfc4514_string()}"
-                if signer
-                else "by a certificate that is not embedded"
-            )
-            raise PkiError(
-                f"it is signed {who}, not by the permissions CA "
-                f"{authority.subject.rfc4514_string()}"
-            )
-        if not self.is_intact(signer):
-            raise PkiError(
-                "its signature does not match its content",
-                "The document was changed after it was signed, or its signature is damaged.",
-            )
+        for signature in self.signatures:
+            signer = signature.signer_among(self.certificates)
+            if signer is None or signer != authority:
+                who = (
+                    f"by {signer.subject.rfc4514_string()}"
+                    if signer
+                    else "by a certificate that is not embedded"
+                )
+                raise PkiError(
+                    f"it is signed {who}, not by the permissions CA "
+                    f"{authority.subject.rfc4514_string()}"
+                )
+            if not signature.is_intact(self.content, signer):
+                raise PkiError(
+                    "its signature does not match its content",
+                    "The document was changed after it was signed, or its signature is damaged.",
+                )
+            if isinstance(signature.digest, hashes.MD5):
+                raise PkiError("it is signed with MD5", "Such a signature can be forged.")
 
     def weakness(self) -> str:
-        """Return the weak hash of the signature as a clause, or ""."""
-        weak = self._digest_algorithm.algorithm.digest_size < hashes.SHA256.digest_size
+        """Return the weak hash of a signature as a clause, or ""."""
+        weak = any(_bits(each.digest) < _bits(hashes.SHA256()) for each in self.signatures)
         return f"it has a weak signature, with {self.digest.upper()}" if weak else ""
 
     def digest_matches(self) -> bool:
-        """Return whether the messageDigest attribute is the digest of the content."""
-        digest = hashes.Hash(self._digest_algorithm.algorithm)
-        digest.update(self.content)
-        return digest.finalize() == self._message_digest
+        """Return whether every messageDigest attribute is the digest of the content."""
+        return all(each.digest_matches(self.content) for each in self.signatures)
 
-    def is_intact(self, signer: x509.Certificate) -> bool:
-        """Return whether the signature verifies with the key of ``signer``."""
-        if self._signed_attributes and not self.digest_matches():
-            return False
-        signed = self._signed_attributes or self.content
-        key, digest = _public_key(signer), self._digest_algorithm
-        try:
-            if isinstance(key, ec.EllipticCurvePublicKey):
-                if _algorithm(self._signature_algorithm) != digest.ecdsa:
-                    return False
-                key.verify(self._signature, signed, ec.ECDSA(digest.algorithm))
-            elif isinstance(key, rsa.RSAPublicKey):
-                if _algorithm(self._signature_algorithm) not in (_RSA, digest.rsa):
-                    return False
-                key.verify(self._signature, signed, padding.PKCS1v15(), digest.algorithm)
-            else:
-                return False
-        except (InvalidSignature, UnsupportedAlgorithm, ValueError):
-            return False
-        return True
+
+def _padding(signer: x509.Certificate, digest: hashes.HashAlgorithm) -> padding.AsymmetricPadding:
+    if signer.public_key_algorithm_oid != PublicKeyAlgorithmOID.RSASSA_PSS:
+        return padding.PKCS1v15()
+    return padding.PSS(padding.MGF1(digest), padding.PSS.AUTO)
+
+
+def _bits(algorithm: hashes.HashAlgorithm) -> int:
+    return 8 * algorithm.digest_size
 
 
 _Part = TypeVar("_Part", bytes, der.Value)
@@ -326,20 +356,20 @@ def _optional(values: list[der.Value], place: int, tag: int) -> list[der.Value]:
 
 
 @_remembered
-def _algorithm(value: der.Value) -> bytes:
-    """Return the OID of an AlgorithmIdentifier that has no parameters, or NULL as parameters."""
-    oid, *parameters = der.children(value.content)
-    if oid.tag != der.OID or [each.whole for each in parameters] not in ([], [_NULL]):
-        raise ValueError("not a known algorithm")
-    return oid.content
+def _digest_of(identifier: der.Value) -> hashes.HashAlgorithm | None:
+    """Return the hash of an AlgorithmIdentifier, whose parameters OpenSSL ignores."""
+    oid, *parameters = der.children(identifier.content)
+    if (identifier.tag, oid.tag) != (der.SEQUENCE, der.OID) or len(parameters) > 1:
+        raise ValueError("not an algorithm")
+    _check_values(oid, *parameters)
+    return _DIGESTS.get(oid.content)
 
 
 def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
-    """Parse a ContentInfo with SignedData and one SignerInfo (RFC 5652, 3, 5.1 and 5.3).
+    """Parse a ContentInfo with SignedData (RFC 2315, 7 and 9; RFC 5652, 3, 5.1 and 5.3).
 
-    Only DER is read, and only the fields that a signature of one signer needs: of anything else,
-    OpenSSL and sros might think differently.  Without ``content``, the signed part is taken from
-    the SignedData.
+    Only DER is read: of anything else, OpenSSL and sros might think differently.  Versions do not
+    count, as for OpenSSL.  Without ``content``, the signed part is taken from the SignedData.
     """
     (message,) = der.children(signature)
     content_type, wrapped = _parts(message, der.OID, der.CONTEXT_0)
@@ -348,48 +378,68 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
         raise ValueError("not SignedData")
     fields = der.children(signed_data.content)
     bags = _optional(fields, 3, der.CONTEXT_0)
+    lists = _optional(fields, 3, der.CONTEXT_1)
     if [each.tag for each in fields] != [der.INTEGER, der.SET, der.SEQUENCE, der.SET]:
         raise ValueError("not the fields of SignedData")
     version, digests, encapsulated, signers = fields
+    der.integer(version)
     kind, *contained = der.children(encapsulated.content)
-    if version.whole != _VERSION or (kind.tag, kind.content) != (der.OID, _DATA):
+    if (kind.tag, kind.content) != (der.OID, _DATA):
         raise ValueError("not a signature of data")
-    if (content is None) != bool(contained):
-        raise ValueError("two contents, or none")
+    inside = [_octets(each) for each in contained]
+    if len(inside) > 1 or (content is None and not inside):
+        raise ValueError("several contents, or none")
     if content is None:
-        (wrapped,) = contained
-        (octets,) = _parts(wrapped, der.OCTET_STRING)
-        if wrapped.tag != der.CONTEXT_0:
-            raise ValueError("no content")
-        content = octets.content
+        (content,) = inside
+    for each in (value for bag in lists for value in der.children(bag.content)):
+        x509.load_der_x509_crl(each.whole)  # OpenSSL reads it, and does not use it
     embedded = [value for bag in bags for value in der.children(bag.content)]
-    (signer,) = _parts(signers, der.SEQUENCE)
-    info = der.children(signer.content)
-    attributes = _optional(info, 3, der.CONTEXT_0)
-    if [each.tag for each in info] != [
-        *(der.INTEGER, der.SEQUENCE, der.SEQUENCE, der.SEQUENCE, der.OCTET_STRING)
-    ]:
-        raise ValueError("not the fields of SignerInfo")
-    version, identifier, digest, signature_algorithm, signature_value = info
-    (listed,) = _parts(digests, der.SEQUENCE)
-    algorithm = _DIGESTS.get(_algorithm(digest))
-    if _algorithm(listed) != _algorithm(digest) or version.whole != _VERSION:
-        raise ValueError("another digest or version than announced")
-    if algorithm is None:
+    listed = [_digest_of(each) for each in der.children(digests.content)]
+    if None in listed:
         raise ValueError("unknown digest")
-    _algorithm(signature_algorithm)
+    signatures = tuple(_signature(each) for each in der.children(signers.content))
+    if not signatures or any(each.digest not in listed for each in signatures):
+        raise ValueError("no signature, or another digest than announced")
     return SignedDocument(
         content=content,
         document=_document(content),
         certificates=tuple(_certificate(each.whole) for each in embedded),
-        digest=algorithm.algorithm.name,
-        _digest_algorithm=algorithm,
-        _signature_algorithm=signature_algorithm,
+        signatures=signatures,
+    )
+
+
+def _octets(wrapped: der.Value) -> bytes:
+    (octets,) = _parts(wrapped, der.OCTET_STRING)
+    if wrapped.tag != der.CONTEXT_0:
+        raise ValueError("no content")
+    return octets.content
+
+
+def _signature(signer: der.Value) -> Signature:
+    """Return the signature of a SignerInfo that names its signer by issuer and serial number."""
+    info = der.children(signer.content)
+    attributes = _optional(info, 3, der.CONTEXT_0)
+    unsigned = _optional(info, 5, der.CONTEXT_1)
+    if signer.tag != der.SEQUENCE or [each.tag for each in info] != [
+        *(der.INTEGER, der.SEQUENCE, der.SEQUENCE, der.SEQUENCE, der.OCTET_STRING)
+    ]:
+        raise ValueError("not the fields of SignerInfo")
+    version, identifier, digest, algorithm, value = info
+    der.integer(version)
+    named = _digest_of(digest)
+    if named is None:
+        raise ValueError("unknown digest")
+    _digest_of(algorithm)
+    for each in unsigned:
+        _attributes(each.content)
+    found = [_attributes(each.content) for each in attributes]
+    return Signature(
+        named,
         # The signature covers the attributes with the tag SET, not with their tag in SignerInfo.
-        _signed_attributes=b"".join(b"\x31" + each.whole[1:] for each in attributes),
-        _message_digest=b"".join(_message_digest(each.content) for each in attributes),
-        _signature=signature_value.content,
-        _issuer_and_serial=_issuer_and_serial(identifier),
+        b"".join(b"\x31" + each.whole[1:] for each in attributes if each.content),
+        b"".join(map(_message_digest, found)),
+        value.content,
+        _issuer_and_serial(identifier),
     )
 
 
@@ -399,22 +449,34 @@ def _issuer_and_serial(identifier: der.Value) -> tuple[bytes, int]:
     return issuer.whole, der.integer(serial)
 
 
-def _message_digest(attributes: bytes) -> bytes:
-    """Return the digest in the signed attributes, after checking their form (RFC 5652, 11)."""
+def _check_values(*values: der.Value) -> None:
+    """Raise `ValueError` for a value that OpenSSL may read in another way, or not at all."""
+    for each in values:
+        if (
+            each.tag not in _ANY_VALUES
+            or (each.tag == der.OID and not _OID.fullmatch(each.content))
+            or (each.tag == _NULL and each.content)
+        ):
+            raise ValueError("not a value of an attribute or parameter")
+
+
+def _attributes(attributes: bytes) -> dict[bytes, der.Value]:
+    """Return the first values of attributes by type, after checking their form (RFC 5652, 11)."""
     found: dict[bytes, der.Value] = {}
     for attribute in der.children(attributes):
         name, values = _parts(attribute, der.OID, der.SET)
         (value,) = der.children(values.content)
-        if attribute.tag != der.SEQUENCE or value.tag not in _ATTRIBUTE_VALUES:
-            raise ValueError("not a signed attribute")
-        if not all(_OID.fullmatch(each.content) for each in (name, value) if each.tag == der.OID):
-            raise ValueError("not an object identifier")
-        if name.content in found:
-            raise ValueError("an attribute appears twice")
-        found[name.content] = value
-    kind, digest = found.get(_CONTENT_TYPE), found.get(_MESSAGE_DIGEST)
-    if kind is None or (kind.tag, kind.content) != (der.OID, _DATA):
-        raise ValueError("not a signature of data")
+        if attribute.tag != der.SEQUENCE:
+            raise ValueError("not an attribute")
+        _check_values(name, value)
+        found.setdefault(name.content, value)
+    return found
+
+
+def _message_digest(attributes: Mapping[bytes, der.Value]) -> bytes:
+    if not attributes:
+        return b""
+    digest = attributes.get(_MESSAGE_DIGEST)
     if digest is None or digest.tag != der.OCTET_STRING:
         raise ValueError("no message digest")
     return digest.content

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from sros_tool.pki import smime
@@ -73,16 +74,18 @@ def authority(
     return builder.sign(signing, digest or hashes.SHA256()), key
 
 
-def signed_by(pair: Pair, *options: str) -> Callable[[bytes], bytes]:
-    """How documents are signed; with options by ``openssl smime``."""
+def signed_by(pair: Pair, *options: str, also: Pair | None = None) -> Callable[[bytes], bytes]:
+    """How documents are signed; with options or a second signer by ``openssl smime``."""
 
     def sign(document: bytes) -> bytes:
-        if not options:
+        if not options and not also:
             return smime.sign(document, *pair)
         with TemporaryDirectory() as folder:
-            signer = Path(folder, "signer.pem")
-            signer.write_bytes(pem(pair[0]) + key_pem(pair[1]))
-            command = ["openssl", "smime", "-sign", "-text", "-signer", str(signer), *options]
+            command = ["openssl", "smime", "-sign", "-text", *options]
+            for number, each in enumerate(filter(None, (pair, also))):
+                signer = Path(folder, f"{number}.pem")
+                signer.write_bytes(pem(each[0]) + key_pem(each[1]))
+                command += ["-signer", str(signer)]
             return subprocess.run(command, input=document, check=True, capture_output=True).stdout
 
     return sign
@@ -166,6 +169,7 @@ def rows() -> list[Row]:
     renewed = authority("permissions CA", key=SIGNER[1])
     same_serial = authority("permissions CA", key=SIGNER[1], serial=SIGNER[0].serial_number)
     other = authority("other CA")
+    with_rsa = authority("permissions CA", key=rsa.generate_private_key(65537, 2048))
     identity_below_plain = authority("identity sub CA", None, by=ROOT)
     identity_below = authority("identity sub CA", CERTIFIES, by=ROOT)
     purposes = {
@@ -195,6 +199,29 @@ def rows() -> list[Row]:
         ),
         Row("opaque", Made(signed_by(SIGNER, "-nodetach")), YES, YES, YES),
         Row("-nocerts", Made(signed_by(SIGNER, "-nocerts")), REFUSED, YES, REFUSED),
+        *(
+            Row(
+                f"signed with {digest}",
+                Made(signed_by(with_rsa, "-md", digest), (with_rsa,)), YES, YES, YES,
+            )
+            for digest in ("md5", "sha224", "sha512-256", "sha3-256")
+        ),
+        Row("without attributes", Made(signed_by(SIGNER, "-noattr")), YES, YES, YES),
+        Row(
+            "two signers, both are the CA", Made(signed_by(SIGNER, also=SIGNER)), YES, YES, YES
+        ),
+        Row(
+            "two signers, the CA and a leaf below", Made(signed_by(SIGNER, also=leaf)),
+            YES, REFUSED, YES,
+        ),
+        Row(
+            "two signers, both in the file of the CA",
+            Made(signed_by(SIGNER, also=other), (SIGNER, other)), YES, YES, REFUSED,
+        ),
+        Row(
+            "two signers, the CA and a stranger", Made(signed_by(SIGNER, also=other)),
+            REFUSED, REFUSED, REFUSED,
+        ),
         Row(
             "a CA that only certifies", Made(permissions=(certifying,)), REFUSED, YES, REFUSED
         ),

@@ -163,7 +163,7 @@ def _smime(data: bytes, place: Place) -> None:
     signer = signed.signer()
     signed.digest_matches()
     if signer:
-        signed.is_intact(signer)
+        signed.signatures[0].is_intact(signed.content, signer)
     describe(place.put("permissions.p7s", data), now=NOW)
     signed.verify(place.permissions_ca)
 

@@ -207,7 +207,7 @@ MESSAGES: dict[str, tuple[Make, bool, bool]] = {
     "nothing": (lambda f: b"", False, False),
     # Stricter than OpenSSL, on purpose: the first is the hole of CVE-2023-24011.
     "by an enclave of the authority": (lambda f: signed(f, "-text", signer="leaf"), True, False),
-    "another algorithm": (lambda f: algorithm(signed(f, "-text"), b"\x03"), True, False),
+    "another algorithm": (lambda f: algorithm(signed(f, "-text"), b"\x03"), True, True),
     "opaque": (lambda f: signed(f, "-text", "-nodetach"), True, True),
     "by key identifier": (lambda f: signed(f, "-text", "-keyid", command="cms"), False, False),
     "by two": (
