@@ -29,11 +29,12 @@ def same_name(one: x509.Name, other: x509.Name) -> bool:
 
 def canonical(name: x509.Name) -> tuple[bytes, ...]:
     """Return the parts (RDNs) of a name, such that names that are equal have equal parts."""
-    return _canonical(name.public_bytes())
+    return canonical_der(name.public_bytes())
 
 
 @lru_cache(maxsize=256)  # a few CAs are compared with many certificates
-def _canonical(name: bytes) -> tuple[bytes, ...]:
+def canonical_der(name: bytes) -> tuple[bytes, ...]:
+    """Return the parts of a name in DER, as `canonical` does."""
     parts = der.children(der.first(name).content)
     return tuple(
         b"".join(sorted(_attribute(each) for each in der.children(part.content))) for part in parts

@@ -30,6 +30,7 @@ from sros_tool.errors import PkiError
 from sros_tool.pki import der
 from sros_tool.pki.certificates import load_der_certificate
 from sros_tool.pki.keys import PrivateKey
+from sros_tool.pki.names import canonical, canonical_der
 
 _BOM = "\ufeff".encode()
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
@@ -123,14 +124,12 @@ class Signature:
     _issuer_and_serial: tuple[bytes, int]
 
     def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
-        """Return the signer's certificate by issuer and serial number, or None.
-
-        OpenSSL compares the issuers' names in a looser way, and takes the first that fits: where
-        another one with this serial number comes first, none is the signer's.
-        """
+        """Return the first certificate with the signer's issuer and serial number, or None."""
         issuer, serial = self._issuer_and_serial
-        first = next((each for each in certificates if each.serial_number == serial), None)
-        return first if first and first.issuer.public_bytes() == issuer else None
+        for each in certificates:
+            if each.serial_number == serial and canonical(each.issuer) == canonical_der(issuer):
+                return each
+        return None
 
     def digest_matches(self, content: bytes) -> bool:
         """Return whether the messageDigest attribute is the digest of ``content``."""
