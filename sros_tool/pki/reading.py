@@ -38,9 +38,16 @@ def read_name(name: x509.Name) -> None:
     of a name, such as a time.
     """
     name.rfc4514_string()
-    for part in der.children(der.first(name.public_bytes()).content):
+    read_name_der(name.public_bytes())
+
+
+def read_name_der(name: bytes) -> None:
+    """Parse every part of a distinguished name in DER, as `read_name` does."""
+    for part in der.children(der.first(name).content):
         for attribute in der.children(part.content):
-            _, value = der.children(attribute.content)
+            oid, value = der.children(attribute.content)
+            if (part.tag, attribute.tag, oid.tag) != (der.SET, der.SEQUENCE, der.OID):
+                raise ValueError("not the structure of a name")
             if value.tag not in _IN_NAMES:
                 raise ValueError(f"a value of a name has the ASN.1 type {value.tag}")
             characters = value.content.decode("utf-16-be") if value.tag == _BMP_STRING else ""

@@ -31,6 +31,7 @@ from sros_tool.pki import der
 from sros_tool.pki.certificates import load_der_certificate
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.pki.names import canonical, canonical_der
+from sros_tool.pki.reading import read_name_der
 
 _BOM = "\ufeff".encode()
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
@@ -121,13 +122,13 @@ class Signature:
     _signed_attributes: bytes
     _message_digest: bytes
     _value: bytes
-    _issuer_and_serial: tuple[bytes, int]
+    _issuer_and_serial: tuple[tuple[bytes, ...], int]
 
     def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
         """Return the first certificate with the signer's issuer and serial number, or None."""
         issuer, serial = self._issuer_and_serial
         for each in certificates:
-            if each.serial_number == serial and canonical(each.issuer) == canonical_der(issuer):
+            if each.serial_number == serial and canonical(each.issuer) == issuer:
                 return each
         return None
 
@@ -443,9 +444,10 @@ def _signature(signer: der.Value) -> Signature:
 
 
 @_remembered
-def _issuer_and_serial(identifier: der.Value) -> tuple[bytes, int]:
+def _issuer_and_serial(identifier: der.Value) -> tuple[tuple[bytes, ...], int]:
     issuer, serial = _parts(identifier, der.SEQUENCE, der.INTEGER)
-    return issuer.whole, der.integer(serial)
+    read_name_der(issuer.whole)
+    return canonical_der(issuer.whole), der.integer(serial)
 
 
 def _check_values(*values: der.Value) -> None:
