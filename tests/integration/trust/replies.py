@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -94,22 +93,26 @@ MODULE = next((path for path in MODULES if Path(path).exists()), "")
 
 
 def set_up_token(folder: Path, keys: Iterable[str]) -> None:
-    """Have the processes to come find these keys on a token; without SoftHSM, they find none."""
+    """Have the processes to come find these keys on tokens; without SoftHSM, they find none.
+
+    Each key has a token of its own: one of a kind that libp11 does not know hides all others.
+    """
     if not MODULE:
         return
     tokens, configuration = folder / "tokens", folder / "softhsm2.conf"
     os.environ |= {"SOFTHSM2_CONF": str(configuration), "PKCS11_MODULE_PATH": MODULE}
     utility = ["softhsm2-util", "--pin", "1234"]
-    if not tokens.exists():
-        tokens.mkdir()
-        configuration.write_text(f"directories.tokendir = {tokens}\nobjectstore.backend = file\n")
-        run([*utility, "--init-token", "--free", "--label", "robot", "--so-pin", "5678"])
+    tokens.mkdir(exist_ok=True)
+    configuration.write_text(f"directories.tokendir = {tokens}\nobjectstore.backend = file\n")
     for label in keys:
         file = folder / f"{label}.pem"
         if not file.exists():
             file.write_bytes(pem(*private_der(label)))
-            number = f"{zlib.crc32(label.encode()):08x}"
-            words = ["--token", "robot", "--label", label.replace(" ", "-"), "--id", number]
+            name = label.replace(" ", "-")
+            run(
+                [*utility, "--init-token", "--free", "--label", f"robot-{name}", "--so-pin", "5678"]
+            )
+            words = ["--token", f"robot-{name}", "--label", name, "--id", "01"]
             # A kind of key that SoftHSM does not take is a key that is not there.
             run([*utility, "--import", file, *words], status=None)
 

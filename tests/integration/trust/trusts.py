@@ -102,7 +102,7 @@ class Trust:
     aliases: dict[str, bytes] = field(default_factory=dict)
     governance: bytes = GOVERNANCE
     on_token: bool = False
-    """Whether key.p11 names the key, on the token "robot", in place of key.pem."""
+    """Whether key.p11 names the key, on a token, in place of key.pem."""
     one_authority: bool = False
     """Whether one CA has both jobs."""
 
@@ -227,8 +227,8 @@ def token_uri(key: str) -> str:
 
     `Trust.write` puts the enclave's folder in it, where the PIN lies.
     """
-    named = f"object={key.replace(' ', '-')};type=private"
-    return f"pkcs11:token=robot;{named}?pin-source=file:{{folder}}/pin"
+    label = key.replace(" ", "-")
+    return f"pkcs11:token=robot-{label};object={label};type=private?pin-source=file:{{folder}}/pin"
 
 
 def _permissions(subjects: Iterable[str]) -> bytes:
