@@ -21,8 +21,8 @@ from pathlib import Path
 from sros_tool.errors import DocumentError, UnavailableError, UsageError
 
 FOLDER, LINK, SUBMODULE = "40000", "120000", "160000"
-FILES = ("100644", "100755", "100664")
-"""Modes of entries of a folder, in octal digits as git stores them."""
+FILES = ("100644", "100755")
+"""Modes of entries of a folder, in octal digits, as git checks them out."""
 
 _MOST_BYTES = 32 * 1024 * 1024
 """Bytes of the largest object that is read."""
@@ -563,5 +563,25 @@ def _entries(data: bytes, length: int) -> dict[str, TreeEntry]:
                 f"a folder of the commit has '{name}' twice, or no file can have this name",
                 "Programs differ in what they take for it.",
             )
-        found[name] = TreeEntry(mode.decode(errors="replace").lstrip("0"), rest[:length].hex())
+        found[name] = TreeEntry(_checked_out(mode), rest[:length].hex())
     return found
+
+
+_OCTAL = re.compile(rb"[0-7]{1,11}")
+_TYPE_BITS, _EXECUTABLE = 0o170000, 0o100
+
+
+def _checked_out(mode: bytes) -> str:
+    """Return the mode that git checks an entry out with, whatever further bits a change gave it.
+
+    Source: git 2.39, cache.h (canon_mode); what is no file, link or folder is a submodule.
+
+    Raises:
+        DocumentError: it is no octal number.
+    """
+    if not _OCTAL.fullmatch(mode):
+        raise DocumentError("an object of the repository is malformed", "It has a mode of no type.")
+    bits = int(mode, 8)
+    file = FILES[bool(bits & _EXECUTABLE)]
+    kinds = {0o100000: file, 0o120000: LINK, 0o040000: FOLDER}
+    return kinds.get(bits & _TYPE_BITS, SUBMODULE)

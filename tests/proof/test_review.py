@@ -187,6 +187,53 @@ def test_links_and_submodules_hide_no_policy(
     assert (path in ended.out) == bool(status)
 
 
+def _tree(change: Change, *entries: tuple[str, str, str]) -> str:
+    """Return the id of a folder that has entries (mode, name, id) besides those of HEAD."""
+    here = [each.split() for each in change.git("ls-tree", "HEAD").splitlines()]
+    listed = [(mode.lstrip("0"), name, digits) for mode, _, digits, name in here]
+    data = b"".join(
+        f"{mode} {name}".encode() + b"\0" + bytes.fromhex(digits)
+        for mode, name, digits in sorted((*listed, *entries), key=lambda each: each[1])
+    )
+    words = ("git", "hash-object", "-w", "--literally", "-t", "tree", "--stdin")
+    made = subprocess.run(words, cwd=change.folder, input=data, capture_output=True, check=True)
+    return made.stdout.decode().strip()
+
+
+def test_no_policy_hides_behind_an_odd_mode(change: Change) -> None:
+    """Git checks these entries out as files, folders and links, and servers accept them."""
+    evil = change.git("rev-parse", "HEAD:robot.xml")
+    link = subprocess.run(
+        ["git", "hash-object", "-w", "--stdin"],
+        cwd=change.folder,
+        input=b"robot.xml",
+        capture_output=True,
+        check=True,
+    )
+    named = (
+        ("100600", "a.xml", evil),
+        ("1100777", "b.xml", evil),
+        ("40755", "folder", _tree(change)),
+        ("120777", "link.xml", link.stdout.decode().strip()),
+    )
+    whole = change.git("commit-tree", _tree(change, *named), "-p", "HEAD", "-m", "x")
+    change.git("reset", "--quiet", "--hard", whole)
+    assert (change.folder / "a.xml").is_file()
+    assert (change.folder / "folder" / "robot.xml").is_file()
+    assert (change.folder / "link.xml").is_symlink()
+    with TemporaryDirectory() as outside:
+        summary = Path(outside, "review.md")
+        ended = change.review("--policy", "robot.xml", "--summary", str(summary))
+        said = summary.read_text()
+    assert ended.status == 1, ended
+    for path in ("a.xml", "b.xml", "folder/robot.xml", "link.xml"):
+        assert f"- `{path}` `changes and is not reviewed" in said
+    change.git("reset", "--hard", change.base)
+    broken = _tree(change, ("100648", "a.xml", evil))
+    with pytest.raises(DocumentError, match="malformed"):
+        Repository(change.folder).folders([broken])
+
+
 def test_a_merge_of_later_commits_is_said(change: Change) -> None:
     """What main lost since the base, a merge can bring back: the base has it, too."""
     main = change.commit({"README": "x"})
