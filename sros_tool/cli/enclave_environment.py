@@ -105,6 +105,8 @@ def loadable_environment(
         wanted = _zenoh_domain(root, zenoh, wanted, domains)
     domain = choose_domain(domains, wanted, root) if domains else 0
     state = open_enclave(folder, now=now(), domain=domain)
+    if not with_zenoh:
+        state = _check_joining(name, folder, state, domain, rmw)
     problems = state.problems_at_home if target else state.problems
     if problems:
         raise KeystoreError(
@@ -168,6 +170,43 @@ def _check_folders_closed(root: Path, folder: Path, name: str) -> None:
             )
         if each == root:
             return
+
+
+def _check_joining(
+    name: str, folder: Path, state: OpenedEnclave, domain: int, rmw: str | None
+) -> OpenedEnclave:
+    """Return an enclave as it is for the vendor of a process, or for all if that is not certain.
+
+    Raises:
+        KeystoreError: it has no fault that its reader names, and each of these vendors refuses it.
+    """
+    from sros_tool.dds.decision.vendors import MEASURED
+    from sros_tool.faults import Fault
+    from sros_tool.keystore.participant import (
+        JoinContext,
+        VendorParticipant,
+        accepted_state,
+        loaded,
+    )
+    from sros_tool.runtime.rmw import chosen_rmw, vendor_of
+
+    vendor, moment = vendor_of(chosen_rmw(rmw, os.environ)), now()
+    there, context = loaded(name, folder, state, at=moment), JoinContext(domain, moment)
+    made = [VendorParticipant(each, there, context) for each in ([vendor] if vendor else MEASURED)]
+    state = accepted_state(state, made)
+    token = Fault.KEY_ON_TOKEN.id  # `_check_token_used` says it
+    refusing = {
+        each.vendor.title: [cause.text for cause in each.causes() if cause.reason != token]
+        for each in made
+    }
+    if state.problems or not all(refusing.values()):
+        return state
+    texts = (f"{title} refuses it: {'; '.join(some)}" for title, some in refusing.items())
+    raise KeystoreError(
+        f"a process cannot run in enclave {name}",
+        f"{'. '.join(texts)}.",
+        f"See `sros check {quote(str(folder))}`.",
+    )
 
 
 def _check_dates_here(name: str, folder: Path, domain: int, rmw: str | None) -> None:

@@ -23,9 +23,16 @@ from sros_tool.dds.governance import Governance, parse_governance, render_govern
 from sros_tool.dds.permissions import Permissions, render_permissions
 from sros_tool.errors import SrosError
 from sros_tool.faults import Fault
-from sros_tool.keystore.layout import CERTIFICATE_FILE, IDENTITY_CA_FILE, KEY_FILE
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    GOVERNANCE_FILE,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
+    PERMISSIONS_FILE,
+)
 from sros_tool.keystore.loading import vendor_problems
 from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
+from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.policy.model import Enclave
@@ -238,18 +245,40 @@ def _crash(problems: Sequence[Problem]) -> Problem | None:
     return None
 
 
+@dataclass(frozen=True, slots=True)
+class RefusalCause:
+    """A reason why no node of a vendor can run in an enclave, or none that peers let in.
+
+    ``reason`` is the id of a fault, or that of a decision; ``text`` is a clause with the file.
+    """
+
+    outcome: Outcome
+    reason: str
+    file: str
+    text: str
+
+
+_OF_GOVERNANCE = {
+    *(Fault.GOVERNANCE_MALFORMED.id, "domain-not-in-governance", "no-topic-rule"),
+    "unauthenticated-with-rtps-protection",
+}
+"""The reasons that lie in the governance, where no fault names the file."""
+
+
 class VendorParticipant:
     """The participant of one vendor in an enclave.
 
     ``problems`` are the faults of files for which the vendor, or all peers, refuse it.
     ``governance`` and ``permissions`` are the documents as the vendor reads them, None if it does
-    not.  ``refusal`` is the decision that keeps the process from running, None if nothing does.
+    not; ``permissions_document`` is the XML of the latter.  ``refusal`` is the decision that keeps
+    the process from running, None if nothing does.
     """
 
     def __init__(self, vendor: Vendor, enclave: LoadedEnclave, context: JoinContext) -> None:
         self.vendor = vendor
         self.governance: Governance | None = None
         self.permissions: Permissions | None = None
+        self.permissions_document = enclave.permissions
         self.problems = enclave.problems(vendor.traits)
         made = self._make(enclave, context)
         self.access = made if isinstance(made, Access) else None
@@ -262,6 +291,26 @@ class VendorParticipant:
             return self.access.join()
         assert self.refusal is not None
         return self.refusal
+
+    def causes(self) -> tuple[RefusalCause, ...]:
+        """Return why no node can run in it, or none that peers let in; empty if nothing is wrong.
+
+        What permissions say of topics is a matter of their policy.
+        """
+        join = self.join()
+        if self.problems:
+            return tuple(
+                RefusalCause(join.outcome, each.fault.id, each.file, str(each))
+                for each in self.problems
+            )
+        stopped = None if join.outcome.ok else join
+        if stopped is None and self.access is not None:
+            stopped = self.access.governed(ROS_DISCOVERY_TOPIC)  # every node of ROS 2 opens it
+        if stopped is None:
+            return ()
+        file = GOVERNANCE_FILE if stopped.reason in _OF_GOVERNANCE else PERMISSIONS_FILE
+        text = f"{file}: {stopped.clause}"
+        return (RefusalCause(stopped.outcome, stopped.reason, file, text),)
 
     def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
         """Return the access of the vendor's process, or the decision that keeps it from running."""
@@ -293,3 +342,29 @@ class VendorParticipant:
             at=context.at,
             zone=context.zone,
         )
+
+
+def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> OpenedEnclave:
+    """Return an enclave as it is for the vendors of these participants, of which there is one.
+
+    Left out are faults that some of them do not refuse, and faults of documents that all of them
+    accept.  Documents that one of them loads are those of the enclave, whoever signed them.
+    """
+    loading = [each for each in made if each.permissions is not None]
+    if not (state.problems and loading):
+        return state
+    sound = not any(each.causes() for each in made)
+    problems = tuple(
+        problem
+        for problem in state.problems
+        if (problem.file == KEY_FILE and problem.fault is Fault.FILE_MISSING)
+        or (problem.fault in _LEFT_TO_THE_VENDOR and not sound)
+        or all(problem in each.problems for each in made)
+    )
+    return replace(
+        state,
+        problems=problems,
+        governance=state.governance or loading[0].governance,
+        permissions=state.permissions or loading[0].permissions,
+        permissions_document=state.permissions_document or loading[0].permissions_document,
+    )

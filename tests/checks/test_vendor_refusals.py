@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, WARNING, Finding
 from tests.checks.bench import Bench
 from tests.checks.keystore_cases import IS_CA
+from tests.support.harness import sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
@@ -129,6 +131,63 @@ def test_the_cause_is_found_once_wherever_the_files_lie(row: Row, bench: Bench) 
         if place == "export":
             assert any(row.says in each.text for each in found if each.id == wanted)
             assert not any("ROOT" in each.remedy for each in found)
+
+
+def signed_below(bench: Bench) -> None:
+    """Sign with an intermediate CA, of which only the root is in the file of the permissions CA."""
+    root, key = bench.new_authority(IS_CA)
+    below = bench.new_authority(IS_CA, issuer=(root.subject, key))
+    bench.adopt("permissions", below)
+    bench.trust("permissions", root)
+
+
+def test_what_some_vendors_accept_is_no_error(bench: Bench) -> None:
+    """Twin: the same by a CA that has nothing to do with it is an error in everything."""
+    signed_below(bench)
+    bench.export()
+    (found,) = (each for each in worst(bench) if each.file.endswith(".p7s"))
+    assert (found.id, found.severity) == ("portable.refused", WARNING)
+    assert "Fast DDS 2.14 refuses it (governance.p7s: " in found.text
+    assert "Fast DDS 2.9.1 and Cyclone DDS 0.10.2 accept it" in found.text
+    assert {each.id for each in worst(bench, vendor="cyclonedds")} == set()
+    assert {each.id for each in worst(bench, vendor="fastdds")} == {"enclave.signature"}
+    base = bench.checked / "enclaves/base"
+    shutil.copy(base / "identity_ca.cert.pem", base / "permissions_ca.cert.pem")
+    assert {each.id for each in worst(bench)} >= {"enclave.signature"}
+
+
+def test_an_open_domain_is_seen_by_whomever_the_governance_is_signed(bench: Bench) -> None:
+    bench.governance(*OPEN)
+    signed_below(bench)
+    bench.export()
+    assert {each.id for each in worst(bench)} == {"governance.no-authenticity"}
+
+
+def _bad_kind(bench: Bench) -> None:
+    kind = "data_protection_kind>"
+    bench.governance((f"{kind}ENCRYPT", f"{kind}SIGN_WITH_ORIGIN_AUTHENTICATION"))
+
+
+@pytest.mark.parametrize(
+    ("work", "rmw", "starts", "loadable"),
+    [
+        (signed_below, "rmw_fastrtps_cpp", False, True),
+        (signed_below, "rmw_cyclonedds_cpp", True, True),
+        (_bad_kind, "rmw_fastrtps_cpp", False, False),
+        (_bad_kind, "rmw_cyclonedds_cpp", False, False),
+        (lambda _: None, "rmw_fastrtps_cpp", True, True),
+    ],
+)
+def test_run_and_verify_start_what_the_vendor_starts(
+    work: Callable[[Bench], object], rmw: str, starts: bool, loadable: bool, bench: Bench
+) -> None:
+    work(bench)
+    robot = bench.export()
+    ended = sros("env", "--rmw", rmw, robot, "/base")
+    assert ended.status == (0 if starts else 2), ended
+    assert ("a process cannot run in enclave /base" in ended.err) is not starts
+    found = json.loads(sros("verify", robot, "--json").out)
+    assert {each["loadable"] for each in found["enclaves"]} == {loadable}
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from sros_tool.checks.keystores.enclaves import WAITS
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, Finding, FindingKind
 from sros_tool.checks.registry import FindingFilter
+from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.delivery.archive import SUFFIXES
@@ -31,6 +32,12 @@ from sros_tool.keystore.layout import (
     search_enclaves,
     waits_for_answer,
 )
+from sros_tool.keystore.participant import (
+    JoinContext,
+    VendorParticipant,
+    accepted_state,
+    loaded,
+)
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.pki.token import Secrets, open_enclave_key
 from sros_tool.pki.token_uri import TokenUri
@@ -44,6 +51,7 @@ _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES)
 class ArrivedEnclave:
     """An enclave on a robot: whether a process can run in it, in which domain, and until when.
 
+    It can if it can on one of the measured vendors; what the others refuse is a finding.
     ``key_elsewhere`` says that only its key is missing here, because it was made on its robot;
     ``token`` is the place of a key on a token.
     """
@@ -153,7 +161,7 @@ def verify_arrival(
             if path.is_file() and path.name.endswith(SUFFIXES)
             else "Name the folder that `sros distribute_key` or `sros import` has written to.",
         )
-    enclaves = tuple(_enclave(root, name, now, domain) for name in names)
+    enclaves = tuple(_enclave(root, name, now, domain, zone) for name in names)
     elsewhere = {
         str(enclave_path(root, each.name) / KEY_FILE) for each in enclaves if each.key_elsewhere
     }
@@ -211,14 +219,21 @@ def _why_none(path: Path) -> str:
     return "It has no enclaves folder with content, and neither cert.pem nor key.pem."
 
 
-def _enclave(root: Path, name: str, now: datetime, domain: int | None) -> ArrivedEnclave:
+def _enclave(
+    root: Path, name: str, now: datetime, domain: int | None, zone: tzinfo
+) -> ArrivedEnclave:
     folder = enclave_path(root, name)
     if waits_for_answer(folder):
         return ArrivedEnclave(name, False, "", None)
     state = open_enclave(folder, now=now, domain=domain)
-    domains = str(state.joined_domains() or "")
+    domains = state.joined_domains()
+    number = domain if domain is not None else next(iter(domains or ()), 0)
+    there, context = loaded(name, folder, state, at=now), JoinContext(number, now, zone)
+    made = [VendorParticipant(each, there, context) for each in MEASURED]
+    state = accepted_state(state, made)
+    loadable = not (state.problems or all(each.causes() for each in made))
     # On the robot, where there is no ledger, a key that is missing is lost.
     at_home = (root / LEDGER).is_file()
     elsewhere = at_home and state.key_on_robot and not state.problems_at_home
     until = state.valid_until()
-    return ArrivedEnclave(name, not state.problems, domains, until, elsewhere, state.token)
+    return ArrivedEnclave(name, loadable, str(domains or ""), until, elsewhere, state.token)

@@ -36,10 +36,17 @@ from sros_tool.checks.keystores.issued import (
 )
 from sros_tool.checks.keystores.of_ros2 import with_cause_of_ros2
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
-from sros_tool.checks.keystores.vendors import REFUSED, SOME_REFUSE, asked_vendors, check_vendors
+from sros_tool.checks.keystores.vendors import (
+    REFUSED,
+    SOME_REFUSE,
+    asked_vendors,
+    check_vendors,
+    evaluate,
+)
 from sros_tool.checks.keystores.zenoh_files import check_network, check_own_zenoh
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import findings_in
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
@@ -105,19 +112,19 @@ def keystore_findings(
     vendors = asked_vendors(vendor)
     about_authorities = list(check_authorities(keystore))
     first, common = _governing(keystore, names)
-    about_governance = list(_governance(keystore, first))
+    about_governance = list(_governance(keystore, first, vendors))
 
     def work(share: Sequence[str]) -> tuple[list[Finding], list[EnclaveSummary]]:
         found: list[Finding] = []
         issued: list[EnclaveSummary] = []
         for name in share:
             state = open_enclave(enclave_path(root, name), now=now, domain=domain)
-            enclave = CheckedEnclave(keystore, name, state)
+            evaluation = evaluate(CheckedEnclave(keystore, name, state), vendors, domain)
+            enclave = evaluation.enclave
             own = list(_enclave_findings(enclave, wanted, common))
             if not waits_for_answer(enclave.folder):
                 shared = [] if any(each.kind is DIFFERS for each in own) else about_governance
-                known = [*about_authorities, *shared, *own]
-                own += check_vendors(enclave, vendors, known, domain=domain)
+                own += check_vendors(evaluation, [*about_authorities, *shared, *own])
             if not on_robot and name not in wanted:  # a policy knows more exactly of its nodes
                 own += check_starting(enclave)
             found += own
@@ -184,14 +191,17 @@ def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, by
     return "", common
 
 
-def _governance(keystore: CheckedKeystore, enclave: str) -> Iterator[Finding]:
+def _governance(
+    keystore: CheckedKeystore, name: str, vendors: Sequence[Vendor]
+) -> Iterator[Finding]:
     """Yield the findings in the governance of an enclave, or of a keystore without enclaves."""
     yield from governance_copy_findings(keystore)
-    if enclave:
-        state = open_enclave(enclave_path(keystore.root, enclave), now=keystore.now)
-        if state.governance:
-            file = CheckedEnclave(keystore, enclave, state).file(GOVERNANCE_FILE)
-            yield from governance_findings(keystore, state.governance, file)
+    if name:
+        state = open_enclave(enclave_path(keystore.root, name), now=keystore.now)
+        enclave = evaluate(CheckedEnclave(keystore, name, state), vendors, None).enclave
+        if enclave.state.governance:
+            file = enclave.file(GOVERNANCE_FILE)
+            yield from governance_findings(keystore, enclave.state.governance, file)
         return
     with suppress(SrosError):  # `sros create_enclave` reports it
         document = smime.parse(keystore.governance).document

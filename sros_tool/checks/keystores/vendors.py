@@ -13,12 +13,18 @@ from sros_tool.checks.keystores.enclaves import fault_remedy, grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome
+from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.faults import FAULTS, Fault
-from sros_tool.keystore.layout import GOVERNANCE_FILE, PERMISSIONS_FILE
-from sros_tool.keystore.participant import JoinContext, VendorParticipant, loaded
+from sros_tool.keystore.layout import PERMISSIONS_FILE
+from sros_tool.keystore.participant import (
+    JoinContext,
+    RefusalCause,
+    VendorParticipant,
+    accepted_state,
+    loaded,
+)
 from sros_tool.keystore.reader import OpenedEnclave
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 
@@ -90,12 +96,6 @@ _NAMED_BY: Mapping[str, frozenset[str]] = {
 }
 """The ids of the findings that name the cause of a vendor's refusal, by its reason."""
 
-_OF_GOVERNANCE = {
-    *(Fault.GOVERNANCE_MALFORMED.id, "domain-not-in-governance", "no-topic-rule"),
-    "unauthenticated-with-rtps-protection",
-}
-"""The reasons that lie in the governance, where no fault names the file."""
-
 _SAYS = {
     Outcome.CRASHES: ("crash on it", "crashes on it"),
     Outcome.PEER_DENIES: ("start, and its peers refuse it", "starts, and its peers refuse it"),
@@ -103,48 +103,67 @@ _SAYS = {
 _REFUSES = ("refuse it", "refuses it")
 
 
-@dataclass(frozen=True, slots=True)
-class _Cause:
-    """Why a vendor refuses an enclave, and what then happens to its process."""
-
-    outcome: Outcome
-    reason: str
-    file: str
-    text: str
-
-
 def asked_vendors(vendor: str) -> tuple[Vendor, ...]:
     """Return the measured vendors that ``vendor`` chooses: "" all, ``zenoh`` none."""
     return tuple(each for each in MEASURED if vendor in ("", each.value))
 
 
-def check_vendors(
-    enclave: CheckedEnclave,
-    vendors: Sequence[Vendor],
-    known: Collection[Finding],
-    *,
-    domain: int | None,
-) -> Iterator[Finding]:
-    """Yield what the vendors refuse, and decide differently.
+@dataclass(frozen=True, slots=True)
+class EnclaveEvaluation:
+    """What vendors make of an enclave.
+
+    ``enclave`` has the faults, and the documents, that it has for these vendors; ``by_domain`` has
+    their participants for each ROS domain.  ``portable`` says that sros wrote the permissions.
+    """
+
+    enclave: CheckedEnclave
+    by_domain: Mapping[int, Mapping[Vendor, VendorParticipant]]
+    portable: bool
+
+
+def evaluate(
+    enclave: CheckedEnclave, vendors: Sequence[Vendor], domain: int | None
+) -> EnclaveEvaluation:
+    """Return what the vendors make of an enclave.
 
     Args:
         enclave: the enclave.
         vendors: the vendors that its nodes may use.
-        known: the findings about the enclave and its CAs.
         domain: the ROS domain to join; None for those of its documents.
     """
     keystore = enclave.keystore
     there = loaded(enclave.name, enclave.folder, enclave.state, at=keystore.now)
-    for number in (domain,) if domain is not None else _domains(enclave.state):
-        context = JoinContext(number, keystore.now, keystore.zone)
-        made = {vendor: VendorParticipant(vendor, there, context) for vendor in vendors}
+    numbers = (domain,) if domain is not None else _domains(enclave.state)
+    by_domain = {
+        number: {
+            vendor: VendorParticipant(
+                vendor, there, JoinContext(number, keystore.now, keystore.zone)
+            )
+            for vendor in vendors
+        }
+        for number in numbers
+    }
+    made = [each for some in by_domain.values() for each in some.values()]
+    state = accepted_state(enclave.state, made) if made else enclave.state
+    return EnclaveEvaluation(
+        CheckedEnclave(keystore, enclave.name, state), by_domain, there.portable is not None
+    )
+
+
+def check_vendors(evaluation: EnclaveEvaluation, known: Collection[Finding]) -> Iterator[Finding]:
+    """Yield what vendors refuse, and decide differently.
+
+    ``known`` are the findings about the enclave and its CAs.
+    """
+    enclave = evaluation.enclave
+    for domain, made in evaluation.by_domain.items():
         if found := list(_refusals(enclave, made, known)):
             yield from found
             return
         # Vendors decide alike on a document as sros writes it, and every topic takes long.
-        if there.portable and all(_file(each) != PERMISSIONS_FILE for each in known):
+        if evaluation.portable and all(_file(each) != PERMISSIONS_FILE for each in known):
             continue
-        if found := list(_different_rights(enclave, made, number)):
+        if found := list(_different_rights(enclave, made, domain)):
             yield from found
             return
 
@@ -179,8 +198,8 @@ def _refusals(
     Nothing is yielded if an error in ``known`` names a cause for each of them; what only some
     refuse is left out where a finding in ``known`` names it.
     """
-    causes = {vendor: tuple(_causes(each)) for vendor, each in made.items()}
-    by_cause: dict[_Cause, list[Vendor]] = {}
+    causes = {vendor: each.causes() for vendor, each in made.items()}
+    by_cause: dict[RefusalCause, list[Vendor]] = {}
     for vendor, some in causes.items():
         for each in some:
             by_cause.setdefault(each, []).append(vendor)
@@ -209,7 +228,7 @@ def _refusals(
     )
 
 
-def _is_named(cause: _Cause, known: Iterable[Finding]) -> bool:
+def _is_named(cause: RefusalCause, known: Iterable[Finding]) -> bool:
     """Return whether a finding names the cause."""
     wanted = _NAMED_BY.get(cause.reason, frozenset())
     own = f"enclave.{cause.reason}"
@@ -223,27 +242,7 @@ def _file(finding: Finding) -> str:
     return finding.file.rpartition("/")[2]
 
 
-def _causes(participant: VendorParticipant) -> Iterator[_Cause]:
-    """Yield why a vendor, or all peers, refuse the participant; nothing if they accept it."""
-    join = participant.join()
-    if participant.problems:
-        for each in participant.problems:
-            yield _Cause(join.outcome, each.fault.id, each.file, str(each))
-        return
-    if not join.outcome.ok:
-        yield _cause_of(join)
-    elif participant.access is not None:
-        governed = participant.access.governed(ROS_DISCOVERY_TOPIC)
-        if governed is not None:
-            yield _cause_of(governed)
-
-
-def _cause_of(decision: Decision) -> _Cause:
-    file = GOVERNANCE_FILE if decision.reason in _OF_GOVERNANCE else PERMISSIONS_FILE
-    return _Cause(decision.outcome, decision.reason, file, f"{file}: {decision.clause}")
-
-
-def _clause(cause: _Cause, vendors: Sequence[Vendor]) -> str:
+def _clause(cause: RefusalCause, vendors: Sequence[Vendor]) -> str:
     several, one = _SAYS.get(cause.outcome, _REFUSES)
     says = one if len(vendors) == 1 else several
     return f"{_listed([each.title for each in vendors])} {says} ({cause.text})"
