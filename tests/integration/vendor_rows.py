@@ -329,6 +329,12 @@ def grants(now: datetime) -> list[Row]:
             YES,
             REFUSED,
         ),
+        Row(
+            "an offset behind Z",
+            ask(permissions(grant(a, end=f"{(now + timedelta(days=9)):%Y-%m-%dT%H:%M:%S}Z12:00"))),
+            YES,
+            YES,
+        ),
     ]
 
 
@@ -429,6 +435,10 @@ def domains() -> list[Row]:
         document = permissions(grant(allow(criteria("publish", "rt/a"))))
         return ask(document, governed=governance(domain_rule(domains=text)))
 
+    def digits(text: str) -> Case:
+        document = permissions(grant(allow(criteria("publish", "rt/a"), domains=text)))
+        return ask(document, domain=0)
+
     low, high = "<id_range><min>40</min></id_range>", "<id_range><max>50</max></id_range>"
     just = "<id_range><min>42</min></id_range>"
     both = "<id_range><min>40</min><max>50</max></id_range>"
@@ -437,6 +447,8 @@ def domains() -> list[Row]:
         Row("permissions from 40 on", allowed(low), PEER_DENIES, REFUSED),
         Row("permissions from 42 on", allowed(just), YES, YES),
         Row("permissions up to 50", allowed(high), YES, CRASHES),
+        Row("permissions for 0x", digits("<id>0x</id>"), YES, YES),
+        Row("permissions for 0xg", digits("<id>0xg</id>"), YES, REFUSED),
         Row("governance for 40 to 50", governed(both), YES, YES),
         Row("governance from 40 on", governed(low), NO, REFUSED),
         Row("governance from 42 on", governed(just), YES, YES),
@@ -512,6 +524,18 @@ def governances() -> list[Row]:
             ),
             PEER_DENIES,
             PEER_DENIES,
+        ),
+        *(
+            Row(
+                f"refused by peers, a topic without protection, {kind} empty",
+                ask(
+                    elsewhere,
+                    governed=topics(free).replace(f"{kind}>NONE".encode(), f"{kind}>".encode()),
+                ),
+                REFUSED,
+                PEER_DENIES,
+            )
+            for kind in ("rtps_protection_kind", "metadata_protection_kind", "data_protection_kind")
         ),
         Row("no topic rules", ask(a, governed=topics()), REFUSED, REFUSED),
         Row(

@@ -198,7 +198,7 @@ _NOTHING = "["
 """An expression that matches nothing: a set that is never closed."""
 _LONGEST_NUMBER = 4000
 """Digits of a number that Python converts; without leading zeros, 64 bits have 20."""
-_INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
+_INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]*|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
 
 
 def _names(rule: type[DomainRule | TopicRule]) -> tuple[str, ...]:
@@ -321,6 +321,8 @@ def _number(node: _Node) -> int:
     if len(digits) > _LONGEST_NUMBER:
         raise UnreadableError(f"<{node.tag}> holds a number of {len(digits)} digits")
     octal = len(digits) > 1 and digits[0] == "0" and digits[1] not in "xX"
+    if digits in ("0x", "0X"):
+        return 0
     number = int(sign + digits, 8 if octal else 0)
     if not -(2**63) <= number < 2**63:
         raise UnreadableError(f"<{node.tag}> holds {number}, which is far too large")
@@ -344,7 +346,8 @@ def _value(node: _Node, attribute: Attribute) -> Value:
         raise UnreadableError(
             f"<{node.tag}> holds {node.text!r}, which is not a protection kind there"
         )
-    return ProtectionKind(node.text) if node.text else ProtectionKind.NONE
+    # Cyclone DDS keeps 0 for a kind without text, which is the strongest one there.
+    return ProtectionKind(node.text or attribute.values[-1])
 
 
 def _domains(node: _Node | None) -> DomainSet:

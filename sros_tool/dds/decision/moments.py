@@ -11,7 +11,8 @@ from sros_tool.dds.decision.vendors import Moments
 from sros_tool.validity import parse_iso
 
 _CYCLONE = re.compile(
-    r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(\.\d{1,12})?(?:Z|([+-])(\d\d):(\d\d))?\Z", re.ASCII
+    r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(\.\d{1,12})?(?:Z|([+Z-])(\d\d):(\d\d))?\Z",
+    re.ASCII,
 )
 # std::get_time of libstdc++ with %Y-%m-%dT%H:%M:%S: the text may end after the year, the month or
 # the day; one blank may precede the day; anything may follow the seconds.
