@@ -14,6 +14,8 @@ from datetime import UTC, datetime, timedelta, tzinfo
 from functools import lru_cache
 from pathlib import Path
 
+from cryptography import x509
+
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
@@ -28,13 +30,19 @@ from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     IDENTITY_CA_FILE,
     KEY_FILE,
+    PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
 )
 from sros_tool.keystore.loading import vendor_problems
 from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
 from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import subject_text, validity_of
+from sros_tool.pki.certificates import (
+    extension,
+    load_certificates,
+    subject_text,
+    validity_of,
+)
 from sros_tool.policy.model import Enclave
 from sros_tool.xml import read_bytes
 
@@ -348,7 +356,8 @@ def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> O
     """Return an enclave as it is for the vendors of these participants, of which there is one.
 
     Left out are faults that some of them do not refuse, and faults of documents that all of them
-    accept.  Documents that one of them loads are those of the enclave, whoever signed them.
+    accept.  Documents that one of them loads are those of the enclave, if a CA signed them: what an
+    enclave has signed for itself stays a fault, whoever takes it (CVE-2023-24011).
     """
     loading = [each for each in made if each.permissions is not None]
     if not (state.problems and loading):
@@ -360,7 +369,10 @@ def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> O
         if (problem.file == KEY_FILE and problem.fault is Fault.FILE_MISSING)
         or (problem.fault in _LEFT_TO_THE_VENDOR and not sound)
         or all(problem in each.problems for each in made)
+        or (problem.fault is Fault.SIGNATURE and not _signed_by_ca(state, problem.file))
     )
+    if any(each.fault is Fault.SIGNATURE for each in problems):
+        return replace(state, problems=problems)
     return replace(
         state,
         problems=problems,
@@ -368,3 +380,19 @@ def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> O
         permissions=state.permissions or loading[0].permissions,
         permissions_document=state.permissions_document or loading[0].permissions_document,
     )
+
+
+def _signed_by_ca(state: OpenedEnclave, file: str) -> bool:
+    """Return whether all signers of a document have the certificate of a CA."""
+    with suppress(SrosError):
+        signed = smime.parse(state.files[file])
+        data = state.files.get(PERMISSIONS_CA_FILE, b"")
+        known = (*signed.certificates, *load_certificates(data, PERMISSIONS_CA_FILE))
+        signers = [each.signer_among(known) for each in signed.signatures]
+        return bool(signers) and all(each is not None and _is_ca(each) for each in signers)
+    return False
+
+
+def _is_ca(certificate: x509.Certificate) -> bool:
+    constraints = extension(certificate, x509.BasicConstraints)
+    return constraints is not None and constraints.ca

@@ -135,7 +135,7 @@ def test_the_cause_is_found_once_wherever_the_files_lie(row: Row, bench: Bench) 
 
 def signed_below(bench: Bench) -> None:
     """Sign with an intermediate CA, of which only the root is in the file of the permissions CA."""
-    root, key = bench.new_authority(IS_CA)
+    root, key = bench.new_authority(IS_CA, common_name="root CA")
     below = bench.new_authority(IS_CA, issuer=(root.subject, key))
     bench.adopt("permissions", below)
     bench.trust("permissions", root)

@@ -347,7 +347,7 @@ def _value(node: _Node, attribute: Attribute) -> Value:
             f"<{node.tag}> holds {node.text!r}, which is not a protection kind there"
         )
     # Cyclone DDS keeps 0 for a kind without text, which is the strongest one there.
-    return ProtectionKind(node.text or attribute.values[-1])
+    return ProtectionKind(node.text or str(attribute.values[-1]))
 
 
 def _domains(node: _Node | None) -> DomainSet:
