@@ -84,8 +84,20 @@ def play(
     return done.stdout + done.stderr
 
 
-STEERING = "\x1b]0;title\x07 \x1b[2K\r \x9b31m \u202e \nPLAY RECAP"
+BLANK = " " * 90 + "\u2800\u3164\u00a0\u0301\u05d0" * 90
+"""What looks like the end of a line on a terminal, or is read in another order."""
+STEERING = f"\x1b]0;title\x07 \x1b[2K\r \x9b31m \u202e {BLANK}\nPLAY RECAP"
 """What moves the cursor, changes the title or the direction of text, or begins another line."""
+SFTP_SERVER = "/usr/lib/openssh/sftp-server"
+
+_ROBOT_WITH_A_LONG_FOLDER = """#!/bin/sh
+# An sshd that names a folder in whose name a line of sftp ends, and a command of sftp begins.
+for command; do :; done
+case "$command" in *mkdir*) ;; *) exec /bin/sh -c "$command" ;; esac
+printf '%s=%s' "$(echo "$command" | grep -o 'ansible-tmp-[0-9.]*-[0-9]*-[0-9]*' | head -n 1)" \
+  "FOLDER/x\\'\\" "
+printf '%2400s!touch TRACE #\n' ''
+"""
 
 
 def fleet_keystore(folder: Path, robots: int) -> Path:
@@ -124,7 +136,7 @@ def test_nobody_revoked_is_an_error(tmp_path: Path, revoke: object, said: str) -
 
 def test_robots_that_lie_in_many_ways(tmp_path: Path) -> None:
     """Facts do not choose who is revoked, and nothing reaches the terminal or the inventory raw."""
-    keystore = fleet_keystore(tmp_path, 7)
+    keystore = fleet_keystore(tmp_path, 8)
     trace = tmp_path / "trace"
     run = ["/bin/sh", "-c", f"echo here >> '{trace}'; echo '{{}}'"]
     steering = {
@@ -158,7 +170,7 @@ def test_robots_that_lie_in_many_ways(tmp_path: Path) -> None:
         "r5": {"ping": {"ping": "pong", "ansible_facts": {"sros_robot": "r4"}}},
     }
     hosts: dict[str, dict[str, Any]] = {}
-    for number in range(1, 8):
+    for number in range(1, 9):
         name = f"r{number}"
         answers = {**reached, "enclaves": INSTALLED, **lies.get(name, {})}
         robot = hostile(tmp_path, name, answers)
@@ -171,6 +183,13 @@ def test_robots_that_lie_in_many_ways(tmp_path: Path) -> None:
     hosts["r6"] = {"ansible_connection": "ssh", "ansible_ssh_executable": str(tmp_path / "ssh")}
     (tmp_path / "r7-python").write_text("#!/bin/sh\nexec sleep 9\n")
     hosts["r7"]["sros_timeout"] = 1
+    script = _ROBOT_WITH_A_LONG_FOLDER.replace("FOLDER", str(tmp_path))
+    (tmp_path / "r8-ssh").write_text(script.replace("TRACE", str(trace)))
+    (tmp_path / "r8-sftp").write_text(f"#!/bin/sh\nexec sftp -D {SFTP_SERVER} -b -\n")
+    hosts["r8"] = {"ansible_connection": "ssh"}
+    for name in ("ssh", "sftp"):
+        (tmp_path / f"r8-{name}").chmod(0o755)
+        hosts["r8"][f"ansible_{name}_executable"] = str(tmp_path / f"r8-{name}")
     with (tmp_path / "r2-python").open("a") as file:
         file.write(f"cat <<'.' | tee /dev/stderr\n{STEERING}\n.\n")
     program = [sys.executable, "-m", "sros_tool"]
@@ -179,18 +198,20 @@ def test_robots_that_lie_in_many_ways(tmp_path: Path) -> None:
     own |= {"sros_revoke": ["r4"], "sros_confirm": False}
     sros("create_enclave", keystore, "/r4/spare", "/dispatcher/r4").ok()
     text = play(tmp_path, "revoke", hosts, *words, pinged=["r4", "r5"], **own)
-    left = [f"/{name}/a" for name in ("r1", "r2", "r3", "r5", "r6", "r7")]
+    left = [f"/{name}/a" for name in ("r1", "r2", "r3", "r5", "r6", "r7", "r8")]
     assert enclaves(keystore) == ["/dispatcher", "/dispatcher/r4", *left], text
     assert not trace.exists(), text
     odd = {each for each in text if not each.isprintable() and each != "\n"}
-    assert not odd, (odd, text)
+    shown = "".join(each for each in text.splitlines() if not each.startswith("<r"))  # not -vvv
+    assert not odd | ({*text} & {*BLANK.strip()}) and " " * 60 not in shown, (odd, text)
     assert text.count("\nPLAY RECAP") == 2, text  # of each playbook
     flat = " ".join(text.split())
     assert "Revoked: /r4/a, /r4/spare. Still valid, with the name" in flat, text
     assert "in the path: /dispatcher/r4. If" in flat, text
     assert "processes: /dispatcher, /dispatcher/r4." in flat, text
-    assert "The revocation list did not get to r2, r3, r5, r6, r7," in flat, text
+    assert "The revocation list did not get to r2, r3, r5, r6, r7, r8," in flat, text
     assert "This robot has facts that take the place of variables (sros_robot)" in flat, text
+    assert "This robot named no folder for files of Ansible" in flat, text
 
 
 def test_facts_of_a_robot_choose_no_command_and_no_keys(tmp_path: Path) -> None:

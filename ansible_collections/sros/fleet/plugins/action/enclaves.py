@@ -7,7 +7,11 @@ import json
 import time
 from typing import Any
 
-from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
+from ansible_collections.sros.fleet.plugins.module_utils.exports import (
+    RefusedError,
+    enclaves_in,
+    read_archive,
+)
 from ansible_collections.sros.fleet.plugins.module_utils.home import ask, decoded
 from ansible_collections.sros.fleet.plugins.plugin_utils.answers import (
     DIFFERENCES,
@@ -18,7 +22,7 @@ from ansible_collections.sros.fleet.plugins.plugin_utils.answers import (
     name,
     number,
     record,
-    text,
+    remarks,
 )
 from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import (
     LeftOutError,
@@ -33,7 +37,7 @@ class ActionModule(RobotAction):
         **dict.fromkeys(
             ("changed_enclaves", "removed_enclaves", "restart", "routers"), list_of(enclave)
         ),
-        "verification": record(by=name, ok=flag, problems=list_of(text), remarks=list_of(text)),
+        "verification": record(by=name, ok=flag, problems=remarks, remarks=remarks),
         "confirmation": record(
             format=number,
             robot=name,
@@ -45,6 +49,8 @@ class ActionModule(RobotAction):
         "diff": DIFFERENCES,
     }
 
+    _sent: frozenset[str] | None = None
+
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of the module, with the export."""
         arguments = {
@@ -53,9 +59,18 @@ class ActionModule(RobotAction):
             if key not in ("archive", "home_time")
         }
         if arguments.get("keystore"):
-            arguments["archive"] = base64.b64encode(export(arguments)).decode()
+            packed = export(arguments)
+            self._sent = frozenset(enclaves_in(read_archive(packed)))
+            arguments["archive"] = base64.b64encode(packed).decode()
         arguments["home_time"] = time.time()
         return arguments
+
+    def shown(self, returned: dict[str, Any]) -> dict[str, Any]:
+        """Return the result without enclaves to restart that are not of this robot."""
+        for key in ("restart", "routers"):
+            if self._sent is not None and key in returned:
+                returned[key] = [each for each in returned[key] if each in self._sent]
+        return super().shown(returned)
 
 
 def export(arguments: dict[str, Any]) -> bytes:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
+import unicodedata
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
 
 _MOST_SHOWN = 4000
+_BLANK = "\u115f\u1160\u2800\u3164\uffa0"
+"""Letters without a shape."""
+_LONG_BLANK = re.compile(" {40,}")
 
 
 def ask(command: list[str], said: bytes = b"") -> subprocess.CompletedProcess:
@@ -40,11 +45,26 @@ def decoded(output: bytes) -> str:
 def harmless(text: str, *, most: int | None = _MOST_SHOWN, lines: bool = False) -> str:
     """Return a text that cannot steer a terminal, as one line unless ``lines`` may stay.
 
-    Control characters, and those that change the direction of text, become question marks.
+    Control characters, and those that change the direction of text, look blank or lie over others,
+    become question marks.  Many blanks, which on a terminal that wraps lines would look like the
+    end of one, become one.
     """
     if most is not None and len(text) > most:
         text = text[:most] + "..."
     text = text.replace("\r\n", "\n")
     if lines:
-        return "".join(each if each.isprintable() or each in "\n\t" else "?" for each in text)
-    return "".join(each if each.isprintable() else " " if each in "\n\t" else "?" for each in text)
+        text = "".join(each if each in "\n\t" or _is_visible(each) else "?" for each in text)
+        return _LONG_BLANK.sub(" ", text)
+    text = "".join(each if _is_visible(each) else " " if each in "\n\t" else "?" for each in text)
+    return re.sub("  +", " ", text)
+
+
+def _is_visible(character: str) -> bool:
+    if character.isascii():
+        return character.isprintable()
+    return (
+        character.isprintable()
+        and character not in _BLANK
+        and unicodedata.category(character)[0] != "M"
+        and unicodedata.bidirectional(character) not in ("R", "AL", "AN")
+    )

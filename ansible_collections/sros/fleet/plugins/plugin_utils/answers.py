@@ -72,6 +72,18 @@ def list_of(each: Reader, most: int = _MOST_ITEMS) -> Reader:
     return read
 
 
+def first_of(each: Reader, most: int) -> Reader:
+    """Return the reader of a list of which the first items and the number of others are taken."""
+
+    def read(value: Any) -> list[Any]:
+        if not isinstance(value, list):
+            raise TypeError
+        more = [f"and {len(value) - most} more"] if len(value) > most else []
+        return [*(each(one) for one in value[:most]), *more]
+
+    return read
+
+
 def map_of(each: Reader) -> Reader:
     """Return the reader of an object whose keys are names."""
 
@@ -94,11 +106,13 @@ def record(**readers: Reader) -> Reader:
     return read
 
 
+remarks = first_of(text, _MOST_REMARKS)
+"""Returns what is shown to the operator, and so is not long."""
 OF_ALL: dict[str, Reader] = {
     "changed": flag,
     "failed": flag,
     "msg": text,
-    "remarks": list_of(text, _MOST_REMARKS),
+    "remarks": remarks,
 }
 """What the answer of each module can have."""
 DIFFERENCES = list_of(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from difflib import unified_diff
 from typing import Any, ClassVar
 
 from ansible.errors import AnsibleConnectionFailure, AnsibleError
@@ -16,6 +17,9 @@ from ansible_collections.sros.fleet.plugins.plugin_utils.facts import check_fact
 
 _INTERPRETER = re.compile(r"(ansible_)?discovered_interpreter_\w+")
 _PROGRAM = re.compile(r"/[A-Za-z0-9_./+-]{1,200}")
+_FOLDER = re.compile(r"/[\w./+=@:,~-]{1,250}")
+_MOST_OF_DIFFERENCES = 200_000
+_LONGEST_SHOWN = 100
 
 
 class LeftOutError(RefusedError):
@@ -48,9 +52,11 @@ class RobotAction(ActionBase):  # type: ignore[misc]
         try:
             result = super().run(tmp, variables)
             check_facts(variables)
+            self._keep_the_agent()
             returned = self._execute_module(
                 module_name=self._task.action, module_args=self.arguments(), task_vars=variables
             )
+            returned = self.shown(returned)
         except AnsibleConnectionFailure as error:
             lost = harmless(str(error))
         except LeftOutError as error:
@@ -60,6 +66,40 @@ class RobotAction(ActionBase):  # type: ignore[misc]
         if lost:  # raised out of the handler, so that no cause is printed with it
             raise AnsibleConnectionFailure(lost)
         return {**result, **_presented(returned, str(variables.get("inventory_hostname", "")))}
+
+    def shown(self, returned: dict[str, Any]) -> dict[str, Any]:
+        """Return a result whose differences are text already.
+
+        Ansible would compare them after the timeout of the task, and a robot can choose texts that
+        take hours.
+        """
+        differences = returned.pop("diff", None)
+        if differences and self._task.diff:
+            text = _compared(differences)
+            returned["diff"] = [{"prepared": text}]
+        return returned
+
+    def _keep_the_agent(self) -> None:
+        """Forward neither an agent nor ports to a robot, whatever the configuration of ssh says."""
+        if self._connection.transport == "ssh":
+            words = self._connection.get_option("ssh_extra_args") or ""
+            own = f"{words} -a -x -o ClearAllForwardings=yes".strip()
+            self._connection.set_option("ssh_extra_args", own)
+
+    def _make_tmp_path(self, *words: Any, **options: Any) -> str:
+        """Return the folder for a module, which a robot names where pipelining is off.
+
+        sftp at home reads it as a part of its commands: what is long becomes another command, and
+        one that begins with an exclamation mark is run at home.
+        """
+        made = str(super()._make_tmp_path(*words, **options))
+        if not _FOLDER.fullmatch(made):
+            self._connection._shell.tmpdir = None
+            raise RefusedError(
+                f"This robot named no folder for files of Ansible, but {made[:_LONGEST_SHOWN]!r}."
+                " Look at the robot."
+            )
+        return made
 
     def _low_level_execute_command(self, *words: Any, **options: Any) -> Any:
         """Return what a command on the robot printed, without what would steer a terminal."""
@@ -78,6 +118,19 @@ class RobotAction(ActionBase):  # type: ignore[misc]
         except RefusedError as error:
             return {"failed": True, "msg": str(error), "_ansible_parsed": True}
         return {**found, "_ansible_parsed": True}
+
+
+def _compared(differences: list[dict[str, Any]]) -> str:
+    """Return the differences as `diff -u` shows them."""
+    text = ""
+    for each in differences:
+        before, after = (each.get(which, "").splitlines() for which in ("before", "after"))
+        old, new = (f"{which}: {each.get(f'{which}_header', '')}" for which in ("before", "after"))
+        compared = unified_diff(before, after, old, new, lineterm="")
+        text += "".join(f"{line}\n" for line in compared)
+        if len(text) > _MOST_OF_DIFFERENCES:
+            return f"{text[:_MOST_OF_DIFFERENCES]}...\n"
+    return text
 
 
 def _presented(returned: Mapping[str, Any], host: str) -> dict[str, Any]:
