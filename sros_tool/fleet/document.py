@@ -15,7 +15,7 @@ from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError
 from sros_tool.files import parse_toml
 from sros_tool.fleet.enclaves import MAX_PATTERNS, pattern_problem, size_problem
-from sros_tool.fleet.inventory import SHOWN, fleet_table, is_json
+from sros_tool.fleet.inventory import SHOWN, connections, fleet_table, is_json
 from sros_tool.fleet.model import (
     MAX_ROBOTS,
     Fleet,
@@ -54,7 +54,7 @@ def read_fleet(path: Path) -> Fleet:
         UnavailableError: an inventory in YAML is named, and PyYAML is not installed.
     """
     data, ending = read_bytes(path, "fleet file", most=MAX_BYTES), path.suffix.lower()
-    if ending in (".yml", ".yaml", ".json"):
+    if ending in _OF_INVENTORIES:
         what = f"the inventory '{path}'"
         table = fleet_table(data, what, is_json=ending == ".json" or is_json(data))
         return _Reader(what, SHOWN).fleet(table)
@@ -71,6 +71,19 @@ def read_fleet(path: Path) -> Fleet:
         ) from error
 
 
+def read_connections(path: Path) -> dict[str, str]:
+    """Return what an inventory says of how Ansible connects (`connections`); nothing for TOML.
+
+    Raises:
+        SrosError: as `read_fleet`.
+    """
+    data, ending = read_bytes(path, "fleet file", most=MAX_BYTES), path.suffix.lower()
+    if ending not in _OF_INVENTORIES:
+        return {}
+    return connections(data, f"the inventory '{path}'", is_json=ending == ".json" or is_json(data))
+
+
+_OF_INVENTORIES = (".yml", ".yaml", ".json")
 _INI_HOST = re.compile(rb"^[A-Za-z0-9_.-]+[ \t]*(?:$|[ \t][A-Za-z_]+=)", re.MULTILINE)
 """A host on a line of its own, or with variables behind it."""
 

@@ -45,6 +45,37 @@ def fleet_table(data: bytes, what: str, *, is_json: bool) -> dict[str, Any]:
     return _Inventory(_loaded(data, what, is_json=is_json), what).table()
 
 
+def connections(data: bytes, what: str, *, is_json: bool) -> dict[str, str]:
+    """Map what in an inventory says how Ansible connects, besides address and user, to its values.
+
+    The variables of groups count together with who is in them; beside a template, every value
+    counts.  Parameters and errors are those of `fleet_table`.
+    """
+    values = dict(_values_below(_loaded(data, what, is_json=is_json)))
+    known = {_VALUES["address"], _VALUES["user"]}
+    found = {
+        path: text
+        for path, text in values.items()
+        if any(part.startswith("ansible_") and part not in known for part in path)
+    }
+    if any("{" in text for text in found.values()):
+        found = values
+    elif any("vars" in path for path in found):
+        found |= {path: text for path, text in values.items() if {"hosts", "children"} & {*path}}
+    return {".".join(path): text for path, text in found.items()}
+
+
+def _values_below(top: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield everything in an inventory that is no mapping, or an empty one, with its keys."""
+    left: list[tuple[tuple[str, ...], Any]] = [((), top)]
+    while left:
+        path, value = left.pop()
+        if isinstance(value, dict) and value:
+            left += [((*path, str(key)), each) for key, each in value.items()]
+        else:
+            yield path, str(value)
+
+
 def _loaded(data: bytes, what: str, *, is_json: bool) -> Mapping[str, Any]:
     if is_json:
         try:

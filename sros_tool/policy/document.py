@@ -55,8 +55,8 @@ from sros_tool.resources import policies_dir
 from sros_tool.xml import parse, read_bytes, serialize, tag_of
 
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
-_INCLUDES = frozenset(f"{{{ns}}}include" for ns in _NAMESPACES)
-_FALLBACKS = frozenset(f"{{{ns}}}fallback" for ns in _NAMESPACES)
+INCLUDES = frozenset(f"{{{ns}}}include" for ns in _NAMESPACES)
+FALLBACKS = frozenset(f"{{{ns}}}fallback" for ns in _NAMESPACES)
 _XML_BASE = "{http://www.w3.org/XML/1998/namespace}base"
 # libxml2 evaluates any XPath, for minutes if it is made for that, and no signal ends it.
 _STEP = re.compile(
@@ -192,7 +192,7 @@ class Includer:
         for each in elements:
             if isinstance(each, etree._ProcessingInstruction):
                 continue
-            if each.tag in _INCLUDES:
+            if each.tag in INCLUDES:
                 yield from self._included(each, place)
                 continue
             self._elements += 1
@@ -218,7 +218,7 @@ class Includer:
                 "Include policy XML, without parse=.",
             )
         inside = [each for each in element if isinstance(each.tag, str)]
-        if len(inside) > 1 or (inside and inside[0].tag not in _FALLBACKS):
+        if len(inside) > 1 or (inside and inside[0].tag not in FALLBACKS):
             raise PolicyError(
                 f"{where}: an include can contain only one <fallback>", "", "Remove the rest."
             )

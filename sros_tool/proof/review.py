@@ -8,7 +8,6 @@ compared is in the result.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -22,25 +21,31 @@ from sros_tool.checks.requirements import VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
 from sros_tool.errors import DocumentError, PolicyError, SrosError
 from sros_tool.faults import Fault
-from sros_tool.fleet.document import read_fleet
-from sros_tool.fleet.expansion import read_policy_for
-from sros_tool.fleet.model import Fleet
+from sros_tool.fleet.document import read_connections, read_fleet
+from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
+from sros_tool.fleet.model import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import Lifetime, Threshold, UnreadableEnclave, due_enclaves
 from sros_tool.keystore.layout import KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.rights import RightsSource, load_rights
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.dropped import dropped_findings, dropped_requirements
 from sros_tool.proof.findings import requirement_findings
 from sros_tool.proof.growth import Growth, compare_access
+from sros_tool.proof.policy_parts import (
+    is_whole_policy,
+    may_be_policy,
+    same_root,
+    used_whole,
+)
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import Requirement, read_requirements
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
 from sros_tool.proof.system import System, load_system, policy_system
-from sros_tool.xml import parse
 
 _HEAD, _BASE = "HEAD", "BASE"
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
@@ -52,15 +57,7 @@ _MOST_OUTSIDE = 32 * 1024 * 1024
 
 No policy is larger.
 """
-_OF_POLICIES = (
-    *((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns=")),
-    *((b"<topics", b"ALLOW"), (b"<services", b"ALLOW"), (b"<actions", b"ALLOW")),
-)
-"""What an XML file that is a policy, or a part of one, has, and what follows in it."""
-_EBCDIC = b"\x4c\x6f\xa7\x94"
-"""The beginning of an XML file in EBCDIC (XML 1.0, appendix F)."""
-_ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
-_READABLE = (b"utf-8", b"utf8", b"utf-16", b"us-ascii", b"ascii", b"iso-8859-", b"windows-125")
+_LONGEST = 200  # characters of the target of a link that are shown
 _OK, _FOUND, _UNDECIDED = 0, 1, 2
 
 
@@ -283,8 +280,8 @@ class _Review:
             yield from self._keystore(path, keystore)
         if self.base:
             yield from self._checked("files", "", partial(self._others, of_head, head_fleet))
-            if base_fleet and head_fleet:
-                where = partial(self._places, base_fleet, head_fleet)
+            if head_fleet:
+                where = partial(self._places, (of_base, base_fleet), (of_head, head_fleet))
                 yield from self._checked("new-access", asked.fleet, where)
         for error in self.head.refused + (self.base.refused if self.base else []):
             yield ReviewStep("files", "", _UNDECIDED, error)
@@ -378,14 +375,28 @@ class _Review:
         before = other.repository.tree(other.commit) if other else ""
         return walk(side.repository, tree, most=_MOST_ENTRIES, other=before)
 
-    def _places(self, before: Fleet, after: Fleet) -> tuple[int, Content] | None:
-        """Return the robots whose keys are delivered to another place than before."""
-        lines = []
-        for name, new in after.robots.items():
-            old = before.robots.get(name)
-            if old and (old.address, old.user) != (new.address, new.user):
-                place = f"{new.user}@{new.address}" if new.user else new.address
-                lines.append((f"gets its keys at another place, {place or 'its name'}", name))
+    def _places(
+        self, base: tuple[list[Path], Fleet | None], head: tuple[list[Path], Fleet]
+    ) -> tuple[int, Content] | None:
+        """Return whose keys are delivered to another place, or in another way, than before."""
+        lines: list[tuple[str, str]] = []
+        robots = base[1].robots if base[1] else {}
+        for name, new in head[1].robots.items():
+            if name in robots and _place(robots[name]) != _place(new):
+                lines.append((f"gets its keys at another place, {_place(new)}", name))
+        earlier = _holders(*base)
+        for enclave, robot in _holders(*head).items():
+            old = earlier.get(enclave, robot)
+            if robot and (not old or (old.name != robot.name and _place(old) != _place(robot))):
+                had = old.name if old else "no robot"
+                lines.append((f"gets the keys of {enclave}, which {had} had", robot.name))
+        if base[1] and self.base:
+            file = self.request.fleet
+            before, after = (read_connections(e.folder / file) for e in (self.base, self.head))
+            for where in sorted({*before, *after}, key=lambda each: ("ansible_" not in each, each)):
+                if before.get(where) != (value := after.get(where)):
+                    said = "is gone, which" if value is None else f"is {value}, which"
+                    lines.append((f"{said} can change how Ansible reaches robots", where))
         return (self._new_access, Facts(tuple(lines))) if lines else None
 
     def _others(self, reviewed: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content] | None:
@@ -425,8 +436,16 @@ class _Review:
     ) -> Iterator[str]:
         """Yield policies of which the reviewed ones, or a keystore, have the file, but not all."""
         named = {str(each.relative_to(self.head.folder)) for each in reviewed}
-        known = [path for path, _ in changed if path in self.head.files and path not in named]
-        policies = [path for path in known if self._is_policy(self.head.files[path])]
+        content = self.request.repository.content
+        known = {
+            path: content(entry.id)
+            for path, entry in changed
+            if path in self.head.files and path not in named
+        }
+        policies = [path for path, data in known.items() if is_whole_policy(data)]
+        yield from self._parts_used_in_part(
+            {k: v for k, v in known.items() if k not in policies}, named
+        )
         if not policies:
             return
         rights = {each for file in reviewed for each in policy_rights(read_policy_for(file, fleet))}
@@ -437,15 +456,25 @@ class _Review:
                     continue
             yield path
 
-    def _is_policy(self, entry: TreeEntry) -> bool:
-        """Return whether a file is a whole policy, or may be one."""
-        content = self.request.repository.content(entry.id)
-        if not _may_be_policy(content):
-            return False
-        try:
-            return parse(content, "the file").tag in ("policy", "profiles")
-        except DocumentError:
-            return True
+    def _parts_used_in_part(
+        self, parts: Mapping[str, bytes], named: Iterable[str]
+    ) -> Iterator[str]:
+        """Yield files for includes of which the reviewed policies do not use all."""
+        files = self.head.files
+
+        def content(path: str) -> bytes | None:
+            return self.request.repository.content(files[path].id) if path in files else None
+
+        whole = used_whole(named, content)
+        for path, data in parts.items():
+            with suppress(SrosError):
+                before = self.base.entry(path) if self.base else None
+                earlier = self.request.repository.content(before.id) if before else data
+                if not may_be_policy(data) or whole.get(path):
+                    continue
+                if path in whole and same_root(earlier, data):
+                    continue
+            yield path
 
     def _unseen(self, path: str, entry: TreeEntry) -> str:
         """Return what at a path of HEAD may lead to policies that are not reviewed, or ""."""
@@ -457,10 +486,11 @@ class _Review:
         repository = self.request.repository
         target = os.fsdecode(repository.content(entry.id))
         with suppress(SrosError):
-            there = self.head.entry(os.path.normpath(Path(path).parent / target))
-            if there and there.mode in FILES and not _may_be_policy(repository.content(there.id)):
+            place = os.path.normpath(Path(path).parent / target)
+            there = None if _is_below(place, self.request.left_out) else self.head.entry(place)
+            if there and there.mode in FILES and not may_be_policy(repository.content(there.id)):
                 return ""
-        return f"a symbolic link to '{target}'"
+        return f"a symbolic link to '{target[:_LONGEST]}'"
 
     @staticmethod
     def _has(side: CommitFiles, path: str) -> bool:
@@ -486,7 +516,7 @@ class _Review:
             digits
             for part in side.repository.contents_in_parts(small.values(), _MOST_BYTES)
             for digits, content in part.items()
-            if _may_be_policy(content)
+            if may_be_policy(content)
         }
         return sorted(path for path, digits in small.items() if digits in of_policies)
 
@@ -653,22 +683,21 @@ class _Review:
         return status, ExpiryCheck(due, unreadable, count)
 
 
+def _place(robot: Robot) -> str:
+    """Return where a robot gets its keys."""
+    return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
+
+
+def _holders(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | None]:
+    """Map the enclaves of policies to the robot that gets their keys; None for those of none."""
+    if fleet is None:
+        return {each.path: None for file in files for each in read_policy(file).enclaves}
+    policies = (FleetPolicy(read_policy(each, placeholders=True), fleet) for each in files)
+    return {path: policy.stated(path)[1] for policy in policies for path in policy}
+
+
 def _is_below(path: str, folders: Iterable[str]) -> bool:
     return any(f"{path}/".startswith(f"{each}/") for each in folders)
-
-
-def _may_be_policy(content: bytes) -> bool:
-    """Return whether a file could be a policy, or a part of one, whatever its name is."""
-    text = content.replace(b"\0", b"")  # UTF-16 has a zero in each letter
-    if text.startswith(_EBCDIC):
-        return True
-    if not text.lstrip(b"\xef\xbb\xbf\xfe\xff \t\r\n").startswith(b"<"):
-        return False
-    text = b" ".join(text.split())
-    encoding = _ENCODING.search(text.partition(b"?>")[0])
-    if encoding and not encoding[1].lower().startswith(_READABLE):
-        return True  # such as UTF-7, in which no element is readable here
-    return any(second in text.partition(first)[2] for first, second in _OF_POLICIES)
 
 
 def _same(base: CommitFiles | None, head: CommitFiles, path: str) -> bool:

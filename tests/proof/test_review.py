@@ -119,6 +119,13 @@ def test_what_a_partial_clone_lacks_is_not_passed_over(change: Change) -> None:
         ),
         ("ebcdic.xml", f'<?xml version="1.0" encoding="IBM037"?>{ROBOT}'.encode("cp037")),
         ("part.xml", b'<profile ns="/" node="n"/>'),
+        ("rights.xml", b"<x><topics publish='&#65;LLOW'><topic>/x</topic></topics></x>"),
+        ("names.xml", b"<x><topic>/x</topic></x>"),
+        (
+            "outer.xml",
+            b"<profiles><xi:include href='x' xmlns:xi='http://www.w3.org/2001/XInclude'/>"
+            b"</profiles>",
+        ),
         (
             "common/Node.xml",
             b'<profile>\n<topics publish="ALLOW"><topic>/x</topic></topics></profile>',
@@ -133,6 +140,38 @@ def test_a_policy_that_is_not_named_is_said(change: Change, name: str, content: 
     change.base = change.git("rev-parse", "HEAD")
     change.commit({name: None})
     assert f"'{name}' is deleted" in change.review("--policy", "robot.xml").out
+
+
+def test_what_no_policy_includes_is_no_part_of_one(change: Change) -> None:
+    change.commit({"world.sdf": "<sdf><plugin><topic>/x</topic><update_rate/></plugin></sdf>"})
+    change.review("--policy", "robot.xml").ok()
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "pointer", "status"),
+    [
+        ("<x>{}</x>", "<x>{}{more}</x>", "/x/topics[@subscribe]", 1),
+        ("<x>{}</x>", "<x>{}{include}</x>", "/x/topics[@subscribe]", 1),
+        ("<x>{}</x>", "<x>{}<!-- -->{}</x>", "/x/*", 0),
+        ("<profile>{}</profile>", "<profile ns='/other' node='n'>{}</profile>", "/profile/*", 1),
+    ],
+)
+def test_a_part_that_is_included_in_part_is_said(
+    change: Change, before: str, after: str, pointer: str, status: int
+) -> None:
+    """Another policy, which is not reviewed, has all of it."""
+    read = '<topics subscribe="ALLOW"><topic>/ok</topic></topics>'
+    include = '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="{}" xpointer="{}"/>'
+    part = include.format("part.xml", f"xpointer({pointer})")
+    reviewed = policy_text({"/a": publish("/x"), "/b": publish("/y") + part})
+    change.base = change.commit({"part.xml": before.replace("{}", read), "robot.xml": reviewed})
+    more = {"{}": read, "{more}": publish("/x"), "{include}": include.format("common/node.xml", "")}
+    for name, text in more.items():
+        after = after.replace(name, text)
+    change.commit({"part.xml": after})
+    ended = change.review("--policy", "robot.xml")
+    assert ended.status == status, ended
+    assert ("'part.xml' changes and is used only in part" in ended.out) == bool(status)
 
 
 def test_a_policy_that_is_included_in_part_is_said(change: Change) -> None:
@@ -159,6 +198,7 @@ def test_a_policy_that_is_included_in_part_is_said(change: Change) -> None:
         ("deploy/robot.xml", "../tests/robot.xml", 1),  # a policy that is left out
         ("deploy", "tests", 1),
         ("deploy.xml", "/etc/robot.xml", 1),
+        ("deploy.xml", "tests/notes", 1),  # which the next change can make a policy, unseen
         ("tests/link.xml", "robot.xml", 0),  # left out
         ("NOTES", "robot.toml", 0),
         ("robots/sub", "../tests", 2),  # in a folder that is reviewed
@@ -173,7 +213,8 @@ def test_links_and_submodules_hide_no_policy(
     text = policy_text({"/c": publish("/z")})
     shutil.copytree(change.folder / "common", change.folder / "robots" / "common")
     text = policy_text({"/c": publish("/z")})
-    change.base = change.commit({"tests/robot.xml": policy_text(WIDER), "robots/c.xml": text})
+    left_out = {"tests/robot.xml": policy_text(WIDER), "tests/notes": "x"}
+    change.base = change.commit({**left_out, "robots/c.xml": text})
     place = change.folder / path
     place.parent.mkdir(exist_ok=True)
     if target:
@@ -299,6 +340,56 @@ def test_a_fleet_counts_as_each_commit_has_it(change: Change) -> None:
     ended = change.review(*words)
     assert ended.status == 1, ended
     assert "new-access fleet.toml: 'r1' gets its keys at another place, 10.6.6.6" in ended.out
+
+
+_TWO = """[robots.r1]
+address = "10.0.0.1"
+namespace = "/n1"
+[robots.r2]
+address = "10.0.0.2"
+namespace = "/n2"
+"""
+_HOSTS = """{"_meta": {"hostvars": {"r1": {"ansible_host": "10.0.0.1"}}},
+ "all": {"children": ["far"], "vars": {"colour": "red"}}, "far": {"hosts": ["r1"]}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("path", "before", "after", "said"),
+    [
+        (
+            "fleet.toml",
+            _TWO,
+            _TWO.replace("/n1", "/n").replace("/n2", "/n1").replace('"/n"', '"/n2"'),
+            "'r1' gets the keys of /n2/a, which r2 had, and 1 more",
+        ),
+        (
+            "fleet.toml",
+            _TWO,
+            f'{_TWO}[robots.hq]\naddress = "10.6.6.6"\nnamespace = "/hq"\n',
+            "'hq' gets the keys of /hq/a, which no robot had",
+        ),
+        ("hosts.json", _HOSTS, _HOSTS.replace("red", "blue"), ""),
+        (
+            "hosts.json",
+            _HOSTS,
+            _HOSTS.replace('"red"', '"red", "ansible_ssh_common_args": "-o ProxyCommand=evil"'),
+            "'all.vars.ansible_ssh_common_args' is -o ProxyCommand=evil, which can change how",
+        ),
+    ],
+)
+def test_keys_go_to_no_other_robot_unseen(
+    change: Change, path: str, before: str, after: str, said: str
+) -> None:
+    """The access of every enclave stays what it is."""
+    rights = publish("/x")
+    alone = {"/hq/a": rights} if "/hq" in after else {}
+    policy = {"{namespace}/a": rights}
+    change.base = change.commit({path: before, "robots.xml": policy_text({**policy, **alone})})
+    change.commit({path: after, "robots.xml": policy_text(policy)})
+    ended = change.review("--policy", "robots.xml", "--fleet", path)
+    assert (f"new-access {path}: {said}" in ended.out) == bool(said), ended
+    assert ended.status == bool(said), ended
 
 
 @pytest.mark.parametrize("case", ["rights", "ca", "governance", "default"])
