@@ -194,6 +194,16 @@ class Fault(Enum):
         "RFC 5280, 6.3.3; Fast DDS 2.14.5; measured.",
         _CRL,
     )
+    CRL_USAGE = (
+        "crl-usage",
+        "a revocation list of a CA that may not sign lists",
+        "The keyUsage of the CA lacks cRLSign, so every vendor refuses the list, and with it every "
+        "participant.",
+        "RFC 5280, 4.2.1.3; OpenSSL 3 (x509_vfy.c); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; "
+        "measured.",
+        "Replace the CA with one whose keyUsage has cRLSign. Until then, nodes start without the "
+        "list, and trust again what was revoked: `rm {path}`.",
+    )
     CRL_PARTIAL = (
         "crl-partial",
         "a revocation list that is not the whole list of its CA",

@@ -20,6 +20,7 @@ from sros_tool.errors import PkiError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    CRL_FILE,
     GOVERNANCE_FILE,
     IDENTITY,
     IDENTITY_CA_FILE,
@@ -35,8 +36,10 @@ from sros_tool.pki.certificates import (
     load_certificates,
     subject_text,
 )
-from sros_tool.pki.chains import Checks, chain_fault
+from sros_tool.pki.chains import Checks, build_chain, chain_fault
+from sros_tool.pki.crl import read_list, read_lists, refusal_of
 from sros_tool.pki.keys import algorithm
+from sros_tool.pki.revocation import Obstacle, list_refusal
 
 Certificates = tuple[x509.Certificate, ...]
 
@@ -44,8 +47,25 @@ _SIDES = (
     (IDENTITY_CA_FILE, CERTIFICATE_FILE),
     (PERMISSIONS_CA_FILE, GOVERNANCE_FILE, PERMISSIONS_FILE),
 )
+_OF_LISTS = {
+    Obstacle.MISSING: Fault.CRL_ISSUER,
+    Obstacle.USAGE: Fault.CRL_USAGE,
+    Obstacle.SCOPE: Fault.CRL_PARTIAL,
+    Obstacle.CRITICAL: Fault.CRL_PARTIAL,
+    Obstacle.NOT_YET_VALID: Fault.CRL_NOT_YET_VALID,
+    Obstacle.EXPIRED: Fault.CRL_EXPIRED,
+    Obstacle.SIGNATURE: Fault.CRL_ISSUER,
+    Obstacle.REVOKED: Fault.REVOKED,
+}
 _VENDOR_SPECIFIC = frozenset(
-    {Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID, Fault.CERTIFICATE_ISSUER, Fault.SIGNATURE}
+    {
+        Fault.CA_EXPIRED,
+        Fault.CA_NOT_YET_VALID,
+        Fault.CERTIFICATE_ISSUER,
+        Fault.SIGNATURE,
+        Fault.CRL_MALFORMED,
+        *_OF_LISTS.values(),
+    }
 )
 """Faults of `OpenedEnclave` for which only some vendors refuse an enclave."""
 _UNREADABLE = (Fault.NOT_SIGNED, Fault.CERTIFICATE_MALFORMED)
@@ -69,12 +89,19 @@ def vendor_problems(
         each.file for each in kept if each.file == CERTIFICATE_FILE or each.fault in _UNREADABLE
     }
     faults = [each for each in _faults(traits, state, at) if each.file not in known]
+    kept += [each for each in faults if _is_of_list(each)]
+    specific = [each for each in specific if not _is_of_list(each)]
+    faults = [each for each in faults if not _is_of_list(each)]
     for side in _SIDES:
         of_side = [each for each in faults if each.file in side]
         files = {each.file for each in of_side} | ({side[0]} if of_side else set())
         crash = [each for each in of_side if each.fault is Fault.CA_CRASH]
         kept += crash or [each for each in specific if each.file in files] or of_side
     return tuple(kept)
+
+
+def _is_of_list(problem: Problem) -> bool:
+    return problem.fault is Fault.CRL_MALFORMED or problem.fault in _OF_LISTS.values()
 
 
 def _is_specific(problem: Problem, state: OpenedEnclave) -> bool:
@@ -100,6 +127,7 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
     authorities = read.get(IDENTITY_CA_FILE)
     if authorities and identity:
         yield from _identity_faults(traits, identity[0], authorities, at)
+        yield from _list_faults(traits, state, identity[0], authorities, at)
     signers = read.get(PERMISSIONS_CA_FILE)
     for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
         if not signers or file not in state.files:
@@ -263,6 +291,46 @@ def _identity_faults(
     trusted = _trusted(traits, authorities)
     if fault := chain_fault(certificate, trusted, at=at, checks=_checks(traits)):
         yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)
+
+
+def _list_faults(
+    traits: VendorTraits,
+    state: OpenedEnclave,
+    certificate: x509.Certificate,
+    authorities: Certificates,
+    at: datetime,
+) -> Iterator[Problem]:
+    """Yield why the vendor refuses an enclave whose chain is valid, by revocation lists."""
+    chain, fault = build_chain(certificate, _trusted(traits, authorities), (), at)
+    if fault:  # reported already
+        return
+    lists: list[tuple[x509.CertificateRevocationList, str]] = []
+    try:
+        if traits.reads_lists_of_authorities:
+            file, data = IDENTITY_CA_FILE, state.files[IDENTITY_CA_FILE]
+            lists += [(each, file) for each in _lists(data, file)]
+        file = CRL_FILE
+        if file in state.files:
+            lists.append((_list(state.files[file], file), file))
+    except PkiError:
+        text = "it has a revocation list that cannot be read, so DDS refuses every participant"
+        yield Problem(file, text, Fault.CRL_MALFORMED)
+        return
+    refusal = list_refusal(chain, [each for each, _ in lists], at=at) if lists else None
+    if refusal is None:
+        return
+    crl, file = next((each for each in lists if each[0] is refusal.list), lists[0])
+    if refusal.obstacle is Obstacle.REVOKED:
+        yield Problem(CERTIFICATE_FILE, f"it is revoked by {file}", Fault.REVOKED)
+        return
+    text, kind = refusal.text, _OF_LISTS[refusal.obstacle]
+    if refusal.obstacle is Obstacle.MISSING and (partial := refusal_of(crl)):
+        text, kind = partial, Fault.CRL_PARTIAL
+    yield Problem(file, f"{text}, so DDS refuses every participant", kind)
+
+
+_lists = lru_cache(maxsize=16)(read_lists)
+_list = lru_cache(maxsize=16)(read_list)
 
 
 def _key_fits(traits: VendorTraits, certificate: x509.Certificate) -> bool:

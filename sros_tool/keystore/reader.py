@@ -68,6 +68,7 @@ from sros_tool.pki.crl import (
     RevocationList,
     lists_as_revoked,
     load_crl,
+    may_sign_lists,
     read_list,
     refusal_of,
     signed_by,
@@ -351,7 +352,7 @@ class OpenedEnclave:
     permissions_bytes: int
     problems: tuple[Problem, ...]
     files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
-    """The content of the required files that can be read, by file name."""
+    """The content of the files that can be read, by name: the required ones, and ``crl.pem``."""
     permissions_document: bytes = field(default=b"", repr=False)
     """The XML in ``permissions.p7s``, even if malformed; empty if its signature is not valid."""
     key_on_robot: bool = False
@@ -457,11 +458,14 @@ def _signed_document(message: bytes, authority: x509.Certificate | None) -> byte
 
 @lru_cache(maxsize=8)
 def _load_crl(
-    data: bytes, authority: x509.Certificate | None
-) -> tuple[x509.CertificateRevocationList, bool]:
-    """Return a revocation list, and whether ``authority`` signed it (True without one)."""
+    data: bytes, authority: x509.Certificate | None, authorities: bytes
+) -> tuple[x509.CertificateRevocationList, x509.Certificate | None]:
+    """Return a revocation list, and the CA of the file ``authorities`` that signed it, or None."""
     crl = read_list(data, CRL_FILE)
-    return crl, authority is None or signed_by(crl, authority)
+    trusted: tuple[x509.Certificate, ...] = (authority,) if authority else ()
+    with suppress(SrosError):
+        trusted = _load_certificates(authorities, IDENTITY_CA_FILE)
+    return crl, next((each for each in trusted if signed_by(crl, each)), None)
 
 
 class _EnclaveFiles:
@@ -485,7 +489,7 @@ class _EnclaveFiles:
         permissions_ca = self._certificate(PERMISSIONS_CA_FILE, files)
         certificate = self._certificate(CERTIFICATE_FILE, files)
         self._check_identity(certificate, identity_ca, files)
-        self._check_revocation(certificate, identity_ca)
+        files[CRL_FILE] = self._check_revocation(certificate, identity_ca, files[IDENTITY_CA_FILE])
         governance = permissions = None
         document = self._signed(GOVERNANCE_FILE, files, permissions_ca)
         if document is not None:
@@ -614,26 +618,36 @@ class _EnclaveFiles:
             self._add(CERTIFICATE_FILE, f"it is refused: {refusal}", Fault.CERTIFICATE_ISSUER)
 
     def _check_revocation(
-        self, certificate: x509.Certificate | None, ca: x509.Certificate | None
-    ) -> None:
+        self,
+        certificate: x509.Certificate | None,
+        ca: x509.Certificate | None,
+        authorities: bytes | None,
+    ) -> bytes | None:
+        """Check and return the revocation list; None without a list that can be read."""
         path = self._folder / CRL_FILE
         if not path.exists():
-            return
+            return None
         try:
             data = read_bytes(path, "revocation list")
         except SrosError as error:
             text = f"it cannot be read: {error.why.rstrip('.') or error.what}"
             self._add(CRL_FILE, text, Fault.FILE_UNREADABLE)
-            return
+            return None
         try:
-            crl, authentic = _load_crl(data, ca)
+            crl, signer = _load_crl(data, ca, authorities or b"")
         except SrosError:
             text = "it is not a revocation list, so DDS refuses every participant"
             self._add(CRL_FILE, text, Fault.CRL_MALFORMED)
-            return
-        if not authentic:
+            return data
+        if ca and not signer:
             text = "it is not of the identity CA, so DDS refuses every participant"
             self._add(CRL_FILE, text, Fault.CRL_ISSUER)
+        if signer and not may_sign_lists(signer):
+            text = (
+                f"the keyUsage of its CA, {subject_text(signer.subject)}, lacks cRLSign, so DDS "
+                "refuses every participant"
+            )
+            self._add(CRL_FILE, text, Fault.CRL_USAGE)
         if refusal := refusal_of(crl):
             text = f"{refusal}, so DDS refuses every participant"
             self._add(CRL_FILE, text, Fault.CRL_PARTIAL)
@@ -647,6 +661,7 @@ class _EnclaveFiles:
             self._add(CRL_FILE, text, Fault.CRL_EXPIRED)
         if certificate and lists_as_revoked(crl, certificate.serial_number):
             self._add(CERTIFICATE_FILE, "it is revoked by crl.pem", Fault.REVOKED)
+        return data
 
     def _signed(
         self, name: str, files: dict[str, bytes | None], authority: x509.Certificate | None

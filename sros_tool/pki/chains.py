@@ -84,7 +84,7 @@ def chain_fault(
 
     ``others`` are possible intermediate certificates; validities are checked at the time ``at``.
     """
-    chain, missing = _build_chain(start, tuple(dict.fromkeys(authorities)), tuple(others), at)
+    chain, missing = build_chain(start, tuple(dict.fromkeys(authorities)), tuple(others), at)
     if missing:
         return missing
     faults = (
@@ -100,7 +100,7 @@ def chain_fault(
     return next(iter(faults), "")
 
 
-def _build_chain(
+def build_chain(
     start: x509.Certificate,
     authorities: Sequence[x509.Certificate],
     others: Sequence[x509.Certificate],

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import datetime
 
 from cryptography import x509
-from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec, ed448, ed25519, rsa
 from cryptography.x509.oid import CRLEntryExtensionOID, ExtensionOID
 
 from sros_tool.errors import PkiError
-from sros_tool.pki.certificates import authority_identifier, subject_text
+from sros_tool.pki import pem
+from sros_tool.pki.certificates import authority_identifier, extension, subject_text
 from sros_tool.pki.keys import PrivateKey
+from sros_tool.pki.names import same_name
 from sros_tool.pki.reading import read_name, reading
 
 CRL_MARK = b"-----BEGIN X509 CRL-----"
 """The first line of a PEM revocation list."""
+_LABEL = "X509 CRL"
 REASONS = tuple(
     flag.value
     for flag in x509.ReasonFlags
@@ -98,13 +103,13 @@ def sign_crl(
     return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
 
 
-def load_crl(pem: bytes, name: str) -> RevocationList:
+def load_crl(data: bytes, name: str) -> RevocationList:
     """Return the first revocation list of a PEM file; ``name`` names the file in errors.
 
     Raises:
         PkiError: the list cannot be read, or does not say when it expires.
     """
-    crl = read_list(pem, name)
+    crl = read_list(data, name)
     next_update = crl.next_update_utc
     if next_update is None:
         raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)
@@ -112,32 +117,52 @@ def load_crl(pem: bytes, name: str) -> RevocationList:
     return RevocationList(_number(crl), crl.last_update_utc, next_update, revoked, crl)
 
 
-def read_list(pem: bytes, name: str) -> x509.CertificateRevocationList:
+def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
     """Return the first revocation list of a PEM file, with or without the time of its expiry.
 
     Raises:
         PkiError: the list cannot be read; ``name`` names the file.
     """
-    with reading(
+    with _reading(name):
+        blocks = pem.blocks(data)
+        return _read(next(each for each in blocks if each.label == _LABEL).content)
+
+
+def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, ...]:
+    """Return all revocation lists of a PEM file, which may have certificates, too.
+
+    Raises:
+        PkiError: a list, or what stands before it, cannot be read; ``name`` names the file.
+    """
+    with _reading(name):
+        blocks = pem.blocks(data)
+        return tuple(_read(each.content) for each in blocks if each.label == _LABEL)
+
+
+def _reading(name: str) -> AbstractContextManager[None]:
+    return reading(
         f"the revocation list {name} cannot be read",
         "It is not a PEM revocation list, or it is damaged; DDS refuses every participant.",
         _RESTORE,
-    ):
-        crl = x509.load_pem_x509_crl(pem)
-        read_name(crl.issuer)
-        subject_text(crl.issuer)
-        _ = crl.last_update_utc, crl.next_update_utc, crl.signature_hash_algorithm, _number(crl)
-        for entry in crl:
-            _revoked(entry)
-        return crl
+    )
 
 
-def embedded_lists(pem: bytes) -> list[bytes]:
+def _read(content: bytes) -> x509.CertificateRevocationList:
+    crl = x509.load_der_x509_crl(content)
+    read_name(crl.issuer)
+    subject_text(crl.issuer)
+    _ = crl.last_update_utc, crl.next_update_utc, crl.signature_hash_algorithm, _number(crl)
+    for entry in crl:
+        _revoked(entry)
+    return crl
+
+
+def embedded_lists(data: bytes) -> list[bytes]:
     """Return the revocation lists among the certificates of a PEM file, a PEM file each.
 
     OpenSSL reads all of them, and nothing that does not begin a line (pem_lib.c).
     """
-    return [CRL_MARK + each for each in (b"\n" + pem).split(b"\n" + CRL_MARK)[1:]]
+    return [CRL_MARK + each for each in (b"\n" + data).split(b"\n" + CRL_MARK)[1:]]
 
 
 def names_issuers(crl: x509.CertificateRevocationList) -> bool:
@@ -200,11 +225,32 @@ def refusal_of(crl: x509.CertificateRevocationList) -> str:
 
 def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
     """Return whether ``authority`` issued and signed the revocation list."""
+    return same_name(crl.issuer, authority.subject) and is_signed_with(crl, authority)
+
+
+def may_sign_lists(authority: x509.Certificate) -> bool:
+    """Return whether OpenSSL accepts revocation lists of a CA: by keyUsage, if it has that."""
+    usage = extension(authority, x509.KeyUsage)
+    return usage is None or usage.crl_sign
+
+
+def is_signed_with(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
+    """Return whether the key of ``authority`` made the signature of the list."""
+    key = authority.public_key()
+    signature, signed = crl.signature, crl.tbs_certlist_bytes
     try:
-        public = authority.public_key()
-        return crl.issuer == authority.subject and crl.is_signature_valid(public)  # type: ignore[arg-type]
-    except (TypeError, ValueError, UnsupportedAlgorithm):
+        how, digest = crl.signature_algorithm_parameters, crl.signature_hash_algorithm
+        if isinstance(key, ec.EllipticCurvePublicKey) and isinstance(how, ec.ECDSA):
+            key.verify(signature, signed, how)
+        elif isinstance(key, rsa.RSAPublicKey) and digest:
+            key.verify(signature, signed, how, digest)  # type: ignore[arg-type]
+        elif isinstance(key, (ed25519.Ed25519PublicKey, ed448.Ed448PublicKey)):
+            key.verify(signature, signed)
+        else:
+            return False
+    except (InvalidSignature, UnsupportedAlgorithm, ValueError, TypeError):
         return False
+    return True
 
 
 def _number(crl: x509.CertificateRevocationList) -> int:

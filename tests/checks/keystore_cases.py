@@ -245,6 +245,14 @@ def _(bench: Bench) -> None:
     bench.options["zone"] = timezone(timedelta(hours=-8))
 
 
+@case("enclave.crl-usage")
+def _(bench: Bench) -> None:
+    usage = x509.KeyUsage(False, False, False, False, False, True, False, False, False)
+    is_ca = (x509.BasicConstraints(True, None), True)
+    bench.adopt("identity", bench.new_authority(is_ca, (usage, True)))
+    bench.revoke()
+
+
 def _tamper(bench: Bench, file: str) -> None:
     data = bench.path(file).read_bytes()
     assert b"rosout" in data

@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import rsa
+from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from sros_tool.pki import smime
@@ -44,8 +45,12 @@ def authority(
     serial: int | None = None,
     is_ca: bool = True,
     identifiers: bool = True,
+    lists: bool = True,
 ) -> Pair:
-    """A certificate for CAs (or with ``is_ca`` false another) and its key."""
+    """A certificate for CAs (or with ``is_ca`` false another) and its key.
+
+    Without ``lists`` it may not sign revocation lists.
+    """
     key = key or generate_key()
     issuer, signing = by or (None, key)
     public = key.public_key()
@@ -59,7 +64,8 @@ def authority(
     ).add_extension(x509.BasicConstraints(is_ca, None), critical=True)
     if usage is not None:
         signs, certifies = SIGNS in usage.split(), CERTIFIES in usage.split()
-        flags = x509.KeyUsage(signs, False, False, False, False, certifies, certifies, False, False)
+        lists = lists and certifies
+        flags = x509.KeyUsage(signs, False, False, False, False, certifies, lists, False, False)
         builder = builder.add_extension(flags, critical=True)
     if purpose:
         builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
@@ -92,11 +98,35 @@ def signed_by(pair: Pair, *options: str, also: Pair | None = None) -> Callable[[
 
 
 @dataclass(frozen=True)
+class Revocation:
+    """A revocation list of a CA; it may name the enclave, or have only changes of another list."""
+
+    by: Pair
+    days: tuple[int, int] = (-1, 5)
+    names_enclave: bool = False
+    changes: bool = False
+    digest: Digest = field(default_factory=hashes.SHA256)
+
+    def pem(self, enclave: x509.Certificate) -> bytes:
+        authority, key = self.by
+        builder = x509.CertificateRevocationListBuilder(
+            authority.subject, NOW + self.days[0] * DAY, NOW + self.days[1] * DAY
+        ).add_extension(x509.CRLNumber(2), critical=False)
+        if self.changes:
+            builder = builder.add_extension(x509.DeltaCRLIndicator(1), critical=True)
+        serial = enclave.serial_number if self.names_enclave else 4711
+        entry = x509.RevokedCertificateBuilder(serial, NOW - DAY).build()
+        made = builder.add_revoked_certificate(entry).sign(key, self.digest)
+        return made.public_bytes(Encoding.PEM)
+
+
+@dataclass(frozen=True)
 class Made:
     """How the enclaves of a row are made.
 
     ``issuer`` issues their certificates with ``digest``, ``sign`` signs their documents; the CA
-    files consist of ``identity`` and ``permissions``, in that order.
+    files consist of ``identity`` and ``permissions``, in that order.  ``lists`` are in ``crl.pem``,
+    and ``lists_of_identity`` behind the certificates of ``identity``.
     """
 
     sign: Callable[[bytes], bytes] | None = None
@@ -106,6 +136,8 @@ class Made:
     own_signer: bool = False
     """Every enclave signs its own permissions, with the key of its identity."""
     digest: Digest = field(default_factory=hashes.SHA256)
+    lists: tuple[Revocation, ...] = ()
+    lists_of_identity: tuple[Revocation, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -148,7 +180,12 @@ def write_enclave(
         ("permissions", made.permissions or (SIGNER,)),
     ):
         data = b"".join(pem(each) for each, _ in pairs)
+        if role == "identity":
+            data += b"".join(each.pem(certificate) for each in made.lists_of_identity)
         (folder / f"{role}_ca.cert.pem").write_bytes(data)
+    if made.lists:
+        data = b"".join(each.pem(certificate) for each in made.lists)
+        (folder / "crl.pem").write_bytes(data)
     (folder / "governance.p7s").write_bytes(sign(governance))
     own = signed_by((certificate, key)) if made.own_signer else sign
     (folder / "permissions.p7s").write_bytes(own(permissions))
@@ -344,5 +381,81 @@ def rows() -> list[Row]:
         Row(
             "root and identity intermediate, which issues",
             Made(issuer=identity_below, identity=(ROOT, identity_below)), YES, YES, REFUSED,
+        ),
+        *list_rows(other, identity_below),
+    ]  # fmt: skip
+
+
+def list_rows(other: Pair, below: Pair) -> list[Row]:
+    """Rows with revocation lists; ``other`` is another CA, ``below`` one that `ROOT` issued."""
+    no_lists = authority("identity CA", lists=False)
+    below_no_lists = authority("identity sub CA", by=ROOT, lists=False)
+    expired = Revocation(ROOT, (-5, -1))
+    return [
+        Row("a list", Made(lists=(Revocation(ROOT),)), YES, YES, YES),
+        Row(
+            "a list with sha512", Made(lists=(Revocation(ROOT, digest=hashes.SHA512()),)),
+            YES, YES, YES,
+        ),
+        *(
+            Row(f"a list that {name}", Made(lists=(each,)), REFUSED, REFUSED, REFUSED)
+            for name, each in {
+                "names the enclave": Revocation(ROOT, names_enclave=True),
+                "has expired": expired,
+                "is of the future": Revocation(ROOT, (1, 5)),
+                "is of another CA": Revocation(other),
+                "has only changes": Revocation(ROOT, changes=True),
+            }.items()
+        ),
+        Row(
+            "a list of a CA without cRLSign",
+            Made(issuer=no_lists, lists=(Revocation(no_lists),)), REFUSED, REFUSED, REFUSED,
+        ),
+        Row(
+            "the second list is of the CA", Made(lists=(Revocation(other), Revocation(ROOT))),
+            REFUSED, REFUSED, REFUSED,
+        ),
+        Row(
+            "the second list has expired", Made(lists=(Revocation(ROOT), expired)), YES, YES, YES
+        ),
+        Row("a list in the CA file", Made(lists_of_identity=(Revocation(ROOT),)), YES, YES, YES),
+        *(
+            Row(
+                f"a list in the CA file that {name}", Made(lists_of_identity=(each,)),
+                REFUSED, REFUSED, YES,
+            )
+            for name, each in {
+                "names the enclave": Revocation(ROOT, names_enclave=True),
+                "has expired": expired,
+                "is of another CA": Revocation(other),
+            }.items()
+        ),
+        Row(
+            "a list of another CA, and that of the CA in its file",
+            Made(lists=(Revocation(other),), lists_of_identity=(Revocation(ROOT),)),
+            YES, YES, REFUSED,
+        ),
+        Row(
+            "two identity CAs, the second issues, with its list",
+            Made(issuer=ROOT, identity=(other, ROOT), lists=(Revocation(ROOT),)),
+            YES, YES, REFUSED,
+        ),
+        Row(
+            "intermediate and root, with the list of the intermediate",
+            Made(issuer=below, identity=(below, ROOT), lists=(Revocation(below),)),
+            YES, YES, REFUSED,
+        ),
+        Row(
+            "intermediate and root, with the list of the root",
+            Made(issuer=below, identity=(below, ROOT), lists=(Revocation(ROOT),)),
+            REFUSED, REFUSED, REFUSED,
+        ),
+        Row(
+            "intermediate without cRLSign and root, with its list",
+            Made(
+                issuer=below_no_lists, identity=(below_no_lists, ROOT),
+                lists=(Revocation(below_no_lists),),
+            ),
+            REFUSED, REFUSED, REFUSED,
         ),
     ]  # fmt: skip

@@ -56,10 +56,12 @@ class Libcrypto:
         *,
         flags: int = 0,
         documents: bool = False,
+        lists: Sequence[bytes] = (),
     ) -> int:
         """Return the error of ``X509_verify_cert``, or 0 if it accepts; -1 for no certificate.
 
-        With ``documents``, for the purpose that signers of S/MIME need.
+        With ``documents``, for the purpose that signers of S/MIME need.  ``lists`` are revocation
+        lists in PEM; -1 if one cannot be read.
         """
         library = self._library
         loaded = [self._load(each) for each in (start, *trusted, *others)]
@@ -73,6 +75,11 @@ class Libcrypto:
                     library.X509_STORE_add_cert(store, each)
                 else:
                     library.OPENSSL_sk_push(untrusted, each)
+            for crl in (self._read("PEM_read_bio_X509_CRL", each) for each in lists):
+                if not crl:
+                    return -1
+                library.X509_STORE_add_crl(store, crl)
+                library.X509_CRL_free(crl)
             library.X509_STORE_CTX_init(context, store, loaded[0], untrusted)
             if documents:
                 library.X509_STORE_CTX_set_default(context, b"smime_sign")

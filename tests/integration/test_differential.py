@@ -93,6 +93,7 @@ NOT_OF_DOCUMENTS = {
     "reader",
     "signers",
     "reads_first_authority",
+    "reads_lists_of_authorities",
     "verifies_authorities",
     "hashes",
     "keys",

@@ -163,6 +163,8 @@ class VendorTraits:
     signers: Signers = Signers.AUTHORITY
     reads_first_authority: bool = False
     """Only the first CA of a file is trusted."""
+    reads_lists_of_authorities: bool = False
+    """Revocation lists in the file of the identity CA are read, besides ``crl.pem``."""
     verifies_authorities: bool = False
     """The first certificate of a CA file is verified, strictly, when it is loaded.
 
@@ -203,6 +205,7 @@ _FAST_2_14 = VendorTraits(
     needs_domain_rule=False,
     refuses_open_rtps=True,
     signers=Signers.LISTED,
+    reads_lists_of_authorities=True,
     verifies_authorities=True,
     verifies_policies=True,
     hashes=Hashes.SHA256,
