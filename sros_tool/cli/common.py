@@ -83,6 +83,20 @@ def dry_run_option(function: Decorated) -> Decorated:
     )(function)
 
 
+def allow_refusal_option(function: Decorated) -> Decorated:
+    """Add ``--allow-refusal VENDOR`` to a verb that changes what enclaves load."""
+    from sros_tool.dds.decision.vendors import MEASURED, Vendor
+
+    return click.option(
+        "--allow-refusal",
+        multiple=True,
+        type=click.Choice([vendor.value for vendor in MEASURED]),
+        callback=lambda _context, _option, words: tuple(map(Vendor, words)),
+        help="Go on although this DDS then refuses enclaves that it accepts today.  Can be "
+        "repeated.",
+    )(function)
+
+
 def robot_option(help_text: str) -> Callable[[Decorated], Decorated]:
     """Add ``--robot NAME`` to a verb that chooses enclaves of a keystore."""
     return click.option(

@@ -11,6 +11,7 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
+    allow_refusal_option,
     complete_file,
     complete_keystore_and_enclave,
     domain_of,
@@ -47,6 +48,7 @@ from sros_tool.terminal import Coloured, echo, echo_bytes
 if TYPE_CHECKING:
     from cryptography import x509
 
+    from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.delivery.answer import ImportedEnclave
@@ -432,6 +434,7 @@ Example:
     help="Refuse a request for another enclave; a revoked one is signed only if it is named here. "
     "Once for each request, in their order.",
 )
+@allow_refusal_option
 @dry_run_option
 @json_option
 def sign_request(
@@ -443,6 +446,7 @@ def sign_request(
     force: bool,
     no_answer: bool,
     only: tuple[str, ...],
+    allow_refusal: tuple[Vendor, ...],
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -467,7 +471,16 @@ def sign_request(
         if output is not None or force:
             raise UsageError("--no-answer makes no file: leave out -o and --force")
         policy = _policy(policy_file, fleet_file)
-        _certify(root, request, policy, only, renew=renew, dry_run=dry_run, as_json=as_json)
+        _certify(
+            root,
+            request,
+            policy,
+            only,
+            allow_refusal,
+            renew=renew,
+            dry_run=dry_run,
+            as_json=as_json,
+        )
         return
     if output is None:
         output = _STREAM if request == _STREAM else Path(request.name).with_suffix(".answer.tar.gz")
@@ -487,6 +500,7 @@ def sign_request(
         force=force,
         domain=domain_from(os.environ),
         keyring=keyring(),
+        allow_refusal=allow_refusal,
         dry_run=dry_run,
     )
     if as_json:
@@ -537,6 +551,7 @@ def _certify(
     request: Path,
     policy: Policy | FleetPolicy | None,
     only: tuple[str, ...],
+    allow_refusal: tuple[Vendor, ...],
     *,
     renew: bool,
     dry_run: bool,
@@ -555,6 +570,7 @@ def _certify(
         renew=renew,
         domain=domain_from(os.environ),
         keyring=keyring(),
+        allow_refusal=allow_refusal,
         dry_run=dry_run,
     )
     if as_json:
@@ -654,10 +670,17 @@ Example:
     help="Accept ANSWER only from this permissions CA: its certificate, or the SHA-256 that "
     "sign_request and create_keystore print.",
 )
+@allow_refusal_option
 @dry_run_option
 @json_option
 def import_verb(
-    answer: Path, folder: Path | None, force: bool, pin: str | None, dry_run: bool, as_json: bool
+    answer: Path,
+    folder: Path | None,
+    force: bool,
+    pin: str | None,
+    allow_refusal: tuple[Vendor, ...],
+    dry_run: bool,
+    as_json: bool,
 ) -> None:
     """On a robot: install the file ANSWER (or -) next to the key in DIR, or change nothing.
 
@@ -672,7 +695,15 @@ def import_verb(
     folder = folder or keystore_from_environment()
     pinned = read_pin(pin) if pin is not None else frozenset[str]()
     data = read_named(answer, "answer")
-    done = import_answer(folder, data, now=now(), pinned=pinned, force=force, dry_run=dry_run)
+    done = import_answer(
+        folder,
+        data,
+        now=now(),
+        pinned=pinned,
+        force=force,
+        allow_refusal=allow_refusal,
+        dry_run=dry_run,
+    )
     if not dry_run:
         print_closed(folder, done.changes)
     if as_json:
@@ -695,6 +726,7 @@ def import_verb(
             "  compare both with the output of sign_request, or use --ca: otherwise they are "
             "not verified"
         )
+    print_notes(done.notes)
     if done.restart_zenoh:
         print_restart((done.name,), exported=False)
 
@@ -712,7 +744,7 @@ def _imported_json(
         "authorities_verified": pinned or not done.first,
         "restart_zenoh": [done.name] if done.restart_zenoh else [],
         "changes": changes_json(folder, done.changes),
-        "notes": [],
+        "notes": notes_json(done.notes),
     }
 
 

@@ -13,6 +13,7 @@ import click
 from sros_tool.cli.common import (
     PATH,
     SeveralValues,
+    allow_refusal_option,
     chosen_enclaves,
     complete_keystore_and_enclave,
     complete_template,
@@ -43,6 +44,7 @@ from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
+    from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.lifecycle.replaced import ReplacedRights
     from sros_tool.keystore.lifecycle.update import KeystoreUpdate
@@ -119,6 +121,7 @@ Example:
 @several_enclaves
 @fleet_option("The robots that the placeholders of the policy stand for.")
 @_revoke_old_option
+@allow_refusal_option
 @dry_run_option
 @json_option
 def create_permission(
@@ -128,6 +131,7 @@ def create_permission(
     robots: tuple[str, ...],
     fleet_file: Path | None,
     revoke_old: bool,
+    allow_refusal: tuple[Vendor, ...],
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -155,6 +159,7 @@ def create_permission(
         domain=ros_domain(),
         revoke_old=revoke_old,
         keyring=keyring(),
+        allow_refusal=allow_refusal,
         dry_run=dry_run,
     )
     _show(result, dry_run, as_json, [policy])
@@ -219,6 +224,7 @@ Example:
     shell_complete=complete_template,
 )
 @_revoke_old_option
+@allow_refusal_option
 @dry_run_option
 @json_option
 def generate_artifacts(
@@ -228,6 +234,7 @@ def generate_artifacts(
     fleet_file: Path | None,
     template_name: str | None,
     revoke_old: bool,
+    allow_refusal: tuple[Vendor, ...],
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -273,6 +280,7 @@ def generate_artifacts(
             create=template,
             revoke_old=revoke_old,
             keyring=keyring(),
+            allow_refusal=allow_refusal,
             dry_run=dry_run,
             progress=step,
         )
@@ -778,6 +786,7 @@ Example:
     "--allow-looser", is_flag=True, help="Allow that something becomes possible that was not."
 )
 @_revoke_old_option
+@allow_refusal_option
 @json_option
 @dry_run_option
 def update_keystore(
@@ -793,6 +802,7 @@ def update_keystore(
     next_stage: bool,
     allow_looser: bool,
     revoke_old: bool,
+    allow_refusal: tuple[Vendor, ...],
     as_json: bool,
     dry_run: bool,
 ) -> int:
@@ -876,6 +886,7 @@ def update_keystore(
             replace_edits=take_edits or discard_edits,
             seen=present,
             keyring=keyring(),
+            allow_refusal=allow_refusal,
             dry_run=dry_run,
             progress=step,
         )

@@ -12,6 +12,7 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
+    allow_refusal_option,
     check_chosen,
     chosen_enclaves,
     complete_keystore_and_enclave,
@@ -36,6 +37,7 @@ from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
+    from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.keystore.lifecycle.renew import Renewal
     from sros_tool.keystore.lifecycle.revoke import Revocation
     from sros_tool.pki.crl import RevocationList
@@ -70,6 +72,7 @@ Example:
     is_flag=True,
     help="Revoke earlier certificates of renewed enclaves, with the reason superseded.",
 )
+@allow_refusal_option
 @dry_run_option
 @json_option
 def renew(
@@ -81,6 +84,7 @@ def renew(
     new_key: bool,
     key: str,
     revoke_old: bool,
+    allow_refusal: tuple[Vendor, ...],
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -112,6 +116,7 @@ def renew(
             key=key,
             revoke_old=revoke_old,
             keyring=keyring(),
+            allow_refusal=allow_refusal,
             dry_run=dry_run,
             progress=step,
         )
@@ -206,6 +211,7 @@ Example:
     is_flag=True,
     help="During a CA rotation: revoke without the key of the old identity CA.",
 )
+@allow_refusal_option
 @dry_run_option
 @json_option
 def revoke(
@@ -215,6 +221,7 @@ def revoke(
     robots: tuple[str, ...],
     reason: str,
     until_retired: bool,
+    allow_refusal: tuple[Vendor, ...],
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -243,6 +250,7 @@ def revoke(
             reason=reason_text,
             keyring=keyring(),
             until_retired=until_retired,
+            allow_refusal=allow_refusal,
             dry_run=dry_run,
         )
     result = replace(result, remarks=(*selection_notes, *result.remarks))
@@ -286,9 +294,16 @@ Example:
 )
 @click.argument("root", type=PATH, required=False)
 @click.option("--refresh", is_flag=True, help="Sign the list again to extend its validity.")
+@allow_refusal_option
 @json_option
 @dry_run_option
-def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
+def crl(
+    root: Path | None,
+    refresh: bool,
+    allow_refusal: tuple[Vendor, ...],
+    as_json: bool,
+    dry_run: bool,
+) -> int:
     """Show the revocation list of the keystore ROOT, or sign it again.
 
     DDS refuses every participant once the list has expired, so the exit status is 1 if it expires
@@ -304,7 +319,9 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     list_enclaves(root)
     result = None
     if refresh:
-        result = refresh_crl(root, now=now(), keyring=keyring(), dry_run=dry_run)
+        result = refresh_crl(
+            root, now=now(), keyring=keyring(), allow_refusal=allow_refusal, dry_run=dry_run
+        )
         if dry_run and not as_json:
             print_plan(root, result.changes)
             return 0
@@ -459,6 +476,7 @@ Example:
     is_flag=True,
     help="Go on although robots of the fleet have not confirmed the stage: they are cut off.",
 )
+@allow_refusal_option
 @json_option
 @dry_run_option
 def rotate_ca(
@@ -476,6 +494,7 @@ def rotate_ca(
     encrypt_ca_keys: bool,
     delete_old_key: bool,
     allow_unconfirmed: bool,
+    allow_refusal: tuple[Vendor, ...],
     as_json: bool,
     dry_run: bool,
 ) -> None:
@@ -514,7 +533,12 @@ def rotate_ca(
                 "Leave out --permissions or --same-key.",
             )
         step = renew_identity_ca(
-            root, now=now(), keyring=keyring(), validity=validity, dry_run=dry_run
+            root,
+            now=now(),
+            keyring=keyring(),
+            validity=validity,
+            allow_refusal=allow_refusal,
+            dry_run=dry_run,
         )
     else:
         roles = [r for r, on in (("identity", identity), ("permissions", permissions)) if on]
@@ -530,6 +554,7 @@ def rotate_ca(
                 validity=validity,
                 delete_old_key=delete_old_key,
                 allow_unconfirmed=allow_unconfirmed,
+                allow_refusal=allow_refusal,
                 dry_run=dry_run,
                 progress=tick,
             )

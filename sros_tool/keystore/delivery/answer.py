@@ -5,18 +5,20 @@ from __future__ import annotations
 import hashlib
 import re
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import write_new_file
 from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.trust import check_same_authority, refuse_ca_keystore, trusted_in
+from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -85,7 +87,8 @@ class ImportedEnclave:
 
     ``first`` says whether the folder trusted no CA before, so that nothing vouched for the new
     ones.  ``until`` is the first expiry of certificate and permissions.  ``restart_zenoh`` says
-    whether processes on Zenoh that run have other rules until they are restarted.
+    whether processes on Zenoh that run have other rules until they are restarted.  ``notes`` are
+    about vendors whose nodes stop.
     """
 
     name: str
@@ -95,6 +98,7 @@ class ImportedEnclave:
     until: datetime
     changes: tuple[Change, ...]
     restart_zenoh: bool = False
+    notes: tuple[Note, ...] = ()
 
 
 def seal(files: dict[str, bytes], number: int, authority: Authority) -> bytes:
@@ -212,6 +216,7 @@ def import_answer(
     now: datetime,
     pinned: frozenset[str] = frozenset(),
     force: bool = False,
+    allow_refusal: Sequence[Vendor] = (),
     dry_run: bool = False,
 ) -> ImportedEnclave:
     """Install an answer next to the enclave's key in ``folder``, or change nothing.
@@ -221,12 +226,14 @@ def import_answer(
         pinned: SHA-256 of permissions CAs; if any, one of them must have signed the answer, also
             with ``force``.
         force: accept an answer that is older than the present files, or comes from other CAs.
+        allow_refusal: vendors on which nodes of the enclave may stop.
 
     Raises:
         DocumentError: ``data`` is not an answer.
         PkiError: the answer is not valid, see `check_answer`.
         KeystoreError: the key is missing, was revoked or is the key of another enclave, or the
-            answer is refused without ``force``.
+            answer is refused without ``force``; or no vendor would accept the enclave, or one would
+            not that does today.
     """
     answer = _read_answer(data)
     name = answer.name
@@ -262,6 +269,7 @@ def import_answer(
         for file in _OPTIONAL:
             if answer.file(file) is None and (place / file).exists():
                 transaction.remove(f"{enclave_folder(name)}/{file}")
+        notes = refuse_stopping(transaction, now, allowed=allow_refusal, remedy=_AGAIN)
         transaction.commit()
     return ImportedEnclave(
         name,
@@ -271,6 +279,7 @@ def import_answer(
         until,
         tuple(transaction.changes),
         ran and any(Path(each.path).name in ZENOH_SIGNED for each in transaction.changes),
+        notes,
     )
 
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from cryptography import x509
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.portable import name_notes
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
@@ -30,6 +31,7 @@ from sros_tool.keystore.fleet import (
     refuse_stale_domains,
     write_fleet,
 )
+from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -119,6 +121,7 @@ def sign_request(
     answer: Path | None = None,
     force: bool = False,
     domain: int | None = None,
+    allow_refusal: Sequence[Vendor] = (),
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Signed:
@@ -135,12 +138,14 @@ def sign_request(
         answer: the path for the answer, which is put in place after the keystore has changed.
         force: replace ``answer`` if it exists.
         domain: refuse a keystore that is not made for this domain.
+        allow_refusal: vendors on which nodes may stop.
 
     Raises:
         PkiError: the request is not valid.
         KeystoreError: the enclave exists (without ``renew``) or does not (with it), it was revoked
             and ``only`` does not name it, it is another one than ``only`` says, its key was revoked
-            or belongs to another enclave, ``answer`` exists, or the keystore cannot issue.
+            or belongs to another enclave, ``answer`` exists, the keystore cannot issue, no vendor
+            would accept the enclave, or one would not that does today.
     """
     request = load_request(data, "that was given")
     if only:
@@ -165,6 +170,7 @@ def sign_request(
         signer.record(sent)
         staged = staged_file(answer, archive) if answer and not dry_run else nullcontext()
         with staged as put_in_place:
+            stopped = refuse_stopping(transaction, now, allowed=allow_refusal)
             transaction.commit()
             if put_in_place:
                 put_in_place()
@@ -175,7 +181,7 @@ def sign_request(
         archive,
         renew,
         tuple(transaction.changes),
-        signer.all_notes(),
+        (*signer.all_notes(), *stopped),
     )
 
 
@@ -225,6 +231,7 @@ def certify_requests(
     only: Sequence[str] = (),
     renew: bool = False,
     domain: int | None = None,
+    allow_refusal: Sequence[Vendor] = (),
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Certified:
@@ -251,6 +258,7 @@ def certify_requests(
         tidy(root)
     list_enclaves(root)
     kept: tuple[str, ...] = ()
+    stopped: tuple[Note, ...] = ()
     with Transaction(root, dry_run=dry_run) as transaction:
         if not renew:
             existing = set(list_enclaves(root))
@@ -262,13 +270,14 @@ def certify_requests(
         if len(kept) < len(requests):
             signer.keep_zenoh()
             signer.record()
+            stopped = refuse_stopping(transaction, now, allowed=allow_refusal)
             transaction.commit()
     return Certified(
         {each.name: key_digest(each.public_key) for each in requests},
         kept,
         signer.authorities.identity.certificate,
         tuple(transaction.changes),
-        signer.all_notes(),
+        (*signer.all_notes(), *stopped),
     )
 
 

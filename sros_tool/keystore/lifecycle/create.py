@@ -17,6 +17,7 @@ from types import MappingProxyType
 
 from cryptography import x509
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.dds.portable import name_notes
@@ -37,6 +38,7 @@ from sros_tool.keystore.fleet import (
     refuse_stale_domains,
     write_fleet,
 )
+from sros_tool.keystore.issuing.acceptance import imported_notes, refuse_stopping
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -73,7 +75,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     earlier_permissions,
     replaced_rights,
 )
-from sros_tool.keystore.lifecycle.revoke import Superseded, revoke_superseded
+from sros_tool.keystore.lifecycle.revoke import Superseded, another_ca, revoke_superseded
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.reader import (
@@ -171,6 +173,9 @@ def create_keystore(
         domains = domains or DomainSet.of((0, 0))
         keystore = _write_keystore(transaction, template, domains, keyring, now, imported)
         append(transaction, keystore.entries, keystore.authorities.identity, now)
+        notes = keystore.authorities.notes
+        if imported:
+            notes += imported_notes(transaction, template, keystore.authorities, domains, now)
         transaction.commit()
     return Creation(
         root,
@@ -178,7 +183,7 @@ def create_keystore(
         domains,
         True,
         changes=transaction.changes,
-        notes=(*keystore.authorities.notes, *place_notes(root)),
+        notes=(*notes, *place_notes(root)),
     )
 
 
@@ -220,13 +225,15 @@ def create_permission(
     now: datetime,
     domain: int | None = None,
     revoke_old: bool = False,
+    allow_refusal: Sequence[Vendor] = (),
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Creation:
     """Replace the permissions of existing enclaves with their rights in ``policy``: all or none.
 
     The replaced permissions work for whoever kept them, until they expire.  ``revoke_old`` ends
-    that: the enclaves get new certificates for the same keys, and all earlier ones are revoked.
+    that: the enclaves get new certificates for the same keys, and all earlier ones are revoked.  On
+    the vendors in ``allow_refusal``, nodes may stop.
     """
     for name in names:
         check_enclave_name(name)
@@ -243,7 +250,13 @@ def create_permission(
     with Transaction(root, dry_run=dry_run) as transaction:
         keystore = open_to_issue(transaction, domain, keyring, now, protections=protections)
         return write_enclaves(
-            transaction, keystore, dict(wanted), now, revoke_old=revoke_old, keyring=keyring
+            transaction,
+            keystore,
+            dict(wanted),
+            now,
+            revoke_old=revoke_old,
+            allow_refusal=allow_refusal,
+            keyring=keyring,
         )
 
 
@@ -257,6 +270,7 @@ def generate_artifacts(
     create: Template | None = None,
     domains: DomainSet | None = None,
     revoke_old: bool = False,
+    allow_refusal: Sequence[Vendor] = (),
     key: str = "",
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
@@ -299,6 +313,7 @@ def generate_artifacts(
                 now,
                 progress,
                 revoke_old=revoke_old,
+                allow_refusal=allow_refusal,
                 keyring=keyring,
                 places=places,
             )
@@ -619,6 +634,7 @@ def write_enclaves(
     progress: Progress | None = None,
     *,
     revoke_old: bool = False,
+    allow_refusal: Sequence[Vendor] = (),
     keyring: Keyring = IN_KEYSTORE,
     places: Mapping[str, TokenUri] = MappingProxyType({}),
 ) -> Creation:
@@ -676,6 +692,12 @@ def write_enclaves(
     )
     kept = kept.without(created)  # no process of theirs runs yet
     append(transaction, entries, keystore.authorities.identity, now)
+    stopped = refuse_stopping(
+        transaction,
+        now,
+        allowed=allow_refusal,
+        remedy=another_ca(transaction.root, "replace the permissions") if revoked else "",
+    )
     transaction.commit()
     return Creation(
         transaction.root,
@@ -696,7 +718,7 @@ def write_enclaves(
         ),
         tuple(each.replaced for each in done.values() if each.replaced),
         keystore.names if revoked else keystore.restart or kept.restart,
-        (*(revoked.remarks if revoked else ()), *keystore.remarks),
+        (*(revoked.remarks if revoked else ()), *keystore.remarks, *stopped),
         kept,
     )
 

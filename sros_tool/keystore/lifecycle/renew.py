@@ -9,6 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from shlex import quote
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.authorities.authority import Authorities, load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
@@ -19,6 +20,7 @@ from sros_tool.keystore.expiry import (
     read_credentials,
     refuse_unreadable,
 )
+from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -36,7 +38,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import append
-from sros_tool.keystore.lifecycle.revoke import Superseded, revoke_superseded
+from sros_tool.keystore.lifecycle.revoke import Superseded, another_ca, revoke_superseded
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import governance_of, load_settings
 from sros_tool.keystore.recorded import EarlierRights, RecordedRights
@@ -87,6 +89,7 @@ def renew(
     new_key: bool = False,
     key: str = "",
     revoke_old: bool = False,
+    allow_refusal: Sequence[Vendor] = (),
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
     progress: Progress | None = None,
@@ -97,10 +100,12 @@ def renew(
     token that ``key`` names, as in `create_enclaves`; the signed rights do not change.  All files
     are replaced at once.  A replaced certificate works for anyone who has its key until it expires
     or is revoked; ``revoke_old`` revokes all earlier certificates of the renewed enclaves, and
-    gives them subjects that no earlier permissions fit.
+    gives them subjects that no earlier permissions fit.  On the vendors in ``allow_refusal``, nodes
+    may stop.
 
     Raises:
-        KeystoreError: enclaves cannot be renewed; the error names all of them.
+        KeystoreError: enclaves cannot be renewed, and the error names all of them; or vendors would
+            refuse enclaves that they accept today.
     """
     if key and (expiring or new_key):
         raise UsageError(
@@ -184,6 +189,12 @@ def renew(
             )
             notes += kept.notes
         append(transaction, entries, authorities.identity, now)
+        notes += refuse_stopping(
+            transaction,
+            now,
+            allowed=allow_refusal,
+            remedy=another_ca(root, "renew with --revoke-old") if revoked else "",
+        )
         transaction.commit()
     return Renewal(
         root,

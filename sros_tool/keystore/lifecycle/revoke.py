@@ -7,12 +7,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from shlex import quote
 
 from cryptography import x509
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.authorities.authority import Authority, load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
 from sros_tool.keystore.layout import (
     CRL,
@@ -20,6 +23,7 @@ from sros_tool.keystore.layout import (
     KEY_URI_FILE,
     OPTIONAL_FILES,
     PERMISSIONS,
+    PRIVATE,
     REQUEST,
     REQUIRED_FILES,
     REVOKED,
@@ -32,7 +36,9 @@ from sros_tool.keystore.ledger import Entry, Ledger, append, certificate_entry, 
 from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner, put_away
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import (
+    authority_files,
     governance_of,
+    identity_file,
     load_ca_certificate,
     load_settings,
     read_certificate,
@@ -86,6 +92,7 @@ def revoke(
     reason: str = "unspecified",
     keyring: Keyring = IN_KEYSTORE,
     until_retired: bool = False,
+    allow_refusal: Sequence[Vendor] = (),
     dry_run: bool = False,
 ) -> Revocation:
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
@@ -95,11 +102,11 @@ def revoke(
     If the ledger may lack some, a remark says so.  The other enclaves get
     ``crl.pem``, a link to the list.  During a rotation of the identity CA, both CAs sign a list; if
     the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts its
-    certificates until it is retired.
+    certificates until it is retired.  On the vendors in ``allow_refusal``, nodes may stop.
 
     Raises:
-        KeystoreError: an enclave does not exist, the identity CA did not issue its certificate, or
-            the key of a CA is missing.
+        KeystoreError: an enclave does not exist, the identity CA did not issue its certificate, the
+            key of a CA is missing, or vendors would refuse other enclaves with the list.
         UsageError: ``reason`` is not one of `REASONS`.
     """
     if reason not in REASONS:
@@ -147,6 +154,9 @@ def revoke(
                 ZenohChange(gone=gone),
             )
         append(transaction, entries, authority, now)
+        stopped = refuse_stopping(
+            transaction, now, allowed=allow_refusal, remedy=another_ca(root, "revoke")
+        )
         transaction.commit()
     return Revocation(
         root,
@@ -154,13 +164,18 @@ def revoke(
         remaining,
         next_update,
         transaction.changes,
-        (*lists.remarks, *_remarks_on_lack(root, ledger, present), *kept.notes),
+        (*lists.remarks, *_remarks_on_lack(root, ledger, present), *kept.notes, *stopped),
         kept,
     )
 
 
 def refresh_crl(
-    root: Path, *, now: datetime, keyring: Keyring = IN_KEYSTORE, dry_run: bool = False
+    root: Path,
+    *,
+    now: datetime,
+    keyring: Keyring = IN_KEYSTORE,
+    allow_refusal: Sequence[Vendor] = (),
+    dry_run: bool = False,
 ) -> Revocation:
     """Sign the revocation list again, so that it is valid for longer.
 
@@ -179,9 +194,26 @@ def refresh_crl(
         next_update, entries = lists.sign((), existing, incomplete=True)
         _link_everywhere(transaction, existing)
         append(transaction, entries, authority, now)
+        stopped = refuse_stopping(
+            transaction, now, allowed=allow_refusal, remedy=another_ca(root, "sign the list")
+        )
         transaction.commit()
-    changes, remarks = transaction.changes, tuple(lists.remarks)
+    changes, remarks = transaction.changes, (*lists.remarks, *stopped)
     return Revocation(root, (), existing, next_update, changes, remarks)
+
+
+def another_ca(root: Path, aim: str) -> str:
+    """Return what to do where DDS refuses the lists of the identity CA, before the ``aim``."""
+    file = identity_file(root)
+    words = ["sros rotate_ca", quote(str(root))]
+    if len(authority_files(root)) > 1:
+        words.append("--identity")
+    if not (root / f"{PRIVATE}/{file}.key.pem").exists():
+        words.append("--identity-key URI")
+    return (
+        f"Replace the identity CA by one that may sign revocation lists: `{' '.join(words)} "
+        f"--finish`, restart all processes, and {aim} then."
+    )
 
 
 def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:

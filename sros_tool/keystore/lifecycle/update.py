@@ -16,6 +16,7 @@ from enum import StrEnum
 from pathlib import Path
 from shlex import quote
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant
@@ -36,6 +37,7 @@ from sros_tool.keystore.expiry import (
     refuse_unreadable,
 )
 from sros_tool.keystore.fleet import EnclaveDomains, checked_fleet
+from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -68,7 +70,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     replaced_rights,
     rights_text,
 )
-from sros_tool.keystore.lifecycle.revoke import Superseded, revoke_superseded
+from sros_tool.keystore.lifecycle.revoke import Superseded, another_ca, revoke_superseded
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.reader import authority_files, governance_of, load_settings
 from sros_tool.keystore.recorded import EarlierRights, RecordedRights
@@ -330,6 +332,7 @@ def update_keystore(
     next_stage: bool = False,
     allow_looser: bool = False,
     revoke_old: bool = False,
+    allow_refusal: Sequence[Vendor] = (),
     replace_edits: bool = False,
     seen: PresentSettings | None = None,
     keyring: Keyring = IN_KEYSTORE,
@@ -347,6 +350,7 @@ def update_keystore(
         allow_looser: accept that something becomes possible that was not.
         revoke_old: issue all certificates again, with subjects that no earlier permissions fit, and
             revoke all earlier ones.
+        allow_refusal: vendors on which nodes may stop.
         replace_edits: accept that ``target`` replaces what somebody edited by hand in the settings
             or the governance, as ``target`` has those edits, or undoes them.
         seen: the settings that ``target`` was made from.
@@ -357,8 +361,9 @@ def update_keystore(
     Raises:
         UsageError: something would become looser without ``allow_looser``, or ``target`` cannot be
             reached from here.
-        KeystoreError: an enclave cannot be issued again, files were edited by hand, or the settings
-            are no longer those that were ``seen``.
+        KeystoreError: an enclave cannot be issued again, files were edited by hand, the settings
+            are no longer those that were ``seen``, or vendors would refuse enclaves that they
+            accept today.
     """
     if not dry_run:
         tidy(root)
@@ -402,6 +407,13 @@ def update_keystore(
                 "Nothing was changed.",
                 "If that is meant, add --allow-looser.",
             )
+        stopped = refuse_stopping(
+            transaction,
+            now,
+            allowed=allow_refusal,
+            remedy=another_ca(root, "update with --revoke-old") if revoke_old else "",
+        )
+        update = replace(update, remarks=(*update.remarks, *stopped))
         transaction.commit()
     return update
 

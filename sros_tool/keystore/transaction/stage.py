@@ -140,10 +140,14 @@ class Changes(Sequence[Change]):
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """The changes that a forked worker staged, sent to the process that commits."""
+    """The changes that a forked worker staged, sent to the process that commits.
+
+    ``kept`` are the new files and the targets of links of a dry run.
+    """
 
     changes: tuple[ChangeRun, ...]
     moves: tuple[Move, ...]
+    kept: dict[str, bytes | str]
 
 
 def staged_name(path: str) -> str:

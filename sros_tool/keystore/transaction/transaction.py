@@ -19,6 +19,7 @@ import os
 import secrets
 import stat
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
@@ -54,12 +55,16 @@ from sros_tool.keystore.transaction.stage import (
     write_manifest,
 )
 from sros_tool.parallel import map_slices
+from sros_tool.xml import read_bytes
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _LOG = logging.getLogger(__name__)
 _KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
+_MOST_LINKS = 8
+_MOST_KEPT = 32 << 20
+"""Bytes of new files that a process keeps in a dry run, so that they can be looked at."""
 
 
 class Transaction:
@@ -87,6 +92,8 @@ class Transaction:
         self._parents: set[str] = set()  # of folders that are staged
         self._moves: list[Move] = []
         self._undo: list[Callable[[], None]] = []
+        self._kept: dict[str, bytes | str] = {}  # new files, and targets of links, of a dry run
+        self._kept_bytes = 0
 
     @property
     def _in(self) -> Folder:
@@ -215,6 +222,9 @@ class Transaction:
     def write(self, path: str, data: bytes, *, private: bool = False) -> None:
         """Stage a file with the content ``data``; a ``private`` file always has mode 0600."""
         self.write_parts(path, (data,), private=private)
+        if self.dry_run and not private and self._kept_bytes + len(data) <= _MOST_KEPT:
+            self._kept[path] = data
+            self._kept_bytes += len(data)
 
     def write_parts(self, path: str, parts: Iterable[bytes], *, private: bool = False) -> None:
         """Stage a file as `write` does, part by part; a dry run takes no part."""
@@ -235,12 +245,60 @@ class Transaction:
         """
         return self._in.read_inside(path)
 
+    def place_after(self, path: str) -> str:
+        """Return where the content of ``path`` will be, through links, for `content_after`."""
+        for _ in range(_MOST_LINKS):
+            target = self._target_after(path)
+            if target is None:
+                break
+            path = os.path.normpath(f"{path.rpartition('/')[0]}/{target}")
+            if target.startswith("/") or path.startswith(".."):  # out of the keystore
+                return str(self.root / path) if path.startswith("..") else target
+        return path
+
+    def content_after(self, place: str) -> bytes | None:
+        """Return the content that a file, not a link, will have.
+
+        It is None if there will be no such file, or if it cannot be read, or if this dry run made
+        too many files to keep this one.
+        """
+        if not self._is_staged(place):
+            return _content(self.root / place)
+        if self.dry_run:
+            kept = self._kept.get(place)
+            return kept if isinstance(kept, bytes) else None
+        return _content(Path(self._stage_place(place)))
+
+    def _target_after(self, path: str) -> str | None:
+        """Return the target of the link that will be at ``path``; None if it will be no link."""
+        if not self._is_staged(path):
+            return _link_target(f"{self.root}/{path}")
+        if self.dry_run:
+            kept = self._kept.get(path)
+            return kept if isinstance(kept, str) else None
+        target = _link_target(self._stage_place(path))
+        return target and target.removeprefix(relocated_target(path, ""))
+
+    def _stage_place(self, path: str) -> str:
+        exists = not self._new_root and self._in.is_folder(path.rpartition("/")[0])
+        staged = f"{STAGE}/{AFTER}/{staged_name(path)}" if exists else f"{self._added}{path}"
+        return f"{self._in.path}/{staged}"
+
+    def changed_folders(self) -> dict[str, set[str]]:
+        """Map each folder ("" is the keystore) to the names of the files in it that change."""
+        found: dict[str, set[str]] = {}
+        for run in self.changes.since(0):
+            found.setdefault(run.folder.removesuffix("/"), set()).update(run.names)
+        return found
+
     def link(self, path: str, target: str) -> None:
         """Stage a symbolic link to ``target``, which is relative to the folder of ``path``."""
         staged = self._prepare(path, target)
         if staged is not None:
             flat = self._folders[path.rpartition("/")[0]]
             self._in.symlink(relocated_target(path, target) if flat else target, staged)
+        else:
+            self._kept[path] = target
 
     def remove(self, path: str) -> None:
         """Stage the removal of a file or link, and of folders that become empty."""
@@ -333,13 +391,15 @@ class Transaction:
         With ``alone``, there are no forked workers: the session of a token does not survive a fork.
         """
         own_process, first_change, first_move = os.getpid(), self.changes.mark(), len(self._moves)
+        first_kept = len(self._kept)
 
         def work_on(part: Sequence[Item]) -> tuple[Result, Staged | None]:
             result = work(part)
             if os.getpid() == own_process:
                 return result, None
             changes, moves = self.changes.since(first_change), self._moves[first_move:]
-            return result, Staged(changes, tuple(moves))
+            kept = dict(islice(self._kept.items(), first_kept, None))
+            return result, Staged(changes, tuple(moves), kept)
 
         slices = [(items, work_on(items))] if alone else map_slices(items, work_on)
         for _, (_, staged) in slices:
@@ -349,6 +409,7 @@ class Transaction:
                     self._note_staged(place, (*self._staged.get(place, ()), *names))
                 self.changes.extend(staged.changes)
                 self._moves += staged.moves
+                self._kept |= staged.kept
         return [(part, result) for part, (result, _) in slices]
 
     def adopt(self) -> None:
@@ -422,6 +483,20 @@ class Transaction:
         self._undo.clear()
         with contextlib.suppress(OSError), Folder(self.root.parent) as parent:
             parent.flush()  # already in place; otherwise the system flushes it soon
+
+
+def _link_target(path: str) -> str | None:
+    try:
+        return os.readlink(path)
+    except OSError:
+        return None
+
+
+def _content(path: Path) -> bytes | None:
+    try:
+        return read_bytes(path, "file")
+    except SrosError:
+        return None
 
 
 def _open_keys(root: Path) -> Iterator[str]:

@@ -18,10 +18,12 @@ from shlex import quote
 
 from cryptography import x509
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.authorities.authority import Authority, write_bundle, write_copies
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring, check_places
+from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -137,6 +139,7 @@ def rotate_ca(
     validity: Span | None = None,
     delete_old_key: bool = False,
     allow_unconfirmed: bool = False,
+    allow_refusal: Sequence[Vendor] = (),
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> RotationStep:
@@ -146,11 +149,12 @@ def rotate_ca(
     "permissions"; default: both) and ``validity`` of the new CAs are only used when a rotation
     begins.  ``keyring`` opens the present keys; ``new_keys`` names the places of new keys outside
     of the keystore.  In a keystore with a fleet, a stage that cuts robots off, because they have
-    not confirmed the one before, needs ``allow_unconfirmed``.
+    not confirmed the one before, needs ``allow_unconfirmed``.  On the vendors in ``allow_refusal``,
+    nodes may stop.
 
     Raises:
-        KeystoreError: a key is missing, an enclave cannot be moved to the new CA, or robots would
-            be cut off.
+        KeystoreError: a key is missing, an enclave cannot be moved to the new CA, robots would be
+            cut off, or vendors would refuse enclaves that they accept today.
         UsageError: the stage ``to`` is over, or is not the next stage.
     """
     if not dry_run:
@@ -173,6 +177,7 @@ def rotate_ca(
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
                 rotator.notes += tuple(of_no_robot(root, names))
+            rotator.notes += refuse_stopping(transaction, now, allowed=allow_refusal)
             transaction.commit()
     return RotationStep(
         root,
@@ -262,6 +267,7 @@ def renew_identity_ca(
     now: datetime,
     keyring: Keyring = IN_KEYSTORE,
     validity: Span | None = None,
+    allow_refusal: Sequence[Vendor] = (),
     dry_run: bool = False,
 ) -> RotationStep:
     """Issue a new certificate for the identity CA, with the same name and key and a later expiry.
@@ -314,8 +320,11 @@ def renew_identity_ca(
         transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
         entry = certificate_entry(now, "ca", new, reason=SAME_KEY)
         append(transaction, [entry], Authority(new, key), now)
+        notes = refuse_stopping(transaction, now, allowed=allow_refusal)
         transaction.commit()
-    return RotationStep(root, RotationStage.NONE, ("identity_ca",), names, transaction.changes)
+    return RotationStep(
+        root, RotationStage.NONE, ("identity_ca",), names, transaction.changes, notes=notes
+    )
 
 
 class _Rotator:

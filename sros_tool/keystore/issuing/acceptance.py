@@ -1,0 +1,399 @@
+"""Acceptance of enclaves by DDS vendors, before a transaction puts new files in place.
+
+Every verb that changes trust calls `refuse_stopping` before it commits.  Each changed enclave is
+evaluated as every measured vendor would load it, now and after the change.  What a vendor accepts
+today and would refuse then, its nodes would stop at their next start, so the change is refused.
+
+All enclaves are read; of those that do not differ in anything that a vendor looks at, one is
+evaluated for all.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from sros_tool.dds.decision.answers import Decision
+from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import render_permissions
+from sros_tool.errors import KeystoreError, Note, SrosError
+from sros_tool.faults import Fault
+from sros_tool.files import write_new_file
+from sros_tool.keystore.authorities.authority import Authorities
+from sros_tool.keystore.issuing.enclave import default_rights
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    CRL,
+    CRL_FILE,
+    ENCLAVES,
+    GOVERNANCE_FILE,
+    GOVERNANCE_P7S,
+    IDENTITY_CA_FILE,
+    KEY_URI_FILE,
+    PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
+    PUBLIC,
+    REQUEST,
+    ROLES,
+    ca_certificate,
+    enclave_folder,
+)
+from sros_tool.keystore.participant import JoinContext, VendorParticipant, load_enclave
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import (
+    enclave_subject,
+    load_certificate,
+    pem,
+    subject_text,
+    validity_of,
+)
+from sros_tool.pki.crl import read_list, sign_crl
+from sros_tool.pki.keys import algorithm, generate_key
+from sros_tool.translate import permissions_for
+from sros_tool.validity import window
+from sros_tool.xml import read_bytes
+
+_LOADED = (
+    IDENTITY_CA_FILE,
+    PERMISSIONS_CA_FILE,
+    CERTIFICATE_FILE,
+    GOVERNANCE_FILE,
+    PERMISSIONS_FILE,
+    CRL_FILE,
+    KEY_URI_FILE,
+)
+"""The files that DDS loads, but for the key, which no change exchanges without its certificate."""
+_NEEDED = _LOADED[:5]
+_ONLY_IDENTITY = {IDENTITY_CA_FILE, CRL.rpartition("/")[2]}
+"""Shared files with which vendors verify no governance and no permissions."""
+_UNUSUAL = re.compile(r"[^A-Za-z0-9/_]")
+_SHOWN = 5
+_EXAMPLE = "/example"
+_MOST_BROKEN = 20
+"""Enclaves of one kind that are tried until a vendor accepts one of them."""
+
+Files = dict[str, bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class Refusals:
+    """The enclaves that a vendor would refuse, and its reasons as clauses."""
+
+    enclaves: tuple[str, ...]
+    reasons: tuple[str, ...]
+
+
+def refuse_stopping(
+    transaction: Transaction,
+    now: datetime,
+    *,
+    allowed: Collection[Vendor] = (),
+    remedy: str = "",
+) -> tuple[Note, ...]:
+    """Refuse a transaction after which vendors refuse enclaves that they accept today.
+
+    An enclave that is new is refused if no vendor would accept it.
+
+    Args:
+        transaction: the transaction, with all its files staged.
+        now: the time at which the enclaves are evaluated.
+        allowed: vendors whose nodes may stop, because the user named them.
+        remedy: what to do instead, as sentences; by default the changed files are named.
+
+    Returns:
+        Notes on what stops on the ``allowed`` vendors.
+
+    Raises:
+        KeystoreError: nodes of a vendor that is not ``allowed`` would stop.
+    """
+    found = stopped_enclaves(transaction, now)
+    if refused := {vendor: each for vendor, each in found.items() if vendor not in allowed}:
+        raise _would_stop(transaction.root, refused, remedy)
+    return tuple(
+        Note(
+            "vendor.refuses",
+            f"{vendor.title} refuses {_some(each.enclaves)} from now on: "
+            f"{'; '.join(each.reasons)}. Its nodes that run go on until they are started again.",
+        )
+        for vendor, each in found.items()
+    )
+
+
+def stopped_enclaves(transaction: Transaction, now: datetime) -> dict[Vendor, Refusals]:
+    """Return the vendors that would refuse enclaves which they accept today, or which are new."""
+    stopped: dict[Vendor, dict[str, list[str]]] = {}
+    for names in _kinds(transaction, now).values():
+        for tried, name in enumerate(names, 1):
+            before, after = _files_before(transaction.root, name), _files_after(transaction, name)
+            accepted = set(MEASURED) - refusals(name, before, now).keys() if before else set()
+            if accepted or not before or tried == _MOST_BROKEN:
+                break
+        if not after:
+            continue
+        refused = refusals(name, after, now)
+        if not before:
+            accepted = set(MEASURED) if len(refused) == len(MEASURED) else set()
+        for vendor in MEASURED:
+            if vendor in accepted and vendor in refused:
+                stopped.setdefault(vendor, {}).setdefault(refused[vendor], []).extend(names)
+    return {
+        vendor: Refusals(tuple(sorted(name for names in by.values() for name in names)), tuple(by))
+        for vendor, by in stopped.items()
+    }
+
+
+def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
+    """Map each measured vendor that refuses an enclave with these files to its reason.
+
+    The key is taken to be that of the certificate.
+    """
+    with tempfile.TemporaryDirectory(prefix="sros-") as folder:
+        for file, data in files.items():
+            write_new_file(Path(folder, file), data)
+        if KEY_URI_FILE not in files:
+            write_new_file(Path(folder, REQUEST), b"\n")  # as where the key is on its robot
+        enclave = load_enclave(name, Path(folder), at=now)
+    domains = enclave.joined_domains
+    domain = next(iter(domains), 0) if domains else 0
+    found = {}
+    for vendor in MEASURED:
+        participant = VendorParticipant(vendor, enclave, JoinContext(domain, now))
+        decision = participant.join()
+        too_large = {each.fault for each in participant.problems} == {Fault.DOCUMENT_SIZE}
+        if not decision.outcome.ok and not too_large:  # of which a note tells
+            found[vendor] = _reason(participant, decision)
+    return found
+
+
+def _reason(participant: VendorParticipant, decision: Decision) -> str:
+    return str(participant.problems[0]).rstrip(".") if participant.problems else decision.clause
+
+
+def _would_stop(root: Path, found: Mapping[Vendor, Refusals], remedy: str) -> KeystoreError:
+    names = tuple(sorted({name for each in found.values() for name in each.enclaves}))
+    why = {vendor: "; ".join(each.reasons[:_SHOWN]) for vendor, each in found.items()}
+    whose = "its" if len(names) == 1 else "their"
+    options = " ".join(f"--allow-refusal {vendor.value}" for vendor in found)
+    return KeystoreError(
+        f"no node could start any more in {_some(names)} of '{root}'",
+        f"{_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
+        f"{remedy or 'Replace the file that is named.'} If no node runs on "
+        f"{_list([each.title for each in found])}, add {options}.",
+    )
+
+
+def _clauses(refused: Mapping[Vendor, str], what: str) -> str:
+    """Return which vendors refuse ``what``, by reason."""
+    by_reason: dict[str, list[str]] = {}
+    for vendor, reason in refused.items():
+        by_reason.setdefault(reason, []).append(vendor.title)
+    return "; ".join(
+        f"{_list(titles)} {'refuses' if len(titles) == 1 else 'refuse'} {what} ({reason})"
+        for reason, titles in by_reason.items()
+    )
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return f"{', '.join(names[:_SHOWN])}{more}"
+
+
+def _list(words: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
+
+
+# ── CAs that are imported ──────────────────────────────────────────────────────────────────
+
+
+def imported_notes(
+    transaction: Transaction,
+    template: Template,
+    authorities: Authorities,
+    domains: DomainSet,
+    now: datetime,
+) -> tuple[Note, ...]:
+    """Return which vendors refuse enclaves of imported CAs, from now on or after a revocation.
+
+    An enclave is issued and evaluated that is not written, without and with a revocation list.
+    Vendors that the notes of ``authorities`` name already are left out.
+
+    Raises:
+        KeystoreError: no vendor would accept an enclave of the keystore.
+    """
+    files = _example(transaction, template, authorities, domains, now)
+    refused = refusals(_EXAMPLE, files, now)
+    if len(refused) == len(MEASURED):
+        raise KeystoreError(
+            f"no DDS vendor would accept an enclave of keystore '{transaction.root}'",
+            f"{_clauses(refused, 'it')}. Nothing was written.",
+            "Name CAs that vendors accept, or let sros make them.",
+        )
+    known = " ".join(note.text for note in authorities.notes)
+    notes = []
+    if new := {vendor: why for vendor, why in refused.items() if vendor.title not in known}:
+        others = [vendor.title for vendor in MEASURED if vendor not in refused]
+        verb = "accepts" if len(others) == 1 else "accept"
+        text = f"{_clauses(new, 'the enclaves of this keystore')}; {_list(others)} {verb} them."
+        notes.append(Note("portable.imported-ca", text))
+    identity = authorities.identity
+    validity = validity_of(identity.certificate).within(window(now, template.revocation_validity))
+    crl = sign_crl(
+        identity.certificate,
+        identity.key,
+        (),
+        number=1,
+        this_update=validity.not_before,
+        next_update=validity.not_after,
+    )
+    listed = refusals(_EXAMPLE, files | {CRL_FILE: crl}, now)
+    if later := {vendor: why for vendor, why in listed.items() if vendor not in refused}:
+        text = (
+            f"with a revocation list of this identity CA, no enclave would work any more: "
+            f"{_clauses(later, 'it')}. So `sros revoke` refuses to sign one. To revoke enclaves, "
+            "have the CA's certificate issued again with keyUsage cRLSign, or let sros make the "
+            "identity CA."
+        )
+        notes.append(Note("portable.revocation-list", text))
+    return tuple(notes)
+
+
+def _example(
+    transaction: Transaction,
+    template: Template,
+    authorities: Authorities,
+    domains: DomainSet,
+    now: datetime,
+) -> Files:
+    """Return the files of an enclave of a new keystore."""
+    files = {
+        f"{role}_ca.cert.pem": transaction.content_after(
+            transaction.place_after(ca_certificate(role))
+        )
+        for role in ROLES
+    }
+    files[GOVERNANCE_FILE] = transaction.content_after(GOVERNANCE_P7S)
+    validity = window(now, template.certificate_validity)
+    subject = enclave_subject(_EXAMPLE, unique=template.unique_subject)
+    certificate = authorities.identity.issuer().issue(
+        subject, generate_key().public_key(), validity
+    )
+    signer = authorities.permissions
+    rights = default_rights(template, _EXAMPLE)
+    validity = validity.within(validity_of(signer.certificate))
+    permissions = permissions_for(
+        rights,
+        subject=subject_text(certificate.subject),
+        validity=validity.within(validity_of(certificate)),
+        domains=domains.closed(),
+    )
+    files[CERTIFICATE_FILE] = pem(certificate)
+    files[PERMISSIONS_FILE] = signer.sign(render_permissions(permissions), "example permissions")
+    return _complete(files)
+
+
+# ── the enclaves that change ───────────────────────────────────────────────────────────────
+
+
+def _kinds(transaction: Transaction, now: datetime) -> dict[tuple[object, ...], list[str]]:
+    """Return the complete enclaves that change, by all in which vendors could see a difference."""
+    changed = transaction.changed_folders()
+    shared = changed.get(PUBLIC, set()) | changed.get(ENCLAVES, set()) & {GOVERNANCE_FILE}
+    documents = not shared <= _ONLY_IDENTITY
+    names = {
+        f"/{folder.removeprefix(ENCLAVES).lstrip('/')}"
+        for folder, files in changed.items()
+        if folder.split("/", 1)[0] == ENCLAVES and not files.isdisjoint(_LOADED)
+    }
+    if shared:
+        names.update(transaction.enclaves)
+    present = frozenset(transaction.enclaves)
+    lists: dict[str, frozenset[int]] = {}
+    found: dict[tuple[object, ...], list[str]] = {}
+    for name in sorted(names):
+        folder = enclave_folder(name)
+        places = {file: transaction.place_after(f"{folder}/{file}") for file in _LOADED}
+        own = frozenset(changed.get(folder, ())).intersection(_LOADED)
+        kind: tuple[object, ...] = tuple(p.removeprefix(f"{folder}/") for p in places.values()), own
+        if name in present:  # otherwise this transaction issues it, as all others that are new
+            data = transaction.content_after(places[CERTIFICATE_FILE])
+            if not data:
+                continue  # it is revoked, or its request is not answered yet
+            crl = places[CRL_FILE]
+            if crl not in lists:
+                lists[crl] = _listed(transaction.content_after(crl) or b"")
+            before = _content(transaction.root / folder / CERTIFICATE_FILE) if own else b""
+            signed = documents or PERMISSIONS_FILE in own
+            kind += (
+                _certificate_kind(data, lists[crl], now),
+                _certificate_kind(before, frozenset(), now),
+                signed and _signers(transaction.content_after(places[PERMISSIONS_FILE]) or b""),
+            )
+        found.setdefault(kind, []).append(name)
+    return found
+
+
+def _files_after(transaction: Transaction, name: str) -> Files:
+    """Return the files of an enclave as they will be; none if one is missing."""
+    places = {f: transaction.place_after(f"{enclave_folder(name)}/{f}") for f in _LOADED}
+    return _complete({file: transaction.content_after(place) for file, place in places.items()})
+
+
+def _files_before(root: Path, name: str) -> Files:
+    """Return the files of an enclave as they are; none if one is missing."""
+    return _complete({file: _content(root / enclave_folder(name) / file) for file in _LOADED})
+
+
+def _complete(found: Mapping[str, bytes | None]) -> Files:
+    files = {file: data for file, data in found.items() if data}
+    return files if all(file in files for file in _NEEDED) else {}
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return read_bytes(path, "file")
+    except SrosError:
+        return b""
+
+
+def _certificate_kind(
+    data: bytes, listed: frozenset[int], now: datetime
+) -> tuple[object, ...] | None:
+    """Return all of a certificate in which vendors could see a difference, but its name and key."""
+    try:
+        found = load_certificate(data, "")
+    except SrosError:
+        return None
+    return (
+        found.issuer.public_bytes(),
+        found.signature_algorithm_oid,
+        algorithm(found.public_key()),
+        tuple((each.oid, each.critical) for each in found.extensions),
+        tuple(each.oid for each in found.subject),
+        frozenset(_UNUSUAL.findall(subject_text(found.subject))),
+        validity_of(found).contains(now),
+        found.serial_number in listed,
+    )
+
+
+def _listed(crl: bytes) -> frozenset[int]:
+    """Return the serial numbers on a revocation list."""
+    try:
+        return frozenset(each.serial_number for each in read_list(crl, ""))
+    except SrosError:
+        return frozenset()
+
+
+def _signers(message: bytes) -> tuple[object, ...] | None:
+    """Return by whom and how permissions are signed."""
+    try:
+        signed = smime.parse(message)
+    except SrosError:
+        return None
+    return signed.certificates, signed.digest

@@ -1,0 +1,226 @@
+"""Changes after which vendors would refuse enclaves that they accept: nothing is written.
+
+The CAs are made by OpenSSL, as those of companies.  The vendors' own answers to such keystores are
+in `tests.integration`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore.issuing.acceptance import refusals, refuse_stopping
+from sros_tool.keystore.layout import CRL, enclave_path, list_enclaves
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.template import load_template
+from sros_tool.keystore.transaction.transaction import Transaction
+from tests.support.children import run
+from tests.support.harness import Ended, sros
+
+CA, SIGNS = "basicConstraints=critical,CA:TRUE", "keyCertSign,digitalSignature"
+PSS = ("-sigopt", "rsa_padding_mode:pss", "-sigopt", "rsa_pss_saltlen:-1")
+RSA = ("-newkey", "rsa:2048")
+EC = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1")
+ALL = tuple(vendor.value for vendor in MEASURED)
+
+
+def now() -> datetime:
+    return datetime.now(UTC)
+
+
+@pytest.fixture(scope="module")
+def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """CAs and their keys: some without cRLSign, one of them below a root, one signed with PSS."""
+    folder = tmp_path_factory.mktemp("pki")
+
+    def make(name: str, *words: str, usage: str = f"{SIGNS},cRLSign") -> None:
+        extensions = ("-addext", CA, "-addext", f"keyUsage=critical,{usage}")
+        out = ("-keyout", f"{name}.key", "-out", f"{name}.pem", "-subj", f"/O=Corp/CN={name}")
+        run(["openssl", "req", "-x509", "-days", "900", "-nodes", *words, *extensions, *out],
+            cwd=folder)  # fmt: skip
+
+    make("good", *EC)
+    make("good RSA", *RSA)
+    make("no lists", *EC, usage=SIGNS)
+    make("PSS", *RSA, *PSS)
+    make("below", *EC, "-CA", "good.pem", "-CAkey", "good.key", usage=SIGNS)
+    chain = (folder / "below.pem").read_bytes() + (folder / "good.pem").read_bytes()
+    (folder / "below.pem").write_bytes(chain)
+    return folder
+
+
+def created(pki: Path, name: str, root: Path, role: str = "identity") -> Ended:
+    place = (f"--{role}-ca", pki / f"{name}.pem", f"--{role}-key", pki / f"{name}.key")
+    return sros("create_keystore", root, "--template", "production", *place)
+
+
+@pytest.fixture
+def corporate(pki: Path, tmp_path: Path) -> Path:
+    """A keystore with an identity CA that may not sign revocation lists, and its enclaves."""
+    root = tmp_path / "ks"
+    created(pki, "no lists", root).ok()
+    sros("create_enclave", root, "/a", "/b", "/lost").ok()
+    return root
+
+
+def refused_by(root: Path, name: str) -> set[Vendor]:
+    files = {path.name: path.read_bytes() for path in enclave_path(root, name).iterdir()}
+    files.pop("key.pem", None)
+    return set(refusals(name, files, now()))
+
+
+def contents(root: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in root.rglob("*")
+        if path.is_file()
+    }
+
+
+@pytest.mark.parametrize("name", ["no lists", "below"])
+def test_an_identity_ca_that_may_not_sign_lists_is_said_when_it_is_imported(
+    name: str, pki: Path, tmp_path: Path
+) -> None:
+    said = created(pki, name, tmp_path / "ks").ok().err
+    assert "note [portable.revocation-list]" in said
+    assert f"CN={name}" in said and "cRLSign" in said and "sros revoke" in said
+    assert "cRLSign" not in created(pki, name, tmp_path / "other", "permissions").err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("revoke", "{}", "/lost"),
+        ("revoke", "{}", "/lost", "--dry-run"),
+        ("crl", "{}", "--refresh"),
+        ("renew", "{}", "/a", "--revoke-old"),
+        ("update_keystore", "{}", "--set", "permissions.validity=90d", "--revoke-old"),
+    ],
+)
+def test_a_list_that_every_vendor_refuses_is_not_signed(
+    words: tuple[str, ...], corporate: Path
+) -> None:
+    before = contents(corporate)
+    ended = sros(*(word.format(corporate) for word in words))
+    assert ended.status == 2, ended
+    assert "no node could start any more in /a, /b" in ended.err
+    assert "Fast DDS 2.14, Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse their files" in ended.err
+    assert "cRLSign" in ended.err and "Nothing was changed." in ended.err
+    remedy = f"sros rotate_ca {corporate} --identity --identity-key URI --finish"
+    assert remedy in ended.err
+    assert contents(corporate) == before
+
+
+def test_what_the_refusal_says_to_do_shuts_the_enclave_out(corporate: Path) -> None:
+    key = f"file:{corporate.parent / 'new.key'}"
+    sros("rotate_ca", corporate, "--identity", "--identity-key", key, "--finish").ok()
+    sros("revoke", corporate, "/lost").ok()
+    assert [refused_by(corporate, name) for name in list_enclaves(corporate)] == [set(), set()]
+
+
+def test_the_user_may_name_the_vendors_on_which_nodes_stop(corporate: Path) -> None:
+    allowed = [word for vendor in ALL for word in ("--allow-refusal", vendor)]
+    ended = sros("revoke", corporate, "/lost", *allowed[:-2])
+    assert "no node could start any more in /a, /b" in ended.err and ended.status == 2
+    assert (
+        "Cyclone DDS 0.10.2 refuses their files" in ended.err and "Fast DDS 2.14" not in ended.err
+    )
+    said = sros("revoke", corporate, "/lost", *allowed).ok().err
+    assert "Cyclone DDS 0.10.2 refuses /a, /b from now on" in said
+    assert refused_by(corporate, "/a") == set(MEASURED)
+    # Nothing that runs today stops any more, so the list can be signed again.
+    sros("crl", corporate, "--refresh").ok()
+
+
+@pytest.mark.parametrize("name", ["good", "good RSA"])
+def test_a_good_ca_is_taken_and_revokes(name: str, pki: Path, tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    assert "note [" not in created(pki, name, root).ok().err
+    sros("create_enclave", root, "/a", "/lost").ok()
+    sros("revoke", root, "/lost").ok()
+    assert refused_by(root, "/a") == set()
+
+
+@pytest.mark.parametrize("role", ["identity", "permissions"])
+def test_a_ca_signed_with_pss_is_said_for_the_vendors_that_refuse_it(
+    role: str, pki: Path, tmp_path: Path
+) -> None:
+    said = created(pki, "PSS", tmp_path / "ks", role).ok().err
+    assert "Fast DDS 2.14 and Fast DDS 2.9.1 refuse" in said and "PSS" in said
+    assert "Cyclone DDS 0.10.2 accepts" in said
+
+
+# ── the evaluation itself ──────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("sound") / "ks"
+    create_keystore(root, template=load_template("production"), now=now())
+    create_enclaves(root, ["/a", "/b", "/b/c"], now=now())
+    return root
+
+
+def _break_list(transaction: Transaction, other: Path) -> None:
+    revoke(other, ["/b"], now=now())
+    transaction.write(CRL, (other / CRL).read_bytes())
+    for name in ("a", "b", "b/c"):
+        up = "../" * (name.count("/") + 2)
+        transaction.link(f"enclaves/{name}/crl.pem", f"{up}{CRL}")
+
+
+def _break_permissions(transaction: Transaction, other: Path) -> None:
+    signed = (enclave_path(other, "/a") / "permissions.p7s").read_bytes()
+    transaction.write("enclaves/a/permissions.p7s", signed)
+
+
+def _break_governance(transaction: Transaction, other: Path) -> None:
+    signed = (other / "enclaves/governance.p7s").read_bytes()
+    transaction.write("enclaves/governance.p7s", signed)
+
+
+def _touch(transaction: Transaction, _other: Path) -> None:
+    for file in ("enclaves/a/permissions.p7s", "enclaves/governance.p7s"):
+        transaction.write(file, transaction.read(file))
+    transaction.remove("enclaves/b/cert.pem")
+
+
+@pytest.mark.parametrize("dry_run", [False, True])
+@pytest.mark.parametrize(
+    ("stage", "stopped"),
+    [
+        (_break_list, "/a, /b, /b/c"),
+        (_break_permissions, "/a"),
+        (_break_governance, "/a, /b, /b/c"),
+        (_touch, ""),
+    ],
+)
+def test_what_is_staged_is_evaluated(
+    stage: Callable[[Transaction, Path], None],
+    stopped: str,
+    dry_run: bool,
+    sound: Path,
+    tmp_path: Path,
+) -> None:
+    root, other = tmp_path / "ks", tmp_path / "other"
+    shutil.copytree(sound, root, symlinks=True)
+    create_keystore(other, template=load_template("production"), now=now())
+    create_enclaves(other, ["/a", "/b"], now=now())
+    with Transaction(root, dry_run=dry_run) as transaction:
+        stage(transaction, other)
+        if not stopped:
+            assert refuse_stopping(transaction, now()) == ()
+            return
+        with pytest.raises(KeystoreError) as refusal:
+            refuse_stopping(transaction, now())
+        assert f"start any more in {stopped} of" in refusal.value.what
+        (note, *_) = refuse_stopping(transaction, now(), allowed=MEASURED)
+        assert note.text.startswith(f"{MEASURED[0].title} refuses {stopped} from now on")
