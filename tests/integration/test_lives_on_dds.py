@@ -1,0 +1,56 @@
+"""Every verb that changes trust, over drawn keystores with live Cyclone DDS nodes.
+
+After a verb that ends with 0, whoever should talk talks, and who was revoked is not heard.  Nothing
+that is sound is refused.  ``SROS_LIVES=200 SROS_LIVES_SEED=7`` is a full run.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from tests.integration.lives import Life, play
+from tests.support.children import LONG
+
+pytestmark = pytest.mark.dds
+
+LIVES = int(os.environ.get("SROS_LIVES", 40 if LONG else 3))
+SEED = int(os.environ.get("SROS_LIVES_SEED", 3))
+AT_ONCE = 8
+
+MAY_REFUSE = re.compile(r"lacks cRLSign|no DDS vendor accepts")
+"""The only reasons for which a verb may refuse a drawn keystore."""
+
+
+def test_whoever_should_talk_talks_after_each_verb(tmp_path: Path) -> None:
+    verbs: Counter[str] = Counter()
+    scenes = refused = silenced = 0
+    wrong: list[str] = []
+    for begin in range(0, LIVES, AT_ONCE):
+        lives = [
+            Life(f"life {number}", tmp_path / str(number), Random(f"{SEED} {number}"))
+            for number in range(begin, min(begin + AT_ONCE, LIVES))
+        ]
+        for life in lives:
+            life.live()
+            verbs.update(life.verbs)
+            refused += len(life.refused)
+            wrong += [each for each in life.refused if not MAY_REFUSE.search(each)]
+        shown = [scene for life in lives for scene in life.scenes]
+        for scene, answers in zip(shown, play(shown), strict=True):
+            scenes += 1
+            silenced += len(scene.silent)
+            for name, answer in answers.items():
+                if (answer == "heard") != (name in scene.heard):
+                    wrong.append(f"{scene.title}: {name}: {answer}")
+        if LIVES > AT_ONCE:
+            print(f"{begin + len(lives)} lives, {scenes} scenes, wrong: {wrong}", flush=True)
+    print(f"seed {SEED}: {LIVES} keystores, verbs {dict(verbs)}, of them refused {refused}, ")
+    print(f"{scenes} times nodes were started, {silenced} of them silent as they should")
+    assert not wrong, "\n\n".join(wrong)
+    assert scenes >= LIVES
