@@ -83,7 +83,7 @@ Files = dict[str, bytes]
 
 
 @dataclass(frozen=True, slots=True)
-class Refusals:
+class _Refusals:
     """The enclaves that a vendor would refuse, and its reasons as clauses."""
 
     enclaves: tuple[str, ...]
@@ -113,7 +113,7 @@ def refuse_stopping(
     Raises:
         KeystoreError: nodes of a vendor that is not ``allowed`` would stop.
     """
-    found = stopped_enclaves(transaction, now)
+    found = _stopped_enclaves(transaction, now)
     if refused := {vendor: each for vendor, each in found.items() if vendor not in allowed}:
         raise _would_stop(transaction.root, refused, remedy)
     return tuple(
@@ -126,7 +126,7 @@ def refuse_stopping(
     )
 
 
-def stopped_enclaves(transaction: Transaction, now: datetime) -> dict[Vendor, Refusals]:
+def _stopped_enclaves(transaction: Transaction, now: datetime) -> dict[Vendor, _Refusals]:
     """Return the vendors that would refuse enclaves which they accept today, or which are new."""
     stopped: dict[Vendor, dict[str, list[str]]] = {}
     for names in _kinds(transaction, now).values():
@@ -144,7 +144,7 @@ def stopped_enclaves(transaction: Transaction, now: datetime) -> dict[Vendor, Re
             if vendor in accepted and vendor in refused:
                 stopped.setdefault(vendor, {}).setdefault(refused[vendor], []).extend(names)
     return {
-        vendor: Refusals(tuple(sorted(name for names in by.values() for name in names)), tuple(by))
+        vendor: _Refusals(tuple(sorted(name for names in by.values() for name in names)), tuple(by))
         for vendor, by in stopped.items()
     }
 
@@ -176,7 +176,7 @@ def _reason(participant: VendorParticipant, decision: Decision) -> str:
     return str(participant.problems[0]).rstrip(".") if participant.problems else decision.clause
 
 
-def _would_stop(root: Path, found: Mapping[Vendor, Refusals], remedy: str) -> KeystoreError:
+def _would_stop(root: Path, found: Mapping[Vendor, _Refusals], remedy: str) -> KeystoreError:
     names = tuple(sorted({name for each in found.values() for name in each.enclaves}))
     why = {vendor: "; ".join(each.reasons[:_SHOWN]) for vendor, each in found.items()}
     whose = "its" if len(names) == 1 else "their"
