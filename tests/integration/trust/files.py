@@ -25,7 +25,6 @@ from tests.integration.trust.trusts import (
     Trust,
     authority,
     list_of,
-    token_uri,
 )
 from tests.support.raw_pki import (
     USAGE,
@@ -429,7 +428,7 @@ def certificate_file(trust: Trust, dice: Dice) -> str:
 def key_file(trust: Trust, dice: Dice) -> str:
     """Forms of the private key, and what else stands in its file."""
     if trust.on_token:
-        return _token_file(trust, dice)
+        return "no key.pem: the key is on a token"  # key.p11 is read by the RMW, not by DDS
     leaf = trust.certificates[LEAF].key
     done = []
     if dice.random() < 0.6:
@@ -479,30 +478,6 @@ def key_file(trust: Trust, dice: Dice) -> str:
 def _public(label: str) -> bytes:
 
     return public_info(label)
-
-
-def _token_file(trust: Trust, dice: Dice) -> str:
-    key = trust.certificates[LEAF].key
-    uri = token_uri(key).encode()
-    kinds = {
-        "another key of the token": token_uri("p256 28").encode() + b"\n",
-        "a key that is not there": uri.replace(b"object=", b"object=no-") + b"\n",
-        "a token that is not there": uri.replace(b"token=robot", b"token=arm") + b"\n",
-        "a wrong PIN": uri.replace(b"/pin", b"/cert.pem") + b"\n",
-        "no line end": uri,
-        "CRLF": uri + b"\r\n",
-        "a blank first": b" " + uri + b"\n",
-        "an empty line first": b"\n" + uri + b"\n",
-        "text behind": uri + b" text\n",
-        "a second line": uri + b"\nsecond\n",
-        "upper case": uri.replace(b"pkcs11:", b"PKCS11:") + b"\n",
-        "nothing": b"",
-        "a file": b"file:///key.pem\n",
-        "a byte order mark": b"\xef\xbb\xbf" + uri + b"\n",
-    }
-    which = dice.choice(sorted(kinds))
-    trust.edit("key.p11", lambda _: kinds[which])
-    return f"key.p11: {which}"
 
 
 def encrypted(label: str, dice: Dice) -> bytes:
