@@ -8,6 +8,7 @@ fenced block it is none of these (CommonMark 0.31, 6.1 and 4.5; GitHub Flavored 
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable
 
 _LONGEST = 400
@@ -57,6 +58,17 @@ def _ticks(text: str) -> int:
     return max((len(run) for run in _RUNS.findall(text)), default=0) + 1
 
 
+_BLANK = "\u115f\u1160\u2800\u3164\uffa0"
+"""Characters that are printable, and look like nothing."""
+
+
 def _shown(text: str) -> str:
-    """Return ``text`` without line ends and characters that are not printable."""
-    return "".join(each if each.isprintable() else f"\\x{ord(each):02x}" for each in text)
+    """Return ``text`` without line ends, and what is not printable or not seen by itself."""
+    return "".join(each if _is_seen(each) else f"\\x{ord(each):02x}" for each in text)
+
+
+def _is_seen(character: str) -> bool:
+    if character.isascii():
+        return character.isprintable()
+    marks = unicodedata.category(character).startswith("M")  # on the character before
+    return character.isprintable() and not marks and character not in _BLANK

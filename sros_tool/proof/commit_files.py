@@ -19,7 +19,9 @@ from sros_tool.proof.repository import FILES, FOLDER, LINK, Repository, TreeEntr
 from sros_tool.proof.revisions import Revision
 
 _MOST_ENTRIES = 200_000
-_MOST_BYTES = 512 * 1024 * 1024
+_MOST_BYTES = 512 * 1024 * 1024  # that differ
+_MOST_WRITTEN = 1024 * 1024 * 1024  # with those that are the same under several names
+_LONGEST_TARGET = 4095  # bytes of a symbolic link (Linux, PATH_MAX)
 
 
 def checked_path(text: str) -> str:
@@ -112,6 +114,9 @@ class CommitFiles:
             if each.mode not in (*FILES, LINK):
                 raise self._no_file(where, each)
             (links if each.mode == LINK else plain)[where] = each
+        sizes = self.repository.sizes(dict.fromkeys(each.id for each in plain.values()))
+        if sum(sizes.get(each.id, 0) for each in plain.values()) > _MOST_WRITTEN:
+            raise DocumentError(f"'{path}' has more than {_MOST_WRITTEN} bytes")
         places: dict[str, list[str]] = {}
         for where, each in plain.items():
             places.setdefault(each.id, []).append(where)
@@ -120,6 +125,10 @@ class CommitFiles:
                 for where in places[digits]:
                     self._write(where, plain[where], content)
         contents = self.repository.contents(each.id for each in links.values())
+        for where, each in links.items():
+            target = contents[each.id]
+            if not 0 < len(target) <= _LONGEST_TARGET or b"\0" in target:
+                raise DocumentError(f"'{where}' is a link that no file system can have")
         top = self.folder / path
         with Folder(self.folder) as folder:
             _make_folders(folder, path)

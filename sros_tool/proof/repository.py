@@ -27,6 +27,7 @@ FILES = ("100644", "100755")
 _MOST_BYTES = 32 * 1024 * 1024
 """Bytes of the largest object that is read."""
 _AT_ONCE = 64 * 1024 * 1024
+_MOST_DEPTH = 200
 _MOST_TAGS = 10
 _WAIT = 60  # seconds
 _WAIT_FOR_SERVER = 600
@@ -475,11 +476,15 @@ def walk(
     With ``other``, only what this folder does not have with the same content at the same path.
 
     Raises:
-        DocumentError: there are more than ``most`` entries; a few objects can stand for millions.
+        DocumentError: there are more than ``most`` entries, of which a few objects can stand for
+            millions, or too many folders in each other, each of which takes a question to git.
     """
     level = [("", tree, other)]
-    count = 0
+    count = depth = 0
     while level:
+        depth += 1
+        if depth > _MOST_DEPTH:
+            raise DocumentError(f"the commit has more than {_MOST_DEPTH} folders in each other")
         ids = [each for _, *pair in level for each in pair if each]
         found = repository.folders(ids)
         below = []

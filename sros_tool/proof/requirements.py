@@ -31,6 +31,7 @@ from sros_tool.xml import read_bytes
 
 _MOST_REQUIREMENTS = 1000
 _MOST_TEXTS = 1000  # of one key
+_MOST_PAIRS = 20_000  # that requirements of one file make of the names of two lists
 _LONGEST_TEXT = 500  # characters of a name or a reason
 EXCEPT = "!"
 """What stands before the enclaves that a list of enclaves excepts."""
@@ -260,7 +261,29 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
         )
     if len(tables) > _MOST_REQUIREMENTS:
         raise DocumentError(f"'{file}' has more than {_MOST_REQUIREMENTS} requirements")
-    return tuple(_READERS[table.kind](table) for _, table in sorted(tables, key=lambda e: e[0]))
+    found = tuple(_READERS[table.kind](table) for _, table in sorted(tables, key=lambda e: e[0]))
+    left = _MOST_PAIRS
+    for each in found:
+        left -= _pairs(each)
+        if left < 0:
+            raise DocumentError(
+                f"{each.source}: there are more than {_MOST_PAIRS} pairs of two names up to here",
+                "Each name of one list counts with each one of the other.",
+                "Write patterns in place of names, or divide the file.",
+            )
+    return found
+
+
+def _pairs(requirement: Requirement) -> int:
+    """Return how many pairs of names a requirement is about that has two lists."""
+    match requirement:
+        case NotBoth(first=first, second=second):
+            one, other = (sum(len(names) for _, names in each) for each in (first, second))
+            return one * other
+        case Apart(sources=sources, targets=targets):
+            return len(sources) * len(targets)
+        case _:
+            return 0
 
 
 _HEADER = re.compile(r"[ \t]*\[\[?[ \t]*([A-Za-z0-9_-]+)[ \t]*\]")

@@ -414,7 +414,10 @@ class _Review:
         for path in self._used_in_part(changed, reviewed, fleet):
             lines.append(("changes and is used only in part, and the rest is not reviewed", path))
             status = self._new_access
+        sizes = self.request.repository.sizes(names)
         for path, entry in changed:
+            if sizes.get(entry.id, 0) > _MOST_OUTSIDE and entry.mode in FILES:
+                lines.append(("changes and is too large to be looked at", path))
             if said := self._unseen(path, entry):
                 lines.append((f"changes and is not reviewed: it is {said}", path))
                 status = self._new_access
@@ -658,7 +661,8 @@ class _Review:
             found = (
                 each
                 for each in path_findings(folder, self._circumstances())
-                if each.id != _FILE_MISSING or Path(each.file).name != KEY_FILE
+                if (each.id != _FILE_MISSING or Path(each.file).name != KEY_FILE)
+                and (not each.file or _is_below(os.path.normpath(each.file), (str(folder),)))
             )
             chosen = FindingFilter(strict=bool(self.base) and not same).choose(found)
             return _status(chosen), chosen

@@ -128,6 +128,7 @@ def test_each_says_what_it_demands() -> None:
 
 
 NOBODY = '[[nobody]]\npublish = ["/x"]\n'
+MANY = ",\n".join(f'"/x{number}"' for number in range(142))
 WRONG = {
     "": "has no requirement",
     "[[nobody]": "not valid TOML",
@@ -169,6 +170,8 @@ WRONG = {
     '[[protected]]\nlevel = "sign"': "r.toml:1: [[protected]] names nothing",
     '[[apart]]\nfrom = ["/x"]': "r.toml:1: to is missing in [[apart]]",
     f"{NOBODY * 1001}": "more than 1000 requirements",
+    f"[[apart]]\nfrom = [{MANY}]\nto = [{MANY}]\n": "r.toml:1: there are more than 20000 pairs",
+    f"[[not_both]]\nfirst.call = [{MANY}]\nsecond.call = [{MANY}]": "more than 20000 pairs",
     f"a = {'[' * 1500}{']' * 1500}": "not valid TOML",
     f"{'x.' * 3000}y = 1": "not valid TOML",
     "[[\x1b]]": "not valid TOML",

@@ -13,6 +13,7 @@ import pytest
 
 from sros_tool.cli.review import review as review_verb
 from sros_tool.errors import DocumentError, SrosError, UsageError
+from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import PROJECT
 from tests.support.code_host import policy as policy_text
@@ -142,9 +143,32 @@ def test_a_policy_that_is_not_named_is_said(change: Change, name: str, content: 
     assert f"'{name}' is deleted" in change.review("--policy", "robot.xml").out
 
 
-def test_what_no_policy_includes_is_no_part_of_one(change: Change) -> None:
-    change.commit({"world.sdf": "<sdf><plugin><topic>/x</topic><update_rate/></plugin></sdf>"})
-    change.review("--policy", "robot.xml").ok()
+def test_what_is_no_part_of_a_policy_and_what_is_too_large(change: Change) -> None:
+    world = "<sdf><plugin><topic>/x</topic><update_rate/></plugin></sdf>"
+    change.commit({"world.sdf": world, "large.xml": b"<policy version='0'>" + b" " * 2**25})
+    said = change.review("--policy", "robot.xml").ok().out
+    assert "files: 'large.xml' changes and is too large to be looked at\n" in said
+
+
+def test_a_keystore_fits_on_a_disk(change: Change) -> None:
+    """A few kilobytes stand for gigabytes, and for folders that no program can delete."""
+    (change.folder / "blob").write_bytes(bytes(2**24))
+    blob = change.git("hash-object", "-w", "blob")
+    nul = change.folder / "nul"
+    nul.write_bytes(b"robot.xml\0evil")
+    link = change.git("hash-object", "-w", "nul")
+    many = _tree(change, *(("100644", f"{number}", blob) for number in range(65)))
+    odd = _tree(change, ("120000", "link", link))
+    top = _tree(change, ("40000", "many", many), ("40000", "odd", odd))
+    commit = change.git("commit-tree", top, "-m", "x")
+    for name, said in (("many", "has more than 1073741824 bytes"), ("odd", "no file system can")):
+        with TemporaryDirectory() as folder:
+            files = CommitFiles(Repository(change.folder), "HEAD", commit, Path(folder))
+            with pytest.raises(DocumentError, match=said):
+                files.tree(name)
+    deep = change.commit({f"{'d/' * 250}file": "x"})
+    ended = change.review("--policy", "robot.xml")
+    assert (ended.status, "more than 200 folders in each other" in ended.out) == (2, True), deep
 
 
 @pytest.mark.parametrize(
@@ -426,7 +450,11 @@ def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     late = change.review(*words, "3000d")
     assert (late.status, "expiry ks: 2 of 2 enclaves" in late.out) == (1, True), late
     certificate = change.folder / "ks/enclaves/a/cert.pem"
-    change.commit({"ks/enclaves/a/cert.pem": "damaged"})
+    settings = (change.folder / "ks/sros.toml").read_text()
+    elsewhere = settings.replace("[authorities]", '[authorities]\nidentity_key = "file:/dev/null"')
+    change.commit({"ks/sros.toml": elsewhere})
+    assert "its mode is" not in change.review(*words, "1d", "--json").out
+    change.commit({"ks/enclaves/a/cert.pem": "damaged", "ks/sros.toml": settings})
     damaged = change.review(*words, "1d")
     assert (damaged.status, "keystore ks: 1 error" in damaged.out) == (2, True), damaged
     certificate.unlink()
