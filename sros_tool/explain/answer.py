@@ -118,6 +118,8 @@ class Answer:
                 return ""
             case Outcome.PEER_DENIES:
                 return "the peers: the node starts, and none of them talks to it"
+            case Outcome.CRASHES if self.decision.hits_peers:
+                return "nobody: the node starts, and the processes of its peers crash"
             case Outcome.CRASHES:
                 return "nobody: the process crashes when it starts"
             case Outcome.DENIED if self.part in self.question.parts:

@@ -258,12 +258,14 @@ class RefusalCause:
     """A reason why no node of a vendor can run in an enclave, or none that peers let in.
 
     ``reason`` is the id of a fault, or that of a decision; ``text`` is a clause with the file.
+    ``hits_peers`` says that the processes of peers crash, and its own does not.
     """
 
     outcome: Outcome
     reason: str
     file: str
     text: str
+    hits_peers: bool = False
 
 
 _OF_GOVERNANCE = {
@@ -318,7 +320,7 @@ class VendorParticipant:
             return ()
         file = GOVERNANCE_FILE if stopped.reason in _OF_GOVERNANCE else PERMISSIONS_FILE
         text = f"{file}: {stopped.clause}"
-        return (RefusalCause(stopped.outcome, stopped.reason, file, text),)
+        return (RefusalCause(stopped.outcome, stopped.reason, file, text, stopped.hits_peers),)
 
     def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
         """Return the access of the vendor's process, or the decision that keeps it from running."""

@@ -15,7 +15,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, WARNING, Finding
 from tests.checks.bench import Bench
-from tests.checks.keystore_cases import IS_CA
+from tests.checks.keystore_cases import IS_CA, TOPIC_RULE
 from tests.support.harness import sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
@@ -103,6 +103,15 @@ ROWS = (
     ),
 )
 
+FREE = (
+    "<enable_discovery_protection>true</enable_discovery_protection>"
+    "<enable_liveliness_protection>true</enable_liveliness_protection>"
+    "<enable_read_access_control>false</enable_read_access_control>"
+    "<enable_write_access_control>false</enable_write_access_control>"
+    "<metadata_protection_kind>ENCRYPT</metadata_protection_kind>"
+    "<data_protection_kind>ENCRYPT</data_protection_kind></topic_rule>"
+)
+"""The end of a topic rule that leaves a topic to everybody."""
 ABOUT_VENDORS = {"enclave.refused", "portable.refused"}
 
 
@@ -220,3 +229,24 @@ def test_the_governance_of_every_exported_enclave_is_judged(bench: Bench) -> Non
             "governance.differs",
             "governance.no-authenticity",
         }
+
+
+def test_a_crash_of_peers_is_said_with_whom_it_hits(bench: Bench) -> None:
+    """Twin: where no topic is free, the process itself crashes."""
+    bench.permissions(("<id>0</id>", "<id_range><max>5</max></id_range>"))
+    asked = (bench.root, "/base", "publish", "/free", "--vendor", "cyclonedds", "--domain", "0")
+    said = json.loads(sros("explain", *asked, "--json").out)
+    assert (said["outcome"], said["denied_by"]) == (
+        "crashes",
+        "nobody: the process crashes when it starts",
+    )
+    free = TOPIC_RULE.replace("*", "rt/free").join(("<topic_rule>", FREE))
+    bench.governance(("<topic_access_rules>", f"<topic_access_rules>{free}"))
+    said = json.loads(sros("explain", *asked, "--json").out)
+    assert (said["outcome"], said["reason"]) == ("crashes", "open-range")
+    assert said["denied_by"].endswith("the node starts, and the processes of its peers crash")
+    words = ("--who", "publish", "/free", "--vendor", "cyclonedds", "--domain", "0")
+    assert "not now: /base  " in (listed := sros("explain", bench.root, *words).out)
+    assert "crashes the processes of its peers" in listed
+    assert "portable.domain-range" in {each.id for each in worst(bench)}
+    assert not ABOUT_VENDORS & {each.id for each in worst(bench)}

@@ -15,6 +15,7 @@ from tests.integration.vendor_oracle import Case, Question
 
 YES, NO, PEER_DENIES, REFUSED = "matched", "denied", "unmatched", "refused"
 CRASHES, INVALID = "crashed", "invalid"
+PEERS_CRASH = "peer crashed"
 
 DENY, ALLOW = "<default>DENY</default>", "<default>ALLOW</default>"
 
@@ -467,6 +468,8 @@ def governances() -> list[Row]:
         return governance(domain_rule("".join(rules), join=join))
 
     elsewhere = permissions(grant(allow(criteria("publish", "rt/x"), domains="<id>7</id>")))
+    high = b"<domains><id_range><max>50</max></id_range></domains>"
+    up_to = a.replace(b"<domains><id>42</id></domains>", high)
     no_rule = permissions(grant(), grant(allow(criteria("publish", "rt/a"))))
 
     def unprotected(*, read: bool = False, write: bool = False) -> str:
@@ -481,6 +484,26 @@ def governances() -> list[Row]:
         Row("an open topic", ask(b, "rt/open", governed=opened), YES, YES),
         Row("an open topic behind a rule for all", ask(b, "rt/open", governed=shut), NO, NO),
         Row("a topic without a rule", ask(a, "rt/z", governed=some), NO, NO),
+        # With a topic that is free, Cyclone DDS starts without a look at the rules: its peers look.
+        Row(
+            "a free topic, domains up to 50",
+            ask(up_to, "rt/open", governed=opened),
+            YES,
+            PEERS_CRASH,
+        ),
+        Row("domains up to 50 beside a free topic", ask(up_to, governed=opened), YES, CRASHES),
+        Row(
+            "a free topic, a rule without domains",
+            ask(up_to.replace(high, b""), "rt/open", governed=opened),
+            REFUSED,
+            PEERS_CRASH,
+        ),
+        Row(
+            "a free topic, an empty default",
+            ask(elsewhere.replace(b">DENY<", b"><"), "rt/open", governed=opened),
+            REFUSED,
+            PEERS_CRASH,
+        ),
         Row("a topic named *", ask(b, "*", governed=opened), YES, INVALID),
         Row("a topic named rt/op*", ask(b, "rt/op*", governed=opened), YES, INVALID),
         Row(

@@ -100,6 +100,7 @@ _SAYS = {
     Outcome.CRASHES: ("crash on it", "crashes on it"),
     Outcome.PEER_DENIES: ("start, and its peers refuse it", "starts, and its peers refuse it"),
 }
+_HIT_PEERS = ("start, and their peers crash", "starts, and its peers crash")
 _REFUSES = ("refuse it", "refuses it")
 
 
@@ -243,7 +244,7 @@ def _file(finding: Finding) -> str:
 
 
 def _clause(cause: RefusalCause, vendors: Sequence[Vendor]) -> str:
-    several, one = _SAYS.get(cause.outcome, _REFUSES)
+    several, one = _HIT_PEERS if cause.hits_peers else _SAYS.get(cause.outcome, _REFUSES)
     says = one if len(vendors) == 1 else several
     return f"{_listed([each.title for each in vendors])} {says} ({cause.text})"
 

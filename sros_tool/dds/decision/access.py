@@ -387,6 +387,7 @@ class _Joining:
     outcome: Outcome
     reason: str
     text: str
+    hits_peers: bool = False
 
 
 def _decide_join(
@@ -420,6 +421,11 @@ def _decide_join(
         return _Joining(Outcome.ALLOWED, "allow-rule", f"an allow rule covers {where}")
     missing = f"no allow rule of the grant covers {where}"
     opened = not governed.all_controlled() and otherwise.outcome is not Outcome.ALLOWED
+    if opened and otherwise.outcome is Outcome.CRASHES:
+        # With a topic that is free it starts without a look at its rules; its peers look at them.
+        text = _verdict_text(otherwise, f"joining {where}", domain)
+        text = text.replace("crashes the process", "crashes the processes of its peers")
+        return _Joining(Outcome.CRASHES, otherwise.reason, text, hits_peers=True)
     if traits.always_needs_allow_rule or opened:
         return _Joining(Outcome.PEER_DENIES, "no-rule", f"{missing}, so peers refuse it")
     if otherwise.outcome is Outcome.DENIED:
@@ -586,7 +592,10 @@ class Access:
         traits = self._traits
         rules, otherwise = _rules_for(traits, grant, self._domain)
         joining = _decide_join(traits, self._governed, grant, rules, otherwise, self._domain)
-        self._join = self._answer(joining.outcome, joining.reason, joining.text)
+        self._join = replace(
+            self._answer(joining.outcome, joining.reason, joining.text),
+            hits_peers=joining.hits_peers,
+        )
         self._peers = {verb: _GrantRules(traits, rules, otherwise, verb) for verb in _ENDPOINTS}
         self._own = self._peers
         if not traits.filters_own_domain:
@@ -603,7 +612,7 @@ class Access:
 
     def _endpoint(self, verb: AccessVerb, topic: str, partitions: tuple[str, ...]) -> Decision:
         join = self._join
-        if join.outcome in (Outcome.REFUSED, Outcome.CRASHES):
+        if join.outcome in (Outcome.REFUSED, Outcome.CRASHES) and not join.hits_peers:
             return join
         traits = self._traits
         if traits.creates_topics and not _is_topic_name(topic):
@@ -637,6 +646,8 @@ class Access:
                 return self._verdict(verdict, asked, rule)
         if not (writes if verb is AccessVerb.PUBLISH else reads):
             text = f"the governance does not control {asked}"
+            if join.hits_peers:
+                return replace(join, topic_rule=rule)
             if join.outcome is Outcome.PEER_DENIES:
                 if not self._in_the_open(rule):
                     return self._peers_refuse(rule)
@@ -645,6 +656,8 @@ class Access:
         verdict = self._own[verb].ask(topic, partitions)
         if not verdict.allowed:
             return self._verdict(verdict, asked, rule)
+        if join.hits_peers:
+            return replace(join, topic_rule=rule)
         if join.outcome is Outcome.PEER_DENIES:
             return self._peers_refuse(rule)
         if self._peers is not self._own:

@@ -27,7 +27,7 @@ class Outcome(StrEnum):
     REFUSED = "refused"
     """The participant does not start at all."""
     CRASHES = "crashes"
-    """The process crashes."""
+    """The process crashes, or its peers do (`Decision.hits_peers`)."""
 
     @property
     def ok(self) -> bool:
@@ -42,6 +42,7 @@ class Decision:
     ``reason`` is a stable word for programs (one of `_REASONS`), ``text`` a sentence for people.
     ``grant`` is an index in the permissions, ``rule`` an index in the grant, ``expression`` the
     ``<topic>`` that matched, ``topic_rule`` the rule of the governance for the topic.
+    ``hits_peers`` says that the processes of peers crash, and its own does not.
     """
 
     outcome: Outcome
@@ -51,6 +52,7 @@ class Decision:
     rule: int | None = None
     expression: str | None = None
     topic_rule: TopicRule | None = None
+    hits_peers: bool = False
 
     @property
     def clause(self) -> str:
