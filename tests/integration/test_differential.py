@@ -95,6 +95,8 @@ NOT_OF_DOCUMENTS = {
     "reads_first_authority",
     "reads_lists_of_authorities",
     "verifies_authorities",
+    "verifies_policies",
+    "reads_trusted_certificates",
     "hashes",
     "keys",
     "reads_tokens",
