@@ -126,8 +126,8 @@ class CommitFiles:
                     self._write(where, plain[where], content)
         contents = self.repository.contents(each.id for each in links.values())
         for where, each in links.items():
-            target = contents[each.id]
-            if not 0 < len(target) <= _LONGEST_TARGET or b"\0" in target:
+            raw = contents[each.id]
+            if not 0 < len(raw) <= _LONGEST_TARGET or b"\0" in raw:
                 raise DocumentError(f"'{where}' is a link that no file system can have")
         top = self.folder / path
         with Folder(self.folder) as folder:
