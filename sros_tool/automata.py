@@ -11,6 +11,7 @@ Names are texts of any characters but NUL, which no DDS and no file can have in 
 from __future__ import annotations
 
 import heapq
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -301,6 +302,50 @@ class _Some:
     exact: frozenset[str] = frozenset()
     automata: frozenset[Automaton] = frozenset()
 
+    @cached_property
+    def everything(self) -> frozenset[Automaton]:
+        """Those of the automata that accept every name."""
+        return frozenset(each for each in self.automata if each.endless_bits & 1)
+
+    def has(self, name: str) -> bool:
+        """Return whether a name is in the set."""
+        return name in self.exact or self.accepts(name)
+
+    def accepts(self, name: str) -> bool:
+        """Return whether an automaton accepts a name."""
+        return any(
+            each.matches(name)
+            for length in self._lengths
+            for each in self._by_prefix.get(name[:length], ())
+        )
+
+    def meeting(self, own: Automaton) -> Iterator[Automaton]:
+        """Yield the automata that may accept a name that ``own`` accepts."""
+        begin = own.prefix
+        for length in self._lengths:
+            if length < len(begin):
+                yield from filter(own.may_meet, self._by_prefix.get(begin[:length], ()))
+        prefixes = self._prefixes
+        for at in range(bisect_left(prefixes, begin), len(prefixes)):
+            if not prefixes[at].startswith(begin):
+                break
+            yield from filter(own.may_meet, self._by_prefix[prefixes[at]])
+
+    @cached_property
+    def _by_prefix(self) -> dict[str, list[Automaton]]:
+        found: dict[str, list[Automaton]] = {}
+        for each in self.automata:
+            found.setdefault(each.prefix, []).append(each)
+        return found
+
+    @cached_property
+    def _prefixes(self) -> list[str]:
+        return sorted(self._by_prefix)
+
+    @cached_property
+    def _lengths(self) -> list[int]:
+        return sorted(set(map(len, self._by_prefix)))
+
     def parts(self) -> tuple[_Node, ...]:
         return ()
 
@@ -501,10 +546,7 @@ class NameSet:
         return hash(self._node)
 
     def __contains__(self, name: str) -> bool:
-        def ask(some: _Some) -> bool:
-            return name in some.exact or any(each.matches(name) for each in some.automata)
-
-        return bool(self._node.truth(ask))
+        return bool(self._node.truth(lambda some: some.has(name)))
 
     def stated(self) -> Iterator[str]:
         """Yield the names of this set that were given as they are, the shortest first."""
@@ -620,33 +662,34 @@ def _leaves(node: _Node) -> Iterator[_Some]:
 # ── searching ──────────────────────────────────────────────────────────────────────────────
 
 
-def _reduced(node: _Node, known: Mapping[Automaton, bool]) -> _Node | bool:
+def _reduced(
+    node: _Node, sure: frozenset[Automaton], possible: frozenset[Automaton] | None
+) -> _Node | bool:
     """Return the part of a set that matters to names that are not ``exact`` in it.
 
-    ``known`` says of automata whether they accept these names.
+    The automata ``sure`` accept these names; of the others, only ``possible`` may, or all for None.
     """
     if isinstance(node, _Some):
-        few, many = sorted((known, node.automata), key=len)
-        met = [each for each in few if each in many]
-        if any(known[each] for each in met):
+        if not sure.isdisjoint(node.automata):
             return True
-        if len(met) == len(node.automata):
+        left = node.automata if possible is None else possible & node.automata
+        if not left:
             return False
-        return _Some(automata=node.automata.difference(met)) if met or node.exact else node
+        return _Some(automata=left) if len(left) < len(node.automata) or node.exact else node
     if isinstance(node, _Not):
-        inner = _reduced(node.of, known)
+        inner = _reduced(node.of, sure, possible)
         return not inner if isinstance(inner, bool) else _Not(inner)
     if isinstance(node, _Every):
         kept: list[_Node] = []
         for each in node.of:
-            inner = _reduced(each, known)
+            inner = _reduced(each, sure, possible)
             if inner is False:
                 return False
             if not isinstance(inner, bool):
                 kept.append(inner)
         return (kept[0] if len(kept) == 1 else _Every(tuple(kept))) if kept else True
     if isinstance(node, _AtLeast):
-        found = [_reduced(each, known) for each in node.of]
+        found = [_reduced(each, sure, possible) for each in node.of]
         count = node.count - found.count(True)
         open_ones = tuple(each for each in found if not isinstance(each, bool))
         if count <= 0 or len(open_ones) < count:
@@ -655,7 +698,7 @@ def _reduced(node: _Node, known: Mapping[Automaton, bool]) -> _Node | bool:
     rules: list[tuple[_Node, bool]] = []
     last = node.last
     for each, says in node.of:
-        inner = _reduced(each, known)
+        inner = _reduced(each, sure, possible)
         if inner is True:
             last = says
             break
@@ -668,6 +711,7 @@ def _reduced(node: _Node, known: Mapping[Automaton, bool]) -> _Node | bool:
 
 _OF_A_STEP = 16
 """So many automata are looked at in the time of one step of a search."""
+_FEW = 64
 _MOST_AUTOMATA = 8192
 """With more of them, a search could take gigabytes."""
 
@@ -680,22 +724,31 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
     that no automaton accepts.
     """
     leaves = tuple(_leaves(node))
-    automata = sorted({each for leaf in leaves for each in leaf.automata}, key=_order)
+    automata = frozenset[Automaton]().union(*(leaf.automata for leaf in leaves))
     if len(automata) > _MOST_AUTOMATA:
         raise _too_many()
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
-    everything = {each: True for each in automata if each.endless_bits & 1}
-    around = _around(node, lambda each: (len(each.automata), 0))
-    for own in automata if around is None else sorted(around.automata, key=_order):
-        if others := len(automata) // _OF_A_STEP:
+    everything = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
+    around = _around(node, _width)
+    for own in sorted(automata if around is None else around.automata, key=_order):
+        met = frozenset(each for leaf in leaves for each in leaf.meeting(own))
+        if others := len(met) // _OF_A_STEP:
             limit.spend(others)
-        known = {each: False for each in automata if not own.may_meet(each)}
-        left = _reduced(node, {**known, **everything, own: True})
+        left = _reduced(node, everything | {own}, met)
         if left is not False:
             yield _Search(_within(own, left), frozenset(filter(own.matches, exact)))
-    if around is None and not everything and _reduced(node, dict.fromkeys(automata, False)):
-        left = _reduced(node, {})
+    none = frozenset[Automaton]()
+    if around is None and not everything and _reduced(node, none, none):
+        left = _reduced(node, none, None)
         yield _Search(_Not(_Some()) if isinstance(left, bool) else left, exact)
+
+
+def _width(around: Surroundings) -> tuple[int, int]:
+    """Return the sort key of surroundings: few automata, none of which may meet all others."""
+    if len(around.automata) > _FEW:
+        return len(around.automata), 0
+    rough, _ = _roughness(around)
+    return len(around.automata) + (not rough) * _MOST_AUTOMATA, rough
 
 
 def _needed(node: _Node) -> frozenset[Automaton]:
@@ -800,7 +853,7 @@ class _Search:
 
 
 def _asked_of(name: str) -> _Ask:
-    return lambda some: any(each.matches(name) for each in some.automata)
+    return lambda some: some.accepts(name)
 
 
 def _spelt(

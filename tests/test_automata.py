@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sros_tool import automata
 from sros_tool.automata import ANY_LETTER, Automaton, Letters, NameSet, SearchLimit
 from sros_tool.dds.decision.matching import matches, names_of
 from sros_tool.dds.decision.vendors import Style
@@ -182,10 +183,29 @@ def test_equal_wildcards_take_no_search() -> None:
 
 
 def test_looking_at_thousands_of_wildcards_counts() -> None:
-    wild = names_of(Style.FNMATCH, [f"rt/x{i}*" for i in range(900)])
+    wild = names_of(Style.FNMATCH, [f"rt/*x{i}" for i in range(900)])
     none = names_of(Style.FNMATCH, ["rt/y?"])
     with pytest.raises(DocumentError, match="so many wildcards"):
         (none - wild).is_empty(SearchLimit(50))
     many = names_of(Style.FNMATCH, [f"rt/x{i}*" for i in range(9000)])
     with pytest.raises(DocumentError, match="so many wildcards"):
         (none - many).is_empty()
+
+
+def test_wildcards_with_other_beginnings_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A set that has thousands of them, below all names, is searched for each of them alone."""
+    sizes: list[int] = []
+    machine = automata._Machine
+
+    def counted(some: tuple[automata.Automaton, ...]) -> automata._Machine:
+        sizes.append(len(some))
+        return machine(some)
+
+    monkeypatch.setattr(automata, "_machine", counted)
+    expressions = [f"rt/t{i}/*" for i in range(200)]
+    for everything in ("*", "?*"):
+        allowed = names_of(Style.FNMATCH, [everything]) & names_of(Style.FNMATCH, expressions)
+        own = allowed & names_of(Style.FNMATCH, ["rt/t7/*"])
+        assert own.example() == "rt/t7/"
+        assert (allowed - names_of(Style.FNMATCH, expressions)).is_empty()
+    assert max(sizes) <= 2

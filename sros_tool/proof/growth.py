@@ -16,7 +16,7 @@ from itertools import islice
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
-from sros_tool.dds.decision.matching import matches, names_of
+from sros_tool.dds.decision.matching import ExpressionIndex, matches, names_of
 from sros_tool.dds.decision.subjects import also_fitting
 from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
@@ -463,6 +463,21 @@ def _without_name(grant: Grant) -> Grant:
     return replace(grant, name="")
 
 
+class _Denials:
+    """What an enclave is denied to write, or to read: ``names`` has all of it."""
+
+    def __init__(self, rights: Sequence[Right], verb: AccessVerb, style: Style) -> None:
+        pairs = [(right, text) for right in rights for text in _topics_of(right)[verb]]
+        self._rights = [right for right, _ in pairs]
+        self._index = ExpressionIndex(style, (text for _, text in pairs))
+        self.names = names_of(style, (text for _, text in pairs))
+
+    def of(self, topic: str) -> Right | None:
+        """Return the first right that denies a topic."""
+        at = self._index.first(topic)
+        return None if at is None else self._rights[at]
+
+
 class _Stated:
     """The rights that two sides state, to say which one gives what ``new`` adds."""
 
@@ -472,6 +487,7 @@ class _Stated:
         self._new_sources: _Sources = {}
         self._examples: dict[tuple[str, AccessVerb, str], list[str]] = defaultdict(list)
         self._found: dict[tuple[object, ...], list[Gain]] = {}
+        self._denials_of: dict[tuple[str, AccessVerb, Style], _Denials] = {}
         rights = new.rights if new.zenoh is None else new.rights | new.zenoh
         earlier = old.rights if old.zenoh is None else old.rights | old.zenoh
         self._allowed = _by_enclave(each for each in rights if each.qualifier is ALLOW)
@@ -508,8 +524,7 @@ class _Stated:
             for name in (enclave, *world.lenders(self._new, enclave))
             for each in self._allowed.get(name, ())
         ]
-        denials = self._denied.get(enclave, ())
-        denied = names_of(world.style, (e for each in denials for e in _topics_of(each)[verb]))
+        denied = self._denials(enclave, verb, world.style)
         for right, topics in allowed:
             for expression in topics:
                 own = more & names_of(world.style, (expression,))
@@ -520,7 +535,9 @@ class _Stated:
                 yield gain
                 if gain.denied and is_expression(expression):
                     # Perhaps there is more than a denial that is gone.
-                    topic = self._example(own - denied, (enclave, verb, expression), world, limit)
+                    topic = self._example(
+                        own - denied.names, (enclave, verb, expression), world, limit
+                    )
                     if topic is not None:
                         yield self._gain(enclave, verb, right, expression, topic, world, domain)
                 break
@@ -528,6 +545,12 @@ class _Stated:
         topic = self._example(more - stated, (enclave, verb, "*"), world, limit)
         if topic is not None:
             yield self._gain(enclave, verb, None, topic, topic, world, domain)
+
+    def _denials(self, enclave: str, verb: AccessVerb, style: Style) -> _Denials:
+        key = enclave, verb, style
+        if key not in self._denials_of:
+            self._denials_of[key] = _Denials(self._denied.get(enclave, ()), verb, style)
+        return self._denials_of[key]
 
     def _example(
         self, names: NameSet, key: tuple[str, AccessVerb, str], world: _World, limit: SearchLimit
@@ -551,14 +574,7 @@ class _Stated:
         world: _World,
         domain: int,
     ) -> Gain:
-        denied = next(
-            (
-                each
-                for each in self._denied.get(enclave, ())
-                if any(matches(world.style, text, topic) for text in _topics_of(each)[verb])
-            ),
-            None,
-        )
+        denied = self._denials(enclave, verb, world.style).of(topic)
         name, action = topic, "write" if verb is AccessVerb.PUBLISH else "read"
         if right:
             at = expression.find(right.name)  # a name in permissions can be empty

@@ -20,12 +20,12 @@ from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import MEASURED, Style
 from sros_tool.errors import DocumentError, UsageError
 from sros_tool.fleet.document import read_fleet
-from sros_tool.proof import sources
+from sros_tool.proof import growth, sources
 from sros_tool.proof.growth import Gain, compare_access
 from sros_tool.proof.repository import Repository
 from sros_tool.proof.sources import load_side
 from sros_tool.proof.zenoh_settings import LONE
-from sros_tool.topics import dds_names
+from sros_tool.topics import DdsNames, dds_names
 from tests.proof.drawn_sides import (
     DOMAINS,
     TOPICS,
@@ -647,6 +647,28 @@ def test_the_work_grows_with_the_number_of_new_names(
     assert len(added) == 100
     assert all(each.source and each.source.line == 2 for each in added)
     assert len(asked) < 300
+
+
+def test_the_work_grows_with_the_number_of_denials_that_are_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not every name is compared with every denial."""
+    names = [f"/t{number}" for number in range(200)]
+    denied = publish(*names).replace("ALLOW", "DENY")
+    for name, rights in (("base", publish("/x") + denied), ("head", publish("/x", *names))):
+        (tmp_path / f"{name}.xml").write_text(policy_text({"/a": rights}))
+    sides = [load_side(tmp_path / f"{name}.xml") for name in ("base", "head")]
+    asked: list[str] = []
+
+    def topics(right: str, name: str) -> DdsNames:
+        asked.append(name)
+        return dds_names(right, name)
+
+    monkeypatch.setattr(growth, "dds_names", topics)
+    added = compare_access(*sides).added
+    assert len(added) == 200
+    assert all(each.denied and each.denied.name == each.name for each in added)
+    assert len(asked) < 20 * 200
 
 
 @pytest.mark.parametrize("name", ["HOME", "XDG_CONFIG_HOME", "GIT_CONFIG_GLOBAL"])
