@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -21,7 +22,11 @@ from sros_tool.runtime.zenoh_environment import (
     override_pairs,
 )
 from sros_tool.xml import read_bytes
-from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
+from sros_tool.zenoh.document import (
+    ConfigurationDocument,
+    UnreadConfigurationError,
+    parse_configuration,
+)
 
 _SOURCE = "rmw_zenoh_cpp (zenoh_config.cpp); 1.10.2 of Zenoh measured."
 _ENV = "`sros env ROOT NAME` and `sros run` set the variables of an enclave."
@@ -42,6 +47,15 @@ FILE_NOT_FOUND = FindingKind(
     "No node, or with ZENOH_ROUTER_CONFIG_URI no router, starts.",
     _SOURCE,
     f"Correct the path. {_ENV}",
+)
+UNREAD = FindingKind(
+    "runtime.zenoh-unread",
+    WARNING,
+    "a configuration of Zenoh that sros does not read",
+    "Zenoh reads more than sros: YAML, lists in place of objects, pipes, more than 16 MiB. Whether "
+    "the configuration enforces anything is not known.",
+    _SOURCE,
+    f"Write it as JSON5 objects into a file. {_ENV}",
 )
 OVERRIDDEN = FindingKind(
     "runtime.zenoh-overridden",
@@ -100,11 +114,15 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
         try:
             data = read_bytes(path, "Zenoh configuration")
         except SrosError as error:
-            yield FILE_NOT_FOUND.found(name, str(error))
+            kind = UNREAD if _may_be_read(path) else FILE_NOT_FOUND
+            yield kind.found(name, str(error))
             continue
         try:
             document = parse_configuration(data, str(path))
             effective = parse_configuration(data, str(path), overrides)
+        except UnreadConfigurationError as error:
+            yield UNREAD.found(name, str(error), str(path))
+            continue
         except SrosError as error:
             yield MALFORMED.found(name, str(error), str(path))
             continue
@@ -113,8 +131,18 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
         yield from _certificates(effective, name)
 
 
+def _may_be_read(path: Path) -> bool:
+    """Return whether another program may read what sros does not read, such as a pipe."""
+    try:
+        return not path.is_dir() and os.access(path, os.R_OK)
+    except ValueError:  # a NUL
+        return False
+
+
 def enforces_nothing(environment: Mapping[str, str], variable: str) -> str:
-    """Return why a process has no access control, or "" if it has, or does not start.
+    """Return why a process has no access control, or "": it has, does not start, or is not known.
+
+    What is not known, the findings on its environment say.
 
     ``variable`` is the one that names its configuration.
     """

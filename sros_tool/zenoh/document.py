@@ -152,6 +152,10 @@ class ConfigurationDocument:
         return self.lines.get(path, 1)
 
 
+class UnreadConfigurationError(DocumentError):
+    """A configuration that Zenoh may read, and sros does not: what it enforces is not known."""
+
+
 def parse_configuration(
     data: bytes, name: str, overrides: Iterable[tuple[str, str]] = (), *, lines: bool = True
 ) -> ConfigurationDocument:
@@ -162,7 +166,9 @@ def parse_configuration(
     lines, and large files are read faster.
 
     Raises:
-        DocumentError: the file has more than 16 MiB, is not JSON5, or Zenoh would not accept it.
+        UnreadConfigurationError: Zenoh may read it, and sros does not: the file has more than
+            16 MiB, is YAML, or has lists in place of objects.
+        DocumentError: the file is not JSON5, or Zenoh would not accept it.
     """
     root = _root(data, name, lines=lines)
     for path, value in overrides:
@@ -193,27 +199,37 @@ def _override(root: _Section, path: str, value: str) -> None:
 
 def _root(data: bytes, name: str, *, lines: bool) -> _Section:
     if len(data) > MOST_BYTES:
-        raise DocumentError(
-            f"the Zenoh configuration '{name}' is too large",
+        raise UnreadConfigurationError(
+            f"the Zenoh configuration '{name}' is too large for sros",
             f"It has more than {MOST_BYTES // 1024**2} MiB.",
         )
     try:
         value = parse_json5(data.decode(), lines=lines)
     except UnicodeDecodeError as error:
-        raise DocumentError(
+        raise _not_json5(name)(
             f"the Zenoh configuration '{name}' is not UTF-8",
             f"The byte at {error.start} is none of a text.",
         ) from error
     except Json5Error as error:
-        raise DocumentError(
+        raise _not_json5(name)(
             f"the Zenoh configuration '{name}' is not JSON5",
             f"Line {error.line}: {error.problem}.",
         ) from error
     if not isinstance(value, Json5Object):
-        raise DocumentError(
+        raise _no_object(value)(
             f"'{name}' is not a Zenoh configuration", "It is not an object with settings."
         )
     return _Section(name, "", value)
+
+
+def _not_json5(name: str) -> type[DocumentError]:
+    """Return the kind of error for what is not JSON5: Zenoh chooses YAML by the file's name."""
+    return UnreadConfigurationError if name.endswith((".yaml", ".yml")) else DocumentError
+
+
+def _no_object(value: object) -> type[DocumentError]:
+    """Return the kind of error for what is no object: Zenoh takes a list of its values as well."""
+    return UnreadConfigurationError if isinstance(value, list) else DocumentError
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,18 +240,21 @@ class _Section:
     path: str
     value: Json5Object
 
-    def refused(self, member: str, problem: str) -> DocumentError:
+    def refused(
+        self, member: str, problem: str, error: type[DocumentError] = DocumentError
+    ) -> DocumentError:
         line = self.value.lines.get(member, self.value.line)
         path = "/".join(each for each in (self.path, member) if each)
-        return DocumentError(
-            f"the Zenoh configuration '{self.name}' is not one that Zenoh accepts",
+        reader = "that sros reads" if error is UnreadConfigurationError else "that Zenoh accepts"
+        return error(
+            f"the Zenoh configuration '{self.name}' is not one {reader}",
             f"Line {line}: {path} {problem}.",
         )
 
     def section(self, member: str) -> _Section:
         value = self.value.get(member, Json5Object(self.value.line))
         if not isinstance(value, Json5Object):
-            raise self.refused(member, "is not an object")
+            raise self.refused(member, "is not an object", _no_object(value))
         return _Section(self.name, f"{self.path}/{member}".lstrip("/"), value)
 
     def boolean(self, member: str, default: bool, *, nullable: bool = True) -> bool:
@@ -290,7 +309,9 @@ class _Section:
         if value is None:
             return None
         if not isinstance(value, list) or not all(isinstance(each, Json5Object) for each in value):
-            raise self.refused(member, "is not a list of objects")
+            elements = value if isinstance(value, list) else ()
+            inner = next((each for each in elements if isinstance(each, list)), None)
+            raise self.refused(member, "is not a list of objects", _no_object(inner))
         return tuple(
             _Section(self.name, f"{self.path}/{member}[{number}]", each)
             for number, each in enumerate(value)
@@ -455,7 +476,7 @@ def _check_size(section: _Section, found: Enforcement) -> None:
         for policy in found.policies
     )
     if meant > _MOST_MEANT:
-        raise DocumentError(
+        raise UnreadConfigurationError(
             f"the access control of '{section.name}' is too large",
             f"Its subjects and policies stand for {meant:.0e} rules; sros reads at most "
             f"{_MOST_MEANT:.0e}.",

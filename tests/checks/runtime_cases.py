@@ -231,6 +231,7 @@ CASES: dict[str, Change] = {
     "runtime.zenoh-process-unread": on_zenoh("mode: client\n"),
     "runtime.zenoh-open": on_zenoh(**{SESSION: None}),
     "runtime.zenoh-file-not-found": on_zenoh(**{SESSION: "/nowhere/session.json5"}),
+    "runtime.zenoh-unread": on_zenoh("[]"),
     "runtime.zenoh-overridden": on_zenoh(
         **{OVERRIDE: 'connect/endpoints=["tls/a:1"];access_control/enabled=false'}
     ),

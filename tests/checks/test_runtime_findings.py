@@ -17,7 +17,8 @@ from sros_tool.checks import runtime
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding
 from sros_tool.checks.registry import FindingFilter
 from sros_tool.checks.runtime import RuntimeState
-from sros_tool.runtime.processes import Process, ProcessTable
+from sros_tool.runtime.processes import Process, ProcessTable, RunningProcesses
+from sros_tool.zenoh.json5 import MOST_BYTES
 from tests.checks.bench import DAY, Bench
 from tests.checks.runtime_cases import (
     CASES,
@@ -132,6 +133,32 @@ def test_nothing_on_zenoh_with_a_session_file(sound_one: RuntimeState, bench: Be
 def test_a_session_file_that_changed_since_the_start(sound_one: RuntimeState, bench: Bench) -> None:
     assert "runtime.process-outdated" not in ids(on_zenoh()(sound_one, bench))
     assert "runtime.process-outdated" in ids(session_written_since(sound_one, bench))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("open.yaml", "mode: client\n"),
+        ("open.yml", "mode: client\n"),
+        ("sequence.json5", '["client"]'),
+        ("sequences.json5", "{mode: 'client', transport: [[]]}"),
+        ("large.json5", f"{{}}{' ' * MOST_BYTES}"),
+        ("pipe", None),
+    ],
+)
+def test_what_zenoh_reads_and_sros_does_not_is_not_called_malformed(
+    name: str, text: str | None, sound_one: RuntimeState, bench: Bench, tmp_path: Path
+) -> None:
+    """Whether it enforces anything is not known, and said so."""
+    if text is None:
+        os.mkfifo(tmp_path / name)
+    else:
+        (tmp_path / name).write_text(text)
+    unset = dict.fromkeys((ENABLE, STRATEGY, KEYSTORE, ENCLAVE))
+    change = on_zenoh(**unset, **{SESSION: str(tmp_path / name)})
+    state = change(sound_one, bench)
+    ids_found = ids(replace(state, running=RunningProcesses()))
+    assert ids_found == {"runtime.zenoh-unread"}
 
 
 @pytest.mark.parametrize(
