@@ -326,6 +326,14 @@ class Fault(Enum):
         "Fast DDS 2.14.5 (FileProvider.cpp); measured.",
         "Put a CA that is signed with SHA-256 first in the file.",
     )
+    CERTIFICATE_CRASH = (
+        "certificate-crash",
+        "a certificate that crashes a vendor",
+        "Fast DDS ends at a certificate with an empty subject: its own, and that of a peer, before "
+        "it verifies it.",
+        "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp); measured.",
+        "Issue a certificate with the common name of the enclave.",
+    )
     CA_CHAIN = (
         "ca-chain",
         "a CA certificate that a vendor refuses",
@@ -408,6 +416,7 @@ FAULTS = {fault.id: fault for fault in Fault}
 VENDOR_FAULTS = (
     Fault.CERTIFICATE_FILE,
     Fault.CA_CRASH,
+    Fault.CERTIFICATE_CRASH,
     Fault.CA_CHAIN,
     Fault.SIGNATURE_HASH,
     Fault.KEY_ALGORITHM,

@@ -96,6 +96,8 @@ def vendor_problems(
         of_side = [each for each in faults if each.file in side]
         files = {each.file for each in of_side} | ({side[0]} if of_side else set())
         crash = [each for each in of_side if each.fault is Fault.CA_CRASH]
+        if not any(each.file == IDENTITY_CA_FILE for each in of_side):  # loaded before
+            crash += [each for each in of_side if each.fault is Fault.CERTIFICATE_CRASH]
         kept += crash or [each for each in specific if each.file in files] or of_side
     return tuple(kept)
 
@@ -288,6 +290,9 @@ def _identity_faults(
         if not _key_fits(traits, each):
             text = f"it has a key of {algorithm(each.public_key())}"
             yield Problem(file, text, Fault.KEY_ALGORITHM)
+    if traits.crashes_on_empty_subject and not certificate.subject.rdns:
+        text = "its subject is empty, which crashes the process"
+        yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_CRASH)
     trusted = _trusted(traits, authorities)
     if fault := chain_fault(certificate, trusted, at=at, checks=_checks(traits)):
         yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)

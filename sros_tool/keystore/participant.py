@@ -246,6 +246,10 @@ class JoinContext:
 def _crash(problems: Sequence[Problem]) -> Problem | None:
     """Return the problem that crashes the process, unless another one stops it before."""
     for each in problems:
+        if each.fault is Fault.CERTIFICATE_CRASH and not any(
+            other.fault is Fault.CRL_MALFORMED for other in problems
+        ):
+            return each
         if each.fault is Fault.CA_CRASH and (
             each.file == IDENTITY_CA_FILE or not any(other.file in _IDENTITY for other in problems)
         ):

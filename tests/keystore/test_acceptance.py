@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from cryptography import x509
 
+from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import ask
 from sros_tool.keystore.participant import JoinContext, load_enclave
 from tests.dds.decision_documents import allow, governance, grant, permissions, publish, subscribe
-from tests.dds.signer_rows import NOW, YES, Row, rows, write_enclave
+from tests.dds.signer_rows import NOW, YES, Made, Row, rows, write_enclave
 
 
 @pytest.mark.parametrize("row", rows(), ids=lambda row: row.name)
@@ -29,3 +31,16 @@ def test_each_vendor(row: Row, tmp_path: Path) -> None:
         assert (not problems) == (answer == YES), (vendor, problems)
         said = Evaluator(vendor, material, JoinContext(42, NOW)).answer(ask("join"))
         assert said.allowed == (answer == YES), (vendor, said)
+
+
+@pytest.mark.parametrize("granted", ["CN=/t", ""])
+def test_an_empty_subject_crashes_fast_dds_before_it_reads_a_document(
+    granted: str, tmp_path: Path
+) -> None:
+    document = permissions(grant(allow(publish("*"), subscribe("*")), subject=granted))
+    made = Row("", Made(), "", "", "")
+    write_enclave(made, tmp_path / "t", x509.Name([]), governance(), document)
+    material = load_enclave("/t", tmp_path / "t", at=NOW)
+    for vendor in (Vendor.FAST, Vendor.FAST_2_9):
+        said = Evaluator(vendor, material, JoinContext(42, NOW)).answer(ask("join"))
+        assert said.outcome is Outcome.CRASHES, said
