@@ -392,8 +392,13 @@ def list_enclaves(
     root: Path | None, patterns: tuple[str, ...], robots: tuple[str, ...], as_json: bool
 ) -> None:
     """List the enclaves of the keystore ROOT, sorted."""
-    from sros_tool.errors import KeystoreError
-    from sros_tool.keystore.layout import enclave_names, is_keystore, refuse_earlier
+    from sros_tool.errors import KeystoreError, counted
+    from sros_tool.keystore.layout import (
+        enclave_names,
+        hidden_enclaves,
+        is_keystore,
+        refuse_earlier,
+    )
 
     root = root or keystore_from_environment()
     if not is_keystore(root):
@@ -405,11 +410,20 @@ def list_enclaves(
         names = tuple(sorted(select_enclaves(root, (), patterns, robots=robots)))
     else:
         names = enclave_names(root)
+    hidden = hidden_enclaves(root)
     if as_json:
-        print_json({"keystore": str(root), "enclaves": names, **_robots_of(root, names)})
+        found = {"keystore": str(root), "enclaves": names, "hidden": hidden}
+        print_json({**found, **_robots_of(root, names)})
         return
     for name in names:
         echo(name)
+    if hidden:
+        shown = ", ".join(hidden[:5]) + (f" and {len(hidden) - 5} more" if hidden[5:] else "")
+        echo(
+            f"{counted(len(hidden), 'enclave')} in a hidden folder, which DDS loads and sros "
+            f"leaves out: {shown}. `sros check {quote(str(root))}` says what to do.",
+            err=True,
+        )
 
 
 def _robots_of(root: Path, names: Sequence[str]) -> dict[str, dict[str, str]]:

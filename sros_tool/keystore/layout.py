@@ -410,6 +410,34 @@ def _unreadable(root: Path, unread: Sequence[UnreadPath], effect: str) -> Keysto
     )
 
 
+def hidden_enclaves(root: Path) -> tuple[str, ...]:
+    """Return the enclaves in hidden folders, which `enclave_names` leaves out, sorted.
+
+    Left out are an interrupted change of sros, and the folder of an enclave's own files that
+    Kubernetes makes next to the link ``..data`` where it mounts a Secret.
+    """
+    found = (name for name in search_enclaves(root, hidden=True)[0] if "/." in name)
+    folders = {name: enclave_path(root, name) for name in found}
+    return tuple(
+        sorted(
+            name
+            for name, folder in folders.items()
+            if STAGE not in folder.parts and not _is_own_secret(folder)
+        )
+    )
+
+
+def _is_own_secret(folder: Path) -> bool:
+    """Return whether a folder is the one that all files of the enclave above it are links into."""
+    link = folder.parent / "..data"
+    try:
+        return link.is_symlink() and all(
+            (folder.parent / each.name).samefile(each) for each in folder.iterdir()
+        )
+    except OSError:
+        return False
+
+
 def list_enclaves(root: Path) -> tuple[str, ...]:
     """Return the names of the enclaves of a keystore, sorted.
 

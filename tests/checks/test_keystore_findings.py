@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
@@ -212,3 +214,39 @@ def test_the_remedy_for_few_rounds_runs(elsewhere: bool, bench: Bench, tmp_path:
     assert kind not in ids(bench)
     assert load_key(key.read_bytes(), "", lambda: SECRET)
     assert key.stat().st_mode & 0o777 == 0o600
+
+
+def mount_as_secret(enclave: Path, version: str) -> None:
+    """Put the files of an enclave behind links, as Kubernetes mounts a Secret."""
+    (enclave / version).mkdir()
+    (enclave / "..data").symlink_to(version)
+    for file in sorted(each for each in enclave.iterdir() if each.name[0] != "."):
+        (enclave / version / file.name).write_bytes(file.read_bytes())
+        file.unlink()
+        file.symlink_to(f"..data/{file.name}")
+
+
+def test_a_secret_that_kubernetes_mounts_hides_no_enclave(bench: Bench, tmp_path: Path) -> None:
+    """Its hidden folder has the files of the enclave itself; any other one is an enclave."""
+    robot = tmp_path / "robot"
+    sros("distribute_key", bench.root, "/base", robot).ok()
+    enclave = robot / "enclaves/base"
+    mount_as_secret(enclave, "..2026_11_23_10_00_00.123")
+    listed = sros("list_enclaves", robot).ok()
+    assert (listed.out, listed.err) == ("/base\n", "")
+    assert "keystore.hidden-enclave" not in {each.id for each in keystore_findings(robot, now=NOW)}
+    (enclave / "..2025_11_23_10_00_00.123").mkdir()
+    (enclave / "..2025_11_23_10_00_00.123/cert.pem").write_bytes(b"")
+    listed = sros("list_enclaves", robot).ok()
+    assert "/base/..2025_11_23_10_00_00.123" in listed.err
+    found = keystore_findings(robot, now=NOW)
+    hidden = [each.subject for each in found if each.id == "keystore.hidden-enclave"]
+    assert hidden == ["/base/..2025_11_23_10_00_00.123"]
+
+
+def test_enclaves_in_hidden_folders_are_named_where_enclaves_are_listed(bench: Bench) -> None:
+    shutil.copytree(bench.path("enclaves/base"), bench.path("enclaves/.h"), symlinks=True)
+    ended = sros("list_enclaves", bench.root).ok()
+    assert "/.h" not in ended.out.splitlines()
+    assert "1 enclave in a hidden folder, which DDS loads and sros leaves out: /.h" in ended.err
+    assert json.loads(sros("list_enclaves", bench.root, "--json").ok().out)["hidden"] == ["/.h"]

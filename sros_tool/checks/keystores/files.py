@@ -38,7 +38,7 @@ from sros_tool.keystore.layout import (
     UnreadPath,
     enclave_folder,
     enclave_path,
-    search_enclaves,
+    hidden_enclaves,
 )
 from sros_tool.keystore.transaction.stage import check_interrupted
 from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
@@ -249,13 +249,9 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
 
 
 def _hidden_enclaves(keystore: CheckedKeystore) -> Iterator[Finding]:
-    hidden = set(search_enclaves(keystore.root, hidden=True)[0]).difference(keystore.names)
-    for name in sorted(hidden):
-        folder = enclave_path(keystore.root, name)
-        if STAGE not in folder.parts:  # an interrupted change, which is a finding
-            yield HIDDEN_ENCLAVE.found(
-                name, "its folder or one above it begins with a dot", str(folder)
-            )
+    for name in hidden_enclaves(keystore.root):
+        folder = str(enclave_path(keystore.root, name))
+        yield HIDDEN_ENCLAVE.found(name, "its folder or one above it begins with a dot", folder)
 
 
 def _has_links(keystore: CheckedKeystore) -> bool:
