@@ -126,6 +126,17 @@ def test_what_the_refusal_says_to_do_shuts_the_enclave_out(corporate: Path) -> N
     assert [refused_by(corporate, name) for name in list_enclaves(corporate)] == [set(), set()]
 
 
+def test_during_a_rotation_the_old_ca_has_to_go_first(corporate: Path) -> None:
+    key = ("--identity-key", f"file:{corporate.parent / 'new.key'}")
+    sros("rotate_ca", corporate, "--identity", *key, "--next").ok()
+    ended = sros("revoke", corporate, "/lost")
+    assert ended.status == 2 and "cRLSign" in ended.err, ended
+    assert f"sros rotate_ca {corporate} --finish" in ended.err
+    sros("rotate_ca", corporate, "--finish").ok()
+    sros("revoke", corporate, "/lost").ok()
+    assert refused_by(corporate, "/a") == set()
+
+
 def test_the_user_may_name_the_vendors_on_which_nodes_stop(corporate: Path) -> None:
     allowed = [word for vendor in ALL for word in ("--allow-refusal", vendor)]
     ended = sros("revoke", corporate, "/lost", *allowed[:-2])

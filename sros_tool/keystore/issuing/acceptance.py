@@ -328,7 +328,8 @@ def _kinds(transaction: Transaction, now: datetime) -> dict[tuple[object, ...], 
             crl = places[CRL_FILE]
             if crl not in lists:
                 lists[crl] = _listed(transaction.content_after(crl) or b"")
-            before = _content(transaction.root / folder / CERTIFICATE_FILE) if own else b""
+            old = transaction.root / folder / CERTIFICATE_FILE
+            before = _content(old) if CERTIFICATE_FILE in own else b""
             signed = documents or PERMISSIONS_FILE in own
             kind += (
                 _certificate_kind(data, lists[crl], now),

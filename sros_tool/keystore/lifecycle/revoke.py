@@ -34,6 +34,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, Ledger, append, certificate_entry, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner, put_away
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import (
     authority_files,
@@ -206,6 +207,11 @@ def another_ca(root: Path, aim: str) -> str:
     """Return what to do where DDS refuses the lists of the identity CA, before the ``aim``."""
     file = identity_file(root)
     words = ["sros rotate_ca", quote(str(root))]
+    if read_rotation(root).stage is not RotationStage.NONE:
+        return (
+            f"First retire the old CA: `{' '.join(words)} --finish`, restart all processes, and "
+            f"{aim} then."
+        )
     if len(authority_files(root)) > 1:
         words.append("--identity")
     if not (root / f"{PRIVATE}/{file}.key.pem").exists():
