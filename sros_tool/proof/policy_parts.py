@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -24,6 +24,9 @@ _EBCDIC = b"\x4c\x6f\xa7\x94"
 """The beginning of an XML file in EBCDIC (XML 1.0, appendix F)."""
 _ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
 _READABLE = (b"utf-8", b"utf8", b"utf-16", b"us-ascii", b"ascii", b"iso-8859-", b"windows-125")
+_BEFORE = b"\xef\xbb\xbf\xfe\xff \t\r\n"
+"""Bytes of byte order marks and white space, which can stand before the first element."""
+_BEGIN = 4096
 _NAMES = frozenset(kind.removesuffix("s") for kind in RIGHTS)
 _WITH_PARTS = ("policy", "enclaves", "enclave", "profiles", "profile", *RIGHTS)
 _WHOLE = re.compile(r"(?:xpointer\(/(?:\*|[\w.-]+)(?P<below>/\*)?\))?")
@@ -35,7 +38,7 @@ def may_be_policy(content: bytes) -> bool:
     text = content.replace(b"\0", b"")  # UTF-16 has a zero in each letter
     if text.startswith(_EBCDIC):
         return True
-    if not text.lstrip(b"\xef\xbb\xbf\xfe\xff \t\r\n").startswith(b"<"):
+    if not text.lstrip(_BEFORE).startswith(b"<"):
         return False
     text = b" ".join(text.split())
     encoding = _ENCODING.search(text.partition(b"?>")[0])
@@ -98,6 +101,23 @@ def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) 
                 found[target] = not whole["below"]
                 left.append(target)
     return found
+
+
+def includes_files(content: bytes) -> bool:
+    """Return whether a file may be XML, which can include others."""
+    begin = content[:_BEGIN].replace(b"\0", b"").lstrip(_BEFORE)
+    return not begin or begin.startswith((b"<", _EBCDIC))
+
+
+def users_of(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str]:
+    """Return those of some files that include some of the parts, or one that does."""
+    includes = {
+        path: {target for target, _ in _includes(path, data)} for path, data in files.items()
+    }
+    found = set(parts)
+    while more := {path for path, targets in includes.items() if targets & found} - found:
+        found |= more
+    return found.difference(parts)
 
 
 def _includes(path: str, content: bytes | None) -> Iterator[tuple[str, str]]:

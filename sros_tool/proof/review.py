@@ -37,10 +37,12 @@ from sros_tool.proof.dropped import dropped_findings, dropped_requirements
 from sros_tool.proof.findings import requirement_findings
 from sros_tool.proof.growth import Growth, compare_access
 from sros_tool.proof.policy_parts import (
+    includes_files,
     is_whole_policy,
     may_be_policy,
     same_root,
     used_whole,
+    users_of,
 )
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import Requirement, read_requirements
@@ -414,6 +416,9 @@ class _Review:
         for path in self._used_in_part(changed, reviewed, fleet):
             lines.append(("changes and is used only in part, and the rest is not reviewed", path))
             status = self._new_access
+        for path in self._not_reviewed_users(changed):
+            lines.append(("is not reviewed, and includes a file that changes", path))
+            status = self._new_access
         sizes = self.request.repository.sizes(names)
         for path, entry in changed:
             if sizes.get(entry.id, 0) > _MOST_OUTSIDE and entry.mode in FILES:
@@ -478,6 +483,34 @@ class _Review:
                 if path in whole and same_root(earlier, data):
                     continue
             yield path
+
+    def _not_reviewed_users(self, changed: Iterable[tuple[str, TreeEntry]]) -> list[str]:
+        """Return policies that are not reviewed, and have a file that a reviewed one has, too.
+
+        A policy includes only what is in its own folder and below.
+        """
+        repository, files = self.request.repository, self.head.files
+        parts = [
+            path
+            for path, entry in changed
+            if path in files and may_be_policy(repository.content(entry.id))
+        ]
+        ids: dict[str, str] = {}
+        for folder in sorted({parent for each in parts for parent in Path(each).parents}):
+            entry = self.head.entry("" if folder == Path() else str(folder))
+            assert entry
+            for name, each in repository.folders([entry.id])[entry.id].items():
+                path = str(folder / name)
+                if each.mode in FILES and not _is_below(path, self.request.left_out):
+                    ids[path] = each.id
+        sizes = repository.sizes(dict.fromkeys(ids.values()))
+        ids = {path: each for path, each in ids.items() if sizes.get(each, 0) <= _MOST_OUTSIDE}
+        contents: dict[str, bytes] = {}
+        for some in repository.contents_in_parts(ids.values(), _MOST_BYTES):
+            contents |= {digits: data for digits, data in some.items() if includes_files(data)}
+        there = {path: contents[each] for path, each in ids.items() if each in contents}
+        users = users_of(parts, there)
+        return sorted(e for e in users if e not in files and is_whole_policy(there[e]))
 
     def _unseen(self, path: str, entry: TreeEntry) -> str:
         """Return what at a path of HEAD may lead to policies that are not reviewed, or ""."""

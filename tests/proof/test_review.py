@@ -198,6 +198,29 @@ def test_a_part_that_is_included_in_part_is_said(
     assert ("'part.xml' changes and is used only in part" in ended.out) == bool(status)
 
 
+def test_a_policy_that_shares_a_part_is_said(change: Change) -> None:
+    """The reviewed policy has the right already that another one gets by a file of both."""
+    part = '<xi:include href="parts/outer.xml" xpointer="xpointer(/x/*)"/>'
+    inner = '<xi:include href="inner.xml" xpointer="xpointer(/x/*)"/>'
+    policies = {
+        "robot.xml": policy_text({"/a": publish("/x") + part}),
+        "other.xml": policy_text({"/b": part}).replace("XInclude", "X&#73;nclude"),
+        "tests/other.xml": policy_text({"/b": publish("/z")}),
+    }
+    outer = f'<x xmlns:xi="http://www.w3.org/2001/XInclude">{inner}</x>'
+    change.base = change.commit(
+        {**policies, "parts/outer.xml": outer, "parts/inner.xml": f"<x>{publish('/x')}</x>"}
+    )
+    change.commit({"parts/inner.xml": f"<x>{publish('/x')}{publish('/y')}</x>"})
+    ended = change.review("--policy", "robot.xml\nother.xml")
+    assert "includes a file that changes" not in ended.out
+    change.base = change.commit({"robot.xml": policy_text({"/a": publish("/x", "/y") + part})})
+    change.commit({"parts/inner.xml": f"<x>{publish('/x')}</x>"})
+    ended = change.review("--policy", "robot.xml")
+    assert ended.status == 1, ended
+    assert "files: 'other.xml' is not reviewed, and includes a file that changes\n" in ended.out
+
+
 def test_a_policy_that_is_included_in_part_is_said(change: Change) -> None:
     """What the reviewed policy does not take from it gets no review."""
     part = """<xi:include href="second.xml" xpointer="xpointer(/policy/enclaves/*[@path='/b'])"/>"""
