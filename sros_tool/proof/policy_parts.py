@@ -59,7 +59,10 @@ def _is_part(root: etree._Element) -> bool:
     return (
         any(each.keys() and _gives_access(each) for each in below)
         or (root.tag in _WITH_PARTS and any(each.tag in INCLUDES for each in below))
-        or ((bool(below[1:]) or root.tag in _NAMES) and all(e.tag in _NAMES for e in only_names))
+        or (
+            (bool(below[1:]) or root.tag in _NAMES)
+            and all(e.tag in _NAMES and e.text for e in only_names)
+        )
     )
 
 

@@ -145,7 +145,14 @@ def test_a_policy_that_is_not_named_is_said(change: Change, name: str, content: 
 
 def test_what_is_no_part_of_a_policy_and_what_is_too_large(change: Change) -> None:
     world = "<sdf><plugin><topic>/x</topic><update_rate/></plugin></sdf>"
-    change.commit({"world.sdf": world, "large.xml": b"<policy version='0'>" + b" " * 2**25})
+    profiles = '<profiles><topic profile_name="x"/></profiles>'  # of Fast DDS
+    change.commit(
+        {
+            "world.sdf": world,
+            "dds.xml": profiles,
+            "large.xml": b"<policy version='0'>" + b" " * 2**25,
+        }
+    )
     said = change.review("--policy", "robot.xml").ok().out
     assert "files: 'large.xml' changes and is too large to be looked at\n" in said
 
