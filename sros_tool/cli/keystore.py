@@ -300,6 +300,7 @@ def _show(
     policies: Sequence[Policy | FleetPolicy] = (),
 ) -> None:
     from sros_tool.checks.signed import as_note, signed_findings
+    from sros_tool.keystore.layout import FLEET
     from sros_tool.keystore.lifecycle.replaced import lasting_text
 
     signed = {*result.created, *result.changed, *result.kept}
@@ -322,6 +323,13 @@ def _show(
         ):
             for name in names:
                 echo(text.format(name))
+        if len(result.created) > _MANY_CREATED:
+            whose = "--robot NAME" if (result.root / FLEET).exists() else "NAME..."
+            echo(
+                f"created {len(result.created)} enclaves; to send them: `sros distribute_key "
+                f"{quote(str(result.root))} {whose} FOLDER`",
+                err=True,
+            )
     if result.kept:
         number = "1 enclave" if len(result.kept) == 1 else f"{len(result.kept)} enclaves"
         echo(f"unchanged: {number}: {_shown_names(result.kept)}", err=True)
@@ -1044,3 +1052,4 @@ def _show_update(
 
 
 _NAMES_SHOWN = 5
+_MANY_CREATED = 20

@@ -685,8 +685,14 @@ class _Reader:
         self, element: etree._Element, place: IncludedFile, tag: str
     ) -> tuple[etree._Element, IncludedFile]:
         if element.tag != tag:
+            found = tag_of(element)
+            elsewhere = f", or move it into <{found}s>" if found in _ITEMS else ""
             raise PolicyError(
-                f"{self._where(element, place)}: <{tag_of(element)}> found, but <{tag}> expected"
+                f"{self._where(element, place)}: <{found}> found, but <{tag}> expected",
+                "",
+                f"Write <{tag}> in its place{elsewhere}."
+                if tag in _ITEMS
+                else f"Write <{tag}> in its place, or around it.",
             )
         return element, place
 

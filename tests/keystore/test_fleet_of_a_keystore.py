@@ -177,3 +177,15 @@ def test_a_request_for_robots_that_the_keystore_does_not_know(made: Path, tmp_pa
     request = tmp_path / "robot/enclaves/new/request.pem"
     ended = sros("sign_request", root, request, *words, "-o", tmp_path / "answer.tgz").ok()
     assert "its fleet does not have the robot of enclave /new" in ended.err, ended
+
+
+def test_many_new_enclaves_are_counted_with_the_next_step(tmp_path: Path) -> None:
+    """What to do next is not lost behind a line for each of them."""
+    (tmp_path / "fleet.toml").write_text("".join(f"[robots.r{n}]\n" for n in range(21)))
+    (tmp_path / "policy.xml").write_text(policy_text({"/{robot}": publish("x")}))
+    root = tmp_path / "ks"
+    words = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
+    ended = sros("generate_artifacts", "-k", root, *words).ok()
+    assert ended.out.count("created enclave ") == 21
+    said = f"created 21 enclaves; to send them: `sros distribute_key {root} --robot NAME FOLDER`"
+    assert said in ended.err

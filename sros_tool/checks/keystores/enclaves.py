@@ -25,7 +25,7 @@ from sros_tool.checks.kind import (
 )
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import Grant
-from sros_tool.errors import SrosError
+from sros_tool.errors import SrosError, counted
 from sros_tool.faults import VENDOR_FAULTS, Fault
 from sros_tool.keystore.issuing.tokens import pin_file_problem, pin_line_break
 from sros_tool.keystore.layout import (
@@ -409,7 +409,7 @@ def with_causes(findings: Sequence[Finding]) -> list[Finding]:
             same[each.text].append(each)
     causes = {
         text: Cause(
-            f"{len(group)} enclaves in which no ordinary node of ROS 2 can start",
+            f"{counted(len(group), 'enclave')} in which no ordinary node of ROS 2 can start",
             f"In {some_names([each.subject for each in group])}, {text}. {NO_NODE.why}",
             group[0].remedy,
             len(group),
