@@ -323,14 +323,24 @@ def is_self_issued(certificate: x509.Certificate) -> bool:
 @lru_cache(maxsize=256)
 def signature_matches(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
     """Return whether the key of ``authority`` made the signature of ``certificate``."""
-    key, signature = authority.public_key(), certificate.signature
-    signed = certificate.tbs_certificate_bytes
+    return is_signed(certificate, certificate.tbs_certificate_bytes, authority)
+
+
+def is_signed(
+    made: x509.Certificate | x509.CertificateRevocationList,
+    signed: bytes,
+    authority: x509.Certificate,
+) -> bool:
+    """Return whether the key of ``authority`` signed ``signed``, a part of ``made``."""
+    key, signature = authority.public_key(), made.signature
+    if not isinstance(key, _SIGNING_KEYS.get(made.signature_algorithm_oid, ())):
+        return False
     try:
-        how = certificate.signature_algorithm_parameters
+        how = made.signature_algorithm_parameters
         if isinstance(key, ec.EllipticCurvePublicKey) and isinstance(how, ec.ECDSA):
             key.verify(signature, signed, how)
-        elif isinstance(key, rsa.RSAPublicKey) and certificate.signature_hash_algorithm:
-            digest = certificate.signature_hash_algorithm
+        elif isinstance(key, rsa.RSAPublicKey) and made.signature_hash_algorithm:
+            digest = made.signature_hash_algorithm
             key.verify(signature, signed, how, digest)  # type: ignore[arg-type]
         elif isinstance(key, (ed25519.Ed25519PublicKey, ed448.Ed448PublicKey)):
             key.verify(signature, signed)

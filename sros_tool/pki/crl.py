@@ -8,14 +8,17 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec, ed448, ed25519, rsa
 from cryptography.x509.oid import CRLEntryExtensionOID, ExtensionOID
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import pem
-from sros_tool.pki.certificates import authority_identifier, extension, subject_text
+from sros_tool.pki.certificates import (
+    authority_identifier,
+    extension,
+    is_signed,
+    subject_text,
+)
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.pki.names import same_name
 from sros_tool.pki.reading import read_name, reading
@@ -225,32 +228,15 @@ def refusal_of(crl: x509.CertificateRevocationList) -> str:
 
 def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
     """Return whether ``authority`` issued and signed the revocation list."""
-    return same_name(crl.issuer, authority.subject) and is_signed_with(crl, authority)
+    return same_name(crl.issuer, authority.subject) and is_signed(
+        crl, crl.tbs_certlist_bytes, authority
+    )
 
 
 def may_sign_lists(authority: x509.Certificate) -> bool:
     """Return whether OpenSSL accepts revocation lists of a CA: by keyUsage, if it has that."""
     usage = extension(authority, x509.KeyUsage)
     return usage is None or usage.crl_sign
-
-
-def is_signed_with(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
-    """Return whether the key of ``authority`` made the signature of the list."""
-    key = authority.public_key()
-    signature, signed = crl.signature, crl.tbs_certlist_bytes
-    try:
-        how, digest = crl.signature_algorithm_parameters, crl.signature_hash_algorithm
-        if isinstance(key, ec.EllipticCurvePublicKey) and isinstance(how, ec.ECDSA):
-            key.verify(signature, signed, how)
-        elif isinstance(key, rsa.RSAPublicKey) and digest:
-            key.verify(signature, signed, how, digest)  # type: ignore[arg-type]
-        elif isinstance(key, (ed25519.Ed25519PublicKey, ed448.Ed448PublicKey)):
-            key.verify(signature, signed)
-        else:
-            return False
-    except (InvalidSignature, UnsupportedAlgorithm, ValueError, TypeError):
-        return False
-    return True
 
 
 def _number(crl: x509.CertificateRevocationList) -> int:

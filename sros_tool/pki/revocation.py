@@ -14,9 +14,8 @@ from typing import NamedTuple
 from cryptography import x509
 from cryptography.x509.oid import CRLEntryExtensionOID, ExtensionOID
 
-from sros_tool.pki.certificates import Extension, extension, subject_text
+from sros_tool.pki.certificates import Extension, extension, is_signed, subject_text
 from sros_tool.pki.crl import (
-    is_signed_with,
     lists_as_revoked,
     may_sign_lists,
     names_issuers,
@@ -97,7 +96,7 @@ def list_refusal(
     if _has_expired(crl, at):
         assert crl.next_update_utc
         return ListRefusal(Obstacle.EXPIRED, crl, f"it expired at {iso(crl.next_update_utc)}")
-    if not is_signed_with(crl, issuer):
+    if not is_signed(crl, crl.tbs_certlist_bytes, issuer):
         return ListRefusal(Obstacle.SIGNATURE, crl, f"it is not signed with the key of {name}")
     if not score.only_known:
         return ListRefusal(Obstacle.CRITICAL, crl, "it has an unknown critical extension")

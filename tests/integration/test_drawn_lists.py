@@ -101,7 +101,8 @@ def draw_list(dice: random.Random, chain: list[x509.Certificate]) -> x509.Certif
             named = [x509.DirectoryName(common_name(dice.choice(("CA", "root"))))]
             entry = entry.add_extension(x509.CertificateIssuer(named), critical=mostly() < 0.8)
         builder = builder.add_revoked_certificate(entry.build())
-    return builder.sign(KEYS[1 if mostly() < 0.9 else 2], hashes.SHA256())
+    digest = dice.choice((*[hashes.SHA256()] * 8, hashes.SHA512(), hashes.SHA3_256()))
+    return builder.sign(KEYS[1 if mostly() < 0.9 else 2], digest)  # type: ignore[arg-type]
 
 
 def test_drawn_lists() -> None:
