@@ -220,7 +220,7 @@ def _certificate_in(block: pem_file.Block, what: str, why: str = _UNREADABLE) ->
     with reading(what, why, _RESTORE):
         # OpenSSL ignores what follows; in a trusted certificate, it says what for.
         certificate, _ = der.split(block.content)
-        return _read_in_full(x509.load_der_x509_certificate(certificate))
+        return _load_der(certificate)
 
 
 def _sentence(clause: str) -> str:
@@ -234,7 +234,20 @@ def load_der_certificate(data: bytes) -> x509.Certificate:
         PkiError: the certificate cannot be read.
     """
     with reading("a certificate in it cannot be read", "It is damaged."):
-        return _read_in_full(x509.load_der_x509_certificate(data))
+        return _load_der(data)
+
+
+def _load_der(data: bytes) -> x509.Certificate:
+    known = len(data) < _USUAL_BYTES
+    return _load_known_der(data) if known else _load_known_der.__wrapped__(data)
+
+
+@lru_cache(maxsize=64)  # several readers load the certificate of an enclave, and the same few CAs
+def _load_known_der(data: bytes) -> x509.Certificate:
+    return _read_in_full(x509.load_der_x509_certificate(data))
+
+
+_USUAL_BYTES = 16 * 1024
 
 
 def _read_in_full(certificate: x509.Certificate) -> x509.Certificate:

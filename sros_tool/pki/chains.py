@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime
 from enum import Flag, auto
+from functools import lru_cache
 from itertools import pairwise
 
 from cryptography import x509
@@ -84,7 +85,18 @@ def chain_fault(
 
     ``others`` are possible intermediate certificates; validities are checked at the time ``at``.
     """
-    chain, missing = build_chain(start, tuple(dict.fromkeys(authorities)), tuple(others), at)
+    return _chain_fault(start, tuple(dict.fromkeys(authorities)), tuple(others), at, checks)
+
+
+@lru_cache(maxsize=64)  # vendors check the same chain, and all documents have the same signer
+def _chain_fault(
+    start: x509.Certificate,
+    authorities: tuple[x509.Certificate, ...],
+    others: tuple[x509.Certificate, ...],
+    at: datetime,
+    checks: Checks,
+) -> str:
+    chain, missing = build_chain(start, authorities, others, at)
     if missing:
         return missing
     faults = (
