@@ -7,12 +7,13 @@ are found by `sros_tool.keystore.reader` and not checked here again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from datetime import datetime
 from functools import lru_cache
 from itertools import dropwhile
 
 from cryptography import x509
-from cryptography.hazmat.primitives.asymmetric import ec, rsa
+from cryptography.hazmat.primitives.asymmetric import dsa, ec, rsa
 from cryptography.x509.oid import SignatureAlgorithmOID
 
 from sros_tool.dds.decision.vendors import MEASURED, Hashes, Keys, Signers, Vendor, VendorTraits
@@ -32,13 +33,14 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedEnclave, Problem
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
+    is_for_pss,
     load_certificate,
     load_certificates,
     subject_text,
 )
 from sros_tool.pki.chains import Checks, build_chain, chain_fault
 from sros_tool.pki.crl import read_list, read_lists, refusal_of
-from sros_tool.pki.keys import algorithm
+from sros_tool.pki.keys import algorithm, load_any_key
 from sros_tool.pki.revocation import Obstacle, list_refusal
 
 Certificates = tuple[x509.Certificate, ...]
@@ -128,7 +130,7 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
             yield Problem(file, *fault)
     authorities = read.get(IDENTITY_CA_FILE)
     if authorities and identity:
-        yield from _identity_faults(traits, identity[0], authorities, at)
+        yield from _identity_faults(traits, identity[0], _key(state), authorities, at)
         yield from _list_faults(traits, state, identity[0], authorities, at)
     signers = read.get(PERMISSIONS_CA_FILE)
     for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
@@ -148,6 +150,12 @@ def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
     if traits.reads_first_authority or file == CERTIFICATE_FILE:
         return (load_certificate(data, file, trusted=traits.reads_trusted_certificates),)
     return load_certificates(data, file)
+
+
+def _key(state: OpenedEnclave) -> object:
+    with suppress(PkiError):
+        return load_any_key(state.files.get(KEY_FILE, b""), KEY_FILE).public_key()
+    return None
 
 
 @lru_cache(maxsize=8)
@@ -197,7 +205,9 @@ def authority_refusals(role: str, certificates: Certificates, at: datetime) -> d
         elif role == IDENTITY:
             trusted = _trusted(traits, certificates)
             below = chain_fault(certificates[0], trusted, at=at, checks=_checks(traits))
-            key = "" if _key_fits(traits, certificates[0]) else "its key algorithm is not supported"
+            first = certificates[0]
+            fits = _key_fits(traits, first.public_key(), pss=is_for_pss(first))
+            key = "" if fits else "its key algorithm is not supported"
             refusals[vendor] = below or key
         elif traits.signers is Signers.CHAIN:
             trusted = _trusted(traits, certificates)
@@ -244,6 +254,8 @@ def _signer_fault(
             return f"the certificate of its signer is not {where}"
         if not signature.is_intact(signed.content, signer):
             return "its signature does not match its content"
+        if is_for_pss(signer):
+            return "the key of its signer is for RSA-PSS alone, which signed documents cannot have"
         if listed:
             continue
         fault = chain_fault(signer, trusted, signed.certificates, at=at, checks=Checks.DOCUMENTS)
@@ -280,16 +292,27 @@ def _checks(traits: VendorTraits) -> Checks:
 
 
 def _identity_faults(
-    traits: VendorTraits, certificate: x509.Certificate, authorities: Certificates, at: datetime
+    traits: VendorTraits,
+    certificate: x509.Certificate,
+    key: object,
+    authorities: Certificates,
+    at: datetime,
 ) -> Iterator[Problem]:
+    """Yield the faults of an identity; ``key`` is the public key of ``key.pem``, or None."""
     if not _hash_fits(traits, certificate):
         pss = certificate.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
         text = "it is signed with RSA-PSS" if pss else "it is not signed with SHA-256"
         yield Problem(CERTIFICATE_FILE, text, Fault.SIGNATURE_HASH)
     for file, each in ((CERTIFICATE_FILE, certificate), (IDENTITY_CA_FILE, authorities[0])):
-        if not _key_fits(traits, each):
+        if not _key_fits(traits, each.public_key(), pss=is_for_pss(each)):
             text = f"it has a key of {algorithm(each.public_key())}"
             yield Problem(file, text, Fault.KEY_ALGORITHM)
+    if key is not None and traits.keys is Keys.SMALL and not _key_fits(traits, key):
+        text = f"it is a key of {algorithm(key)}"
+        yield Problem(KEY_FILE, text, Fault.KEY_ALGORITHM)
+    if traits.verifies_policies and is_for_pss(certificate):
+        text = "its key is for RSA-PSS alone, and key.pem does not say so"
+        yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_FILE)
     if traits.crashes_on_empty_subject and not certificate.subject.rdns:
         text = "its subject is empty, which crashes the process"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_CRASH)
@@ -338,10 +361,11 @@ _lists = lru_cache(maxsize=16)(read_lists)
 _list = lru_cache(maxsize=16)(read_list)
 
 
-def _key_fits(traits: VendorTraits, certificate: x509.Certificate) -> bool:
-    key = certificate.public_key()
+def _key_fits(traits: VendorTraits, key: object, *, pss: bool = False) -> bool:
+    if traits.keys is Keys.ANY:
+        return True
     if isinstance(key, ec.EllipticCurvePublicKey):
         return traits.keys is not Keys.SMALL or key.key_size == 256
     if isinstance(key, rsa.RSAPublicKey):
-        return traits.keys is not Keys.SMALL or key.key_size == 2048
-    return traits.keys is Keys.ANY
+        return traits.keys is not Keys.SMALL or (key.key_size == 2048 and not pss)
+    return traits.keys is Keys.EC_AND_RSA and isinstance(key, dsa.DSAPublicKey)

@@ -328,6 +328,7 @@ class VendorParticipant:
 
     def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
         """Return the access of the vendor's process, or the decision that keeps it from running."""
+        late: Decision | None = None
         if self.problems:
             crash = _crash(self.problems)
             if crash:
@@ -337,8 +338,10 @@ class VendorParticipant:
             noticed_late = all(
                 (self.vendor, each.fault) in _ONLY_PEERS_NOTICE for each in self.problems
             )
-            outcome = Outcome.PEER_DENIES if noticed_late else Outcome.REFUSED
-            return Decision(outcome, first.fault.id, f"{self.vendor.title}: {first}.")
+            text = f"{self.vendor.title}: {first}."
+            if not noticed_late:
+                return Decision(Outcome.REFUSED, first.fault.id, text)
+            late = Decision(Outcome.PEER_DENIES, first.fault.id, text)
         governance = _governance_as(self.vendor, enclave.governance)
         if isinstance(governance, Refusal):
             return replace(governance.decision(), reason=Fault.GOVERNANCE_MALFORMED.id)
@@ -347,7 +350,7 @@ class VendorParticipant:
         if isinstance(permissions, Refusal):
             return replace(permissions.decision(), reason=Fault.PERMISSIONS_MALFORMED.id)
         self.permissions = permissions
-        return Access(
+        access = Access(
             self.vendor,
             governance,
             permissions,
@@ -356,6 +359,11 @@ class VendorParticipant:
             at=context.at,
             zone=context.zone,
         )
+        if late is None:
+            return access
+        # Its own process may still refuse the documents.
+        joined = access.join()
+        return joined if joined.outcome in (Outcome.REFUSED, Outcome.CRASHES) else late
 
 
 def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> OpenedEnclave:

@@ -73,7 +73,7 @@ from sros_tool.pki.crl import (
     refusal_of,
     signed_by,
 )
-from sros_tool.pki.keys import load_key
+from sros_tool.pki.keys import load_any_key
 from sros_tool.pki.token_uri import TokenUri, read_token_file
 from sros_tool.validity import Window, iso
 from sros_tool.values import shows
@@ -600,7 +600,7 @@ class _EnclaveFiles:
         if key is None:
             return
         try:
-            private = load_key(key, KEY_FILE)
+            private = load_any_key(key, KEY_FILE)
         except SrosError as error:
             fault = Fault.KEY_ENCRYPTED if _ENCRYPTED.search(key) else Fault.KEY_MALFORMED
             self._add(KEY_FILE, error.why.rstrip("."), fault)

@@ -12,13 +12,14 @@ from typing import TypeVar
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec, ed448, ed25519, rsa
-from cryptography.x509.oid import NameOID, SignatureAlgorithmOID
+from cryptography.hazmat.primitives.asymmetric import ec, ed448, ed25519, padding, rsa
+from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
+from cryptography.x509.oid import NameOID, PublicKeyAlgorithmOID, SignatureAlgorithmOID
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
 from sros_tool.pki import pem as pem_file
-from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm, is_weak
+from sros_tool.pki.keys import KEY_LABELS, PrivateKey, PublicKey, algorithm, check_key, is_weak
 from sros_tool.pki.names import same_name
 from sros_tool.pki.object_names import short_names
 from sros_tool.pki.reading import read_name, reading
@@ -67,8 +68,7 @@ _SIGNING_KEYS: dict[x509.ObjectIdentifier, type] = {
         if name.startswith(("RSA", "ECDSA", "_RSA")) and not name.startswith("ECDSA_WITH_SHA3_")
     },
 }
-"""The kind of key that makes a signature, by its algorithm; OpenSSL 3.0 has no ECDSA with SHA-3."""
-
+"""The kind of key that makes a signature, by its OID; OpenSSL 3.0 has no ECDSA with SHA-3."""
 _NOT_A_CA = x509.BasicConstraints(ca=False, path_length=None)
 _A_CA = x509.BasicConstraints(ca=True, path_length=1)
 
@@ -184,7 +184,7 @@ def load_certificate(data: bytes, name: str, *, trusted: bool = True) -> x509.Ce
     labels = pem_file.CERTIFICATES if trusted else pem_file.CERTIFICATES[:-1]
     for block in _blocks(data, what):
         if block.label in labels:
-            return _certificate_in(block, what)
+            return _certificate_in(block, what, alone=trusted)
     why = f"It is not a PEM certificate: {pem_file.missing(data, 'CERTIFICATE')}."
     raise PkiError(what, why, _RESTORE)
 
@@ -197,9 +197,18 @@ def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
     """
     first = load_certificate(data, name)
     what = f"the certificates {name} cannot be read"
-    blocks = [each for each in _blocks(data, what) if each.label in pem_file.CERTIFICATES]
-    later = "A certificate after the first one is damaged."
-    return (first, *(_certificate_in(each, what, later) for each in blocks[1:]))
+    others: list[x509.Certificate] = []
+    for block in list(_blocks(data, what)):
+        if block.label in pem_file.CERTIFICATES:
+            why = "A certificate after the first one is damaged."
+            others.append(_certificate_in(block, what, why))
+        elif block.label == "X509 CRL":
+            with reading(what, "A revocation list in it is damaged.", _RESTORE):
+                x509.load_der_x509_crl(der.split(block.content)[0])
+        elif block.label in KEY_LABELS and not block.headers:
+            with reading(what, "A private key in it is damaged.", _RESTORE):
+                check_key(block.content)
+    return (first, *others[1:])
 
 
 _RESTORE = "Restore it from a backup, or issue it again."
@@ -213,14 +222,30 @@ def _blocks(data: bytes, what: str) -> Iterator[pem_file.Block]:
         raise PkiError(what, _sentence(error.what), _RESTORE) from error
 
 
-def _certificate_in(block: pem_file.Block, what: str, why: str = _UNREADABLE) -> x509.Certificate:
+def _certificate_in(
+    block: pem_file.Block, what: str, why: str = _UNREADABLE, *, alone: bool = False
+) -> x509.Certificate:
     if block.headers:
         why = f"It has PEM headers ('{block.headers.splitlines()[0].decode('ascii', 'replace')}')."
         raise PkiError(what, why, "Remove the lines between '-----BEGIN' and the certificate.")
     with reading(what, why, _RESTORE):
-        # OpenSSL ignores what follows; in a trusted certificate, it says what for.
-        certificate, _ = der.split(block.content)
+        certificate, rest = der.split(block.content)
+        if rest and (alone or block.label == pem_file.CERTIFICATES[-1]):
+            _check_trust(rest)
         return _load_der(certificate)
+
+
+def _check_trust(rest: bytes) -> None:
+    """Refuse what stands behind a certificate, unless it only names the certificate (X509_AUX).
+
+    What the certificate is trusted for would restrict it, which sros does not decide.  Some readers
+    of OpenSSL ignore what is no such value.
+    """
+    (settings,) = der.children(rest)
+    if settings.tag != der.SEQUENCE or any(
+        each.tag in (der.SEQUENCE, der.CONTEXT_0) for each in der.children(settings.content)
+    ):
+        raise ValueError("it says what it is trusted for")
 
 
 def _sentence(clause: str) -> str:
@@ -263,7 +288,7 @@ def _read_in_full(certificate: x509.Certificate) -> x509.Certificate:
     return certificate
 
 
-def same_key(certificate: x509.Certificate, key: PrivateKey) -> bool:
+def same_key(certificate: x509.Certificate, key: PrivateKeyTypes) -> bool:
     """Return whether ``key`` is the private key of ``certificate``."""
     return certificate.public_key() == key.public_key()
 
@@ -298,9 +323,10 @@ def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) ->
     kind = _SIGNING_KEYS.get(certificate.signature_algorithm_oid)
     if not (
         same_name(certificate.issuer, authority.subject)
-        and _names_one_algorithm(certificate)
         and kind
+        and _names_one_algorithm(certificate)
         and isinstance(authority.public_key(), kind)
+        and (_uses_pss(certificate) or not is_for_pss(authority))
     ):
         return False
     named = extension(certificate, x509.AuthorityKeyIdentifier)
@@ -317,6 +343,25 @@ def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) ->
         and named.authority_cert_serial_number in (None, authority.serial_number)
         and (not issuers or same_name(issuers[0], authority.issuer))
     )
+
+
+def _uses_pss(certificate: x509.Certificate) -> bool:
+    return certificate.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
+
+
+def is_for_pss(certificate: x509.Certificate) -> bool:
+    """Return whether the key of a certificate is an RSA key for RSA-PSS alone (RFC 4055, 1.2)."""
+    return certificate.public_key_algorithm_oid == PublicKeyAlgorithmOID.RSASSA_PSS
+
+
+def has_explicit_curve(certificate: x509.Certificate) -> bool:
+    """Return whether the elliptic curve of a certificate's key is given by its parameters."""
+    if certificate.public_key_algorithm_oid != PublicKeyAlgorithmOID.EC_PUBLIC_KEY:
+        return False
+    parts = der.children(der.first(certificate.tbs_certificate_bytes).content)
+    key = parts[6 if parts[0].tag == der.CONTEXT_0 else 5]
+    algorithm_of_key = der.children(der.first(key.content).content)
+    return algorithm_of_key[-1].tag == der.SEQUENCE
 
 
 @lru_cache(maxsize=256)
@@ -349,12 +394,14 @@ def is_signed(
     if not isinstance(key, _SIGNING_KEYS.get(made.signature_algorithm_oid, ())):
         return False
     try:
-        how = made.signature_algorithm_parameters
-        if isinstance(key, ec.EllipticCurvePublicKey) and isinstance(how, ec.ECDSA):
-            key.verify(signature, signed, how)
+        if isinstance(key, ec.EllipticCurvePublicKey):
+            how = made.signature_algorithm_parameters
+            key.verify(signature, signed, how)  # type: ignore[arg-type]
         elif isinstance(key, rsa.RSAPublicKey) and made.signature_hash_algorithm:
+            pss = made.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
+            scheme = made.signature_algorithm_parameters if pss else padding.PKCS1v15()
             digest = made.signature_hash_algorithm
-            key.verify(signature, signed, how, digest)  # type: ignore[arg-type]
+            key.verify(signature, signed, scheme, digest)  # type: ignore[arg-type]
         elif isinstance(key, (ed25519.Ed25519PublicKey, ed448.Ed448PublicKey)):
             key.verify(signature, signed)
         else:

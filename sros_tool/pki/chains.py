@@ -20,6 +20,7 @@ from sros_tool.errors import PkiError
 from sros_tool.pki import der
 from sros_tool.pki.certificates import (
     extension,
+    has_explicit_curve,
     is_self_issued,
     likely_issued,
     signature_matches,
@@ -227,6 +228,9 @@ def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
     strict = Checks.STRICT in checks
     if strict and _Authority.OLD in _authority(chain[0]):
         yield f"{subject_text(chain[0].subject)} has no basicConstraints, so it is not a CA"
+    if len(chain) > 1:
+        for each in filter(has_explicit_curve, chain):
+            yield f"the curve of the key of {subject_text(each.subject)} has no name"
     below = 0
     for place, each in enumerate(chain):
         name = subject_text(each.subject)

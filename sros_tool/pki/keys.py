@@ -8,6 +8,7 @@ import os
 import re
 import textwrap
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
@@ -20,6 +21,7 @@ from cryptography.hazmat.primitives.padding import PKCS7
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
+from sros_tool.pki import pem as pem_file
 from sros_tool.pki.reading import reading
 
 PrivateKey = ec.EllipticCurvePrivateKey | rsa.RSAPrivateKey
@@ -91,10 +93,29 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
         PkiError: the key cannot be read, is encrypted and ``passphrase`` is None or wrong, is
             neither an EC nor an RSA key, or would take OpenSSL long, which no signal ends.
     """
+    key = load_any_key(pem, name, passphrase)
+    if not isinstance(key, (ec.EllipticCurvePrivateKey, rsa.RSAPrivateKey)):
+        raise PkiError(
+            f"the private key {name} is neither an elliptic-curve nor an RSA key",
+            "DDS Security accepts EC prime256v1 and RSA 2048.",
+            "Use a key of one of these kinds.",
+        )
+    return key
+
+
+def load_any_key(
+    pem: bytes, name: str, passphrase: Callable[[], str] | None = None
+) -> PrivateKeyTypes:
+    """Return the key of a PEM file, also one of a kind that DDS Security does not have.
+
+    Raises:
+        PkiError: as `load_key`, but for the kind of the key.
+    """
+    pem = _key_block(pem, name)
     if len(pem) > _MAX_BYTES:
         raise PkiError(
             f"the private key {name} is too large",
-            f"Its file has more than {_MAX_BYTES // 1024} KiB; an RSA key of 4096 bits has 4 KiB.",
+            f"It has more than {_MAX_BYTES // 1024} KiB; an RSA key of 4096 bits has 4 KiB.",
             "Use an EC prime256v1 key, or an RSA key of 2048 bits.",
         )
     try:
@@ -110,23 +131,56 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
         key = _decrypted(pem, name, passphrase())
     except Exception as error:  # of many classes: see `reading`
         raise _unreadable(name) from error
-    if not isinstance(key, (ec.EllipticCurvePrivateKey, rsa.RSAPrivateKey)):
-        raise PkiError(
-            f"the private key {name} is neither an elliptic-curve nor an RSA key",
-            "DDS Security accepts EC prime256v1 and RSA 2048.",
-            "Use a key of one of these kinds.",
-        )
     return _validated(key, name) if isinstance(key, rsa.RSAPrivateKey) else key
 
 
-def _unreadable(name: str) -> PkiError:
-    return PkiError(
-        f"the private key {name} cannot be read",
-        "It is not a PEM private key, or it is damaged.",
-        "Restore it from a backup.",
-    )
+def check_key(content: bytes) -> None:
+    """Raise an error of any class unless ``content`` is a private key in DER."""
+    if len(content) > _MAX_BYTES:
+        raise ValueError("too large")
+    key, _ = der.split(content)
+    serialization.load_der_private_key(key, None, unsafe_skip_rsa_key_validation=True)
 
 
+def _unreadable(name: str, reason: str = "") -> PkiError:
+    why = f"It is not a PEM private key, or it is damaged{f': {reason}' if reason else ''}."
+    return PkiError(f"the private key {name} cannot be read", why, "Restore it from a backup.")
+
+
+def _key_block(data: bytes, name: str) -> bytes:
+    """Return the first private key of a PEM file as OpenSSL reads it, in the usual form of PEM."""
+    damaged = False
+    try:
+        for block in pem_file.blocks(data):
+            if block.label in KEY_LABELS and not block.headers:
+                # OpenSSL passes over a damaged key.
+                with suppress(Exception):
+                    check_key(block.content)
+                    break
+                damaged = True
+            elif block.label in (*KEY_LABELS, "ENCRYPTED PRIVATE KEY"):
+                break
+        else:
+            raise _unreadable(name, "" if damaged else pem_file.missing(data, "PRIVATE KEY"))
+    except PkiError as error:
+        raise error if error.why else _unreadable(name, error.what) from error
+    encrypted = block.headers.startswith(_TRADITIONAL)
+    if block.headers and not encrypted:
+        raise _unreadable(name, "it has other PEM headers than those of an encrypted key")
+    begin = [f"-----BEGIN {block.label}-----".encode(), *block.headers.splitlines()]
+    der_key = block.content
+    if not encrypted:  # OpenSSL ignores what follows the key
+        with suppress(PkiError):
+            der_key, _ = der.split(block.content)
+    content = base64.b64encode(der_key)
+    lines = [content[start : start + 64] for start in range(0, len(content), 64)]
+    end = f"-----END {block.label}-----\n".encode()
+    return b"\n".join([*begin, *([b""] if encrypted else []), *lines, end])
+
+
+KEY_LABELS = ("PRIVATE KEY", "RSA PRIVATE KEY", "EC PRIVATE KEY", "DSA PRIVATE KEY")
+"""The PEM labels of private keys that are not encrypted, unless a header says so."""
+_TRADITIONAL = b"Proc-Type: 4,ENCRYPTED"
 _MAX_BYTES = 16 * 1024
 _MAX_RSA_BITS = 4096
 _MAX_ROUNDS = 2_000_000
@@ -195,7 +249,6 @@ def _derivation(block: bytes) -> tuple[bool, list[int]]:
 
 _FEWEST_ROUNDS = 600_000  # OWASP Password Storage Cheat Sheet (2025), of PBKDF2 with SHA-256
 _LEAST_SCRYPT_WORK = 2**17  # N * r * p of `openssl pkcs8 -scrypt`
-_TRADITIONAL = b"Proc-Type: 4,ENCRYPTED"
 
 
 def few_rounds(pem: bytes) -> str:

@@ -43,12 +43,12 @@ def blocks(data: bytes) -> Iterator[Block]:
         PkiError: a block is damaged, so OpenSSL does not read what follows; or its first line ends
             with a byte beyond ASCII, which OpenSSL drops on some processors only.
     """
-    if b"\0" in data:
-        raise PkiError("it has a zero byte, so it is not a PEM file")
     pieces = iter(_PIECE.findall(data))
     start = True  # a byte order mark is dropped here, and behind each block
     for piece in pieces:
         line = (piece.removeprefix(_BOM) if start else piece).rstrip(_BLANKS)
+        if b"\0" in line and line.startswith(b"-----BEGIN "):
+            raise PkiError("a line '-----BEGIN' in it has a zero byte")
         begin = _BEGIN.fullmatch(line)
         start = bool(begin)
         if begin:
@@ -74,6 +74,8 @@ def _block(label: bytes, pieces: Iterator[bytes]) -> Block:
     split = short = False
     for piece in pieces:
         line = piece.rstrip(_BLANKS)
+        if b"\0" in piece:
+            raise PkiError(f"the block {name} in it has a zero byte")
         if not line:
             if not split:
                 if len(parts) == 2:
@@ -92,13 +94,15 @@ def _block(label: bytes, pieces: Iterator[bytes]) -> Block:
     if line != _END + label + b"-----":
         raise PkiError(f"the block {name} in it does not end with '-----END {name}-----'")
     if len(parts) == 1 and any(b":" in each for each in parts[0]):
-        parts.append([])
+        parts.append([])  # headers alone
     headers = b"\n".join(parts.pop(0)) if len(parts) == 2 else b""
     return Block(label.decode("utf-8", "replace"), headers, _decoded(b"\n".join(parts[0]), name))
 
 
 def _decoded(encoded: bytes, name: str) -> bytes:
     text = encoded.partition(b"-")[0].translate(None, _BETWEEN)
+    if not text:
+        raise PkiError(f"the block {name} in it is empty")
     if len(text) % 4 or not _BASE64.fullmatch(text):
         raise PkiError(f"the block {name} in it is not valid base64")
     return base64.b64decode(text)

@@ -7,7 +7,7 @@ of Fast DDS 2.9.1, Fast DDS 2.14.5 and Cyclone DDS 0.10.2.
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -15,15 +15,17 @@ from tempfile import TemporaryDirectory
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import rsa
-from cryptography.hazmat.primitives.serialization import Encoding
-from cryptography.x509.oid import ExtendedKeyUsageOID
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519, padding, rsa
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.name import _ASN1Type
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, parse_subject, pem
-from sros_tool.pki.keys import PrivateKey, generate_key, key_pem
+from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 
-YES, REFUSED = "matched", "refused"
+YES, REFUSED, CRASHED, UNMATCHED = "matched", "refused", "crashed", "unmatched"
+PSS = padding.PSS(padding.MGF1(hashes.SHA256()), padding.PSS.DIGEST_LENGTH)
 NOW = datetime.now(UTC).replace(microsecond=0)
 DAY = timedelta(days=1)
 Pair = tuple[x509.Certificate, PrivateKey]
@@ -43,13 +45,16 @@ def authority(
     purpose: x509.ObjectIdentifier | None = None,
     digest: Digest | None = None,
     serial: int | None = None,
-    is_ca: bool = True,
+    is_ca: bool | None = True,
     identifiers: bool = True,
     lists: bool = True,
+    pss: bool = False,
+    also: x509.ExtensionType | None = None,
 ) -> Pair:
     """A certificate for CAs (or with ``is_ca`` false another) and its key.
 
-    Without ``lists`` it may not sign revocation lists.
+    ``is_ca`` None is none of both; without ``lists`` it may not sign revocation lists.  ``also`` is
+    another extension, which is critical.
     """
     key = key or generate_key()
     issuer, signing = by or (None, key)
@@ -61,7 +66,11 @@ def authority(
         serial or x509.random_serial_number(),
         NOW + days[0] * DAY,
         NOW + days[1] * DAY,
-    ).add_extension(x509.BasicConstraints(is_ca, None), critical=True)
+    )
+    if is_ca is not None:
+        builder = builder.add_extension(x509.BasicConstraints(is_ca, None), critical=True)
+    if also is not None:
+        builder = builder.add_extension(also, critical=True)
     if usage is not None:
         signs, certifies = SIGNS in usage.split(), CERTIFIES in usage.split()
         lists = lists and certifies
@@ -77,7 +86,7 @@ def authority(
             x509.AuthorityKeyIdentifier.from_issuer_public_key(above),  # type: ignore[arg-type]
             critical=False,
         )
-    return builder.sign(signing, digest or hashes.SHA256()), key
+    return builder.sign(signing, digest or hashes.SHA256(), rsa_padding=PSS if pss else None), key
 
 
 def signed_by(pair: Pair, *options: str, also: Pair | None = None) -> Callable[[bytes], bytes]:
@@ -138,6 +147,13 @@ class Made:
     digest: Digest = field(default_factory=hashes.SHA256)
     lists: tuple[Revocation, ...] = ()
     lists_of_identity: tuple[Revocation, ...] = ()
+    pss: bool = False
+    """The certificates of enclaves are signed with RSA-PSS."""
+    named: x509.Name | None = None
+    """The issuer that they name; else the subject of their CA."""
+    edit: Callable[[Path], object] | None = None
+    """What is done to the files of an enclave at last."""
+    key: Callable[[], PrivateKey | ed25519.Ed25519PrivateKey] = generate_key
 
 
 @dataclass(frozen=True)
@@ -157,11 +173,11 @@ def write_enclave(
     """All files of an enclave as the row has them made."""
     made = row.made
     issuer = made.issuer or ROOT
-    key = generate_key()
+    key = made.key()
     name = parse_subject(subject) if isinstance(subject, str) else subject
     certificate = (
         x509.CertificateBuilder(
-            issuer[0].subject,
+            made.named or issuer[0].subject,
             name,
             key.public_key(),
             x509.random_serial_number(),
@@ -169,11 +185,12 @@ def write_enclave(
             NOW + DAY,
         )
         .add_extension(x509.BasicConstraints(False, None), critical=True)
-        .sign(issuer[1], made.digest)
+        .sign(issuer[1], made.digest, rsa_padding=PSS if made.pss else None)
     )
     sign = made.sign or signed_by(made.permissions[0] if made.permissions else SIGNER)
     folder.mkdir()
-    (folder / "key.pem").write_bytes(key_pem(key))
+    plain = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    (folder / "key.pem").write_bytes(plain)
     (folder / "cert.pem").write_bytes(pem(certificate))
     for role, pairs in (
         ("identity", made.identity or (issuer,)),
@@ -187,8 +204,41 @@ def write_enclave(
         data = b"".join(each.pem(certificate) for each in made.lists)
         (folder / "crl.pem").write_bytes(data)
     (folder / "governance.p7s").write_bytes(sign(governance))
-    own = signed_by((certificate, key)) if made.own_signer else sign
-    (folder / "permissions.p7s").write_bytes(own(permissions))
+    if made.own_signer:
+        assert isinstance(key, ec.EllipticCurvePrivateKey)
+        sign = signed_by((certificate, key))
+    (folder / "permissions.p7s").write_bytes(sign(permissions))
+    if made.edit:
+        made.edit(folder)
+
+
+IDENTITY, PERMISSIONS, LEAF, KEY = (
+    "identity_ca.cert.pem", "permissions_ca.cert.pem", "cert.pem", "key.pem"
+)  # fmt: skip
+
+
+def replaced(name: str, old: bytes, new: bytes) -> Callable[[Path], object]:
+    """How the bytes ``old`` become ``new`` in a file; b"" is its start."""
+
+    def edit(folder: Path) -> None:
+        data = (folder / name).read_bytes()
+        assert old in data
+        (folder / name).write_bytes(data.replace(old, new) if old else new + data)
+
+    return edit
+
+
+def appended(name: str, data: bytes) -> Callable[[Path], object]:
+    """How bytes are appended to a file."""
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes() + data)
+
+
+def short_key(folder: Path) -> None:
+    """Write the key as older OpenSSL does: SEC 1, behind the parameters of its curve."""
+    key = load_key((folder / KEY).read_bytes(), KEY)
+    plain = key.private_bytes(Encoding.PEM, PrivateFormat.TraditionalOpenSSL, NoEncryption())
+    parameters = b"-----BEGIN EC PARAMETERS-----\nBggqhkjOPQMBBw==\n-----END EC PARAMETERS-----\n"
+    (folder / KEY).write_bytes(parameters + plain)
 
 
 ROOT = authority("identity CA")
@@ -383,6 +433,8 @@ def rows() -> list[Row]:
             Made(issuer=identity_below, identity=(ROOT, identity_below)), YES, YES, REFUSED,
         ),
         *list_rows(other, identity_below),
+        *certificate_rows(),
+        *file_rows(),
     ]  # fmt: skip
 
 
@@ -459,3 +511,62 @@ def list_rows(other: Pair, below: Pair) -> list[Row]:
             REFUSED, REFUSED, REFUSED,
         ),
     ]  # fmt: skip
+
+
+def certificate_rows() -> Iterator[Row]:
+    """Certificates as companies issue them."""
+    rsa_key = rsa.generate_private_key(65537, 2048)
+    pss = authority("identity CA", key=rsa_key, pss=True)
+    pkcs = authority("identity CA", key=rsa_key)
+    yield Row("an identity CA with RSA-PSS", Made(issuer=pss), REFUSED, REFUSED, YES)
+    yield Row("a permissions CA with RSA-PSS", Made(permissions=(pss,)), REFUSED, REFUSED, YES)
+    yield Row("a leaf with RSA-PSS", Made(issuer=pkcs, pss=True), REFUSED, REFUSED, YES)
+    both = Made(issuer=ROOT, identity=(authority("other CA", key=rsa_key, pss=True), ROOT))
+    yield Row("a CA with RSA-PSS before the one that issues", both, YES, CRASHED, REFUSED)
+    twin = authority("identity CA", identifiers=False)
+    plain = authority("identity CA", identifiers=False)
+    both = Made(issuer=plain, identity=(twin, plain))
+    yield Row("another CA of the same name before it", both, REFUSED, REFUSED, REFUSED)
+    old = authority("identity CA", is_ca=None)
+    yield Row("a CA without basicConstraints", Made(issuer=old), YES, REFUSED, YES)
+    policy = x509.PolicyInformation(x509.ObjectIdentifier("1.2.3.4"), None)
+    policies = authority("identity CA", also=x509.CertificatePolicies([policy]))
+    yield Row("a CA with critical policies", Made(issuer=policies), YES, YES, YES)
+    for excluded, answer in (("/t", REFUSED), ("robot.example", YES)):
+        base = x509.DirectoryName(common_name(excluded))
+        constraints = x509.NameConstraints(None, [base])
+        made = Made(issuer=authority("identity CA", also=constraints))
+        yield Row(f"nameConstraints that exclude CN={excluded}", made, answer, answer, answer)
+    kind = _ASN1Type.PrintableString
+    text = x509.NameAttribute(NameOID.COMMON_NAME, " IDENTITY  ca", kind)
+    named = Made(named=x509.Name([text]))
+    yield Row("an issuer in other letters, blanks and string type", named, YES, YES, YES)
+    young = Made(key=ed25519.Ed25519PrivateKey.generate)
+    yield Row("an Ed25519 key", young, UNMATCHED, UNMATCHED, REFUSED)
+
+
+def file_rows() -> Iterator[Row]:
+    """PEM as it comes out of templates, mail and other programs."""
+    begin, end = b"-----BEGIN CERTIFICATE-----\n", b"-----END CERTIFICATE-----\n"
+    for name, edit in {
+        "an indented CA file": replaced(IDENTITY, b"-----BEGIN", b"  -----BEGIN"),
+        "text glued before a certificate": replaced(LEAF, b"-----BEGIN", b"cert: -----BEGIN"),
+        "PEM headers": replaced(PERMISSIONS, begin, begin + b"Subject: x\n\n"),
+        "PEM headers in a key": replaced(KEY, b"KEY-----\nM", b"KEY-----\nSubject: x\n\nM"),
+        "a key in quotes": replaced(KEY, b"", b'"'),
+    }.items():
+        yield Row(name, Made(edit=edit), REFUSED, REFUSED, REFUSED)
+    for name, edit in {
+        "CR LF": replaced(IDENTITY, b"\n", b"\r\n"),
+        "a byte order mark": replaced(IDENTITY, b"", b"\xef\xbb\xbf"),
+        "no line break at the end": replaced(LEAF, end, end.strip()),
+        "text before a certificate": replaced(PERMISSIONS, b"", b"Certificate:\n    Data:\n"),
+        "X509 CERTIFICATE": replaced(LEAF, b" CERTIFICATE", b" X509 CERTIFICATE"),
+        "a key behind the parameters of its curve": short_key,
+        "a key in a CA file": appended(PERMISSIONS, key_pem(generate_key())),
+    }.items():
+        yield Row(name, Made(edit=edit), YES, YES, YES)
+    damaged = appended(PERMISSIONS, begin + b"MIIB\n" + end)
+    yield Row("a damaged second CA", Made(edit=damaged), REFUSED, REFUSED, YES)
+    trusted = replaced(IDENTITY, b" CERTIFICATE", b" TRUSTED CERTIFICATE")
+    yield Row("TRUSTED CERTIFICATE", Made(edit=trusted), YES, YES, REFUSED)

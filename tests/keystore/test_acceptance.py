@@ -13,7 +13,24 @@ from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import ask
 from sros_tool.keystore.participant import JoinContext, load_enclave
 from tests.dds.decision_documents import allow, governance, grant, permissions, publish, subscribe
-from tests.dds.signer_rows import NOW, YES, Made, Row, rows, write_enclave
+from tests.dds.signer_rows import (
+    CRASHED,
+    NOW,
+    REFUSED,
+    UNMATCHED,
+    YES,
+    Made,
+    Row,
+    rows,
+    write_enclave,
+)
+
+OUTCOMES = {
+    YES: Outcome.ALLOWED,
+    REFUSED: Outcome.REFUSED,
+    UNMATCHED: Outcome.PEER_DENIES,
+    CRASHED: Outcome.CRASHES,
+}
 
 
 @pytest.mark.parametrize("row", rows(), ids=lambda row: row.name)
@@ -30,7 +47,7 @@ def test_each_vendor(row: Row, tmp_path: Path) -> None:
         problems = [str(each) for each in material.problems(vendor.traits)]
         assert (not problems) == (answer == YES), (vendor, problems)
         said = Evaluator(vendor, material, JoinContext(42, NOW)).answer(ask("join"))
-        assert said.allowed == (answer == YES), (vendor, said)
+        assert said.outcome is OUTCOMES[answer], (vendor, said)
 
 
 @pytest.mark.parametrize("granted", ["CN=/t", ""])
