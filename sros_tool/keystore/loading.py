@@ -329,9 +329,6 @@ def _list_faults(
     at: datetime,
 ) -> Iterator[Problem]:
     """Yield why the vendor refuses an enclave whose chain is valid, by revocation lists."""
-    chain, fault = build_chain(certificate, _trusted(traits, authorities), (), at)
-    if fault:  # reported already
-        return
     lists: list[tuple[x509.CertificateRevocationList, str]] = []
     try:
         if traits.reads_lists_of_authorities:
@@ -344,7 +341,11 @@ def _list_faults(
         text = "it has a revocation list that cannot be read, so DDS refuses every participant"
         yield Problem(file, text, Fault.CRL_MALFORMED)
         return
-    refusal = list_refusal(chain, [each for each, _ in lists], at=at) if lists else None
+    if not lists:
+        return
+    chain, fault = build_chain(certificate, _trusted(traits, authorities), (), at)
+    # A fault of the chain is reported already.
+    refusal = None if fault else list_refusal(chain, [each for each, _ in lists], at=at)
     if refusal is None:
         return
     crl, file = next((each for each in lists if each[0] is refusal.list), lists[0])

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime
 from enum import Enum
+from functools import lru_cache
 from typing import NamedTuple
 
 from cryptography import x509
@@ -96,7 +97,7 @@ def list_refusal(
     if _has_expired(crl, at):
         assert crl.next_update_utc
         return ListRefusal(Obstacle.EXPIRED, crl, f"it expired at {iso(crl.next_update_utc)}")
-    if not is_signed(crl, crl.tbs_certlist_bytes, issuer):
+    if not _is_signed(_Content(crl), issuer):
         return ListRefusal(Obstacle.SIGNATURE, crl, f"it is not signed with the key of {name}")
     if not score.only_known:
         return ListRefusal(Obstacle.CRITICAL, crl, "it has an unknown critical extension")
@@ -110,7 +111,7 @@ def list_refusal(
 
 def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate) -> bool:
     """Return whether the list has an entry for the certificate, and not one that takes it back."""
-    if not names_issuers(crl):
+    if not _entries(_Content(crl)).name_issuers:
         return lists_as_revoked(crl, certificate.serial_number)
     issuers: list[x509.Name] | None = None
     for entry in crl:
@@ -141,7 +142,7 @@ def _best(
         if _value(crl, x509.DeltaCRLIndicator):
             continue
         score = _Score(
-            not _has_unknown(crl),
+            not _entries(_Content(crl)).has_unknown,
             _is_in_scope(chain[0], crl, point),
             crl.last_update_utc <= at and not _has_expired(crl, at),
             issuer is chain[min(1, len(chain) - 1)],
@@ -184,15 +185,44 @@ def _identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certifi
     return not names or same_name(names[0], authority.issuer)
 
 
-def _has_unknown(crl: x509.CertificateRevocationList) -> bool:
-    """Return whether the list or an entry has a critical extension that OpenSSL does not know."""
-    if any(each.critical and each.oid not in _READ_IF_CRITICAL for each in crl.extensions):
-        return True
-    return any(
+class _Content:
+    """A list with a hash, that of the object: all enclaves of a keystore have the same lists."""
+
+    def __init__(self, crl: x509.CertificateRevocationList) -> None:
+        self.crl = crl
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Content) and self.crl is other.crl
+
+    def __hash__(self) -> int:
+        return id(self.crl)
+
+
+class _Entries(NamedTuple):
+    """Whether a list has a critical extension that OpenSSL does not know, also in an entry.
+
+    ``name_issuers`` says whether its entries name the CAs whose certificates they revoke.
+    """
+
+    has_unknown: bool
+    name_issuers: bool
+
+
+@lru_cache(maxsize=16)
+def _entries(content: _Content) -> _Entries:
+    crl = content.crl
+    unknown = any(each.critical and each.oid not in _READ_IF_CRITICAL for each in crl.extensions)
+    in_entry = any(
         each.critical and each.oid != CRLEntryExtensionOID.CERTIFICATE_ISSUER
         for entry in crl
         for each in entry.extensions
     )
+    return _Entries(unknown or in_entry, names_issuers(crl))
+
+
+@lru_cache(maxsize=16)
+def _is_signed(content: _Content, issuer: x509.Certificate) -> bool:
+    return is_signed(content.crl, content.crl.tbs_certlist_bytes, issuer)
 
 
 def _is_in_scope(
