@@ -435,6 +435,9 @@ Example:
     "Once for each request, in their order.",
 )
 @allow_refusal_option
+@click.option(
+    "--refuse-revoked", is_flag=True, help="Refuse a revoked enclave also if --enclave names it."
+)
 @dry_run_option
 @json_option
 def sign_request(
@@ -447,6 +450,7 @@ def sign_request(
     no_answer: bool,
     only: tuple[str, ...],
     allow_refusal: tuple[Vendor, ...],
+    refuse_revoked: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -477,6 +481,7 @@ def sign_request(
             policy,
             only,
             allow_refusal,
+            refuse_revoked=refuse_revoked,
             renew=renew,
             dry_run=dry_run,
             as_json=as_json,
@@ -495,6 +500,7 @@ def sign_request(
         now=now(),
         policy=_policy(policy_file, fleet_file),
         only=only,
+        refuse_revoked=refuse_revoked,
         renew=renew,
         answer=None if stream else output,
         force=force,
@@ -553,6 +559,7 @@ def _certify(
     only: tuple[str, ...],
     allow_refusal: tuple[Vendor, ...],
     *,
+    refuse_revoked: bool,
     renew: bool,
     dry_run: bool,
     as_json: bool,
@@ -567,6 +574,7 @@ def _certify(
         now=now(),
         policy=policy,
         only=only,
+        refuse_revoked=refuse_revoked,
         renew=renew,
         domain=domain_from(os.environ),
         keyring=keyring(),

@@ -127,7 +127,10 @@ def enclaves(keystore: Path) -> list[str]:
 def test_nobody_revoked_is_an_error(tmp_path: Path, revoke: object, said: str) -> None:
     keystore = fleet_keystore(tmp_path, 2)
     shutil.rmtree(keystore / "enclaves/r2")
-    own = {"sros_keystore": str(keystore), "sros_program": [sys.executable, "-m", "sros_tool"]}
+    own: dict[str, Any] = {"sros_keystore": str(keystore)}
+    own |= {"sros_program": [sys.executable, "-m", "sros_tool"]}
+    for_robots = {"ansible_become": True, "ansible_become_user": "nobody"}
+    own |= {**for_robots, "ansible_become_exe": "/bin/false"}
     hosts: dict[str, Any] = {"r4": {"sros_robot": "r1"}, "r2": {}}
     text = " ".join(play(tmp_path, "revoke", hosts, **own, sros_revoke=revoke).split())
     assert said in text and "failed=1" in text, text
@@ -244,10 +247,13 @@ def test_facts_of_a_robot_choose_no_command_and_no_keys(tmp_path: Path) -> None:
 
 
 def test_a_revoked_robot_gets_no_certificate_for_another_key(tmp_path: Path) -> None:
-    keystore = fleet_keystore(tmp_path, 2)
+    """Nor does one of which only one enclave was revoked."""
+    keystore = fleet_keystore(tmp_path, 3)
     sros("revoke", keystore, "--robot", "r2").ok()
+    sros("create_enclave", keystore, "/r3/own").ok()
+    sros("revoke", keystore, "/r3/own").ok()
     hosts: dict[str, Any] = {}
-    for name, own in (("r1", "/spare"), ("r2", "/r2/a")):
+    for name, own in (("r1", "/spare"), ("r2", "/r2/a"), ("r3", "/r3/own")):
         sros("create_request", own, tmp_path / "asked").ok()
         made = (tmp_path / f"asked/enclaves{own}/request.pem").read_text()
         answers: dict[str, dict[str, Any]] = {
@@ -263,8 +269,9 @@ def test_a_revoked_robot_gets_no_certificate_for_another_key(tmp_path: Path) -> 
         }
     program = [sys.executable, "-m", "sros_tool"]
     text = play(tmp_path, "requests", hosts, sros_keystore=str(keystore), sros_program=program)
-    assert enclaves(keystore) == ["/dispatcher", "/r1/a", "/spare"], text
-    assert "failed=1" not in text, text
+    assert enclaves(keystore) == ["/dispatcher", "/r1/a", "/r3/a", "/spare"], text
+    assert "enclave /r3/own was revoked" in text, text
+    assert "Left out, because of what they answered (see above): r3." in " ".join(text.split())
 
 
 def test_a_status_is_green_only_if_all_were_asked_and_verify(tmp_path: Path) -> None:
@@ -278,19 +285,56 @@ def test_a_status_is_green_only_if_all_were_asked_and_verify(tmp_path: Path) -> 
     hosts["r3"] = {"ansible_connection": "ssh", "ansible_ssh_executable": "/bin/false"}
     own: dict[str, Any] = {"sros_program": [sys.executable, "-m", "sros_tool"]}
     own |= {"sros_keystore": str(keystore), "sros_confirm": False}
-    text = " ".join(play(tmp_path, "status", hosts, **own, sros_hosts="r1,r2,r3,r33").split())
+    text = " ".join(play(tmp_path, "status", hosts, **own).split())
     assert "/r1/a: key.pem: not the key" in text, text
-    assert "No robot of the inventory is meant by r33 in sros_hosts" in text, text
     assert "Not reached, or lost on the way: r3." in text, text
     assert "r3 :" in text and "failed=1" in text, text
 
 
-@pytest.mark.parametrize("which", ["deliver", "status"])
-def test_no_robot_meant_is_an_error(tmp_path: Path, which: str) -> None:
+def test_a_status_with_missing_files_is_no_success(tmp_path: Path) -> None:
+    keystore = fleet_keystore(tmp_path, 1)
+    python = hostile(tmp_path, "r1", {"reach": {"reached": True}, "enclaves": INSTALLED})
+    hosts = {"r1": {"ansible_connection": "local", "ansible_python_interpreter": str(python)}}
+    own: dict[str, Any] = {"sros_program": [sys.executable, "-m", "sros_tool"]}
+    text = play(tmp_path, "status", hosts, **own, sros_keystore=str(keystore))
+    assert "1 robot: 1 files missing" in text and "Not every robot has what an export" in text, text
+    assert "failed=1" in text, text
+
+
+def test_a_rotation_goes_on_without_a_revoked_robot(tmp_path: Path) -> None:
+    keystore = fleet_keystore(tmp_path, 2)
+    sros("revoke", keystore, "--robot", "r2").ok()
+    status = json.loads(sros("rotate_ca", keystore, "--status", "--json").ok().out)
+    answers: dict[str, dict[str, Any]] = {"reach": {"reached": True}, "enclaves": INSTALLED}
+    python = hostile(tmp_path, "r", answers)
+    robot = {"ansible_connection": "local", "ansible_python_interpreter": str(python)}
+    own: dict[str, Any] = {"sros_program": [sys.executable, "-m", "sros_tool"]}
+    own |= {"sros_keystore": str(keystore), "sros_confirm": False, "sros_stage": "distribute"}
+    own |= {"sros_replace_ca": [each["sha256"] for each in status["authorities"]]}
+    text = play(tmp_path, "rotation_stage", {"r1": robot, "r2": robot}, **own)
+    assert "failed=1" not in text and "Restart and confirm" in text, text
+
+
+def test_no_robot_meant_is_an_error(tmp_path: Path) -> None:
     own = {"sros_keystore": str(fleet_keystore(tmp_path, 1)), "sros_hosts": "r*9"}
     program = [sys.executable, "-m", "sros_tool"]
-    text = " ".join(play(tmp_path, which, {"r1": {}}, **own, sros_program=program).split())
+    text = " ".join(play(tmp_path, "deliver", {"r1": {}}, **own, sros_program=program).split())
     assert "No robot of the inventory is meant by r*9 in sros_hosts" in text, text
+
+
+def test_a_name_that_means_nobody_stops_a_rotation(tmp_path: Path) -> None:
+    """Otherwise all stages are taken, and no robot has the files of one."""
+    own = {"sros_keystore": "/nowhere", "sros_hosts": "r1:!r99", "sros_replace_ca": "0" * 64}
+    text = " ".join(play(tmp_path, "rotate", {"r1": {}}, **own).split())
+    assert "No robot of the inventory is meant by !r99 in sros_hosts. Nothing was done." in text
+    assert "Look which CA issues" not in text, text
+
+
+def test_no_two_hosts_get_the_keys_of_one_robot(tmp_path: Path) -> None:
+    own = {"sros_keystore": "/nowhere", "sros_robot": "r1"}
+    text = " ".join(play(tmp_path, "deliver", {"r1": {}, "r2": {}}, **own).split())
+    assert "the keys of one robot, because of sros_robot: r1 (r1, r2). Nothing was done" in text
+    assert "Install and verify" not in text, text
 
 
 def test_a_robot_names_only_enclaves_to_restart(tmp_path: Path) -> None:
@@ -312,6 +356,26 @@ def test_a_robot_names_only_enclaves_to_restart(tmp_path: Path) -> None:
     text = play(tmp_path, "deliver", {"r1": robot}, **own)
     assert "another kind of value than it should for restart" in text, text
     assert "a repair" not in text, text
+
+
+def test_a_revocation_is_not_done_while_a_robot_has_another_valid_key(tmp_path: Path) -> None:
+    """One robot in each batch fails, and the host of the office has files of all others."""
+    keystore = fleet_keystore(tmp_path, 4)
+    sros("create_enclave", keystore, "/spare").ok()
+    answers: dict[str, dict[str, Any]] = {"reach": {"reached": True}, "enclaves": INSTALLED}
+    failing: dict[str, dict[str, Any]] = {"reach": {"failed": True, "msg": "no"}}
+    hosts: dict[str, Any] = {}
+    for name in ("r1", "r2", "r3", "r4", "office"):
+        python = hostile(tmp_path, name, failing if name in ("r1", "r2") else answers)
+        hosts[name] = {"ansible_connection": "local", "ansible_python_interpreter": str(python)}
+    hosts["office"]["sros_patterns"] = ["/*"]
+    hosts["r3"] |= {"sros_patterns": ["/r3/*", "/dispatcher"], "sros_own_keys": ["/spare"]}
+    own: dict[str, Any] = {"sros_program": [sys.executable, "-m", "sros_tool"]}
+    own |= {"sros_keystore": str(keystore), "sros_confirm": False, "sros_serial": 1}
+    text = " ".join(play(tmp_path, "revoke", hosts, **own, sros_revoke=["r3"]).split())
+    assert "did not get to r1, r2, which" in text, text
+    assert "keys that are still valid: /dispatcher, /spare. Revoke" in text, text
+    assert "ok: [r4]" in text.partition("Install and verify the enclaves]")[2], text
 
 
 def test_bad_requests_of_robots_get_no_certificate_and_stop_no_other(tmp_path: Path) -> None:

@@ -117,6 +117,7 @@ def sign_request(
     now: datetime,
     policy: Policy | FleetPolicy | None = None,
     only: Sequence[str] = (),
+    refuse_revoked: bool = False,
     renew: bool = False,
     answer: Path | None = None,
     force: bool = False,
@@ -135,6 +136,7 @@ def sign_request(
         data: the request (PEM).
         only: the enclave that the request has to be for, if it is known: a robot chooses what its
             request says.
+        refuse_revoked: refuse a revoked enclave also if ``only`` names it.
         answer: the path for the answer, which is put in place after the keystore has changed.
         force: replace ``answer`` if it exists.
         domain: refuse a keystore that is not made for this domain.
@@ -159,7 +161,7 @@ def sign_request(
     list_enclaves(root)
     with Transaction(root, dry_run=dry_run) as transaction:
         signer = _Signer(transaction, keyring, domain, now, stated)
-        issued = signer.certify(request, renew=renew, named=bool(only))
+        issued = signer.certify(request, renew=renew, named=bool(only) and not refuse_revoked)
         kept = signer.keep_zenoh()
         files = _answer_files(root, issued, kept)
         number = read_ledger(root, having=("what", "answer")).next_number()
@@ -229,6 +231,7 @@ def certify_requests(
     now: datetime,
     policy: Policy | FleetPolicy | None = None,
     only: Sequence[str] = (),
+    refuse_revoked: bool = False,
     renew: bool = False,
     domain: int | None = None,
     allow_refusal: Sequence[Vendor] = (),
@@ -266,7 +269,7 @@ def certify_requests(
         signer = _Signer(transaction, keyring, domain, now, stated)
         for request in requests:
             if request.name not in kept:
-                signer.certify(request, renew=renew, named=bool(only))
+                signer.certify(request, renew=renew, named=bool(only) and not refuse_revoked)
         if len(kept) < len(requests):
             signer.keep_zenoh()
             signer.record()

@@ -23,4 +23,6 @@ class ActionModule(ActionBase):  # type: ignore[misc]
             check_facts(task_vars or {})
         except RefusedError as error:
             return {**result, "failed": True, "msg": str(error)}
+        # ansible_become is for robots, and its variable goes before the keyword of a task.
+        self._connection.set_become_plugin(None)
         return {**result, **self._execute_module(task_vars=task_vars)}

@@ -10,7 +10,15 @@ module: reach
 short_description: See whether a robot can be reached, and has Python
 description:
   - Unlike M(ansible.builtin.ping), it takes no facts and nothing else from what the robot answers.
-options: {}
+options:
+  robot:
+    description: The name of the robot in the fleet.
+    type: str
+  revoked:
+    description: Robots that are being revoked. They are skipped, and not connected to.
+    type: list
+    elements: str
+    default: []
 attributes:
   check_mode:
     support: full
@@ -38,7 +46,12 @@ from ansible.module_utils.basic import AnsibleModule
 
 def main() -> None:
     """Run the module."""
-    AnsibleModule(argument_spec={}, supports_check_mode=True).exit_json(changed=False, reached=True)
+    arguments = {
+        "robot": {"type": "str"},
+        "revoked": {"type": "list", "elements": "str", "default": []},
+    }
+    module = AnsibleModule(argument_spec=arguments, supports_check_mode=True)
+    module.exit_json(changed=False, reached=True)
 
 
 if __name__ == "__main__":
