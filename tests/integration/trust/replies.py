@@ -51,8 +51,11 @@ def word(reply: Reply) -> str:
 def same(said: str, observed: str) -> bool:
     """Return whether what the engine says is what a library was observed to do.
 
-    A peer that crashes is a crash, whomever it hits.
+    A peer that crashes is a crash, whomever it hits.  Where only the peer is refused, since its own
+    name is not one that a name constraint permits, the enclave itself has joined.
     """
+    if observed == "peer refused":
+        return said != "refused"
     return said == observed.removeprefix("peer ").replace("hung", "crashed")
 
 
