@@ -49,6 +49,9 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     make("good", *EC)
     make("good RSA", *RSA)
+    policies = ("-addext", "certificatePolicies=critical,1.2.3.4")
+    names = ("-addext", "nameConstraints=critical,permitted;DNS:corp.example")
+    make("critical extensions", *EC, *policies, *names)
     make("no lists", *EC, usage=SIGNS)
     make("PSS", *RSA, *PSS)
     make("below", *EC, "-CA", "good.pem", "-CAkey", "good.key", usage=SIGNS)
@@ -151,7 +154,7 @@ def test_the_user_may_name_the_vendors_on_which_nodes_stop(corporate: Path) -> N
     sros("crl", corporate, "--refresh").ok()
 
 
-@pytest.mark.parametrize("name", ["good", "good RSA"])
+@pytest.mark.parametrize("name", ["good", "good RSA", "critical extensions"])
 def test_a_good_ca_is_taken_and_revokes(name: str, pki: Path, tmp_path: Path) -> None:
     root = tmp_path / "ks"
     assert "note [" not in created(pki, name, root).ok().err
