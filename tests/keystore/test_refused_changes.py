@@ -207,6 +207,12 @@ def _touch(transaction: Transaction, _other: Path) -> None:
     transaction.remove("enclaves/b/cert.pem")
 
 
+def _to_token(transaction: Transaction, _other: Path) -> None:
+    """What only Fast DDS can use, as whoever asks for it is told."""
+    transaction.write("enclaves/a/key.p11", b"pkcs11:token=t;object=o\n")
+    transaction.remove("enclaves/a/key.pem")
+
+
 @pytest.mark.parametrize("dry_run", [False, True])
 @pytest.mark.parametrize(
     ("stage", "stopped"),
@@ -215,6 +221,7 @@ def _touch(transaction: Transaction, _other: Path) -> None:
         (_break_permissions, "/a"),
         (_break_governance, "/a, /b, /b/c"),
         (_touch, ""),
+        (_to_token, ""),
     ],
 )
 def test_what_is_staged_is_evaluated(

@@ -74,6 +74,8 @@ _NEEDED = _LOADED[:5]
 _ONLY_IDENTITY = {IDENTITY_CA_FILE, CRL.rpartition("/")[2]}
 """Shared files with which vendors verify no governance and no permissions."""
 _UNUSUAL = re.compile(r"[^A-Za-z0-9/_]")
+_CHOSEN = {Fault.DOCUMENT_SIZE, Fault.KEY_ON_TOKEN}
+"""Faults that follow from what the user asked for, and of which notes tell."""
 _SHOWN = 5
 _EXAMPLE = "/example"
 _MOST_BROKEN = 20
@@ -166,8 +168,8 @@ def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
     for vendor in MEASURED:
         participant = VendorParticipant(vendor, enclave, JoinContext(domain, now))
         decision = participant.join()
-        too_large = {each.fault for each in participant.problems} == {Fault.DOCUMENT_SIZE}
-        if not decision.outcome.ok and not too_large:  # of which a note tells
+        faults = {each.fault for each in participant.problems}
+        if not decision.outcome.ok and not (faults and faults <= _CHOSEN):
             found[vendor] = _reason(participant, decision)
     return found
 
