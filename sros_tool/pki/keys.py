@@ -112,12 +112,6 @@ def load_any_key(
         PkiError: as `load_key`, but for the kind of the key.
     """
     pem = _key_block(pem, name)
-    if len(pem) > _MAX_BYTES:
-        raise PkiError(
-            f"the private key {name} is too large",
-            f"It has more than {_MAX_BYTES // 1024} KiB; an RSA key of 4096 bits has 4 KiB.",
-            "Use an EC prime256v1 key, or an RSA key of 2048 bits.",
-        )
     try:
         key = serialization.load_pem_private_key(pem, None, unsafe_skip_rsa_key_validation=True)
     except TypeError as error:
@@ -152,13 +146,19 @@ def _key_block(data: bytes, name: str) -> bytes:
     damaged = False
     try:
         for block in pem_file.blocks(data):
+            if len(block.content) > _MAX_BYTES and block.label in _ALL_LABELS:
+                raise PkiError(
+                    f"the private key {name} is too large",
+                    f"It has more than {_MAX_BYTES // 1024} KiB; an RSA key of 4096 bits has 4.",
+                    "Use an EC prime256v1 key, or an RSA key of 2048 bits.",
+                )
             if block.label in KEY_LABELS and not block.headers:
                 # OpenSSL passes over a damaged key.
                 with suppress(Exception):
                     check_key(block.content)
                     break
                 damaged = True
-            elif block.label in (*KEY_LABELS, "ENCRYPTED PRIVATE KEY"):
+            elif block.label in _ALL_LABELS:
                 break
         else:
             raise _unreadable(name, "" if damaged else pem_file.missing(data, "PRIVATE KEY"))
@@ -180,6 +180,7 @@ def _key_block(data: bytes, name: str) -> bytes:
 
 KEY_LABELS = ("PRIVATE KEY", "RSA PRIVATE KEY", "EC PRIVATE KEY", "DSA PRIVATE KEY")
 """The PEM labels of private keys that are not encrypted, unless a header says so."""
+_ALL_LABELS = (*KEY_LABELS, "ENCRYPTED PRIVATE KEY")
 _TRADITIONAL = b"Proc-Type: 4,ENCRYPTED"
 _MAX_BYTES = 16 * 1024
 _MAX_RSA_BITS = 4096
