@@ -128,7 +128,7 @@ def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
     """
     with _reading(name):
         blocks = pem.blocks(data)
-        return _read(next(each for each in blocks if each.label == _LABEL).content)
+        return _read_block(next(each for each in blocks if each.label == _LABEL))
 
 
 def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, ...]:
@@ -139,7 +139,7 @@ def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, 
     """
     with _reading(name):
         blocks = pem.blocks(data)
-        return tuple(_read(each.content) for each in blocks if each.label == _LABEL)
+        return tuple(_read_block(each) for each in blocks if each.label == _LABEL)
 
 
 def _reading(name: str) -> AbstractContextManager[None]:
@@ -148,6 +148,12 @@ def _reading(name: str) -> AbstractContextManager[None]:
         "It is not a PEM revocation list, or it is damaged; DDS refuses every participant.",
         _RESTORE,
     )
+
+
+def _read_block(block: pem.Block) -> x509.CertificateRevocationList:
+    if block.headers:
+        raise ValueError("OpenSSL reads no list with PEM headers")
+    return _read(block.content)
 
 
 def _read(content: bytes) -> x509.CertificateRevocationList:

@@ -11,8 +11,10 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from sros_tool.errors import PkiError
 from sros_tool.pki.certificates import load_certificate, load_certificates, pem
+from sros_tool.pki.crl import read_list, sign_crl
 from sros_tool.pki.keys import generate_key, key_pem, load_key
-from tests.dds.signer_rows import authority
+from sros_tool.validity import Window
+from tests.dds.signer_rows import DAY, NOW, authority
 from tests.integration.libcrypto import Libcrypto, libcrypto
 from tests.support.children import LONG
 
@@ -47,6 +49,15 @@ def test_a_damaged_second_certificate_hides_the_file_but_not_the_first() -> None
     assert pem(load_certificate(data, "x")) == FIRST
     with pytest.raises(PkiError):
         load_certificates(data, "x")
+
+
+def test_a_list_with_headers_is_refused_as_a_certificate_with_headers() -> None:
+    pair = authority("CA")
+    at = Window(NOW - DAY, NOW + DAY)
+    made = sign_crl(*pair, [], number=1, this_update=at.not_before, next_update=at.not_after)
+    assert read_list(made, "x").issuer == pair[0].subject
+    with pytest.raises(PkiError):
+        read_list(made.replace(b" CRL-----\n", b" CRL-----\nSubject: x\n\n", 1), "x")
 
 
 def test_a_trusted_certificate_is_passed_over_where_asked() -> None:
