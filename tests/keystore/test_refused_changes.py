@@ -52,6 +52,7 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
     policies = ("-addext", "certificatePolicies=critical,1.2.3.4")
     names = ("-addext", "nameConstraints=critical,permitted;DNS:corp.example")
     make("critical extensions", *EC, *policies, *names)
+    make("P-384", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:secp384r1")
     make("no lists", *EC, usage=SIGNS)
     make("PSS", *RSA, *PSS)
     make("below", *EC, "-CA", "good.pem", "-CAkey", "good.key", usage=SIGNS)
@@ -161,6 +162,16 @@ def test_a_good_ca_is_taken_and_revokes(name: str, pki: Path, tmp_path: Path) ->
     sros("create_enclave", root, "/a", "/lost").ok()
     sros("revoke", root, "/lost").ok()
     assert refused_by(root, "/a") == set()
+
+
+def test_a_permissions_ca_may_have_a_larger_key(pki: Path, tmp_path: Path) -> None:
+    """Cyclone DDS asks for small keys of identities and their CA alone."""
+    root = tmp_path / "ks"
+    assert "note [" not in created(pki, "P-384", root, "permissions").ok().err
+    sros("create_enclave", root, "/a").ok()
+    assert refused_by(root, "/a") == set()
+    assert "key-algorithm" not in sros("check", root).out
+    assert "Cyclone" in created(pki, "P-384", tmp_path / "other").ok().err
 
 
 @pytest.mark.parametrize("role", ["identity", "permissions"])

@@ -130,7 +130,10 @@ def _authority_findings(
         yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}. {refused}", file)
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain[:1]), "")):
         yield CA_PURPOSE.found(subject, fault, file)
-    yield from key_findings(certificate, subject, file, what=f"{name} has")
+    signs_documents = role == PERMISSIONS  # no vendor asks for small keys then (measured)
+    for found in key_findings(certificate, subject, file, what=f"{name} has"):
+        if found.kind is not KEY_ALGORITHM or not signs_documents:
+            yield found
     yield from _extensions(certificate, subject, name, file)
 
 

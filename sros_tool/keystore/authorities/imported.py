@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.errors import Note, PkiError
-from sros_tool.keystore.layout import PERMISSIONS
+from sros_tool.keystore.layout import IDENTITY, PERMISSIONS
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.pki.certificates import (
     issued_by,
@@ -154,7 +154,7 @@ def _notes(
         fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
             isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
         )
-        if not fits:
+        if role == IDENTITY and not fits:
             yield Note(
                 "portable.key-algorithm",
                 f"{name} has a key of {algorithm(key)}; Cyclone DDS accepts only EC secp256r1 and "
