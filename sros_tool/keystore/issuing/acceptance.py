@@ -82,6 +82,8 @@ _MOST_BROKEN = 20
 """Enclaves of one kind that are tried until a vendor accepts one of them."""
 
 Files = dict[str, bytes]
+_Kind = tuple[tuple[str, ...], frozenset[str], tuple[object, ...]]
+"""Where an enclave's files lie, which of them change, and what vendors see in them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +133,7 @@ def refuse_stopping(
 def _stopped_enclaves(transaction: Transaction, now: datetime) -> dict[Vendor, _Refusals]:
     """Return the vendors that would refuse enclaves which they accept today, or which are new."""
     stopped: dict[Vendor, dict[str, list[str]]] = {}
-    for names in _kinds(transaction, now).values():
+    for (_, own, _), names in _kinds(transaction, now).items():
         for tried, name in enumerate(names, 1):
             before, after = _files_before(transaction.root, name), _files_after(transaction, name)
             accepted = set(MEASURED) - refusals(name, before, now).keys() if before else set()
@@ -141,7 +143,8 @@ def _stopped_enclaves(transaction: Transaction, now: datetime) -> dict[Vendor, _
             continue
         refused = refusals(name, after, now)
         if not before:
-            accepted = set(MEASURED) if len(refused) == len(MEASURED) else set()
+            all_new = {CERTIFICATE_FILE, PERMISSIONS_FILE} <= own
+            accepted = set(MEASURED) if all_new and len(refused) == len(MEASURED) else set()
         for vendor in MEASURED:
             if vendor in accepted and vendor in refused:
                 stopped.setdefault(vendor, {}).setdefault(refused[vendor], []).extend(names)
@@ -184,7 +187,7 @@ def _would_stop(root: Path, found: Mapping[Vendor, _Refusals], remedy: str) -> K
     whose = "its" if len(names) == 1 else "their"
     options = " ".join(f"--allow-refusal {vendor.value}" for vendor in found)
     return KeystoreError(
-        f"no node could start any more in {_some(names)} of '{root}'",
+        f"no node could start in {_some(names)} of '{root}'",
         f"{_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
         f"{remedy or 'Replace the file that is named.'} If no node runs on "
         f"{_list([each.title for each in found])}, add {options}.",
@@ -303,7 +306,7 @@ def _example(
 # ── the enclaves that change ───────────────────────────────────────────────────────────────
 
 
-def _kinds(transaction: Transaction, now: datetime) -> dict[tuple[object, ...], list[str]]:
+def _kinds(transaction: Transaction, now: datetime) -> dict[_Kind, list[str]]:
     """Return the complete enclaves that change, by all in which vendors could see a difference."""
     changed = transaction.changed_folders()
     shared = changed.get(PUBLIC, set()) | changed.get(ENCLAVES, set()) & {GOVERNANCE_FILE}
@@ -317,12 +320,13 @@ def _kinds(transaction: Transaction, now: datetime) -> dict[tuple[object, ...], 
         names.update(transaction.enclaves)
     present = frozenset(transaction.enclaves)
     lists: dict[str, frozenset[int]] = {}
-    found: dict[tuple[object, ...], list[str]] = {}
+    found: dict[_Kind, list[str]] = {}
     for name in sorted(names):
         folder = enclave_folder(name)
         places = {file: transaction.place_after(f"{folder}/{file}") for file in _LOADED}
         own = frozenset(changed.get(folder, ())).intersection(_LOADED)
-        kind: tuple[object, ...] = tuple(p.removeprefix(f"{folder}/") for p in places.values()), own
+        shared_places = tuple(place.removeprefix(f"{folder}/") for place in places.values())
+        looks: tuple[object, ...] = ()
         if name in present:  # otherwise this transaction issues it, as all others that are new
             data = transaction.content_after(places[CERTIFICATE_FILE])
             if not data:
@@ -333,12 +337,12 @@ def _kinds(transaction: Transaction, now: datetime) -> dict[tuple[object, ...], 
             old = transaction.root / folder / CERTIFICATE_FILE
             before = _content(old) if CERTIFICATE_FILE in own else b""
             signed = documents or PERMISSIONS_FILE in own
-            kind += (
+            looks = (
                 _certificate_kind(data, lists[crl], now),
                 _certificate_kind(before, frozenset(), now),
                 signed and _signers(transaction.content_after(places[PERMISSIONS_FILE]) or b""),
             )
-        found.setdefault(kind, []).append(name)
+        found.setdefault((shared_places, own, looks), []).append(name)
     return found
 
 
