@@ -70,8 +70,15 @@ class Grant:
 
     @property
     def validity(self) -> Window:
-        """The validity of the grant by the standard: a date without a zone is in UTC."""
-        return Window(parse_iso(self.not_before), parse_iso(self.not_after))
+        """The validity of the grant by the standard: a date without a zone is in UTC.
+
+        Raises `DocumentError` if a date is of a form that only some vendors read.
+        """
+        try:
+            return Window(parse_iso(self.not_before), parse_iso(self.not_after))
+        except ValueError as error:
+            text = f"{self.not_before!r} or {self.not_after!r} is not an XML date and time"
+            raise DocumentError(text) from error
 
     def domains(self) -> DomainSet:
         """Return the domains in which some rule allows something."""

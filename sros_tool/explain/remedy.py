@@ -48,6 +48,8 @@ _BY_REASON: dict[str, str | Fault] = {
     "empty-topic": _VENDOR,
     "long-name": "Use a shorter name: on DDS at most 251 characters, prefix and suffix included.",
     "no-topic-rule": "Make a keystore from a template: its governance has a rule for every topic.",
+    "empty-subject": "Issue a certificate with a common name: `sros renew {root} {enclave}`.",
+    "blank-subject": Fault.PERMISSIONS_SUBJECT,
     "invalid-name": "Use a name of letters, digits, '_' and '/'.",
     "partition": "Leave partitions out of permissions; sros never writes them.",
 }

@@ -338,7 +338,9 @@ def _list_faults(
         if file in state.files:
             lists.append((_list(state.files[file], file), file))
     except PkiError:
-        text = "it has a revocation list that cannot be read, so DDS refuses every participant"
+        text = "it is not a revocation list, so DDS refuses every participant"
+        if file == IDENTITY_CA_FILE:
+            text = "it has a revocation list that cannot be read, so DDS refuses every participant"
         yield Problem(file, text, Fault.CRL_MALFORMED)
         return
     if not lists:

@@ -369,14 +369,14 @@ class VendorParticipant:
 def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> OpenedEnclave:
     """Return an enclave as it is for the vendors of these participants, of which there is one.
 
-    Left out are faults that some of them do not refuse, and faults of documents that all of them
+    Left out are faults that some of them do not refuse, and faults of documents that some of them
     accept.  Documents that one of them loads are those of the enclave, if a CA signed them: what an
     enclave has signed for itself stays a fault, whoever takes it (CVE-2023-24011).
     """
     loading = [each for each in made if each.permissions is not None]
     if not (state.problems and loading):
         return state
-    sound = not any(each.causes() for each in made)
+    sound = not all(each.causes() for each in made)
     problems = tuple(
         problem
         for problem in state.problems

@@ -24,7 +24,7 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
-from sros_tool.errors import KeystoreError, PkiError, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -403,14 +403,18 @@ class OpenedEnclave:
     def valid_until(self) -> datetime | None:
         """Return the first expiry among its certificates and its grant, in UTC.
 
-        Return None if the certificate or the permissions cannot be read.
+        Return None if the certificate or the permissions, or their dates, cannot be read.
         """
         if not (self.certificate and self.permissions):
             return None
         certificates = (self.certificate, self.identity_ca, self.permissions_ca)
         moments = [validity_of(each).not_after for each in certificates if each]
-        with suppress(SrosError):  # a grant that expires before it begins
+        try:
             moments += [self.grant.validity.not_after] if self.grant else []
+        except DocumentError:
+            return None
+        except SrosError:  # a grant that expires before it begins
+            pass
         return min(moments)
 
 

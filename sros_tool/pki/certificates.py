@@ -83,12 +83,14 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
 
     The OU keeps other permissions from matching: the permissions of an enclave whose name contains
     this name (Cyclone DDS compares parts), and the permissions for an earlier certificate.  The
-    RFC 4514 text has the CN first, as Fast DDS 2.9.1 and Cyclone DDS 0.10.2 compare it.
+    RFC 4514 text has the CN first; that of the root enclave has it last, because Cyclone DDS takes
+    its slash for the end of a part, and refuses a subject with an empty part before another one.
     """
     if not unique:
         return common_name(name)
     part = x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, secrets.token_hex(8))
-    return x509.Name([part, x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    parts = [part, x509.NameAttribute(NameOID.COMMON_NAME, name)]
+    return x509.Name(parts[::-1] if name.endswith("/") else parts)
 
 
 def has_unique_part(subject: x509.Name) -> bool:

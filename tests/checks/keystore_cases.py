@@ -208,7 +208,7 @@ CASES |= {
     ),
     "enclave.signature": lambda b: _tamper(b, "enclaves/base/permissions.p7s"),
     "enclave.governance-malformed": lambda b: b.governance(("domain_access_rules>", "rules>")),
-    "enclave.permissions-malformed": lambda b: b.permissions(("<default>DENY</default>", "")),
+    "enclave.permissions-malformed": lambda b: b.permissions(("validity>", "window>")),
     "enclave.governance-domain": lambda b: b.options.update(domain=7),
     "enclave.permissions-expired": lambda b: at(b, 181),
     "enclave.permissions-not-yet-valid": lambda b: b.permissions(

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.kind import NOTE
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.lifecycle.create import create_keystore
 from sros_tool.keystore.template import load_template
@@ -234,7 +235,10 @@ def test_a_secret_that_kubernetes_mounts_hides_no_enclave(bench: Bench, tmp_path
     mount_as_secret(enclave, "..2026_11_23_10_00_00.123")
     listed = sros("list_enclaves", robot).ok()
     assert (listed.out, listed.err) == ("/base\n", "")
-    assert "keystore.hidden-enclave" not in {each.id for each in keystore_findings(robot, now=NOW)}
+    mounted = enclave / "..2026_11_23_10_00_00.123"
+    mounted.chmod(0o700)
+    (mounted / "key.pem").chmod(0o600)
+    assert [each for each in keystore_findings(robot, now=NOW) if each.severity is not NOTE] == []
     (enclave / "..2025_11_23_10_00_00.123").mkdir()
     (enclave / "..2025_11_23_10_00_00.123/cert.pem").write_bytes(b"")
     listed = sros("list_enclaves", robot).ok()

@@ -165,6 +165,28 @@ def test_what_some_vendors_accept_is_no_error(bench: Bench) -> None:
     assert {each.id for each in worst(bench)} >= {"enclave.signature"}
 
 
+@pytest.mark.parametrize("other", ["2030-13-45T00:00:00Z", "soon"])
+def test_a_date_that_is_none_is_one_error(other: str, bench: Bench) -> None:
+    bench.permissions((_not_after(bench), f"<not_after>{other}<"))
+    bench.export()
+    assert [each.id for each in worst(bench)] == ["enclave.permissions-malformed"]
+    assert sros("verify", bench.checked).status == 1
+
+
+def _not_after(bench: Bench) -> str:
+    text = bench.path("enclaves/base/permissions.p7s").read_text()
+    return text[text.index("<not_after>") : text.index("</not_after>") + 1]
+
+
+def test_a_document_that_some_vendors_accept_is_no_error(bench: Bench) -> None:
+    """Fast DDS needs the default of a grant, and Cyclone DDS does not."""
+    bench.permissions(("<default>DENY</default>", ""))
+    bench.export()
+    (found,) = worst(bench)
+    assert (found.id, found.severity) == ("portable.refused", WARNING)
+    assert found.text.startswith("Fast DDS 2.14 and Fast DDS 2.9.1 refuse it (permissions.p7s: ")
+
+
 def test_an_open_domain_is_seen_by_whomever_the_governance_is_signed(bench: Bench) -> None:
     bench.governance(*OPEN)
     signed_below(bench)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -286,11 +287,15 @@ def _on_token(enclave: CheckedEnclave, place: TokenUri) -> Iterator[Finding]:
 
 
 def grant_of(enclave: CheckedEnclave) -> Grant | None:
-    """Return the grant that DDS reads for the enclave, if its validity is not empty."""
+    """Return the grant that DDS reads for the enclave, if its validity is a time that is not empty.
+
+    Dates may be of a form that only some vendors read.
+    """
     grant = enclave.state.grant
-    if grant is None or parse_iso(grant.not_after) <= parse_iso(grant.not_before):
-        return None
-    return grant
+    with suppress(ValueError):
+        if grant and parse_iso(grant.not_after) > parse_iso(grant.not_before):
+            return grant
+    return None
 
 
 def _certificate(enclave: CheckedEnclave, certificate: x509.Certificate) -> Iterator[Finding]:

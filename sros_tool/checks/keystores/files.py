@@ -277,6 +277,7 @@ def _below(
     root = os.fspath(keystore.root)
     keys = {os.path.join(root, ENCLAVES, name[1:], KEY_FILE) for name in keystore.names}
     keys |= {os.path.join(root, ENCLAVES, KEY_FILE)}
+    keys |= set(map(_mounted, keys))
     home = keystore.is_home
     unread: list[OSError] = []
     for parent, folders, files in os.walk(start, onerror=unread.append):
@@ -314,6 +315,19 @@ def _below(
                 yield from _other(path, root, info, home)
     for error in unread:
         yield _unread(error, root)
+
+
+def _mounted(key: str) -> str:
+    """Return where a key lies in the secret that Kubernetes mounts; else ``key``.
+
+    There, the files of a folder are links into ..data, itself a link to a folder beside it.
+    """
+    parent, name = os.path.split(key)
+    data = os.path.join(parent, "..data")
+    if not (os.path.islink(key) and os.readlink(key) == f"..data/{name}" and os.path.islink(data)):  # noqa: PTH115
+        return key
+    inside = os.readlink(data)  # noqa: PTH115 - as above
+    return key if os.sep in inside else os.path.join(parent, inside, name)
 
 
 def _unread(error: OSError, root: str) -> Finding:

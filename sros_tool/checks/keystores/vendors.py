@@ -82,7 +82,7 @@ _NAMED_BY: Mapping[str, frozenset[str]] = {
             *("enclave.permissions-expired", "enclave.permissions-local-time"),
             *("enclave.permissions-malformed", "portable.time-format", "portable.several-grants"),
         ),
-        "malformed": ("portable.time-format",),
+        "malformed": ("portable.time-format", "enclave.permissions-malformed"),
         "no-grant": ("enclave.permissions-subject", "portable.subject"),
         "no-rule": ("enclave.permissions-domain", "enclave.permissions-domains"),
         "no-topic-rule": ("governance.no-topic-rule",),
