@@ -101,6 +101,8 @@ def vendor_problems(
         if not any(each.file == IDENTITY_CA_FILE for each in of_side):  # loaded before
             crash += [each for each in of_side if each.fault is Fault.CERTIFICATE_CRASH]
         kept += crash or [each for each in specific if each.file in files] or of_side
+    if not any(each.fault is Fault.KEY_ALGORITHM for each in kept):
+        kept += [each for each in faults if each.file == KEY_FILE]
     return tuple(kept)
 
 
