@@ -181,7 +181,8 @@ FEWER_DOMAINS = FindingKind(
 
 _MOMENT = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
 _SUBJECT = re.compile(
-    r"(?:[A-Za-z0-9.]+=[^,|\"\s/][^,|\"]*|CN=/[^,|\"\s]*)(?:,(?! )[A-Za-z0-9.]+=[^,|\"/]+)*(?:,CN=/)?\Z"
+    r"(?:[A-Za-z0-9.]+=[^,|\"\s/][^,|\"]*|CN=/[^,|\"\s]*)(?:,(?! )[A-Za-z0-9.]+=[^,|\"/]+)*"
+    r"(?:,CN=/)?\Z"
 )
 _LAST_YEAR = 2262
 _WEST, _EAST = timedelta(hours=12), timedelta(hours=14)

@@ -322,12 +322,13 @@ def _mounted(key: str) -> str:
 
     There, the files of a folder are links into ..data, itself a link to a folder beside it.
     """
-    parent, name = os.path.split(key)
-    data = os.path.join(parent, "..data")
-    if not (os.path.islink(key) and os.readlink(key) == f"..data/{name}" and os.path.islink(data)):  # noqa: PTH115
+    path = Path(key)
+    data = path.with_name("..data")
+    if not (path.is_symlink() and data.is_symlink()):
         return key
-    inside = os.readlink(data)  # noqa: PTH115 - as above
-    return key if os.sep in inside else os.path.join(parent, inside, name)
+    inside = data.readlink()
+    mounted = path.readlink() == Path("..data", path.name) and len(inside.parts) == 1
+    return os.fspath(path.parent / inside / path.name) if mounted else key
 
 
 def _unread(error: OSError, root: str) -> Finding:
