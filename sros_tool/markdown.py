@@ -58,7 +58,7 @@ def _ticks(text: str) -> int:
     return max((len(run) for run in _RUNS.findall(text)), default=0) + 1
 
 
-_BLANK = "\u115f\u1160\u2800\u3164\uffa0"
+_BLANK = "\u115f\u1160\u2800\u3164\uffa0\U0001d159"
 """Characters that are printable, and look like nothing."""
 
 

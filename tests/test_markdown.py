@@ -49,7 +49,9 @@ def test_a_name_is_one_code_span(text: str) -> None:
     assert len(shown) < 1000
 
 
-@pytest.mark.parametrize("unseen", ["\ufe0f", "\u3164", "\u2800", "\u0336", "\U000e0041"])
+@pytest.mark.parametrize(
+    "unseen", ["\ufe0f", "\u3164", "\u2800", "\u0336", "\U0001d159", "\U000e0041"]
+)
 def test_two_names_that_look_alike_are_told_apart(unseen: str) -> None:
     assert code(f"robot{unseen}.xml") == f"`robot\\x{ord(unseen):x}.xml`"
     assert code("r\u00e9sum\u00e9 \U0001f7e2") == "`r\u00e9sum\u00e9 \U0001f7e2`"

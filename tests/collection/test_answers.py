@@ -14,6 +14,7 @@ from ansible_collections.sros.fleet.plugins.action.enclaves import ActionModule
 from ansible_collections.sros.fleet.plugins.module_utils.home import harmless
 from ansible_collections.sros.fleet.plugins.plugin_utils.answers import read_answer
 from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import RobotAction
+from tests.support.children import run
 
 
 def answered(**answer: object) -> dict[str, Any]:
@@ -51,14 +52,18 @@ def test_differences_are_compared_before_the_task_ends() -> None:
     assert len(shown["prepared"]) < 300_000
 
 
-def test_an_agent_is_not_forwarded() -> None:
+def test_nothing_is_forwarded_to_a_robot() -> None:
+    """Ansible puts ``ssh_args``, which are first here, before ``ssh_extra_args``."""
     options = {"ssh_extra_args": "-o ForwardAgent=yes"}
     made = RobotAction.__new__(RobotAction)
     made._connection = SimpleNamespace(
         transport="ssh", get_option=options.get, set_option=options.__setitem__
     )
     made._keep_the_agent()
-    assert options["ssh_extra_args"].split()[2:] == ["-a", "-x", "-o", "ClearAllForwardings=yes"]
+    asked = ["-A", "-X", "-L", "9:r9:9", "-R", "9:r9:9", *options["ssh_extra_args"].split()]
+    shown = run(["ssh", "-F", "/dev/null", "-T", "-G", *asked, "r1"]).stdout.splitlines()
+    assert {"forwardagent no", "forwardx11 no"} <= {*shown}, shown
+    assert not [each for each in shown if each.startswith(("localforward", "remoteforward"))], shown
 
 
 def test_text_is_visible_and_in_its_order() -> None:

@@ -11,8 +11,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from ansible_collections.sros.fleet.plugins.filter.due_units import due_units, without_unit
+from ansible_collections.sros.fleet.plugins.filter.sharing import sharing
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
 from sros_tool import __version__
 from tests.integration.robots import CHECKOUT
@@ -52,6 +54,23 @@ def test_the_syntax_of_each_play(tmp_path: Path) -> None:
     words = ("-i", tmp_path / "inventory.json", "--syntax-check", "-e", facts)
     said = ansible("ansible-playbook", *words, *plays, folder=tmp_path)
     assert said.count("playbook:") == len(PLAYS)
+
+
+def test_each_play_looks_at_the_names_first() -> None:
+    """Otherwise enclaves are renewed at home before a name that is misspelt stops the play."""
+    of_user = {"deliver", "renew", "change", "revoke", "rotation_stage", "requests", "status"}
+    assert set(PLAYS) - of_user == {"hosts", "report", "rotate", "sign_rights"}
+    for name in of_user:
+        first = yaml.safe_load((COLLECTION / f"playbooks/{name}.yml").read_text())[0]
+        assert first["ansible.builtin.import_playbook"] == "hosts.yml", name
+
+
+def test_two_hosts_of_one_robot_are_named() -> None:
+    """Those with patterns get what these say, whatever their robot is called."""
+    hosts: dict[str, dict[str, object]] = {"r1": {}, "r2": {"sros_robot": "r1"}, "r4": {}}
+    hosts["r3"] = {"sros_robot": "r1", "sros_patterns": ["/r3/*"]}
+    assert sharing(hosts, [*hosts]) == ["r1 (r1, r2)"]
+    assert not sharing(hosts, ["r2", "r3", "r4"])
 
 
 @needs_ansible

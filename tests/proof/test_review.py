@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -483,7 +484,8 @@ def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     settings = (change.folder / "ks/sros.toml").read_text()
     elsewhere = settings.replace("[authorities]", '[authorities]\nidentity_key = "file:/dev/null"')
     change.commit({"ks/sros.toml": elsewhere})
-    assert "its mode is" not in change.review(*words, "1d", "--json").out
+    (only,) = json.loads(change.review(*words, "1d", "--json").out)["findings"]
+    assert only["id"] == "keystore.settings-edited", only
     change.commit({"ks/enclaves/a/cert.pem": "damaged", "ks/sros.toml": settings})
     damaged = change.review(*words, "1d")
     assert (damaged.status, "keystore ks: 1 error" in damaged.out) == (2, True), damaged
