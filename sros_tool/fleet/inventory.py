@@ -46,17 +46,18 @@ def fleet_table(data: bytes, what: str, *, is_json: bool) -> dict[str, Any]:
 
 
 def connections(data: bytes, what: str, *, is_json: bool) -> dict[str, str]:
-    """Map what in an inventory says how Ansible connects, besides address and user, to its values.
+    """Map what in an inventory says how Ansible delivers keys, and whose, to its values.
 
-    The variables of groups count together with who is in them; beside a template, every value
-    counts.  Parameters and errors are those of `fleet_table`.
+    Left out is what a fleet has (`fleet_table`).  The variables of groups count together with who
+    is in them; beside a template, every value counts.  Parameters and errors are those of
+    `fleet_table`.
     """
     values = dict(_values_below(_loaded(data, what, is_json=is_json)))
-    known = {_VALUES["address"], _VALUES["user"]}
+    known = {*_VALUES.values(), _ROBOT}
     found = {
         path: text
         for path, text in values.items()
-        if any(part.startswith("ansible_") and part not in known for part in path)
+        if any(part.startswith(("ansible_", "sros_")) and part not in known for part in path)
     }
     if any("{" in text for text in found.values()):
         found = values

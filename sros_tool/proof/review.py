@@ -395,10 +395,10 @@ class _Review:
         if base[1] and self.base:
             file = self.request.fleet
             before, after = (read_connections(e.folder / file) for e in (self.base, self.head))
-            for where in sorted({*before, *after}, key=lambda each: ("ansible_" not in each, each)):
+            for where in sorted({*before, *after}, key=_decisive_first):
                 if before.get(where) != (value := after.get(where)):
                     said = "is gone, which" if value is None else f"is {value}, which"
-                    lines.append((f"{said} can change how Ansible reaches robots", where))
+                    lines.append((f"{said} can change how Ansible delivers keys, and whose", where))
         return (self._new_access, Facts(tuple(lines))) if lines else None
 
     def _others(self, reviewed: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content] | None:
@@ -718,6 +718,11 @@ class _Review:
         )
         status = _UNDECIDED if unreadable else _FOUND if due else _OK
         return status, ExpiryCheck(due, unreadable, count)
+
+
+def _decisive_first(where: str) -> tuple[bool, str]:
+    """Return the key that sorts variables of Ansible and of the plays before who has them."""
+    return not any(part in where for part in ("ansible_", "sros_")), where
 
 
 def _place(robot: Robot) -> str:

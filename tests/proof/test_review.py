@@ -431,6 +431,12 @@ _HOSTS = """{"_meta": {"hostvars": {"r1": {"ansible_host": "10.0.0.1"}}},
             _HOSTS.replace('"red"', '"red", "ansible_ssh_common_args": "-o ProxyCommand=evil"'),
             "'all.vars.ansible_ssh_common_args' is -o ProxyCommand=evil, which can change how",
         ),
+        (
+            "hosts.json",
+            _HOSTS,
+            _HOSTS.replace('10.0.0.1"', '10.0.0.1", "sros_patterns": ["/*"]'),
+            "'_meta.hostvars.r1.sros_patterns' is ['/*'], which can change how",
+        ),
     ],
 )
 def test_keys_go_to_no_other_robot_unseen(
