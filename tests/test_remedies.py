@@ -20,6 +20,7 @@ from tests.support.harness import sros
 
 PACKAGE = Path(sros_tool.__file__).parent
 FILLED_IN = re.compile(r"\{[\w.]*\}")
+QUOTED = re.compile(r"`(?:[^`]*(?:&& |sudo |\$\())?(sros [^`]+?)(?:\)\")?`")
 OPTIONAL = re.compile(r"\[.*?\]|\.\.\.")
 
 
@@ -45,7 +46,7 @@ def named_commands() -> Iterator[tuple[str, str]]:
             text = text_of(node)
             if text is None or "sros " not in text:
                 continue
-            for command in re.findall(r"`(?:[^`]*&& )?(sros [^`]+)`", text):
+            for command in QUOTED.findall(text):
                 if not re.search(r"-\w*value|valuevalue", command):  # an option filled in later
                     yield command, f"{path.relative_to(PACKAGE)}:{getattr(node, 'lineno', 0)}"
 

@@ -12,6 +12,7 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     IDENTITY,
@@ -110,7 +111,7 @@ ENCLAVE_NOT_FOUND = FindingKind(
     "With Enforce the node does not start; without Enforce it runs unsecured. Names are "
     "case-sensitive.",
     _RCL,
-    "Correct the name, or create the enclave with `sros create_enclave`.",
+    "Correct the name, or create the enclave with `sros create_enclave ROOT NAME`.",
 )
 NO_ENCLAVE = FindingKind(
     "runtime.enclave-unset",
@@ -146,8 +147,7 @@ DOMAIN_NOT_GOVERNED = FindingKind(
     'No node starts: Fast DDS says "Not found topic access rule for topic ros_discovery_info", '
     'Cyclone DDS "Could not find domain in governance".',
     "DDS-Security 1.1, 9.4.1.2; measured.",
-    "Set ROS_DOMAIN_ID to a domain of the keystore, or make a keystore for this domain with `sros "
-    "create_keystore --domain`.",
+    Fault.GOVERNANCE_DOMAIN.remedy.format(root="ROOT", enclave="NAME"),
 )
 CA_KEY_HERE = FindingKind(
     "runtime.ca-key-present",
@@ -155,7 +155,8 @@ CA_KEY_HERE = FindingKind(
     "nodes use the keystore that holds the CA keys",
     "An attacker who takes over a node can create any enclave, with any rights.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6.",
-    "Run nodes with an export (`sros distribute_key`), and keep this keystore elsewhere.",
+    "Run nodes with an export (`sros distribute_key ROOT NAME TARGET`), and keep this keystore "
+    "elsewhere.",
 )
 
 _READ = (

@@ -146,8 +146,8 @@ EVERYTHING = FindingKind(
     "a wildcard that allows publishing, calling or serving every name",
     "The enclave can command every node and answer in place of every other node.",
     "ROS 2 design, ROS 2 Security Enclaves: least privilege.",
-    "Name the topics, services and actions that the node uses; `sros minimize_policy` replaces "
-    "the wildcard by the observed names.",
+    "Name the topics, services and actions that the node uses: `sros minimize_policy POLICY "
+    "--observed OBSERVED -o OUTPUT` writes the observed names in place of the wildcard.",
 )
 WIDE = FindingKind(
     "policy.wide-wildcard",
@@ -528,8 +528,8 @@ DOCUMENT_SIZE = FindingKind(
     "Cyclone DDS accept them.",
     "ros2/sros2 issue 228; Fast DDS 2.9.1 (SecurityManager.cpp) and 2.14.5, Cyclone DDS 0.10.2; "
     "measured.",
-    "Remove rights that are never used, or use wildcards (`sros minimize_policy` shows both), or "
-    "split the enclave.",
+    "Remove rights that are never used, or use wildcards (`sros minimize_policy POLICY --observed "
+    "OBSERVED` shows both), or split the enclave.",
     vendors=(Vendor.FAST_2_9,),
 )
 LONG_NAME = FindingKind(
@@ -595,7 +595,7 @@ ROOT_ENCLAVE = FindingKind(
     "without an enclave / in the keystore, it does not start.",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
     "Remove the enclave / from the policy once each process has its own: `sros generate_policy "
-    "--enclave-per-node` learns them so.",
+    "POLICY --enclave-per-node` learns them so.",
 )
 
 

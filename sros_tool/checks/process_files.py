@@ -17,6 +17,7 @@ from sros_tool.dds.decision.moments import read_moment
 from sros_tool.dds.decision.vendors import Moments, Vendor
 from sros_tool.dds.permissions import Grant, parse_permissions
 from sros_tool.errors import SrosError
+from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -101,6 +102,8 @@ PROCESS_NOT_SEEN = FindingKind(
     "Run it as root: `sudo sros check runtime`.",
 )
 
+_NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="ROOT")
+"""The remedy where a CA has expired, and nothing can be renewed with it."""
 _MOST_LEDGER = 64 * 1024 * 1024
 _LOADED_BY_ZENOH = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
 
@@ -128,14 +131,11 @@ def file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator[
     elif newer:
         text = f"it started at {iso(process.started)}; {', '.join(newer)} of {name} changed later"
         yield PROCESS_OUTDATED.found(process.label, text)
-    expired = [
-        f"{what} at {iso(window.not_after)}"
-        for what, window in loaded.windows.items()
-        if window.not_after < now
-    ]
-    if expired:
-        text = f"of {name} expired: {', '.join(expired)}"
-        yield PROCESS_EXPIRED.found(process.label, text)
+    ends = {what: each.not_after for what, each in loaded.windows.items() if each.not_after < now}
+    if ends:
+        expired = ", ".join(f"{what} at {iso(end)}" for what, end in ends.items())
+        remedy = _NEW_AUTHORITY if ends.keys() & set(_AUTHORITIES.values()) else ""
+        yield PROCESS_EXPIRED.found(process.label, f"of {name} expired: {expired}", remedy=remedy)
     yield from _local_time(process, loaded, now, zone)
     if enclave.writable:
         yield PROCESS_REPLACEABLE.found(process.label, plain_path(enclave.writable))

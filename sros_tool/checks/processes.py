@@ -25,6 +25,7 @@ from sros_tool.checks.process_files import (
     unsecured_because,
 )
 from sros_tool.checks.zenoh_environment import (
+    OWN_CONFIGURATION,
     PROCESS_OPEN,
     enforces_nothing,
     is_zenoh,
@@ -113,8 +114,8 @@ ZENOH_UNREAD = FindingKind(
     "Zenoh reads more forms than sros, such as YAML, and a process without an RMW chooses its "
     "configuration itself. It may enforce nothing: whether it does is not known.",
     "Zenoh 1.10.2, measured.",
-    "Write the configuration as JSON5 objects, or start the process with `sros run ROOT NAME -- "
-    "COMMAND...`.",
+    "Write the configuration as JSON5 objects, or start the process with the one of its enclave. "
+    f"{OWN_CONFIGURATION}",
 )
 PROCESS_ELSEWHERE = FindingKind(
     "runtime.process-elsewhere",

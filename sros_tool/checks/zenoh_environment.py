@@ -29,7 +29,10 @@ from sros_tool.zenoh.document import (
 )
 
 _SOURCE = "rmw_zenoh_cpp (zenoh_config.cpp); 1.10.2 of Zenoh measured."
-_ENV = "`sros env ROOT NAME` and `sros run` set the variables of an enclave."
+OWN_CONFIGURATION = (
+    "`sros zenoh ROOT` writes the configuration of each enclave, where the CA keys are; `sros env "
+    "ROOT NAME` and `sros run ROOT NAME -- COMMAND...` set the variables of an enclave."
+)
 
 NO_SESSION_FILE = FindingKind(
     "runtime.zenoh-open",
@@ -38,7 +41,7 @@ NO_SESSION_FILE = FindingKind(
     "rmw_zenoh reads no ROS_SECURITY_* variable and no file of an enclave. Without a session file, "
     "every node uses the default of rmw_zenoh_cpp: no TLS, no access control.",
     _SOURCE,
-    f"Set ZENOH_SESSION_CONFIG_URI to the session.json5 of the enclave. {_ENV}",
+    f"Set ZENOH_SESSION_CONFIG_URI to the session.json5 of the enclave. {OWN_CONFIGURATION}",
 )
 FILE_NOT_FOUND = FindingKind(
     "runtime.zenoh-file-not-found",
@@ -46,7 +49,7 @@ FILE_NOT_FOUND = FindingKind(
     "a variable of rmw_zenoh names no file that can be read",
     "No node, or with ZENOH_ROUTER_CONFIG_URI no router, starts.",
     _SOURCE,
-    f"Correct the path. {_ENV}",
+    f"Correct the path. {OWN_CONFIGURATION}",
 )
 UNREAD = FindingKind(
     "runtime.zenoh-unread",
@@ -55,7 +58,7 @@ UNREAD = FindingKind(
     "Zenoh reads more than sros: YAML, lists in place of objects, pipes, more than 16 MiB. Whether "
     "the configuration enforces anything is not known.",
     _SOURCE,
-    f"Write it as JSON5 objects into a file. {_ENV}",
+    f"Write it as JSON5 objects into a file. {OWN_CONFIGURATION}",
 )
 OVERRIDDEN = FindingKind(
     "runtime.zenoh-overridden",
@@ -64,7 +67,7 @@ OVERRIDDEN = FindingKind(
     "It is applied after the file, for nodes and the router alike, and can switch off access "
     "control, TLS and everything else that the file states.",
     _SOURCE,
-    f"Leave only the paths of certificates and keys in it. {_ENV}",
+    f"Leave only the paths of certificates and keys in it. {OWN_CONFIGURATION}",
 )
 NO_CERTIFICATE = FindingKind(
     "runtime.zenoh-no-certificate",
@@ -72,7 +75,7 @@ NO_CERTIFICATE = FindingKind(
     "a configuration of Zenoh with TLS, and without the paths of certificates and keys",
     "No session opens with it, and no router starts.",
     "Zenoh 1.10.2, measured.",
-    f"Name them in ZENOH_CONFIG_OVERRIDE. {_ENV}",
+    f"Name them in ZENOH_CONFIG_OVERRIDE. {OWN_CONFIGURATION}",
 )
 PROCESS_OPEN = FindingKind(
     "runtime.zenoh-process-open",
@@ -81,7 +84,7 @@ PROCESS_OPEN = FindingKind(
     "It runs without a session file, or with one that has no access control: whoever connects to "
     "it, or plays its router, reads everything from it and sends it anything.",
     _SOURCE,
-    "Stop it, and start it with `sros run ROOT NAME -- COMMAND...`.",
+    f"Stop it, and start it again. {OWN_CONFIGURATION}",
 )
 
 _NEEDED = {

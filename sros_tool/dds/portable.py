@@ -27,7 +27,7 @@ def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> It
 _CONSEQUENCES = {
     "portable.document-size": f"; with {MAX_SIGNED_BYTES} or more, Fast DDS 2.9 may never "
     "finish the handshake. Remove rights that are never used, or use wildcards (`sros "
-    "minimize_policy` shows both), or split the enclave.",
+    "minimize_policy POLICY --observed OBSERVED` shows both), or split the enclave.",
     "portable.long-name": f"; on Fast DDS no peer matches a topic of more than "
     f"{_LONGEST_TOPIC} bytes. Use shorter namespaces and names.",
     "portable.deny-blocks-topic": " on Cyclone DDS, which refuses the topic as a whole; Fast "

@@ -7,6 +7,8 @@ import re
 import shlex
 import shutil
 import sys
+from collections.abc import Iterator
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -14,10 +16,16 @@ import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
+from sros_tool.checks.policies import policy_file_findings
 from sros_tool.checks.registry import KINDS
-from tests.checks.bench import SECRET, Bench
+from sros_tool.checks.runtime import RuntimeState, runtime_findings
+from tests.checks import policy_cases, runtime_cases
+from tests.checks.bench import DAY, SECRET, Bench
 from tests.checks.keystore_cases import CASES
-from tests.support.harness import Ended, sros
+from tests.checks.sound_keystore import NOW
+from tests.checks.test_policy_findings import enclave
+from tests.checks.test_policy_findings import policy as policy_of
+from tests.support.harness import Ended, forked, sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
@@ -42,20 +50,22 @@ ELSEWHERE = {
 """Why the commands for a finding cannot be run where a case makes it, by its id."""
 
 
-def commands(finding: Finding, policy: Path, target: Path) -> list[list[str]]:
+def commands(finding: Finding, policy: Path, target: Path, **others: object) -> list[list[str]]:
     """The commands of a remedy with arguments, with the names that a person fills in."""
     name = finding.subject.split(",")[0] if finding.subject.startswith("/") else "/base"
-    words = {
+    words: dict[str, object] = {
         "POLICY_FILE": policy,
         "POLICY": policy,
+        "OBSERVED": policy,
         "FLEET_FILE": target.with_name("fleet.toml"),
         "TARGET": target,
         "NAME": name,
         "NAME...": name,
         "IDS": 0,
         "ID": 0,
+        **others,
     }
-    found = re.findall(r"`(sros [^`]+)`", finding.remedy)
+    found = re.findall(r"`(?:eval \"\$\()?(sros [^`]+?)(?:\)\")?`", finding.remedy)
     split = (shlex.split(part)[1:] for each in found for part in each.split(" && "))
     whole = (each for each in split if any(not word.startswith("-") for word in each[1:]))
     return [[str(words.get(word, word)) for word in each] for each in whole]
@@ -97,3 +107,116 @@ def test_no_remedy_names_a_command_that_refuses(
             shutil.copytree(tmp_path / "broken", root, symlinks=True)
             ended = run(words)
         assert ended.status < 2, (words, ended.err)
+
+
+POLICIES = [each for each in policy_cases.CASES if "`sros " in KINDS[each.id].remedy]
+SHOWN_ONLY = {"portable.document-size"}
+"""The findings whose commands show what a person may change, and write nothing."""
+
+
+@pytest.mark.parametrize("case", POLICIES, ids=lambda case: case.id)
+def test_the_remedy_of_a_policy_can_be_carried_out(case: policy_cases.Case, tmp_path: Path) -> None:
+    written, observed, output = (tmp_path / f"{each}.xml" for each in ("robot", "seen", "narrow"))
+
+    def write(path: Path, content: str) -> None:
+        path.write_text(policy_of(enclave(content, ns=case.ns, basics=case.basics)))
+
+    write(observed, case.good)
+    write(written, case.bad)
+    found = next(each for each in policy_file_findings(written) if each.id == case.id)
+    named = commands(found, written, tmp_path, OBSERVED=observed, OUTPUT=output)
+    assert named
+    for words in named:
+        sros(*words, cwd=tmp_path).ok()
+    if include := re.search("<xi:include .*?/>", found.remedy):
+        write(written, case.bad + include[0])
+    left = policy_file_findings(output if output.exists() else written)
+    assert (case.id in {each.id for each in left}) is (case.id in SHOWN_ONLY)
+
+
+_MACHINE = "its command looks at this machine, and not at the one of the case"
+NOT_HERE = {
+    "runtime.container-alone": _MACHINE,
+    "runtime.process-elsewhere": _MACHINE,
+    "runtime.process-not-seen": _MACHINE,
+    "runtime.rmw-without-security": _MACHINE,
+}
+"""Why the commands for a finding about the runtime are not run, by its id."""
+RUNTIME = {
+    **{each: (each, change) for each, change in runtime_cases.CASES.items()},
+    "expired, but not its CA": (
+        "runtime.process-expired",
+        lambda state, _: replace(state, now=state.now + 400 * DAY),
+    ),
+}
+STARTS = ("env", "run")
+"""The verbs that give a process its variables, which changes no file."""
+STARTED, OTHERS = (
+    [
+        name
+        for name, (kind, _) in RUNTIME.items()
+        if "sros " in KINDS[kind].remedy and kind not in NOT_HERE
+        if bool(re.search("sros (env|run) (?!.*update_keystore)", KINDS[kind].remedy)) is starts
+    ]
+    for starts in (True, False)
+)
+
+
+@pytest.fixture(scope="module")
+def robot(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Bench, RuntimeState]:
+    """A keystore with files for Zenoh, and a robot with an export; only to be read."""
+    copy = tmp_path_factory.mktemp("robot") / "copy"
+    shutil.copytree(sound, copy, symlinks=True)
+    bench = Bench(copy / "ks", NOW)
+    return bench, runtime_cases.SOUND(runtime_cases.sound_state(bench), bench)
+
+
+def found_in(state: RuntimeState) -> list[Finding]:
+    return runtime_findings(runtime_cases.seen(state))
+
+
+def variables(verb: str, output: str) -> Iterator[tuple[str, str]]:
+    """The variables that `sros env` prints for a shell, or `env` as they are."""
+    for line in output.splitlines():
+        name, _, value = line.removeprefix("export ").partition("=")
+        yield name, "".join(shlex.split(value)) if verb == "env" else value
+
+
+@pytest.mark.parametrize("name", STARTED)
+def test_what_starts_with_the_variables_of_a_remedy_is_mended(
+    name: str, robot: tuple[Bench, RuntimeState], tmp_path: Path
+) -> None:
+    bench, sound = robot
+    kind, change = RUNTIME[name]
+    for index in range(len(sound.running.processes)):
+        sound = runtime_cases.changed(index, environment=sound.environment)(sound, bench)
+    state = change(sound, bench)
+    found = next(each for each in found_in(state) if each.id == kind)
+    node = state.running.processes[0]
+    here = {**state.environment, **ENVIRONMENT}
+    named = commands(found, tmp_path, bench.root, **{"ROOT": bench.root, "COMMAND...": "env"})
+    assert named
+    for words in named:
+        if words[0] == "zenoh" and bench.path("enclaves/router").exists():
+            continue  # another finding had it write the files
+        ended = forked(*words, env=here).ok()
+        if words[0] in STARTS:
+            given = {**state.environment, **dict(variables(words[0], ended.out))}
+            started = replace(node, environment=given)
+            mended = replace(state, environment=given)
+            again = runtime_cases.with_processes(mended, started, sound.running.processes[1])
+            assert kind not in {each.id for each in found_in(again)}, words
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_no_remedy_of_the_runtime_names_a_command_that_refuses(
+    name: str, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind, change = RUNTIME[name]
+    state = change(runtime_cases.SOUND(runtime_cases.sound_state(bench), bench), bench)
+    found = next(each for each in found_in(state) if each.id == kind)
+    at(state.now, monkeypatch)
+    named = commands(found, tmp_path, tmp_path / "target", ROOT=bench.root, IDS="0,7")
+    assert named
+    for words in named:
+        sros(*words, env={**state.environment, **ENVIRONMENT}).ok()
