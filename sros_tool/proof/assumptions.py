@@ -56,8 +56,7 @@ def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permi
     unique = other.later is not None and other.later.unique_subject
     found = {}
     for name, permissions in side.permissions.items():
-        known = other.permissions.get(name)
-        subject = next((grant.subject for grant in known.grants), "") if known else ""
+        subject = other.subject_of(name)
         if not subject and unique:
             subject = f"CN={name},OU={sha256(name.encode()).hexdigest()}"
         grants = permissions.grants

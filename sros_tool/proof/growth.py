@@ -10,14 +10,20 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, product
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import ExpressionIndex, matches, names_of
-from sros_tool.dds.decision.subjects import also_fitting
+from sros_tool.dds.decision.subjects import (
+    ComparisonCrash,
+    also_fitting,
+    certified_text,
+    same_subject,
+)
 from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
@@ -132,7 +138,9 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
             f"'{head.shown}' cannot be compared: {unclear[0]}",
             "Apart from that, nothing is new.",
         )
-    sides = (_edges(before), _edges(after)) if added and scope is None else ({}, {})
+    sides: tuple[_Edges | None, ...] = ({}, {})
+    if added and scope is None:
+        sides = tuple(_edges(each, _borrowed(each, worlds)) for each in (before, after))
     unknown = "only some enclaves are compared" if scope is not None else ""
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
@@ -157,6 +165,26 @@ def _not_compared(base: AccessSource, head: AccessSource) -> Iterator[str]:
     if found := contradiction(head):
         yield f"the protection of HEAD: {found}"
     yield from unknown_settings(base.zenoh_files, head.zenoh_files)
+    if "zenoh" in (base.kind, head.kind):
+        return
+    for side, vendor in product((base, head), MEASURED):
+        for name, certified in side.certified.items():
+            if name in side.permissions and not _fits(vendor, side, name, certified.subject):
+                yield (
+                    f"on {vendor.title} the permissions of {name} in '{side.shown}' do not fit its "
+                    "certificate, so it is not certain what it can do"
+                )
+
+
+def _fits(vendor: Vendor, side: AccessSource, name: str, subject: str) -> bool:
+    """Return whether the permissions of an enclave fit a certificate with a subject."""
+    text = certified_text(vendor.traits, subject)
+    with suppress(ComparisonCrash):
+        return any(
+            same_subject(vendor.traits.subjects, each.subject.strip(), text)
+            for each in side.permissions[name].grants
+        )
+    return False
 
 
 # ── worlds ─────────────────────────────────────────────────────────────────────────────────
@@ -246,20 +274,26 @@ def _lenders(vendor: Vendor, *sides: AccessSource) -> _Lenders:
             name: [grant.subject for grant in permissions.grants]
             for name, permissions in side.permissions.items()
         }
-        certified = {name: subjects[0] for name, subjects in granted.items() if subjects}
+        subjects = {name: side.subject_of(name) for name in granted}
+        certified = {name: subject for name, subject in subjects.items() if subject}
         by_side[id(side)] = also_fitting(vendor.traits, certified, granted)
     return lambda side, enclave: by_side[id(side)].get(enclave, ())
 
 
 def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
-    def own_access(
-        side: AccessSource, governance: Governance, permissions: Permissions, enclave: str, at: int
+    def access_by(
+        side: AccessSource, governance: Governance, name: str, subject: str, at: int
     ) -> Access:
-        subject = permissions.grants[0].subject if permissions.grants else ""
-        found = Access(vendor, governance, permissions, subject, domain=at, at=AT)
+        """Return what the permissions of an enclave give to a certificate.
+
+        Those that do not fit it count as if they did: `_not_compared` says so.
+        """
+        granted = (each.subject for each in side.permissions[name].grants[:1])
+        subject = subject if _fits(vendor, side, name, subject) else next(granted, "")
+        found = Access(vendor, governance, side.permissions[name], subject, domain=at, at=AT)
         if found.join().reason in ("no-grant", "malformed") or found.join().outcome == "crashes":
             raise DocumentError(
-                f"the permissions of {enclave} in '{side.shown}' cannot be compared",
+                f"the permissions of {name} in '{side.shown}' cannot be compared",
                 found.join().text,
                 "Sign them again.",
             )
@@ -269,8 +303,9 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
         governance = side.governance
         if enclave not in side.permissions or governance is None:
             return _NO_ACCESS
+        subject = side.subject_of(enclave)
         usable = [
-            own_access(side, governance, side.permissions[name], name, domain)
+            access_by(side, governance, name, subject, domain)
             for name in (enclave, *lenders(side, enclave))
         ]
         return _Access(
@@ -446,8 +481,12 @@ def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> 
     if old.governance != new.governance:
         return False
     names = (enclave, *world.lenders(old, enclave))
-    return names == (enclave, *world.lenders(new, enclave)) and all(
-        _same_grants(old.permissions.get(each), new.permissions.get(each)) for each in names
+    return (
+        names == (enclave, *world.lenders(new, enclave))
+        and old.subject_of(enclave) == new.subject_of(enclave)
+        and all(
+            _same_grants(old.permissions.get(each), new.permissions.get(each)) for each in names
+        )
     )
 
 
@@ -649,14 +688,46 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
             yield NewReach(source, target, tuple(path))
 
 
-def _edges(side: AccessSource) -> _Edges | None:
-    """Return all hops, or None if there are too many to follow them."""
-    network = _network(side)
-    found: dict[str, Mapping[str, Hop]] = {}
+def _borrowed(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[str, str]]:
+    """Yield the enclaves that can use the permissions of another one in a world, with that one."""
+    worlds = tuple(worlds)
+    for enclave in side.permissions:
+        lenders = (each for world in worlds for each in world.lenders(side, enclave))
+        yield from ((enclave, each) for each in dict.fromkeys(lenders))
+
+
+def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | None:
+    """Return all hops, or None if there are too many to follow them.
+
+    Who uses the permissions of another enclave in place of its own counts as one more enclave, to
+    which its own denials do not apply.
+    """
+    rights = side.zenoh if side.kind == "zenoh" and side.zenoh is not None else side.rights
+    by_enclave = _by_enclave(rights)
+    more: list[Right] = []
+    real: dict[str, str] = {}
+    for enclave, lender in borrowed:
+        name = f"{enclave} by {lender}"
+        real[name] = enclave
+        more += (each._replace(enclave=name) for each in by_enclave.get(lender, ()))
+        if len(more) > _MOST_HOPS:
+            return None
+    network = Network(
+        rights.union(more),
+        without=OF_EVERY_NODE,
+        questions=QUESTIONS,
+        unguarded=unguarded(side.governance) if side.governance else (),
+        everybody=sorted(side.permissions),
+    )
+    found: dict[str, dict[str, Hop]] = defaultdict(dict)
     left = _MOST_HOPS
     for each in network.enclaves:
-        found[each] = {hop.target: hop for hop in network.hops(each)}
-        left -= len(found[each])
+        source = real.get(each, each)
+        for hop in network.hops(each):
+            target = real.get(hop.target, hop.target)
+            if target != source and target not in found[source]:
+                found[source][target] = replace(hop, source=source, target=target)
+                left -= 1
         if left < 0:
             return None
     return found
@@ -672,14 +743,3 @@ def _reached(edges: _Edges, start: str) -> dict[str, Hop]:
                 found[there] = hop
                 row.append(there)
     return found
-
-
-def _network(side: AccessSource) -> Network:
-    rights = side.zenoh if side.kind == "zenoh" and side.zenoh is not None else side.rights
-    return Network(
-        rights,
-        without=OF_EVERY_NODE,
-        questions=QUESTIONS,
-        unguarded=unguarded(side.governance) if side.governance else (),
-        everybody=sorted(side.permissions),
-    )

@@ -170,12 +170,16 @@ def _looser_later(
 
 def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
     """Yield the certificates whose name is not that of their enclave, or of their key before."""
-    names = {key: name for name, key in old.certified.values()}
-    for enclave, (name, key) in new.certified.items():
-        before = names.get(key, enclave)
-        if name not in (before, old.certified.get(enclave, (enclave, ""))[0]):
-            text = "whoever has its key is that enclave to all others"
-            yield SettingChange(Effect.LOOSER, f"certificate of {enclave}", before, name, text)
+    names = {each.key: each.name for each in old.certified.values()}
+    for enclave, new_one in new.certified.items():
+        before = names.get(new_one.key, enclave)
+        old_one = old.certified.get(enclave)
+        if new_one.name not in (before, old_one.name if old_one else enclave):
+            what, text = (
+                f"certificate of {enclave}",
+                "whoever has its key is that enclave to all others",
+            )
+            yield SettingChange(Effect.LOOSER, what, before, new_one.name, text)
 
 
 def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:

@@ -93,6 +93,15 @@ class Trust:
 
 
 @dataclass(frozen=True, slots=True)
+class CertifiedEnclave:
+    """What a certificate says: its subject, the common name in it, and a digest of the key."""
+
+    subject: str
+    name: str
+    key: str
+
+
+@dataclass(frozen=True, slots=True)
 class AccessSource:
     """What a file, a folder or a revision gives.
 
@@ -103,8 +112,8 @@ class AccessSource:
     for; None for all.  ``governance`` is None if it has none of its own.  ``authorities`` are the
     CAs that its enclaves trust, pairs of role and fingerprint, and ``trusts`` whom each of them
     trusts, and `KEYSTORE_ITSELF`; None if it does not say.  ``later`` are the settings for enclaves
-    that are created later, None without any.  ``certified`` has the common name in the certificate
-    of each enclave, with a digest of its key.  ``zenoh_files`` are the configurations of Zenoh, by
+    that are created later, None without any.  ``certified`` has what the certificate of each
+    enclave says, as far as there is one.  ``zenoh_files`` are the configurations of Zenoh, by
     enclave and file name.
     """
 
@@ -119,7 +128,7 @@ class AccessSource:
     authorities: frozenset[tuple[str, str]] | None = None
     trusts: Mapping[str, Trust] | None = None
     later: Template | None = None
-    certified: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    certified: Mapping[str, CertifiedEnclave] = field(default_factory=dict)
     zenoh_files: Mapping[str, SignedConfiguration] = field(default_factory=dict)
     scope: frozenset[str] | None = None
     notes: tuple[Note, ...] = ()
@@ -127,6 +136,13 @@ class AccessSource:
     protections: tuple[StatedProtection, ...] | None = None
     enclaves: Mapping[str, Enclave] = field(default_factory=dict)
     revision: Revision | None = None
+
+    def subject_of(self, enclave: str) -> str:
+        """Return the subject in an enclave's certificate; without one that of its grant, or ""."""
+        if certified := self.certified.get(enclave):
+            return certified.subject
+        known = self.permissions.get(enclave)
+        return next((grant.subject for grant in known.grants), "") if known else ""
 
     def sources_of(self, enclave: str) -> dict[Right, Source]:
         """Return the file and line that states each right of an enclave, if it is of a policy."""
@@ -248,14 +264,15 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
     )
 
 
-def _certified(folders: Mapping[str, Path]) -> dict[str, tuple[str, str]]:
-    """Map enclaves to the common name in their certificate, and a digest of the certified key."""
+def _certified(folders: Mapping[str, Path]) -> dict[str, CertifiedEnclave]:
+    """Map the enclaves that have a certificate to what it says."""
     found = {}
     for name, folder in folders.items():
         if (file := folder / CERTIFICATE_FILE).exists():
             certificate = load_certificate(read_bytes(file, "certificate"), f"'{file}'")
             key = key_digest(certificate.public_key())  # type: ignore[arg-type]
-            found[name] = common_name_of(certificate.subject), key
+            subject = certificate.subject
+            found[name] = CertifiedEnclave(subject_text(subject), common_name_of(subject), key)
     return found
 
 

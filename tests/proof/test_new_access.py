@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -26,6 +27,7 @@ from sros_tool.proof.repository import Repository
 from sros_tool.proof.sources import load_side
 from sros_tool.proof.zenoh_settings import LONE
 from sros_tool.topics import DdsNames, dds_names
+from tests.checks.bench import Bench, name_of
 from tests.proof.drawn_sides import (
     DOMAINS,
     TOPICS,
@@ -625,6 +627,65 @@ def test_an_enclave_whose_subject_fits_the_permissions_of_another_one(tmp_path: 
     )
     back = compare_access(*(load_side(tmp_path / each) for each in ("head.xml", "base.xml")))
     assert not back.added
+
+
+@pytest.fixture(scope="module")
+def lent(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """A keystore with unique subjects, of /mux and of /robot/mux, which commands /wheels."""
+    folder = tmp_path_factory.mktemp("lent")
+    reader = SENDER.format("/wheels", "odom").replace(
+        "</profile>", '<topics subscribe="ALLOW"><topic>cmd_vel</topic></topics></profile>'
+    )
+    text = SENDER.format("/robot/mux", "cmd_vel") + SENDER.format("/mux", "log") + reader
+    (folder / "robot.xml").write_text(NAMED.format(text), encoding="utf-8")
+    sros("create_keystore", "base", "--template", "production", cwd=folder).ok()
+    sros("generate_artifacts", "-k", "base", "-p", "robot.xml", cwd=folder).ok()
+    return Bench(folder / "base", datetime.now(UTC))
+
+
+def test_a_certificate_that_fits_the_permissions_of_another_one(lent: Bench) -> None:
+    """The subject of a grant cannot hide whose permissions fit the certificate."""
+    head = Bench(lent.root.with_name("head"), lent.now)
+    shutil.copytree(lent.root, head.root, symlinks=True)
+    head.issue("mux", subject=name_of(("CN", "/mux")))
+    head.permissions(("CN=/mux<", "CN=/mux,,x<"), name="mux")
+    words = ("diff_policy", "--no-new-access", "base", "head")
+    ended = sros(*words, cwd=head.root.parent)
+    assert ended.status == 1
+    assert (
+        "+ /mux publish topic /cmd_vel by the permissions of /robot/mux, which fit its "
+        "certificate; with Cyclone DDS 0.10.2\n" in ended.out
+    )
+    reach = json.loads(sros(*words, "--json", cwd=head.root.parent).out)["reach"]
+    assert [(each["source"], each["target"]) for each in reach] == [("/mux", "/wheels")]
+
+
+def test_a_certificate_that_does_not_fit_its_own_permissions_is_said(lent: Bench) -> None:
+    odd = Bench(lent.root.with_name("odd"), lent.now)
+    shutil.copytree(lent.root, odd.root, symlinks=True)
+    odd.issue("mux", subject=name_of(("CN", "/mux")))
+    odd.permissions(("CN=/mux<", "CN=/mux,OU=1<"), name="mux")
+    for sides, status in ((("base", "odd"), 1), (("odd", "base"), 2)):
+        ended = sros("diff_policy", "--no-new-access", *sides, cwd=odd.root.parent)
+        assert ended.status == status
+        assert "the permissions of /mux in 'odd' do not fit its certificate" in ended.err
+        assert ("+ /mux publish topic /cmd_vel by the permissions" in ended.out) is (status == 1)
+
+
+def test_whom_borrowed_permissions_let_an_enclave_influence(tmp_path: Path) -> None:
+    """A denial of its own does not count there: the other permissions are loaded in their place."""
+    reader = SENDER.format("/wheels", "odom").replace(
+        "</profile>", '<topics subscribe="ALLOW"><topic>cmd_vel</topic></topics></profile>'
+    )
+    old = SENDER.format("/robot/mux", "cmd_vel") + reader
+    new = SENDER.format("/mux", "log").replace(
+        "</profile>", '<topics publish="DENY"><topic>cmd_vel</topic></topics></profile>'
+    )
+    for name, text in (("base.xml", old), ("head.xml", old + new)):
+        (tmp_path / name).write_text(NAMED.format(text), encoding="utf-8")
+    words = ("diff_policy", "--no-new-access", "base.xml", "head.xml", "--json")
+    reach = json.loads(sros(*words, cwd=tmp_path).out)["reach"]
+    assert [(each["source"], each["target"]) for each in reach] == [("/mux", "/wheels")]
 
 
 def test_the_work_grows_with_the_number_of_new_names(
