@@ -114,9 +114,13 @@ class CommitFiles:
             if each.mode not in (*FILES, LINK):
                 raise self._no_file(where, each)
             (links if each.mode == LINK else plain)[where] = each
-        sizes = self.repository.sizes(dict.fromkeys(each.id for each in plain.values()))
+        of_all = (each.id for each in (*plain.values(), *links.values()))
+        sizes = self.repository.sizes(dict.fromkeys(of_all))
         if sum(sizes.get(each.id, 0) for each in plain.values()) > _MOST_WRITTEN:
             raise DocumentError(f"'{path}' has more than {_MOST_WRITTEN} bytes")
+        for where, each in links.items():  # before they are read: many are too large together
+            if not 0 < sizes.get(each.id, 1) <= _LONGEST_TARGET:
+                raise DocumentError(f"'{where}' is a link that no file system can have")
         places: dict[str, list[str]] = {}
         for where, each in plain.items():
             places.setdefault(each.id, []).append(where)
@@ -126,8 +130,7 @@ class CommitFiles:
                     self._write(where, plain[where], content)
         contents = self.repository.contents(each.id for each in links.values())
         for where, each in links.items():
-            raw = contents[each.id]
-            if not 0 < len(raw) <= _LONGEST_TARGET or b"\0" in raw:
+            if b"\0" in contents[each.id]:
                 raise DocumentError(f"'{where}' is a link that no file system can have")
         top = self.folder / path
         with Folder(self.folder) as folder:

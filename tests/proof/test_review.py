@@ -160,16 +160,20 @@ def test_what_is_no_part_of_a_policy_and_what_is_too_large(change: Change) -> No
 
 def test_a_keystore_fits_on_a_disk(change: Change) -> None:
     """A few kilobytes stand for gigabytes, and for folders that no program can delete."""
-    (change.folder / "blob").write_bytes(bytes(2**24))
+    (change.folder / "blob").write_bytes(bytes(2**25 + 1))  # larger than what is read
     blob = change.git("hash-object", "-w", "blob")
+    (change.folder / "blob").unlink()
     nul = change.folder / "nul"
     nul.write_bytes(b"robot.xml\0evil")
     link = change.git("hash-object", "-w", "nul")
-    many = _tree(change, *(("100644", f"{number}", blob) for number in range(65)))
+    many = _tree(change, *(("100644", f"{number}", blob) for number in range(32)))
     odd = _tree(change, ("120000", "link", link))
-    top = _tree(change, ("40000", "many", many), ("40000", "odd", odd))
+    long = _tree(change, ("120000", "link", blob))
+    folders = (("40000", "long", long), ("40000", "many", many), ("40000", "odd", odd))
+    top = _tree(change, *folders)
     commit = change.git("commit-tree", top, "-m", "x")
-    for name, said in (("many", "has more than 1073741824 bytes"), ("odd", "no file system can")):
+    no_link = "no file system can have"
+    for name, said in (("many", "has more than 1073741824"), ("odd", no_link), ("long", no_link)):
         with TemporaryDirectory() as folder:
             files = CommitFiles(Repository(change.folder), "HEAD", commit, Path(folder))
             with pytest.raises(DocumentError, match=said):
