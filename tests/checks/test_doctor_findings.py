@@ -40,7 +40,7 @@ def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) 
 
     sound = said()
     assert "runtime.rmw-without-security" not in sound
-    assert "enclave." not in sound
+    assert "[enclave." not in sound
     env["RMW_IMPLEMENTATION"] = "rmw_x"
     bench.path("enclaves/base/cert.pem").write_text("")
     broken = said()
