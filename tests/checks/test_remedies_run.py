@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import pkgutil
 import re
 import shlex
 import shutil
@@ -14,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool import cli
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import policy_file_findings
@@ -73,7 +76,8 @@ def commands(finding: Finding, policy: Path, target: Path, **others: object) -> 
 
 def at(moment: datetime, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the program take a moment for the present one."""
-    sros("--version")
+    for each in pkgutil.iter_modules(cli.__path__, "sros_tool.cli."):
+        importlib.import_module(each.name)  # one that is imported later would keep the moment
     for name, module in list(sys.modules.items()):
         if name.startswith("sros_tool.cli.") and hasattr(module, "now"):
             monkeypatch.setattr(module, "now", lambda: moment)
