@@ -416,9 +416,11 @@ def list_enclaves(
         from sros_tool.keystore.selection import select_enclaves
 
         names = tuple(sorted(select_enclaves(root, (), patterns, robots=robots)))
+        hidden = hidden_enclaves(root)
     else:
-        names = enclave_names(root)
-    hidden = hidden_enclaves(root)
+        every = enclave_names(root, hidden=True)
+        hidden = hidden_enclaves(root, every)
+        names = tuple(each for each in every if "/." not in each)
     if as_json:
         found = {"keystore": str(root), "enclaves": names, "hidden": hidden}
         print_json({**found, **_robots_of(root, names)})

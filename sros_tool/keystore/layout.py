@@ -410,14 +410,14 @@ def _unreadable(root: Path, unread: Sequence[UnreadPath], effect: str) -> Keysto
     )
 
 
-def hidden_enclaves(root: Path) -> tuple[str, ...]:
+def hidden_enclaves(root: Path, among: Iterable[str] | None = None) -> tuple[str, ...]:
     """Return the enclaves in hidden folders, which `enclave_names` leaves out, sorted.
 
-    Left out are an interrupted change of sros, and the folder of an enclave's own files that
+    ``among`` are the names that a search with hidden ones found; None searches for them.  Left out are an interrupted change of sros, and the folder of an enclave's own files that
     Kubernetes makes next to the link ``..data`` where it mounts a Secret.
     """
-    found = (name for name in search_enclaves(root, hidden=True)[0] if "/." in name)
-    folders = {name: enclave_path(root, name) for name in found}
+    names = search_enclaves(root, hidden=True)[0] if among is None else among
+    folders = {name: enclave_path(root, name) for name in names if "/." in name}
     return tuple(
         sorted(
             name

@@ -438,7 +438,8 @@ def test_a_lost_certificate_is_issued_for_the_same_key(keystore: Path) -> None:
 
 def test_list_enclaves_as_json(keystore: Path) -> None:
     listed = json.loads(sros("list_enclaves", keystore, "--json").ok().out)
-    assert listed == {"version": 1, "keystore": str(keystore), "enclaves": ["/a", "/b"]}
+    named = {"enclaves": ["/a", "/b"], "hidden": []}
+    assert listed == {"version": 1, "keystore": str(keystore), **named}
 
 
 def test_exports_repeat_byte_by_byte(keystore: Path, tmp_path: Path) -> None:

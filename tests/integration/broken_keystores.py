@@ -456,7 +456,7 @@ MORE = (
     ),
     Breakage(
         "no default", lambda b: b.permissions(("<default>DENY</default>", "")), REFUSED, MATCHED,
-        "enclave.permissions-malformed", "Expected tag default",
+        "portable.refused", "Expected tag default",
     ),
     Breakage(
         "a grant without a name", lambda b: b.permissions((' name="/base"', "")), REFUSED,
