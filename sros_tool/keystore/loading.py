@@ -7,7 +7,6 @@ are found by `sros_tool.keystore.reader` and not checked here again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from datetime import datetime
 from functools import lru_cache
 from itertools import dropwhile
@@ -40,7 +39,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.chains import Checks, build_chain, chain_fault
 from sros_tool.pki.crl import read_list, read_lists, refusal_of
-from sros_tool.pki.keys import algorithm, load_any_key
+from sros_tool.pki.keys import algorithm
 from sros_tool.pki.revocation import Obstacle, list_refusal
 
 Certificates = tuple[x509.Certificate, ...]
@@ -132,7 +131,7 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
             yield Problem(file, *fault)
     authorities = read.get(IDENTITY_CA_FILE)
     if authorities and identity:
-        yield from _identity_faults(traits, identity[0], _key(state), authorities, at)
+        yield from _identity_faults(traits, identity[0], state.public_key, authorities, at)
         yield from _list_faults(traits, state, identity[0], authorities, at)
     signers = read.get(PERMISSIONS_CA_FILE)
     for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
@@ -146,18 +145,11 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
         yield Problem(PERMISSIONS_FILE, f"{text}handshake may never finish", Fault.DOCUMENT_SIZE)
 
 
-@lru_cache(maxsize=32)
 def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
     """Return the certificates that the vendor reads from a file; raise `PkiError` if it cannot."""
     if traits.reads_first_authority or file == CERTIFICATE_FILE:
         return (load_certificate(data, file, trusted=traits.reads_trusted_certificates),)
     return load_certificates(data, file)
-
-
-def _key(state: OpenedEnclave) -> object:
-    with suppress(PkiError):
-        return load_any_key(state.files.get(KEY_FILE, b""), KEY_FILE).public_key()
-    return None
 
 
 @lru_cache(maxsize=8)

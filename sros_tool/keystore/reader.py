@@ -57,7 +57,6 @@ from sros_tool.pki.certificates import (
     load_certificate,
     load_certificates,
     other_issuer,
-    same_key,
     subject_text,
     validity_of,
     weakness,
@@ -337,7 +336,7 @@ class Problem:
         return f"{self.file}: {self.text}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class OpenedEnclave:
     """The content of an enclave's files as far as they can be read, and their problems.
 
@@ -362,13 +361,15 @@ class OpenedEnclave:
 
     The key is not compared with the certificate, because no token is opened to read an enclave.
     """
+    public_key: object = field(default=None, repr=False)
+    """The public key of ``key.pem``; None if that cannot be read."""
 
-    @property
+    @cached_property
     def subject(self) -> str:
         """The subject of the enclave's certificate, or ""."""
         return subject_text(self.certificate.subject) if self.certificate else ""
 
-    @property
+    @cached_property
     def grant(self) -> Grant | None:
         """The grant that DDS reads: the first for the subject of the certificate."""
         return self.permissions.grant_of(self.subject) if self.permissions else None
@@ -422,7 +423,7 @@ def weaknesses(state: OpenedEnclave) -> Iterator[tuple[str, str]]:
     """Yield weak cryptography in an enclave's files: the name of the file, and a clause."""
     for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, CERTIFICATE_FILE):
         with suppress(SrosError):
-            for each in _load_certificates(state.files.get(file, b""), file):
+            for each in load_certificates(state.files.get(file, b""), file):
                 if text := weakness(each):
                     yield file, text
     for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
@@ -447,8 +448,6 @@ _ENCRYPTED = re.compile(rb"ENCRYPTED")
 _SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
 # The enclaves of a keystore share some files, which are parsed only once.
-_load_certificate = lru_cache(maxsize=8)(load_certificate)
-_load_certificates = lru_cache(maxsize=8)(load_certificates)
 _parse_governance = lru_cache(maxsize=8)(parse_governance)
 
 
@@ -468,7 +467,7 @@ def _load_crl(
     crl = read_list(data, CRL_FILE)
     trusted: tuple[x509.Certificate, ...] = (authority,) if authority else ()
     with suppress(SrosError):
-        trusted = _load_certificates(authorities, IDENTITY_CA_FILE)
+        trusted = load_certificates(authorities, IDENTITY_CA_FILE)
     return crl, next((each for each in trusted if signed_by(crl, each)), None)
 
 
@@ -492,7 +491,7 @@ class _EnclaveFiles:
         identity_ca = self._certificate(IDENTITY_CA_FILE, files)
         permissions_ca = self._certificate(PERMISSIONS_CA_FILE, files)
         certificate = self._certificate(CERTIFICATE_FILE, files)
-        self._check_identity(certificate, identity_ca, files)
+        public_key = self._check_identity(certificate, identity_ca, files)
         files[CRL_FILE] = self._check_revocation(certificate, identity_ca, files[IDENTITY_CA_FILE])
         governance = permissions = None
         document = self._signed(GOVERNANCE_FILE, files, permissions_ca)
@@ -522,6 +521,7 @@ class _EnclaveFiles:
             document or b"",
             key_on_robot(self._folder),
             token,
+            public_key,
         )
 
     def _add(self, file: str, text: str, fault: Fault) -> None:
@@ -569,7 +569,7 @@ class _EnclaveFiles:
         if data is None:
             return None
         try:
-            certificate = _load_certificate(data, name)
+            certificate = load_certificate(data, name)
         except SrosError as error:
             self._add(name, error.why.rstrip("."), Fault.CERTIFICATE_MALFORMED)
             return None
@@ -590,7 +590,8 @@ class _EnclaveFiles:
         certificate: x509.Certificate | None,
         ca: x509.Certificate | None,
         files: Mapping[str, bytes | None],
-    ) -> None:
+    ) -> object:
+        """Check certificate and key; return the public key of ``key.pem``, or None."""
         key, authorities = files[KEY_FILE], files[IDENTITY_CA_FILE]
         if certificate and ca and not issued_by(certificate, ca):
             self._add(
@@ -602,19 +603,20 @@ class _EnclaveFiles:
         elif certificate and ca and authorities and not self._problems:
             self._check_chain(certificate, authorities)
         if key is None:
-            return
+            return None
         try:
-            private = load_any_key(key, KEY_FILE)
+            public_key = load_any_key(key, KEY_FILE).public_key()
         except SrosError as error:
             fault = Fault.KEY_ENCRYPTED if _ENCRYPTED.search(key) else Fault.KEY_MALFORMED
             self._add(KEY_FILE, error.why.rstrip("."), fault)
-            return
-        if certificate and not same_key(certificate, private):
+            return None
+        if certificate and certificate.public_key() != public_key:
             self._add(KEY_FILE, "it is not the key of cert.pem", Fault.KEY_MISMATCH)
+        return public_key
 
     def _check_chain(self, certificate: x509.Certificate, authorities: bytes) -> None:
         try:
-            chain = _load_certificates(authorities, "")
+            chain = load_certificates(authorities, "")
         except SrosError as error:  # in a certificate after the first one
             self._add(IDENTITY_CA_FILE, error.why.rstrip("."), Fault.CERTIFICATE_MALFORMED)
             return

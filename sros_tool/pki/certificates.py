@@ -182,6 +182,11 @@ def load_certificate(data: bytes, name: str, *, trusted: bool = True) -> x509.Ce
     Raises:
         PkiError: the certificate cannot be read, here or by OpenSSL.
     """
+    return _first_certificate(data, name, trusted)
+
+
+@lru_cache(maxsize=16)  # several readers load the certificate of an enclave, and the same few CAs
+def _first_certificate(data: bytes, name: str, trusted: bool) -> x509.Certificate:
     what = f"the certificate {name} cannot be read"
     labels = pem_file.CERTIFICATES if trusted else pem_file.CERTIFICATES[:-1]
     for block in _blocks(data, what):
@@ -191,6 +196,7 @@ def load_certificate(data: bytes, name: str, *, trusted: bool = True) -> x509.Ce
     raise PkiError(what, why, _RESTORE)
 
 
+@lru_cache(maxsize=16)
 def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
     """Return all certificates of a PEM file, at least one; ``name`` names the file in errors.
 
@@ -218,10 +224,21 @@ _UNREADABLE = "It is not a PEM certificate, it is damaged, or its key algorithm 
 
 
 def _blocks(data: bytes, what: str) -> Iterator[pem_file.Block]:
+    found, damage = _known_blocks(data)
+    yield from found
+    if damage:
+        raise PkiError(what, _sentence(damage), _RESTORE)
+
+
+@lru_cache(maxsize=8)  # several readers ask for the certificate of an enclave, or for all of them
+def _known_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
+    """Return the blocks of a PEM file up to the first damage, and what is damaged, or ""."""
+    found: list[pem_file.Block] = []
     try:
-        yield from pem_file.blocks(data)
+        found.extend(pem_file.blocks(data))
     except PkiError as error:
-        raise PkiError(what, _sentence(error.what), _RESTORE) from error
+        return tuple(found), error.what
+    return tuple(found), ""
 
 
 def _certificate_in(
@@ -356,6 +373,7 @@ def is_for_pss(certificate: x509.Certificate) -> bool:
     return certificate.public_key_algorithm_oid == PublicKeyAlgorithmOID.RSASSA_PSS
 
 
+@lru_cache(maxsize=256)
 def has_explicit_curve(certificate: x509.Certificate) -> bool:
     """Return whether the elliptic curve of a certificate's key is given by its parameters."""
     if certificate.public_key_algorithm_oid != PublicKeyAlgorithmOID.EC_PUBLIC_KEY:
@@ -375,6 +393,7 @@ def _names_one_algorithm(certificate: x509.Certificate) -> bool:
     return outer.whole == parts[2 if parts[0].tag == der.CONTEXT_0 else 1].whole
 
 
+@lru_cache(maxsize=256)
 def is_self_issued(certificate: x509.Certificate) -> bool:
     """Return whether the subject and the issuer of a certificate are equal."""
     return same_name(certificate.subject, certificate.issuer)

@@ -114,7 +114,7 @@ def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> byt
     ))  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Signature:
     """A signature in a message; ``digest`` is its hash algorithm."""
 
@@ -138,6 +138,7 @@ class Signature:
         digest.update(content)
         return digest.finalize() == self._message_digest
 
+    @lru_cache(maxsize=8)  # noqa: B019 - every vendor verifies the same few
     def is_intact(self, content: bytes, signer: x509.Certificate) -> bool:
         """Return whether the signature of ``content`` verifies with the key of ``signer``.
 

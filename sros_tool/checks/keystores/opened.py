@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -114,7 +114,7 @@ class CheckedKeystore:
         return os.path.join(self.root, path)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class CheckedEnclave:
     """An enclave, the content of its files, and its keystore."""
 
@@ -122,7 +122,7 @@ class CheckedEnclave:
     name: str
     state: OpenedEnclave
 
-    @property
+    @cached_property
     def folder(self) -> Path:
         """Its folder."""
         return enclave_path(self.keystore.root, self.name)

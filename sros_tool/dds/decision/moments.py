@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from calendar import timegm
 from datetime import datetime, timedelta, tzinfo
+from functools import lru_cache
 from math import inf
 
 from sros_tool.dds.decision.vendors import Moments
@@ -23,6 +24,7 @@ _LAST_YEAR = 2262  # of 64 bits of nanoseconds
 _FARTHEST = timedelta(hours=12)
 
 
+@lru_cache(maxsize=64)  # the enclaves of a keystore share most of their dates
 def read_moment(rule: Moments, text: str, zone: tzinfo) -> float | None:
     """Return the moment that ``text`` means; None if the vendor calls the document malformed.
 

@@ -105,7 +105,7 @@ class DocumentReader(Enum):
     """Cyclone DDS' own."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class VendorTraits:
     """The names of one vendor, and its rules where vendors differ.
 
