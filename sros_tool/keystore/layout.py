@@ -413,8 +413,9 @@ def _unreadable(root: Path, unread: Sequence[UnreadPath], effect: str) -> Keysto
 def hidden_enclaves(root: Path, among: Iterable[str] | None = None) -> tuple[str, ...]:
     """Return the enclaves in hidden folders, which `enclave_names` leaves out, sorted.
 
-    ``among`` are the names that a search with hidden ones found; None searches for them.  Left out are an interrupted change of sros, and the folder of an enclave's own files that
-    Kubernetes makes next to the link ``..data`` where it mounts a Secret.
+    ``among`` are the names that a search with hidden ones found; None searches for them.  Left out
+    are an interrupted change of sros, and the folder of an enclave's own files that Kubernetes
+    makes next to the link ``..data`` where it mounts a Secret.
     """
     names = search_enclaves(root, hidden=True)[0] if among is None else among
     folders = {name: enclave_path(root, name) for name in names if "/." in name}
