@@ -256,3 +256,21 @@ def test_what_is_staged_is_evaluated(
         assert f"start in {stopped} of" in refusal.value.what
         (note, *_) = refuse_stopping(transaction, now(), allowed=MEASURED)
         assert note.text.startswith(f"{MEASURED[0].title} refuses {stopped} from now on")
+
+
+def test_a_dry_run_says_what_it_did_not_keep(
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twin: without the limit, what it would do is refused."""
+    root, other = tmp_path / "ks", tmp_path / "other"
+    shutil.copytree(sound, root, symlinks=True)
+    create_keystore(other, template=load_template("production"), now=now())
+    with Transaction(root, dry_run=True) as transaction:
+        _break_governance(transaction, other)
+        with pytest.raises(KeystoreError):
+            refuse_stopping(transaction, now())
+    monkeypatch.setattr("sros_tool.keystore.transaction.transaction._MOST_KEPT", 100)
+    with Transaction(root, dry_run=True) as transaction:
+        _break_governance(transaction, other)
+        (note,) = refuse_stopping(transaction, now())
+        assert note.text.startswith("vendors were not asked about enclaves/governance.p7s: ")

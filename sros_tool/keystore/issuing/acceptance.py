@@ -112,7 +112,7 @@ def refuse_stopping(
         remedy: what to do instead, as sentences; by default the changed files are named.
 
     Returns:
-        Notes on what stops on the ``allowed`` vendors.
+        Notes on what stops on the ``allowed`` vendors, and on what a dry run did not look at.
 
     Raises:
         KeystoreError: nodes of a vendor that is not ``allowed`` would stop.
@@ -120,14 +120,18 @@ def refuse_stopping(
     found = _stopped_enclaves(transaction, now)
     if refused := {vendor: each for vendor, each in found.items() if vendor not in allowed}:
         raise _would_stop(transaction.root, refused, remedy)
-    return tuple(
+    notes = [
         Note(
             "vendor.refuses",
             f"{vendor.title} refuses {_some(each.enclaves)} from now on: "
             f"{'; '.join(each.reasons)}. Its nodes that run go on until they are started again.",
         )
         for vendor, each in found.items()
-    )
+    ]
+    if unseen := transaction.not_kept():
+        text = f"vendors were not asked about {_some(unseen)}: this dry run makes too many files"
+        notes.append(Note("vendor.not-asked", text))
+    return tuple(notes)
 
 
 def _stopped_enclaves(transaction: Transaction, now: datetime) -> dict[Vendor, _Refusals]:

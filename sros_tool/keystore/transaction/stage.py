@@ -142,12 +142,13 @@ class Changes(Sequence[Change]):
 class Staged:
     """The changes that a forked worker staged, sent to the process that commits.
 
-    ``kept`` are the new files and the targets of links of a dry run.
+    ``kept`` are the new files, None for those beyond its limit, and the targets of links of a dry
+    run.
     """
 
     changes: tuple[ChangeRun, ...]
     moves: tuple[Move, ...]
-    kept: dict[str, bytes | str]
+    kept: dict[str, bytes | str | None]
 
 
 def staged_name(path: str) -> str:

@@ -92,7 +92,8 @@ class Transaction:
         self._parents: set[str] = set()  # of folders that are staged
         self._moves: list[Move] = []
         self._undo: list[Callable[[], None]] = []
-        self._kept: dict[str, bytes | str] = {}  # new files, and targets of links, of a dry run
+        # New files, None for those beyond the limit, and targets of links, of a dry run.
+        self._kept: dict[str, bytes | str | None] = {}
         self._kept_bytes = 0
 
     @property
@@ -222,9 +223,10 @@ class Transaction:
     def write(self, path: str, data: bytes, *, private: bool = False) -> None:
         """Stage a file with the content ``data``; a ``private`` file always has mode 0600."""
         self.write_parts(path, (data,), private=private)
-        if self.dry_run and not private and self._kept_bytes + len(data) <= _MOST_KEPT:
-            self._kept[path] = data
-            self._kept_bytes += len(data)
+        if self.dry_run and not private:
+            fits = self._kept_bytes + len(data) <= _MOST_KEPT
+            self._kept[path] = data if fits else None
+            self._kept_bytes += len(data) if fits else 0
 
     def write_parts(self, path: str, parts: Iterable[bytes], *, private: bool = False) -> None:
         """Stage a file as `write` does, part by part; a dry run takes no part."""
@@ -268,6 +270,13 @@ class Transaction:
             kept = self._kept.get(place)
             return kept if isinstance(kept, bytes) else None
         return _content(Path(self._stage_place(place)))
+
+    def not_kept(self) -> list[str]:
+        """Return the new files of which `content_after` cannot tell: a dry run keeps up to a limit.
+
+        Private files are not among them.
+        """
+        return sorted(path for path, kept in self._kept.items() if kept is None)
 
     def _target_after(self, path: str) -> str | None:
         """Return the target of the link that will be at ``path``; None if it will be no link."""
