@@ -17,12 +17,13 @@ from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.x509.oid import NameOID, PublicKeyAlgorithmOID, SignatureAlgorithmOID
 
 from sros_tool.errors import PkiError
-from sros_tool.pki import der
+from sros_tool.pki import der, tolerant
 from sros_tool.pki import pem as pem_file
 from sros_tool.pki.keys import KEY_LABELS, PrivateKey, PublicKey, algorithm, check_key, is_weak
 from sros_tool.pki.names import same_name
 from sros_tool.pki.object_names import short_names
-from sros_tool.pki.reading import read_name, reading
+from sros_tool.pki.reading import is_of_reading, read_name, reading
+from sros_tool.pki.tolerant import TolerantName
 from sros_tool.validity import Window
 
 _CA_USAGE = x509.KeyUsage(
@@ -212,7 +213,7 @@ def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
             others.append(_certificate_in(block, what, why))
         elif block.label == "X509 CRL":
             with reading(what, "A revocation list in it is damaged.", _RESTORE):
-                x509.load_der_x509_crl(der.split(block.content)[0])
+                tolerant.check_list(block.content)
         elif block.label in KEY_LABELS and not block.headers:
             with reading(what, "A private key in it is damaged.", _RESTORE):
                 check_key(block.content)
@@ -288,7 +289,12 @@ def _load_der(data: bytes) -> x509.Certificate:
 
 @lru_cache(maxsize=64)  # several readers load the certificate of an enclave, and the same few CAs
 def _load_known_der(data: bytes) -> x509.Certificate:
-    return _read_in_full(x509.load_der_x509_certificate(data))
+    try:
+        return _read_in_full(x509.load_der_x509_certificate(data))
+    except BaseException as error:
+        if not is_of_reading(error):
+            raise
+    return _read_names(tolerant.read_certificate(data))
 
 
 _USUAL_BYTES = 16 * 1024
@@ -296,12 +302,16 @@ _USUAL_BYTES = 16 * 1024
 
 def _read_in_full(certificate: x509.Certificate) -> x509.Certificate:
     """Return ``certificate`` after parsing every part that sros uses."""
-    for name in (certificate.subject, certificate.issuer):
-        read_name(name)
-        subject_text(name)
     certificate.public_key()
     authority_identifier(certificate)
     _ = certificate.signature_hash_algorithm, certificate.serial_number
+    return _read_names(certificate)
+
+
+def _read_names(certificate: x509.Certificate) -> x509.Certificate:
+    for name in (certificate.subject, certificate.issuer):
+        read_name(name)
+        subject_text(name)
     if certificate.not_valid_after_utc <= certificate.not_valid_before_utc:
         raise ValueError("it expires before its validity begins")
     return certificate
@@ -339,6 +349,8 @@ def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) ->
     As OpenSSL 3.0 (``X509_check_issued``), compare the names, the kind of the key, and the key
     identifiers where both have one.
     """
+    if tolerant.unread_extension(certificate) or tolerant.unread_extension(authority):
+        return False
     kind = _SIGNING_KEYS.get(certificate.signature_algorithm_oid)
     if not (
         same_name(certificate.issuer, authority.subject)
@@ -378,7 +390,7 @@ def has_explicit_curve(certificate: x509.Certificate) -> bool:
     """Return whether the elliptic curve of a certificate's key is given by its parameters."""
     if certificate.public_key_algorithm_oid != PublicKeyAlgorithmOID.EC_PUBLIC_KEY:
         return False
-    parts = der.children(der.first(certificate.tbs_certificate_bytes).content)
+    parts = der.children(der.first(der.normalized(certificate.tbs_certificate_bytes)).content)
     key = parts[6 if parts[0].tag == der.CONTEXT_0 else 5]
     algorithm_of_key = der.children(der.first(key.content).content)
     return algorithm_of_key[-1].tag == der.SEQUENCE
@@ -387,7 +399,7 @@ def has_explicit_curve(certificate: x509.Certificate) -> bool:
 @lru_cache(maxsize=256)
 def _names_one_algorithm(certificate: x509.Certificate) -> bool:
     """Return whether the signed part names the algorithm of the signature (RFC 5280, 4.1.1.2)."""
-    whole = der.first(certificate.public_bytes(serialization.Encoding.DER))
+    whole = der.first(der.normalized(certificate.public_bytes(serialization.Encoding.DER)))
     signed, outer, _ = der.children(whole.content)
     parts = der.children(signed.content)
     return outer.whole == parts[2 if parts[0].tag == der.CONTEXT_0 else 1].whole
@@ -465,7 +477,7 @@ def subject_text(name: x509.Name) -> str:
 
     RDNs, and the attributes within an RDN, are in reverse order; non-ASCII characters are kept.
     """
-    if all(len(rdn) == 1 for rdn in name.rdns):
+    if isinstance(name, TolerantName) or all(len(rdn) == 1 for rdn in name.rdns):
         return _name_text(name.public_bytes())
     # In DER, the attributes within an RDN are in the order of DER.
     return ",".join(
@@ -476,9 +488,11 @@ def subject_text(name: x509.Name) -> str:
 
 @lru_cache(maxsize=1024)  # the subjects of a keystore are asked for repeatedly
 def _name_text(name: bytes) -> str:
-    """Return a name (DER) that has one attribute in each RDN, as OpenSSL prints it."""
-    rdns = der.children(der.first(name).content)
-    return ",".join(_attribute_text(der.first(rdn.content)) for rdn in reversed(rdns))
+    """Return a name (DER), with the attributes of an RDN in their order, as OpenSSL prints it."""
+    return ",".join(
+        "+".join(map(_attribute_text, reversed(der.children(rdn.content))))
+        for rdn in reversed(der.children(der.first(name).content))
+    )
 
 
 def _attribute_text(attribute: der.Value) -> str:

@@ -17,7 +17,7 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID, ObjectIdentifier
 
 from sros_tool.errors import PkiError
-from sros_tool.pki import der
+from sros_tool.pki import der, tolerant
 from sros_tool.pki.certificates import (
     extension,
     has_explicit_curve,
@@ -28,6 +28,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.name_constraints import name_faults
+from sros_tool.pki.tolerant_extensions import is_unread
 from sros_tool.validity import iso
 
 _NETSCAPE_TYPE = ObjectIdentifier("2.16.840.1.113730.1.1")
@@ -58,6 +59,8 @@ _RESTRICTING = {
 _SSL_CLIENT, _SMIME, _SMIME_CA, _ANY_NETSCAPE_CA = 0x80, 0x20, 0x02, 0x07
 _ANY_POLICY = ObjectIdentifier("2.5.29.32.0")
 _DEEPEST = 100
+_WITH_EXTENSIONS = 3
+"""The version of X.509 certificates that brought extensions (RFC 5280, 4.1.2.1)."""
 
 
 class Checks(Flag):
@@ -99,7 +102,8 @@ def _chain_fault(
 ) -> str:
     chain, missing = build_chain(start, authorities, others, at)
     if missing:
-        return missing
+        unread = (fault for each in (start, *authorities) for fault in _unread_faults(each))
+        return next(unread, missing)
     # Of a chain that all vendors find valid, only what the checks add is left to ask.
     new = not checks or bool(_chain_fault(start, authorities, others, at, Checks.NONE))
     faults = (
@@ -181,6 +185,7 @@ def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
     """Return the extensions for which OpenSSL, or sros, refuses a certificate in any chain."""
     name = subject_text(certificate.subject)
     faults = []
+    faults += _unread_faults(certificate)
     if extension(certificate, x509.KeyUsage) == _NO_USAGE:
         faults.append(f"the keyUsage of {name} is empty")
     if _netscape_type(certificate) == -1:
@@ -192,6 +197,11 @@ def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
         elif found.critical and found.oid not in _CRITICAL:
             faults.append(f"{name} has the unknown critical extension {oid}")
     return tuple(faults)
+
+
+def _unread_faults(certificate: x509.Certificate) -> list[str]:
+    unread = tolerant.unread_extension(certificate)
+    return [f"the {unread} of {subject_text(certificate.subject)} cannot be read"] if unread else []
 
 
 class _Authority(Flag):
@@ -288,12 +298,15 @@ def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         name = subject_text(each.subject)
         usage = extension(each, x509.KeyUsage)
         constraints = extension(each, x509.BasicConstraints)
+        version = tolerant.version_of(each)
+        if version < _WITH_EXTENSIONS and list(each.extensions):
+            yield f"{name} has extensions, which its version has not"
         if constraints and constraints.ca:
             if ExtensionOID.BASIC_CONSTRAINTS not in _critical(each):
                 yield f"the basicConstraints of {name} are not critical"
             if usage is None:
                 yield f"{name} is a CA without keyUsage"
-            if extension(each, x509.SubjectKeyIdentifier) is None:
+            if version >= _WITH_EXTENSIONS and extension(each, x509.SubjectKeyIdentifier) is None:
                 yield f"{name} is a CA without subjectKeyIdentifier"
         elif usage and usage.key_cert_sign:
             yield f"{name} has keyCertSign but is not a CA"
@@ -307,7 +320,7 @@ def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
             yield f"the subjectAltName of {name} is empty"
         if _IDENTIFIERS & _critical(each):
             yield f"a key identifier of {name} is critical"
-        if each is not chain[-1]:
+        if version >= _WITH_EXTENSIONS and each is not chain[-1]:
             authority = extension(each, x509.AuthorityKeyIdentifier)
             if authority is None or authority.key_identifier is None:
                 yield f"{name} lacks an authorityKeyIdentifier"
@@ -322,6 +335,8 @@ def _critical(certificate: x509.Certificate) -> set[ObjectIdentifier]:
 
 def _time_faults(chain: Sequence[x509.Certificate], at: datetime) -> Iterator[str]:
     for each in chain:
+        if date := tolerant.unread_date(each):
+            yield f"the {date} of {subject_text(each.subject)} cannot be read"
         validity = validity_of(each)
         if at > validity.not_after:
             yield f"{subject_text(each.subject)} expired at {iso(validity.not_after)}"
@@ -343,6 +358,13 @@ def _signature_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
             yield f"the signature of {subject_text(below.subject)} is not by the key of {name}"
 
 
+_POLICIES = (
+    ExtensionOID.CERTIFICATE_POLICIES,
+    ExtensionOID.POLICY_CONSTRAINTS,
+    ExtensionOID.INHIBIT_ANY_POLICY,
+)
+
+
 def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     """Yield why no policy holds for the whole chain, if its certificates demand one (pcy_tree.c).
 
@@ -358,6 +380,8 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
             yield f"{name} has a certificate policy twice"
         if any(other.oid == ExtensionOID.POLICY_MAPPINGS for other in each.extensions):
             yield f"{name} has policyMappings, not known to sros"
+        if any(found.oid in _POLICIES and is_unread(found) for found in each.extensions):
+            yield f"the policies of {name} cannot be read"
         constraints = extension(each, x509.PolicyConstraints)
         after = constraints.require_explicit_policy if constraints else None
         if demanded:

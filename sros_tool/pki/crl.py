@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.x509.oid import CRLEntryExtensionOID, ExtensionOID
 
 from sros_tool.errors import PkiError
-from sros_tool.pki import pem
+from sros_tool.pki import der, pem, tolerant
 from sros_tool.pki.certificates import (
     authority_identifier,
     extension,
@@ -21,7 +21,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.pki.names import same_name
-from sros_tool.pki.reading import read_name, reading
+from sros_tool.pki.reading import is_of_reading, read_name, reading
 
 CRL_MARK = b"-----BEGIN X509 CRL-----"
 """The first line of a PEM revocation list."""
@@ -157,7 +157,16 @@ def _read_block(block: pem.Block) -> x509.CertificateRevocationList:
 
 
 def _read(content: bytes) -> x509.CertificateRevocationList:
-    crl = x509.load_der_x509_crl(content)
+    data, _ = der.split(content)
+    try:
+        return _read_in_full(x509.load_der_x509_crl(data))
+    except BaseException as error:
+        if not is_of_reading(error):
+            raise
+    return _read_in_full(tolerant.read_list(data))
+
+
+def _read_in_full(crl: x509.CertificateRevocationList) -> x509.CertificateRevocationList:
     read_name(crl.issuer)
     subject_text(crl.issuer)
     _ = crl.last_update_utc, crl.next_update_utc, crl.signature_hash_algorithm, _number(crl)

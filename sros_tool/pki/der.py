@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from sros_tool.errors import PkiError
 
-INTEGER, BIT_STRING, OCTET_STRING, OID, SEQUENCE, SET = 0x02, 0x03, 0x04, 0x06, 0x30, 0x31
+BOOLEAN, INTEGER, BIT_STRING, OCTET_STRING, OID, SEQUENCE, SET = 1, 2, 3, 4, 6, 0x30, 0x31
 UTC_TIME, GENERALIZED_TIME = 0x17, 0x18
 CONTEXT_0, CONTEXT_1 = 0xA0, 0xA1
 
@@ -63,15 +63,80 @@ def first(data: bytes) -> Value:
 
 
 def split(data: bytes) -> tuple[bytes, bytes]:
-    """Return the first value in ``data``, encoded, and the bytes after it.
+    """Return the first value in ``data``, which is in BER, as it is written, and what follows it.
 
     Raises:
         PkiError: the value is truncated, or has a form that this reader does not support.
     """
-    size = data[1] & 0x7F if len(data) > 1 and data[1] >= 0x80 else 0
-    length = int.from_bytes(data[2 : 2 + size], "big") if size else (data[1:2] or b"\0")[0]
-    value = first(data[: 2 + size + length]).whole
-    return value, data[len(value) :]
+    end = _normalized(data, 0, 0)[1]
+    return data[:end], data[end:]
+
+
+def normalized(data: bytes) -> bytes:
+    """Return the first value in ``data``, which is in BER (X.690, 8), with the lengths of DER.
+
+    Also the values inside it, if it is constructed; OpenSSL reads both alike.
+
+    Raises:
+        PkiError: the value is truncated, too deep, or has a form that this reader does not support.
+    """
+    return _normalized(data, 0, 0)[0]
+
+
+def first_part(data: bytes) -> bytes:
+    """Return the first value inside a constructed value in BER, as it is written; raise as above.
+
+    That is what a signature covers.
+    """
+    begin = _header(data, 0)[1]
+    return data[begin : _normalized(data, begin, 1)[1]]
+
+
+_DEEPEST = 30
+_CONSTRUCTED = 0x20
+_INDEFINITE = 0x80
+_END_OF_CONTENTS = b"\0\0"
+
+
+def _header(data: bytes, start: int) -> tuple[int, int, int | None]:
+    """Return the tag of the value at ``start``, where its content begins, and where it ends.
+
+    The end is None if a mark of two bytes ends it.
+    """
+    if len(data) - start < 2:
+        raise PkiError("a DER value is cut short")
+    tag, length = data[start], data[start + 1]
+    begin = start + 2
+    if tag & 0x1F == 0x1F or tag == 0 or (length == _INDEFINITE and not tag & _CONSTRUCTED):
+        raise PkiError("a DER value has a form that is not supported")
+    if length == _INDEFINITE:
+        return tag, begin, None
+    if length > _INDEFINITE:
+        size = length - _INDEFINITE
+        length = int.from_bytes(data[begin : begin + size], "big")
+        begin += size
+    if begin + length > len(data):
+        raise PkiError("a DER value is cut short")
+    return tag, begin, begin + length
+
+
+def _normalized(data: bytes, start: int, depth: int) -> tuple[bytes, int]:
+    """Return the value at ``start``, with the lengths of DER, and where it ends."""
+    if depth > _DEEPEST:
+        raise PkiError("a DER value has a form that is not supported")
+    tag, begin, end = _header(data, start)
+    if not tag & _CONSTRUCTED and end is not None:
+        content = data[begin:end]
+        is_true = tag == BOOLEAN and len(content) == 1 and content != b"\0"
+        return encode(tag, b"\xff" if is_true else content), end
+    parts = []
+    inside = data[:end]
+    while begin < len(inside) and (end or inside[begin : begin + 2] != _END_OF_CONTENTS):
+        part, begin = _normalized(inside, begin, depth + 1)
+        parts.append(part)
+    if end is None and begin >= len(inside):
+        raise PkiError("a DER value is cut short")
+    return encode(tag, *parts), begin if end else begin + 2
 
 
 def integer(value: Value) -> int:

@@ -23,6 +23,7 @@ from sros_tool.errors import PkiError
 from sros_tool.pki import der
 from sros_tool.pki import pem as pem_file
 from sros_tool.pki.reading import reading
+from sros_tool.pki.tolerant import UnknownKey
 
 PrivateKey = ec.EllipticCurvePrivateKey | rsa.RSAPrivateKey
 PublicKey = ec.EllipticCurvePublicKey | rsa.RSAPublicKey
@@ -319,4 +320,6 @@ def algorithm(key: object) -> str:
         return f"EC {key.curve.name}"
     if isinstance(key, (rsa.RSAPrivateKey, rsa.RSAPublicKey)):
         return f"RSA {key.key_size}"
+    if isinstance(key, UnknownKey):
+        return "an algorithm that is not known"
     return type(key).__name__.lstrip("_").removesuffix("PublicKey")

@@ -26,9 +26,14 @@ def reading(what: str, why: str, remedy: str = "") -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        if isinstance(error, Exception) or type(error).__name__ == "PanicException":
+        if is_of_reading(error):
             raise PkiError(what, why, remedy) from error
         raise
+
+
+def is_of_reading(error: BaseException) -> bool:
+    """Return whether an error may be one of `cryptography` about what it reads."""
+    return isinstance(error, Exception) or type(error).__name__ == "PanicException"
 
 
 def read_name(name: x509.Name) -> None:

@@ -22,6 +22,7 @@ from sros_tool.pki.crl import (
     names_issuers,
 )
 from sros_tool.pki.names import canonical, same_name
+from sros_tool.pki.tolerant_extensions import ContradictoryPoint
 from sros_tool.validity import iso
 
 Lists = Sequence[x509.CertificateRevocationList]
@@ -139,7 +140,7 @@ def _best(
         point = _value(crl, x509.IssuingDistributionPoint)
         if issuer is None or (point and (point.indirect_crl or point.only_some_reasons)):
             continue
-        if _value(crl, x509.DeltaCRLIndicator):
+        if _value(crl, x509.DeltaCRLIndicator) or _value(crl, ContradictoryPoint):
             continue
         score = _Score(
             not _entries(_Content(crl)).has_unknown,

@@ -27,7 +27,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, pkcs7
 from cryptography.x509.oid import PublicKeyAlgorithmOID
 
 from sros_tool.errors import PkiError
-from sros_tool.pki import der
+from sros_tool.pki import der, tolerant
 from sros_tool.pki.certificates import load_der_certificate
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.pki.names import canonical, canonical_der
@@ -340,7 +340,11 @@ def _decoded(encoded: bytes) -> bytes:
 
 # All documents of a keystore embed the certificate of the permissions CA.
 _certificate = lru_cache(maxsize=16)(load_der_certificate)
-_public_key = lru_cache(maxsize=16)(x509.Certificate.public_key)
+
+
+@lru_cache(maxsize=16)
+def _public_key(certificate: x509.Certificate) -> object:
+    return certificate.public_key()
 
 
 def _parts(value: der.Value, *tags: int) -> list[der.Value]:
@@ -393,7 +397,7 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     if content is None:
         (content,) = inside
     for each in (value for bag in lists for value in der.children(bag.content)):
-        x509.load_der_x509_crl(each.whole)  # OpenSSL reads it, and does not use it
+        tolerant.check_list(each.whole)  # OpenSSL reads it, and does not use it
     embedded = [value for bag in bags for value in der.children(bag.content)]
     listed = [_digest_of(each) for each in der.children(digests.content)]
     if None in listed:

@@ -16,6 +16,7 @@ from sros_tool.pki.certificates import common_name
 from sros_tool.pki.revocation import Obstacle, list_refusal
 from tests.integration.libcrypto import CRL_CHECK, libcrypto
 from tests.support.children import LONG
+from tests.support.openssl import takes_changes_for_lists
 
 DRAWN = 6000 if LONG else 400
 NOW = datetime.now(UTC).replace(microsecond=0)
@@ -105,16 +106,24 @@ def draw_list(dice: random.Random, chain: list[x509.Certificate]) -> x509.Certif
     return builder.sign(KEYS[1 if mostly() < 0.9 else 2], digest)  # type: ignore[arg-type]
 
 
+def _has_only_changes(crl: x509.CertificateRevocationList) -> bool:
+    return any(isinstance(each.value, x509.DeltaCRLIndicator) for each in crl.extensions)
+
+
 def test_drawn_lists() -> None:
     openssl = libcrypto()
     if openssl is None:
         pytest.skip("there is no libcrypto.so.3")
     dice, count, wrong = random.Random(30), Counter[object](), []
+    asked = 0
     for number in range(DRAWN):
         root = draw_certificate(dice, 0, None)
         above = draw_certificate(dice, 1, root)
         chain = [draw_certificate(dice, 2, above), above, root]
         lists = [draw_list(dice, chain) for _ in range(dice.choice((1, 1, 1, 2, 3)))]
+        if any(map(_has_only_changes, lists)) and takes_changes_for_lists():
+            continue
+        asked += 1
         start, *trusted = (each.public_bytes(Encoding.DER) for each in chain)
         written = [each.public_bytes(Encoding.PEM) for each in lists]
         error = openssl.fault(start, trusted, flags=CRL_CHECK, lists=written)
@@ -128,4 +137,4 @@ def test_drawn_lists() -> None:
     print(dict(count))
     assert not wrong, f"{len(wrong)}: {wrong[0]}"
     assert all(count[each] for each in (None, *KNOWN.values()))
-    assert count["the same reason"] > 0.9 * DRAWN
+    assert count["the same reason"] > 0.9 * asked

@@ -21,6 +21,7 @@ from tests.integration.vendor_oracle import (
     with_patience,
 )
 from tests.integration.vendor_rows import OPEN
+from tests.support.openssl import takes_changes_for_lists
 
 pytestmark = pytest.mark.dds
 
@@ -53,7 +54,8 @@ def test_the_next_permissions_ca_needs_the_name_of_the_old_one(
 @pytest.mark.parametrize("asked", ["Fast DDS", "Cyclone DDS"])
 def test_every_row(asked: str, tmp_path: Path) -> None:
     vendor = Vendor.CYCLONE if asked == "Cyclone DDS" else fastdds_vendor()
-    table = rows()
+    taken = "a list that has only changes" if takes_changes_for_lists() else ""
+    table = [row for row in rows() if row.name != taken]
     granted = permissions(
         grant(allow(publish("*"), subscribe("*"), domains="<id>0</id>"), subject="CN=/t")
     )
