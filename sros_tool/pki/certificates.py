@@ -346,18 +346,18 @@ def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> boo
 def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
     """Return whether ``authority`` may have issued ``certificate``; ignore key and validity.
 
-    As OpenSSL 3.0 (``X509_check_issued``), compare the names, the kind of the key, and the key
-    identifiers where both have one.
+    As OpenSSL 3.0 (``ossl_x509_likely_issued``), compare the names, the kind of the key with the
+    algorithm that the signed part names, and the key identifiers where both have one.
     """
     if tolerant.unread_extension(certificate) or tolerant.unread_extension(authority):
         return False
-    kind = _SIGNING_KEYS.get(certificate.signature_algorithm_oid)
+    algorithm = _signed_algorithm(certificate)
+    kind = _SIGNING_KEYS.get(algorithm)
     if not (
         same_name(certificate.issuer, authority.subject)
         and kind
-        and _names_one_algorithm(certificate)
         and isinstance(authority.public_key(), kind)
-        and (_uses_pss(certificate) or not is_for_pss(authority))
+        and (algorithm == SignatureAlgorithmOID.RSASSA_PSS or not is_for_pss(authority))
     ):
         return False
     named = extension(certificate, x509.AuthorityKeyIdentifier)
@@ -374,10 +374,6 @@ def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) ->
         and named.authority_cert_serial_number in (None, authority.serial_number)
         and (not issuers or same_name(issuers[0], authority.issuer))
     )
-
-
-def _uses_pss(certificate: x509.Certificate) -> bool:
-    return certificate.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
 
 
 def is_for_pss(certificate: x509.Certificate) -> bool:
@@ -397,12 +393,20 @@ def has_explicit_curve(certificate: x509.Certificate) -> bool:
 
 
 @lru_cache(maxsize=256)
-def _names_one_algorithm(certificate: x509.Certificate) -> bool:
-    """Return whether the signed part names the algorithm of the signature (RFC 5280, 4.1.1.2)."""
+def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
+    """Return the algorithm in the signed part and that of the signature (RFC 5280, 4.1.1.2).
+
+    OpenSSL compares them when it verifies the signature, which it does not of a self-signed CA.
+    """
     whole = der.first(der.normalized(certificate.public_bytes(serialization.Encoding.DER)))
     signed, outer, _ = der.children(whole.content)
     parts = der.children(signed.content)
-    return outer.whole == parts[2 if parts[0].tag == der.CONTEXT_0 else 1].whole
+    return parts[2 if parts[0].tag == der.CONTEXT_0 else 1], outer
+
+
+def _signed_algorithm(certificate: x509.Certificate) -> x509.ObjectIdentifier:
+    inner, _ = _algorithms(certificate)
+    return x509.ObjectIdentifier(der.decode_oid(der.first(inner.content).content))
 
 
 @lru_cache(maxsize=256)
@@ -414,7 +418,9 @@ def is_self_issued(certificate: x509.Certificate) -> bool:
 @lru_cache(maxsize=256)
 def signature_matches(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
     """Return whether the key of ``authority`` made the signature of ``certificate``."""
-    return is_signed(certificate, certificate.tbs_certificate_bytes, authority)
+    inner, outer = _algorithms(certificate)
+    signed = certificate.tbs_certificate_bytes
+    return inner.whole == outer.whole and is_signed(certificate, signed, authority)
 
 
 def is_signed(
@@ -427,13 +433,12 @@ def is_signed(
     if not isinstance(key, _SIGNING_KEYS.get(made.signature_algorithm_oid, ())):
         return False
     try:
-        if isinstance(key, ec.EllipticCurvePublicKey):
-            how = made.signature_algorithm_parameters
-            key.verify(signature, signed, how)  # type: ignore[arg-type]
-        elif isinstance(key, rsa.RSAPublicKey) and made.signature_hash_algorithm:
+        digest = made.signature_hash_algorithm
+        if isinstance(key, ec.EllipticCurvePublicKey) and digest:
+            key.verify(signature, signed, ec.ECDSA(digest))
+        elif isinstance(key, rsa.RSAPublicKey) and digest:
             pss = made.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
             scheme = made.signature_algorithm_parameters if pss else padding.PKCS1v15()
-            digest = made.signature_hash_algorithm
             key.verify(signature, signed, scheme, digest)  # type: ignore[arg-type]
         elif isinstance(key, (ed25519.Ed25519PublicKey, ed448.Ed448PublicKey)):
             key.verify(signature, signed)
