@@ -40,6 +40,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.chains import Checks, build_chain, chain_fault
 from sros_tool.pki.crl import read_list, read_lists, refusal_of
 from sros_tool.pki.keys import algorithm
+from sros_tool.pki.pem import read_as_text
 from sros_tool.pki.revocation import Obstacle, list_refusal
 
 Certificates = tuple[x509.Certificate, ...]
@@ -121,10 +122,12 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
     read: dict[str, Certificates] = {}
     for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, CERTIFICATE_FILE):
         if file in state.files:
+            data = _content(traits, state, file)
             try:
-                read[file] = _certificates(traits, state.files[file], file)
+                read[file] = _certificates(traits, data, file)
             except PkiError as error:
-                yield Problem(file, error.why.rstrip("."), Fault.CERTIFICATE_FILE)
+                cut = ", because it has a zero byte" if data != state.files[file] else ""
+                yield Problem(file, f"{error.why.rstrip('.')}{cut}", Fault.CERTIFICATE_FILE)
     identity = read.pop(CERTIFICATE_FILE, None)
     for file, certificates in read.items():
         if fault := _authority_fault(traits, certificates, at):
@@ -143,6 +146,12 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
     if largest is not None and state.permissions_bytes > largest:
         text = f"it has {state.permissions_bytes} bytes, and from {largest + 1} on the "
         yield Problem(PERMISSIONS_FILE, f"{text}handshake may never finish", Fault.DOCUMENT_SIZE)
+
+
+def _content(traits: VendorTraits, state: OpenedEnclave, file: str) -> bytes:
+    """Return what the vendor reads of a file with certificates or lists."""
+    data = state.files[file]
+    return read_as_text(data) if traits.reads_files_as_text else data
 
 
 def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
@@ -326,11 +335,11 @@ def _list_faults(
     lists: list[tuple[x509.CertificateRevocationList, str]] = []
     try:
         if traits.reads_lists_of_authorities:
-            file, data = IDENTITY_CA_FILE, state.files[IDENTITY_CA_FILE]
-            lists += [(each, file) for each in _lists(data, file)]
+            file = IDENTITY_CA_FILE
+            lists += [(each, file) for each in _lists(_content(traits, state, file), file)]
         file = CRL_FILE
         if file in state.files:
-            lists.append((_list(state.files[file], file), file))
+            lists.append((_list(_content(traits, state, file), file), file))
     except PkiError:
         text = "it is not a revocation list, so DDS refuses every participant"
         if file == IDENTITY_CA_FILE:

@@ -57,6 +57,22 @@ def blocks(data: bytes) -> Iterator[Block]:
             raise PkiError("a line '-----BEGIN' in it ends with a byte beyond ASCII")
 
 
+def read_as_text(data: bytes) -> bytes:
+    """Return what OpenSSL reads of a PEM file through a file pointer (bss_file.c).
+
+    A zero byte ends its line, and a line that begins with a zero byte the whole file.
+    """
+    if b"\0" not in data:
+        return data
+    lines: list[bytes] = []
+    for piece in _PIECE.findall(data):
+        line, zero, _ = piece.partition(b"\0")
+        if zero and not line:
+            break
+        lines.append(line + b"\n" if zero else piece)
+    return b"".join(lines)
+
+
 def missing(data: bytes, label: str) -> str:
     """Return why OpenSSL finds no block with this label in a PEM file, as a clause."""
     if _NOT_AT_START.search(data):

@@ -97,13 +97,14 @@ NOT_OF_DOCUMENTS = {
     "verifies_authorities",
     "verifies_policies",
     "reads_trusted_certificates",
+    "reads_files_as_text",
     "hashes",
     "keys",
     "reads_tokens",
     "crashes_on_empty_subject",
 }
-"""Rules about what is around the documents: `test_signers_on_dds`, `test_subjects_on_dds` and
-`test_key_on_token` tell."""
+"""Rules about what is around the documents: `test_signers_on_dds`, `test_subjects_on_dds`,
+`test_drawn_trust` and `test_key_on_token` tell."""
 
 
 @pytest.mark.parametrize("vendor", ASK)

@@ -174,6 +174,8 @@ class VendorTraits:
     """Of a chain, the policies and the CA's own signature are verified, too (Fast DDS)."""
     reads_trusted_certificates: bool = True
     """A certificate may be in a PEM block ``TRUSTED CERTIFICATE``."""
+    reads_files_as_text: bool = False
+    """In a file with certificates or a list, a zero byte ends its line, and perhaps the file."""
     hashes: Hashes = Hashes.ANY
     keys: Keys = Keys.ANY
     reads_tokens: bool = True
@@ -208,6 +210,7 @@ _FAST_2_14 = VendorTraits(
     reads_lists_of_authorities=True,
     verifies_authorities=True,
     verifies_policies=True,
+    reads_files_as_text=True,
     hashes=Hashes.SHA256,
     keys=Keys.EC_AND_RSA,
 )

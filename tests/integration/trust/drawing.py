@@ -27,6 +27,7 @@ from tests.integration.trust.files import (
     key_file,
     pem_form,
     trusted_certificate,
+    zero_bytes,
 )
 from tests.integration.trust.lists import (
     list_dates,
@@ -56,6 +57,7 @@ FAMILIES: dict[str, Family] = {
     "ca file": ca_file,
     "trusted certificate": trusted_certificate,
     "pem": pem_form,
+    "zero bytes": zero_bytes,
     "certificate file": certificate_file,
     "key file": key_file,
     "list issuer": list_issuer,

@@ -394,6 +394,23 @@ def pem_form(trust: Trust, dice: Dice) -> str:
     return f"{file}: {' + '.join(done)}"
 
 
+ZEROS = (
+    b"\0\0\0\n", b"\0-----BEGIN CERTIFICATE-----\n", b"text\0\0\n", b"text\0", b"x" * 253 + b"\0\n",
+    b"x" * 254 + b"\0\n", b"x" * 300 + b"\0\n", b"\n\0", b"# \0 # \0\n",
+)  # fmt: skip
+
+
+def zero_bytes(trust: Trust, dice: Dice) -> str:
+    """Zero bytes between the blocks of a PEM file."""
+    choices = (IDENTITY_FILE, PERMISSIONS_FILE, "cert.pem", "key.pem", "crl.pem")
+    file = dice.choice([each for each in choices if each == "key.pem" or each in trust.files])
+    zeros, first = dice.choice(ZEROS), dice.random() < 0.6
+    behind = dice.choice((b"", damaged_block(trust, dice)[1]))
+    trust.edit(file, lambda data: zeros + data if first else data + zeros + behind)
+    place = "before" if first else f"behind, then {len(behind)} bytes"
+    return f"{file}: {zeros[:10]!r}..., {len(zeros)} bytes, {place}"
+
+
 def certificate_file(trust: Trust, dice: Dice) -> str:
     """More than the certificate in cert.pem."""
     parts = trust.files["cert.pem"]
