@@ -38,7 +38,7 @@ from sros_tool.pki.certificates import (
     subject_text,
 )
 from sros_tool.pki.chains import Checks, build_chain, chain_fault
-from sros_tool.pki.crl import read_list, read_lists, refusal_of
+from sros_tool.pki.crl import is_loaded, read_list, read_lists, refusal_of
 from sros_tool.pki.keys import algorithm
 from sros_tool.pki.pem import read_as_text
 from sros_tool.pki.revocation import Obstacle, list_refusal
@@ -71,6 +71,20 @@ _VENDOR_SPECIFIC = frozenset(
 )
 """Faults of `OpenedEnclave` for which only some vendors refuse an enclave."""
 _UNREADABLE = (Fault.NOT_SIGNED, Fault.CERTIFICATE_MALFORMED)
+CRASHES = (Fault.CA_CRASH, Fault.CERTIFICATE_CRASH)
+_BEFORE_DDS = (Fault.FILE_MISSING, Fault.LINK_DANGLING)
+_READ_FIRST = (IDENTITY_CA_FILE, CRL_FILE, CERTIFICATE_FILE)
+_ON_READING = (
+    Fault.FILE_UNREADABLE,
+    Fault.FILE_EMPTY,
+    Fault.CERTIFICATE_MALFORMED,
+    Fault.CERTIFICATE_FILE,
+    Fault.CRL_MALFORMED,
+    *CRASHES,
+)
+"""Faults that a process meets before it verifies a chain."""
+_OF_CA = (Fault.SIGNATURE_HASH, Fault.CA_CHAIN)
+"""Faults that are met with these in the file of a CA."""
 
 
 def vendor_problems(
@@ -78,8 +92,8 @@ def vendor_problems(
 ) -> tuple[Problem, ...]:
     """Return the problems for which a vendor refuses to load an enclave at the time ``at``.
 
-    Of governance and permissions, only signature and size are checked here; problems in their
-    content are taken from ``state``.
+    They are in the order in which a process meets them.  Of governance and permissions, only
+    signature and size are checked here; problems in their content are taken from ``state``.
     """
     specific = [each for each in state.problems if _is_specific(each, state)]
     kept = [each for each in state.problems if each not in specific]
@@ -90,20 +104,37 @@ def vendor_problems(
     known = {
         each.file for each in kept if each.file == CERTIFICATE_FILE or each.fault in _UNREADABLE
     }
-    faults = [each for each in _faults(traits, state, at) if each.file not in known]
+    faults = [
+        each
+        for each in sorted(_faults(traits, state, at), key=_when_met)
+        if each.file not in known or each.fault in CRASHES
+    ]
     kept += [each for each in faults if _is_of_list(each)]
     specific = [each for each in specific if not _is_of_list(each)]
     faults = [each for each in faults if not _is_of_list(each)]
     for side in _SIDES:
         of_side = [each for each in faults if each.file in side]
         files = {each.file for each in of_side} | ({side[0]} if of_side else set())
-        crash = [each for each in of_side if each.fault is Fault.CA_CRASH]
-        if not any(each.file == IDENTITY_CA_FILE for each in of_side):  # loaded before
-            crash += [each for each in of_side if each.fault is Fault.CERTIFICATE_CRASH]
-        kept += crash or [each for each in specific if each.file in files] or of_side
+        if of_side and of_side[0].fault in CRASHES:
+            kept.append(of_side[0])
+            continue
+        of_side = [each for each in of_side if each.fault not in CRASHES]
+        kept += [each for each in specific if each.file in files] or of_side
     if not any(each.fault is Fault.KEY_ALGORITHM for each in kept):
         kept += [each for each in faults if each.file == KEY_FILE]
-    return tuple(kept)
+    return tuple(sorted(kept, key=_when_met))
+
+
+def _when_met(problem: Problem) -> int:
+    """Return the place of a problem among those that a process would meet."""
+    if problem.fault in _BEFORE_DDS:  # the RMW looks for all files
+        return 0
+    early = (*_ON_READING, *_OF_CA) if problem.file == IDENTITY_CA_FILE else _ON_READING
+    if problem.file in _READ_FIRST and problem.fault in early:
+        return 1 + _READ_FIRST.index(problem.file)
+    later = (*_READ_FIRST, KEY_FILE, KEY_URI_FILE), (PERMISSIONS_CA_FILE,)
+    places = (place for place, files in enumerate(later, 4) if problem.file in files)
+    return next(places, 6)
 
 
 def _is_of_list(problem: Problem) -> bool:
@@ -341,10 +372,12 @@ def _list_faults(
         if file in state.files:
             lists.append((_list(_content(traits, state, file), file), file))
     except PkiError:
-        text = "it is not a revocation list, so DDS refuses every participant"
-        if file == IDENTITY_CA_FILE:
-            text = "it has a revocation list that cannot be read, so DDS refuses every participant"
-        yield Problem(file, text, Fault.CRL_MALFORMED)
+        what, fault = "it is not a revocation list", Fault.CRL_MALFORMED
+        if is_loaded(_content(traits, state, file)):
+            what, fault = "a part of its revocation list cannot be read", Fault.CRL_PARTIAL
+        elif file == IDENTITY_CA_FILE:
+            what = "it has a revocation list that cannot be read"
+        yield Problem(file, f"{what}, so DDS refuses every participant", fault)
         return
     if not lists:
         return

@@ -26,14 +26,12 @@ from sros_tool.dds.permissions import Permissions, render_permissions
 from sros_tool.errors import SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
-    CERTIFICATE_FILE,
     GOVERNANCE_FILE,
-    IDENTITY_CA_FILE,
     KEY_FILE,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
 )
-from sros_tool.keystore.loading import vendor_problems
+from sros_tool.keystore.loading import CRASHES, vendor_problems
 from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
 from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki import smime
@@ -220,8 +218,6 @@ def _expiries(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetim
 
 # ── what a vendor makes of it ──────────────────────────────────────────────────────────────
 
-_IDENTITY = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
-"""The files that are read before those of the permissions."""
 _ONLY_PEERS_NOTICE = {
     (Vendor.CYCLONE, Fault.KEY_MISMATCH),
     (Vendor.FAST, Fault.KEY_ALGORITHM),
@@ -241,20 +237,6 @@ class JoinContext:
     domain: int
     at: datetime
     zone: tzinfo = UTC
-
-
-def _crash(problems: Sequence[Problem]) -> Problem | None:
-    """Return the problem that crashes the process, unless another one stops it before."""
-    for each in problems:
-        if each.fault is Fault.CERTIFICATE_CRASH and not any(
-            other.fault is Fault.CRL_MALFORMED for other in problems
-        ):
-            return each
-        if each.fault is Fault.CA_CRASH and (
-            each.file == IDENTITY_CA_FILE or not any(other.file in _IDENTITY for other in problems)
-        ):
-            return each
-    return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,17 +312,16 @@ class VendorParticipant:
         """Return the access of the vendor's process, or the decision that keeps it from running."""
         late: Decision | None = None
         if self.problems:
-            crash = _crash(self.problems)
-            if crash:
-                text = f"{self.vendor.title}: {crash}."
-                return Decision(Outcome.CRASHES, crash.fault.id, text)
-            first = self.problems[0]
-            noticed_late = all(
-                (self.vendor, each.fault) in _ONLY_PEERS_NOTICE for each in self.problems
-            )
+            noticed = [
+                each
+                for each in self.problems
+                if (self.vendor, each.fault) not in _ONLY_PEERS_NOTICE
+            ]
+            first = (noticed or self.problems)[0]
             text = f"{self.vendor.title}: {first}."
-            if not noticed_late:
-                return Decision(Outcome.REFUSED, first.fault.id, text)
+            if noticed:
+                outcome = Outcome.CRASHES if first.fault in CRASHES else Outcome.REFUSED
+                return Decision(outcome, first.fault.id, text)
             late = Decision(Outcome.PEER_DENIES, first.fault.id, text)
         governance = _governance_as(self.vendor, enclave.governance)
         if isinstance(governance, Refusal):
