@@ -72,7 +72,9 @@ _VENDOR_SPECIFIC = frozenset(
 """Faults of `OpenedEnclave` for which only some vendors refuse an enclave."""
 _UNREADABLE = (Fault.NOT_SIGNED, Fault.CERTIFICATE_MALFORMED)
 CRASHES = (Fault.CA_CRASH, Fault.CERTIFICATE_CRASH)
-_BEFORE_DDS = (Fault.FILE_MISSING, Fault.LINK_DANGLING)
+"""Faults that crash a process."""
+BEFORE_DDS = (Fault.FILE_MISSING, Fault.LINK_DANGLING)
+"""Faults that end a process before DDS reads a file: the RMW looks for all files."""
 _READ_FIRST = (IDENTITY_CA_FILE, CRL_FILE, CERTIFICATE_FILE)
 _ON_READING = (
     Fault.FILE_UNREADABLE,
@@ -127,14 +129,18 @@ def vendor_problems(
 
 def _when_met(problem: Problem) -> int:
     """Return the place of a problem among those that a process would meet."""
-    if problem.fault in _BEFORE_DDS:  # the RMW looks for all files
+    if problem.fault in BEFORE_DDS:
         return 0
     early = (*_ON_READING, *_OF_CA) if problem.file == IDENTITY_CA_FILE else _ON_READING
     if problem.file in _READ_FIRST and problem.fault in early:
         return 1 + _READ_FIRST.index(problem.file)
-    later = (*_READ_FIRST, KEY_FILE, KEY_URI_FILE), (PERMISSIONS_CA_FILE,)
-    places = (place for place, files in enumerate(later, 4) if problem.file in files)
-    return next(places, 6)
+    later = (
+        (*_READ_FIRST, KEY_FILE, KEY_URI_FILE),
+        (PERMISSIONS_CA_FILE,),
+        (GOVERNANCE_FILE,),
+        (PERMISSIONS_FILE,),
+    )
+    return 4 + next(place for place, files in enumerate(later) if problem.file in files)
 
 
 def _is_of_list(problem: Problem) -> bool:

@@ -31,7 +31,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
 )
-from sros_tool.keystore.loading import CRASHES, vendor_problems
+from sros_tool.keystore.loading import BEFORE_DDS, CRASHES, vendor_problems
 from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
 from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki import smime
@@ -261,6 +261,16 @@ _OF_GOVERNANCE = {
 """The reasons that lie in the governance, where no fault names the file."""
 
 
+def _crashes_before(problem: Problem, governance: Governance | Refusal) -> bool:
+    """Return whether a process crashes on its governance before it meets a problem."""
+    return (
+        isinstance(governance, Refusal)
+        and governance.outcome is Outcome.CRASHES
+        and problem.file == PERMISSIONS_FILE
+        and problem.fault not in BEFORE_DDS
+    )
+
+
 class VendorParticipant:
     """The participant of one vendor in an enclave.
 
@@ -294,7 +304,7 @@ class VendorParticipant:
         What permissions say of topics is a matter of their policy.
         """
         join = self.join()
-        if self.problems:
+        if join.reason in {each.fault.id for each in self.problems}:
             return tuple(
                 RefusalCause(join.outcome, each.fault.id, each.file, str(each))
                 for each in self.problems
@@ -311,19 +321,18 @@ class VendorParticipant:
     def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
         """Return the access of the vendor's process, or the decision that keeps it from running."""
         late: Decision | None = None
-        if self.problems:
-            noticed = [
-                each
-                for each in self.problems
-                if (self.vendor, each.fault) not in _ONLY_PEERS_NOTICE
-            ]
-            first = (noticed or self.problems)[0]
-            text = f"{self.vendor.title}: {first}."
-            if noticed:
-                outcome = Outcome.CRASHES if first.fault in CRASHES else Outcome.REFUSED
-                return Decision(outcome, first.fault.id, text)
-            late = Decision(Outcome.PEER_DENIES, first.fault.id, text)
         governance = _governance_as(self.vendor, enclave.governance)
+        noticed = [
+            each for each in self.problems if (self.vendor, each.fault) not in _ONLY_PEERS_NOTICE
+        ]
+        if noticed and not _crashes_before(noticed[0], governance):
+            first = noticed[0]
+            outcome = Outcome.CRASHES if first.fault in CRASHES else Outcome.REFUSED
+            return Decision(outcome, first.fault.id, f"{self.vendor.title}: {first}.")
+        if self.problems:
+            first = self.problems[0]
+            text = f"{self.vendor.title}: {first}."
+            late = Decision(Outcome.PEER_DENIES, first.fault.id, text)
         if isinstance(governance, Refusal):
             return replace(governance.decision(), reason=Fault.GOVERNANCE_MALFORMED.id)
         self.governance = governance

@@ -37,6 +37,7 @@ from tests.integration.trust.lists import (
     list_issuer,
 )
 from tests.integration.trust.messages import (
+    documents,
     message_algorithms,
     message_attributes,
     message_signers,
@@ -69,6 +70,7 @@ FAMILIES: dict[str, Family] = {
     "message algorithms": message_algorithms,
     "message attributes": message_attributes,
     "message structure": message_structure,
+    "documents": documents,
     "leaf subject": leaf_subject,
     "grant subject": grant_subject,
     "ca subject": ca_subject,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 from tests.integration.trust.certificates import (
@@ -212,3 +213,22 @@ def message_structure(trust: Trust, dice: Dice) -> str:
     for _, plan in plans:
         plan.certificates, plan.options, plan.lists = inside, options, lists
     return f"{'+'.join(file for file, _ in plans)}: {'; '.join(words)} {options or ''}"
+
+
+_EXPRESSION = re.compile(rb"<topic_expression>[^<]*<")
+
+
+def documents(trust: Trust, dice: Dice) -> str:
+    """Faults of governance and permissions that meet."""
+    governance = dice.choice(("as it is", "an empty expression", "no expression", "malformed"))
+    if governance == "malformed":
+        trust.governance = b"<x/>"
+    elif governance != "as it is":
+        empty = b"<topic_expression><" if governance == "an empty expression" else b"<x><"
+        trust.governance = _EXPRESSION.sub(empty, trust.governance)
+    wrong = {"as they are": [], "governance.p7s": ["governance.p7s"]}
+    wrong |= {"permissions.p7s": ["permissions.p7s"], "both": ["governance.p7s", "permissions.p7s"]}
+    files, how = dice.choice(sorted(wrong)), dice.choice(("not signed", "changed"))
+    for file in wrong[files]:
+        trust.edit(file, lambda data: data.replace(b"dds", b"DDS") if how == "changed" else b"x\n")
+    return f"governance with {governance}, {files} {how}"
