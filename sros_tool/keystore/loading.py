@@ -378,12 +378,12 @@ def _list_faults(
         if file in state.files:
             lists.append((_list(_content(traits, state, file), file), file))
     except PkiError:
-        what, fault = "it is not a revocation list", Fault.CRL_MALFORMED
+        what, kind = "it is not a revocation list", Fault.CRL_MALFORMED
         if is_loaded(_content(traits, state, file)):
-            what, fault = "a part of its revocation list cannot be read", Fault.CRL_PARTIAL
+            what, kind = "a part of its revocation list cannot be read", Fault.CRL_PARTIAL
         elif file == IDENTITY_CA_FILE:
             what = "it has a revocation list that cannot be read"
-        yield Problem(file, f"{what}, so DDS refuses every participant", fault)
+        yield Problem(file, f"{what}, so DDS refuses every participant", kind)
         return
     if not lists:
         return
