@@ -209,7 +209,7 @@ class Fault(Enum):
         "a revocation list that is not the whole list of its CA",
         "No certificate can be verified with it, so every participant is refused. OpenSSL uses no "
         "list of changes, of one place or of some certificates, and none with a critical extension "
-        "that it does not know, or with one that it cannot read.",
+        "that it does not know.",
         "RFC 5280, 5.2; OpenSSL 3 (x_crl.c, x509_vfy.c); Fast DDS 2.9.1, Cyclone DDS 0.10.2; "
         "measured.",
         _CRL,

@@ -38,7 +38,7 @@ from sros_tool.pki.certificates import (
     subject_text,
 )
 from sros_tool.pki.chains import Checks, build_chain, chain_fault
-from sros_tool.pki.crl import is_loaded, read_list, read_lists, refusal_of
+from sros_tool.pki.crl import read_list, read_lists, refusal_of
 from sros_tool.pki.keys import algorithm
 from sros_tool.pki.pem import read_as_text
 from sros_tool.pki.revocation import Obstacle, list_refusal
@@ -378,12 +378,10 @@ def _list_faults(
         if file in state.files:
             lists.append((_list(_content(traits, state, file), file), file))
     except PkiError:
-        what, kind = "it is not a revocation list", Fault.CRL_MALFORMED
-        if is_loaded(_content(traits, state, file)):
-            what, kind = "a part of its revocation list cannot be read", Fault.CRL_PARTIAL
-        elif file == IDENTITY_CA_FILE:
-            what = "it has a revocation list that cannot be read"
-        yield Problem(file, f"{what}, so DDS refuses every participant", kind)
+        text = "it is not a revocation list, so DDS refuses every participant"
+        if file == IDENTITY_CA_FILE:
+            text = "it has a revocation list that cannot be read, so DDS refuses every participant"
+        yield Problem(file, text, Fault.CRL_MALFORMED)
         return
     if not lists:
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -129,18 +129,6 @@ def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
     with _reading(name):
         blocks = pem.blocks(data)
         return _read_block(next(each for each in blocks if each.label == _LABEL))
-
-
-def is_loaded(data: bytes) -> bool:
-    """Return whether a DDS vendor loads the first list of a PEM file, and only then refuses it.
-
-    OpenSSL reads the extensions of a list when it verifies a certificate with it (x_crl.c).
-    """
-    with suppress(PkiError), _reading("in it"):
-        block = next(each for each in pem.blocks(data) if each.label == _LABEL)
-        x509.load_der_x509_crl(block.content)
-        return not block.headers
-    return False
 
 
 def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, ...]:
