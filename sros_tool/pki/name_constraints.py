@@ -12,6 +12,7 @@ from cryptography.x509.oid import NameOID
 from sros_tool.pki import der
 from sros_tool.pki.certificates import extension, is_self_issued, subject_text
 from sros_tool.pki.names import canonical
+from sros_tool.pki.tolerant_extensions import UnreadableName
 
 _IA5_MAIL = der.encode(der.OID, der.encode_oid(NameOID.EMAIL_ADDRESS.dotted_string)) + b"\x16"
 _HOST = re.compile(r"(?!.*(?:\.-|-\.))\w(?:[\w-]*\w)?(?:\.[\w-]*\w)+", re.ASCII)
@@ -44,7 +45,7 @@ def _names(certificate: x509.Certificate, *, leaf: bool) -> Iterator[x509.Genera
         readable = _IA5_MAIL in subject.public_bytes() and str(text.value).isascii()
         yield x509.RFC822Name(str(text.value)) if readable else None
     names = tuple(extension(certificate, x509.SubjectAlternativeName) or ())
-    yield from names
+    yield from (None if isinstance(name, UnreadableName) else name for name in names)
     if leaf and not any(isinstance(each, x509.DNSName) for each in names):
         for common in subject.get_attributes_for_oid(NameOID.COMMON_NAME):
             host = str(common.value).rstrip("\0")

@@ -155,7 +155,7 @@ class _Signed:
         return int.from_bytes(sha256(self._data).digest()[:7], "big")
 
 
-class TolerantCertificate(_Signed):
+class _TolerantCertificate(_Signed):
     """A certificate; see `cryptography.x509.Certificate` for the members."""
 
     def __init__(self, data: bytes) -> None:
@@ -168,7 +168,7 @@ class TolerantCertificate(_Signed):
         self.number = number + 1
         serial, _, issuer, validity, subject, key, *rest = parts
         self.serial_number = der.integer(serial)
-        self.issuer, self.subject = read_name(issuer.whole), read_name(subject.whole)
+        self.issuer, self.subject = _name(issuer.whole), _name(subject.whole)
         begin, end = _sequence(validity)
         self.unread_dates = [
             name for name, date in (("notBefore", begin), ("notAfter", end)) if not _date(date)
@@ -196,7 +196,7 @@ class TolerantCertificate(_Signed):
         return self._key
 
 
-class TolerantEntry(NamedTuple):
+class _TolerantEntry(NamedTuple):
     """An entry of a list; see `cryptography.x509.RevokedCertificate` for the members."""
 
     serial_number: int
@@ -204,7 +204,7 @@ class TolerantEntry(NamedTuple):
     extensions: x509.Extensions
 
 
-class TolerantList(_Signed):
+class _TolerantList(_Signed):
     """A revocation list; see `cryptography.x509.CertificateRevocationList` for the members."""
 
     def __init__(self, data: bytes) -> None:
@@ -213,7 +213,7 @@ class TolerantList(_Signed):
         if parts[0].tag == der.INTEGER:
             parts.pop(0)
         _, issuer, begin, *rest = parts
-        self.issuer = read_name(issuer.whole)
+        self.issuer = _name(issuer.whole)
         dates = [_date(begin)]
         while rest and rest[0].tag in _TIMES:
             dates.append(_date(rest.pop(0)))
@@ -233,13 +233,13 @@ class TolerantList(_Signed):
         """The signed part, as it was read."""
         return self._signed_bytes()
 
-    def __iter__(self) -> Iterator[TolerantEntry]:
+    def __iter__(self) -> Iterator[_TolerantEntry]:
         return iter(self._entries)
 
     def __len__(self) -> int:
         return len(self._entries)
 
-    def get_revoked_certificate_by_serial_number(self, serial: int) -> TolerantEntry | None:
+    def get_revoked_certificate_by_serial_number(self, serial: int) -> _TolerantEntry | None:
         """Return the entry for a serial number, if there is one."""
         return next((entry for entry in self if entry.serial_number == serial), None)
 
@@ -250,12 +250,12 @@ def read_certificate(data: bytes) -> x509.Certificate:
     Raises:
         PkiError, ValueError: OpenSSL does not read it either.
     """
-    return cast(x509.Certificate, TolerantCertificate(data))
+    return cast(x509.Certificate, _TolerantCertificate(data))
 
 
 def read_list(data: bytes) -> x509.CertificateRevocationList:
     """Return a revocation list that `cryptography` does not read; raise as `read_certificate`."""
-    return cast(x509.CertificateRevocationList, TolerantList(data))
+    return cast(x509.CertificateRevocationList, _TolerantList(data))
 
 
 def check_list(data: bytes) -> None:
@@ -268,12 +268,12 @@ def check_list(data: bytes) -> None:
     try:
         x509.load_der_x509_crl(value)
     except ValueError:
-        TolerantList(value)
+        _TolerantList(value)
 
 
 def is_tolerated(certificate: x509.Certificate) -> bool:
     """Return whether a certificate is one that `cryptography` does not read."""
-    return isinstance(certificate, TolerantCertificate)
+    return isinstance(certificate, _TolerantCertificate)
 
 
 def unread_extension(certificate: x509.Certificate) -> str:
@@ -292,18 +292,18 @@ def unread_extension(certificate: x509.Certificate) -> str:
 
 def version_of(certificate: x509.Certificate) -> int:
     """Return the version of a certificate as people count: the one with extensions is the third."""
-    if isinstance(certificate, TolerantCertificate):
+    if isinstance(certificate, _TolerantCertificate):
         return certificate.number
     return int(certificate.version.value) + 1
 
 
 def unread_date(certificate: x509.Certificate) -> str:
     """Return which date of a certificate OpenSSL does not compare, or ""."""
-    tolerated = certificate if isinstance(certificate, TolerantCertificate) else None
+    tolerated = certificate if isinstance(certificate, _TolerantCertificate) else None
     return next(iter(tolerated.unread_dates), "") if tolerated else ""
 
 
-def read_name(data: bytes) -> x509.Name:
+def _name(data: bytes) -> x509.Name:
     """Return a distinguished name in DER, also with values that their types do not allow.
 
     Raises:
@@ -317,7 +317,7 @@ def read_name(data: bytes) -> x509.Name:
     return cast(x509.Name, TolerantName(data))
 
 
-def _entries(values: list[der.Value]) -> Iterator[TolerantEntry]:
+def _entries(values: list[der.Value]) -> Iterator[_TolerantEntry]:
     """Yield the entries of a list; OpenSSL decodes extensions up to the first one that is damaged.
 
     Source: x_crl.c (crl_set_issuers).
@@ -335,7 +335,7 @@ def _entries(values: list[der.Value]) -> Iterator[TolerantEntry]:
             damaged = True
             found = x509.Extensions([])
         moment = _date(date) or datetime.min.replace(tzinfo=UTC)
-        yield TolerantEntry(der.integer(serial), moment, found)
+        yield _TolerantEntry(der.integer(serial), moment, found)
 
 
 _DECODED_OF_ENTRIES = (CRLEntryExtensionOID.CERTIFICATE_ISSUER, CRLEntryExtensionOID.CRL_REASON)

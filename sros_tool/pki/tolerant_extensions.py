@@ -34,7 +34,7 @@ DECODED = frozenset(
 """What OpenSSL decodes of a certificate before it uses it (v3_purp.c): damaged, it is invalid."""
 
 
-class LooseConstraints(x509.BasicConstraints):
+class _LooseConstraints(x509.BasicConstraints):
     """basicConstraints that may have a path length without being those of a CA."""
 
     def __init__(self, ca: bool, path_length: int | None) -> None:
@@ -47,7 +47,7 @@ class LooseConstraints(x509.BasicConstraints):
         return self._longest
 
 
-class LooseKeyIdentifier(x509.AuthorityKeyIdentifier):
+class _LooseKeyIdentifier(x509.AuthorityKeyIdentifier):
     """An authorityKeyIdentifier that may name an issuer without a serial number, or the reverse."""
 
     def __init__(
@@ -215,7 +215,7 @@ def _in_entry(extension: bytes) -> x509.Extensions:
 # ── what it does not ───────────────────────────────────────────────────────────────────────
 
 
-def _basic_constraints(content: bytes) -> LooseConstraints:
+def _basic_constraints(content: bytes) -> _LooseConstraints:
     ca, length = False, None
     parts = _inside(content)
     if parts and parts[0].tag == der.BOOLEAN:
@@ -224,7 +224,7 @@ def _basic_constraints(content: bytes) -> LooseConstraints:
         length = der.integer(parts.pop(0))
     if parts or (length is not None and length < 0):
         raise ValueError("OpenSSL takes it for invalid")
-    return LooseConstraints(ca, length)
+    return _LooseConstraints(ca, length)
 
 
 def _key_usage(content: bytes) -> x509.KeyUsage:
@@ -279,7 +279,7 @@ def _names(values: Iterable[der.Value]) -> list[x509.GeneralName]:
     return names
 
 
-def _authority_key_identifier(content: bytes) -> LooseKeyIdentifier:
+def _authority_key_identifier(content: bytes) -> _LooseKeyIdentifier:
     key, issuer, serial = None, None, None
     for part in _inside(content):
         if part.tag == 0x80 and issuer is None and serial is None:
@@ -290,7 +290,7 @@ def _authority_key_identifier(content: bytes) -> LooseKeyIdentifier:
             serial = int.from_bytes(part.content, "big", signed=True)
         else:
             raise ValueError("not an authorityKeyIdentifier")
-    return LooseKeyIdentifier(key, issuer, serial)
+    return _LooseKeyIdentifier(key, issuer, serial)
 
 
 def _point(content: bytes) -> x509.ExtensionType | None:
