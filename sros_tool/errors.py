@@ -66,10 +66,12 @@ class UnavailableError(SrosError):
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A remark with a stable ``id`` (such as ``portable.document-size``) and one paragraph."""
+    """A remark on the result."""
 
     id: str
+    """A stable name, such as ``portable.document-size``."""
     text: str
+    """One paragraph for people."""
 
 
 def check_meaning(read: object, meant: object, what: str) -> None:

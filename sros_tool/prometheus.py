@@ -6,8 +6,11 @@ Source: Prometheus, "Exposition formats", text format 0.0.4.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from sros_tool.written import DryRun, FileChange, NamedKeystore, Notes
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z", re.ASCII)
 
@@ -17,7 +20,9 @@ class Sample:
     """A value with its labels, which may have any text."""
 
     value: int | float
+    """The value; moments are in seconds since 1970."""
     labels: Mapping[str, str] = field(default_factory=dict)
+    """Its labels and their values, such as ``keystore``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,13 +34,28 @@ class Metric:
     """
 
     name: str
+    """Its name."""
     help: str
+    """What it says."""
     samples: tuple[Sample, ...]
+    """Its values."""
 
     def __post_init__(self) -> None:
         for name in (self.name, *(label for each in self.samples for label in each.labels)):
             if not _NAME.match(name) or name.startswith("__"):
                 raise ValueError(f"{name!r} is not a name of Prometheus")
+
+
+class KeystoreMetrics(NamedTuple):
+    """The metrics of a keystore. With ``-o FILE`` they are written there as text, too."""
+
+    keystore: NamedKeystore
+    metrics: Sequence[Metric]
+    """The metrics, all of them gauges."""
+    dry_run: DryRun
+    changes: Sequence[FileChange]
+    """The file that was written or, with ``--dry-run``, would be; empty without ``-o``."""
+    notes: Notes
 
 
 def render_metrics(metrics: Iterable[Metric]) -> str:

@@ -32,7 +32,9 @@ class Window:
     """A validity from ``not_before`` to ``not_after``, both included and both in UTC."""
 
     not_before: datetime
+    """Begin of its validity, in UTC."""
     not_after: datetime
+    """End of its validity, in UTC."""
 
     def __post_init__(self) -> None:
         if self.not_after <= self.not_before:

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import Enum
 from pathlib import PurePath
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from sros_tool.validity import iso
 
 _Value = TypeVar("_Value")
-_SHOWN: dict[type, tuple[str, ...]] = {}
-"""The attributes of each class that its JSON object has."""
+_SHOWN: dict[type, ShownKeys | None] = {}
+"""The keys of the JSON object that a class becomes; None for a class that becomes none."""
 
 
 _JSON_VERSION = 1
 """The version of what ``--json`` prints: a key that changes its meaning or goes raises it."""
 
 
-def versioned(value: Mapping[str, Any]) -> dict[str, Any]:
+def versioned(value: object) -> dict[str, Any]:
     """Return the object that ``--json`` prints: ``version`` before the keys of ``value``."""
-    return {"version": _JSON_VERSION, **value}
+    return {"version": _JSON_VERSION, **as_plain(value)}
 
 
 def parse_json(data: bytes) -> Any:
@@ -93,9 +93,9 @@ def _yaml_escape(character: str) -> str:
 def as_plain(value: object) -> Any:
     """Return ``value`` as JSON types: dictionaries, lists, strings, numbers, booleans and None.
 
-    A dataclass or a named tuple becomes a dictionary of its public fields, in their order, or of
-    the attributes that `shows` names.  An enumeration becomes its value, a datetime
-    CCYY-MM-DDThh:mm:ssZ in UTC, a path its text, a tuple a list, and a set a sorted list.
+    A dataclass or a named tuple becomes a dictionary of its public fields, in their order, unless
+    `shows` says otherwise.  An enumeration becomes its value, a datetime
+    CCYY-MM-DDThh:mm:ssZ in UTC, a path its text, a sequence a list, and a set a sorted list.
 
     Raises:
         TypeError: ``value`` is of another type, such as bytes.
@@ -104,14 +104,14 @@ def as_plain(value: object) -> Any:
         return value
     if isinstance(value, Enum):
         return value.value
-    if names := _shown(type(value)):
-        return {name: as_plain(getattr(value, name)) for name in names}
+    if shape := shown(type(value)):
+        return _as_object(value, shape)
     if isinstance(value, Mapping):
         return {as_plain(key): as_plain(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [as_plain(each) for each in value]
     if isinstance(value, (set, frozenset)):
         return [as_plain(each) for each in sorted(value)]
+    if isinstance(value, Sequence) and not isinstance(value, (str, bytes)):
+        return [as_plain(each) for each in value]
     if isinstance(value, datetime):
         return iso(value)
     if isinstance(value, PurePath):
@@ -119,21 +119,68 @@ def as_plain(value: object) -> Any:
     raise TypeError(f"a {type(value).__name__} has no form in JSON: {value!r}")
 
 
-def shows(*names: str) -> Callable[[type[_Value]], type[_Value]]:
-    """Return a class decorator that makes `as_plain` use these attributes instead of the fields."""
+class ShownKeys(NamedTuple):
+    """The keys of the JSON object that a class becomes: see `shows`."""
+
+    names: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+    null_if_empty: tuple[str, ...] = ()
+    spread: tuple[str, ...] = ()
+
+
+def shows(
+    *names: str,
+    optional: tuple[str, ...] = (),
+    null_if_empty: tuple[str, ...] = (),
+    spread: tuple[str, ...] = (),
+) -> Callable[[type[_Value]], type[_Value]]:
+    """Return a class decorator that chooses the keys of the JSON object that `as_plain` makes.
+
+    Args:
+        names: the attributes that become keys; without any, the public fields of the class.
+        optional: those that are left out where they are None.
+        null_if_empty: those that are null where they are empty.
+        spread: those whose own keys stand in place of theirs; None has no keys.
+    """
 
     def decorate(kind: type[_Value]) -> type[_Value]:
-        _SHOWN[kind] = names
+        _SHOWN[kind] = ShownKeys(names or _public_fields(kind), optional, null_if_empty, spread)
         return kind
 
     return decorate
 
 
-def _shown(kind: type) -> tuple[str, ...]:
-    """Return the attributes that the JSON object of a class has; none if it has no fields."""
+def shown(kind: type) -> ShownKeys | None:
+    """Return the keys that the JSON object of a class has; None if it becomes no object."""
     if kind not in _SHOWN:
-        names: tuple[str, ...] = getattr(kind, "_fields", ())
-        if is_dataclass(kind):
-            names = tuple(each.name for each in fields(kind))
-        _SHOWN[kind] = tuple(name for name in names if not name.startswith("_"))
+        names = _public_fields(kind)
+        _SHOWN[kind] = ShownKeys(names) if names else None
     return _SHOWN[kind]
+
+
+class Words(tuple[str, ...]):
+    """The words that a text is one of, as an annotation of its type for the JSON Schema."""
+
+
+def key_of(name: str) -> str:
+    """Return the key of an attribute, which may be a word of Python with an underscore after it."""
+    return name.rstrip("_")
+
+
+def _public_fields(kind: type) -> tuple[str, ...]:
+    names: tuple[str, ...] = getattr(kind, "_fields", ())
+    if is_dataclass(kind):
+        names = tuple(each.name for each in fields(kind))
+    return tuple(name for name in names if not name.startswith("_"))
+
+
+def _as_object(value: object, shape: ShownKeys) -> dict[str, Any]:
+    plain: dict[str, Any] = {}
+    for name in shape.names:
+        part = getattr(value, name)
+        if name in shape.spread:
+            plain |= as_plain(part) or {}
+        elif part is not None or name not in shape.optional:
+            empty = name in shape.null_if_empty and not part
+            plain[key_of(name)] = None if empty else as_plain(part)
+    return plain

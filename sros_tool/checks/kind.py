@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 
 from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.values import shows
 
 
 class Severity(StrEnum):
@@ -54,25 +54,32 @@ _WEIGHTS = {each: weight for weight, each in enumerate(Severity)}
 NOTE, WARNING, ERROR = Severity.NOTE, Severity.WARNING, Severity.ERROR
 
 
+@shows("id", "severity", "title", "why", "source", "remedy", "vendors", null_if_empty=("vendors",))
 @dataclass(frozen=True, slots=True)
 class FindingKind:
     """A kind of finding.
 
     ``id`` is stable and has the form ``family.name``.  ``title`` is a clause; ``why``, ``source``
-    and ``remedy`` are sentences.  ``source`` says where the rule comes from: a section of a
-    specification, a vendor and version, ROS.  ``group`` is an id that several kinds share.
-    ``vendors`` are the affected DDS vendors; empty means all.  A ``prominent`` note is shown where
+    and ``remedy`` are sentences.  ``source`` is a section of a specification, a vendor and version,
+    or ROS.  ``group`` is an id that several kinds share.  A ``prominent`` note is shown where
     warnings are, and counts as the note that it is.
     """
 
     id: str
+    """Its id."""
     severity: Severity
+    """Its severity."""
     title: str
+    """What is wrong."""
     why: str
+    """Why that matters."""
     source: str
+    """Where the rule comes from."""
     remedy: str
+    """What to do."""
     group: str = ""
     vendors: tuple[Vendor, ...] = ()
+    """The DDS vendors that it concerns; null for all."""
     prominent: bool = False
 
     @property
@@ -93,29 +100,17 @@ class FindingKind:
         """Return a finding of this kind."""
         return Finding(self, subject, text, file, line or None, remedy, accepted, related)
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the JSON value that `sros check --list --json` prints."""
-        return {
-            "id": self.id,
-            "severity": self.severity.word,
-            "title": self.title,
-            "why": self.why,
-            "source": self.source,
-            "remedy": self.remedy,
-            "vendors": list(self.vendors) or None,
-        }
-
 
 @dataclass(frozen=True, slots=True)
 class RelatedPlace:
-    """Another place that a finding is about; ``text`` says what is there, as a clause.
-
-    ``line`` counts from 1; None stands for the whole file.
-    """
+    """Another place that a finding is about."""
 
     text: str
+    """What is there."""
     file: str
+    """The file."""
     line: int | None = None
+    """The line in that file, from 1, or null."""
 
     def __str__(self) -> str:
         """Return text such as ``robot.xml:12``."""
@@ -138,40 +133,53 @@ class Cause:
     place: str = ""
 
 
+@shows(
+    *("id", "severity", "subject", "file", "line", "text", "remedy", "source", "accepted"),
+    "related",
+    null_if_empty=("file", "accepted"),
+)
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A problem found at one place.
+    """A finding of ``sros check``.
 
-    ``subject`` is the affected enclave, variable or file; ``file`` is a path, or ""; ``line``
-    counts from 1.  ``text`` says what was found; ``own_remedy`` replaces the remedy of the kind
-    unless it is empty.  ``accepted`` names the template or setting that accepts the finding, which
-    then counts as a note.  ``related`` are other places that it is
-    about, in the order to read them.  ``cause`` is set if others have the same cause.
+    ``own_remedy`` replaces the remedy of the kind unless it is empty.  An accepted finding counts
+    as a note.  ``cause`` is set if others have the same cause.
     """
 
     kind: FindingKind
     subject: str
+    """The enclave, variable or file that it is about."""
     text: str
+    """What was found."""
     file: str = ""
+    """The file that has it, or null."""
     line: int | None = None
+    """The line in that file, from 1, or null."""
     own_remedy: str = ""
     accepted: str = ""
+    """The template or setting that accepts it, or null."""
     related: tuple[RelatedPlace, ...] = ()
+    """Other places that it is about, in the order to read them."""
     cause: Cause | None = None
 
     @property
     def id(self) -> str:
-        """The id of its kind."""
+        """The kind of finding, such as ``enclave.certificate-expired``."""
         return self.kind.id
 
     @property
+    def source(self) -> str:
+        """Where the rule comes from."""
+        return self.kind.source
+
+    @property
     def severity(self) -> Severity:
-        """The severity of its kind, or `NOTE` if it was accepted."""
+        """Its severity."""
         return NOTE if self.accepted else self.kind.severity
 
     @property
     def remedy(self) -> str:
-        """The remedy of this finding, or else of its kind."""
+        """What to do."""
         return self.own_remedy or self.kind.remedy
 
     @property
@@ -180,23 +188,6 @@ class Finding:
         if not self.file:
             return self.subject
         return f"{self.file}:{self.line}" if self.line else self.file
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the JSON value that `sros check --json` prints."""
-        return {
-            "id": self.id,
-            "severity": self.severity.word,
-            "subject": self.subject,
-            "file": self.file or None,
-            "line": self.line,
-            "text": self.text,
-            "remedy": self.remedy,
-            "source": self.kind.source,
-            "accepted": self.accepted or None,
-            "related": [
-                {"text": each.text, "file": each.file, "line": each.line} for each in self.related
-            ],
-        }
 
 
 def by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
-from typing import Any
 
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.process_files import PROCESS_NOT_SEEN
@@ -23,24 +22,19 @@ class ChangeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FindingChange:
-    """A finding that is new, says something else than before, or is over."""
+    """A change among the findings about processes; each is an object on a line of its own."""
 
-    kind: ChangeKind
     time: datetime
+    """When it was seen, in UTC."""
+    change: ChangeKind
+    """What became of the finding: it is new, says something else, or is over."""
     finding: Finding
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the JSON value that `sros check runtime --watch --json` prints on a line."""
-        return {
-            "time": iso(self.time),
-            "change": self.kind.value,
-            "finding": self.finding.as_json(),
-        }
+    """The finding."""
 
     def __str__(self) -> str:
         """Return a line of text."""
         of = self.finding
-        head = f"{iso(self.time)} {self.kind}: {of.subject}: {of.severity.word}: {of.kind.title}"
+        head = f"{iso(self.time)} {self.change}: {of.subject}: {of.severity.word}: {of.kind.title}"
         return f"{head} [{of.id}]: {of.text}"
 
 
@@ -61,9 +55,9 @@ class FindingNews:
         before, self._before = self._before, found
         for key, each in before.items():
             if key not in found:
-                yield FindingChange(ChangeKind.OVER, now, each)
+                yield FindingChange(now, ChangeKind.OVER, each)
         for key, each in found.items():
             if key not in before:
-                yield FindingChange(ChangeKind.NEW, now, each)
+                yield FindingChange(now, ChangeKind.NEW, each)
             elif each.text != before[key].text and each.kind is not PROCESS_NOT_SEEN:
-                yield FindingChange(ChangeKind.CHANGED, now, each)
+                yield FindingChange(now, ChangeKind.CHANGED, each)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from types import ModuleType
+from typing import NamedTuple
 
 from sros_tool.checks import (
     environment,
@@ -26,7 +27,16 @@ from sros_tool.checks.keystores import (
     vendors,
     zenoh_files,
 )
-from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, Severity, by_id
+from sros_tool.checks.kind import (
+    ERROR,
+    NOTE,
+    WARNING,
+    Finding,
+    FindingKind,
+    Severity,
+    by_cause,
+    by_id,
+)
 from sros_tool.errors import UsageError
 
 _MODULES = (
@@ -114,9 +124,75 @@ class ChosenFindings:
     accepted: tuple[Finding, ...]
     hidden: int
 
+    def numbers(self) -> dict[str, int]:
+        """Return the number of shown findings of each severity, the worst first."""
+        severities = [finding.severity for finding in self.shown]
+        return {str(level): severities.count(level) for level in (ERROR, WARNING, NOTE)}
+
     def fails(self, level: Severity) -> bool:
         """Return whether a finding of at least this severity is shown."""
         return any(each.severity >= level for each in self.shown)
+
+
+class SharedCause(NamedTuple):
+    """What several findings have in common."""
+
+    title: str
+    """What is wrong."""
+    text: str
+    """What was found, and why it matters."""
+    remedy: str
+    """What to do about all of them."""
+    findings: Sequence[int]
+    """The positions of its findings in ``findings``, from 0."""
+
+
+class FindingCounts(NamedTuple):
+    """The numbers of findings."""
+
+    error: int
+    """Errors shown."""
+    warning: int
+    """Warnings shown."""
+    note: int
+    """Notes shown."""
+    accepted: int
+    """Findings that the template accepts, which ``--strict`` makes count."""
+    hidden: int
+    """Findings below ``--severity``."""
+
+
+class ShownFindings(NamedTuple):
+    """The findings."""
+
+    findings: Sequence[Finding]
+    """The findings that are shown."""
+    causes: Sequence[SharedCause]
+    """What several findings have in common, which is shown in their place as text."""
+    accepted: Sequence[Finding]
+    """Findings that the keystore's template accepts."""
+    counts: FindingCounts
+    """The numbers of findings."""
+
+
+def shown_findings(chosen: ChosenFindings) -> ShownFindings:
+    """Return what ``--json`` prints of findings."""
+    place = {id(finding): index for index, finding in enumerate(chosen.shown)}
+    causes = [
+        SharedCause(cause.title, cause.text, cause.remedy, [place[id(one)] for one in group])
+        for group in by_cause(chosen.shown)
+        if len(group) > 1 and (cause := group[0].cause)
+    ]
+    error, warning, note = chosen.numbers().values()
+    counts = FindingCounts(error, warning, note, len(chosen.accepted), chosen.hidden)
+    return ShownFindings(chosen.shown, causes, chosen.accepted, counts)
+
+
+class AllKinds(NamedTuple):
+    """All kinds of findings."""
+
+    kinds: Sequence[FindingKind]
+    """The kinds."""
 
 
 def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations, islice, product
 from pathlib import Path
+from typing import Annotated, NamedTuple
 
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import DocumentError
 from sros_tool.policy.patterns import ComparisonLimit
-from sros_tool.translate_from_zenoh import is_self_limiting
+from sros_tool.translate_from_zenoh import RightsBehindRules, is_self_limiting
+from sros_tool.values import Words
+from sros_tool.written import DryRun, FileChange, Notes
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import Message
 from sros_tool.zenoh.configuration import Mode
@@ -469,3 +472,81 @@ def _overruled(
 def _meet(one: str, other: str, limit: ComparisonLimit) -> bool:
     limit.spend(len(one) + len(other))
     return intersects(one, other)
+
+
+# ── what is printed of a configuration ──────────────────────────────────────────────────────
+
+VERBS = {"publish": "publish", "subscribe": "subscribe", "request": "call", "reply": "serve"}
+"""The word for each right to a name, of those that rules of Zenoh give."""
+
+Verb = Annotated[str, Words(VERBS.values()), "The right."]
+
+
+class AllowedName(NamedTuple):
+    """A right to a name of ROS."""
+
+    right: Verb
+    name: str
+    """The topic or service, perhaps with wildcards."""
+    domain: str
+    """The ROS domain, perhaps with wildcards."""
+    lacks: Sequence[str]
+    """Kinds of messages without which the right is of no use, and which are not allowed."""
+
+
+class KeyRight(NamedTuple):
+    """A right and a key."""
+
+    right: Verb
+    key: str
+    """A key expression of Zenoh."""
+
+
+class SubjectRights(NamedTuple):
+    """A subject of access control."""
+
+    id: str | None
+    """Its id; null without access control."""
+    names: Sequence[str] | None
+    """The common names of its certificates; null for everybody."""
+    own: bool
+    """Whether the rights are those of the process itself, by rules that bind only itself."""
+    rights: Sequence[AllowedName]
+    """What it may do."""
+    unsaid: Sequence[KeyRight]
+    """Rights to keys that no ROS name states exactly."""
+    denied: Sequence[KeyRight]
+    """Denied keys; a wildcard may pass a denial."""
+
+
+class ReadConfiguration(NamedTuple):
+    """What an existing configuration allows whom."""
+
+    file: str
+    """The configuration, as it was named."""
+    mode: Mode
+    """How the process takes part in the network."""
+    enforced: bool
+    """Whether access control is on."""
+    subjects: Sequence[SubjectRights]
+    """To whom its rules apply."""
+    findings: Sequence[Finding]
+    """The findings that are warnings or errors."""
+    output: Path | None
+    """The policy that was written, or null."""
+    dry_run: DryRun
+    changes: Sequence[FileChange]
+    """The files that were written or, with ``--dry-run`` or ``--check``, would be."""
+    notes: Notes
+
+
+def subject_rights(behind: RightsBehindRules) -> SubjectRights:
+    """Return what is printed of the rights of a subject."""
+    return SubjectRights(
+        behind.subject or None,
+        behind.names,
+        behind.own,
+        [AllowedName(VERBS[it.right], it.name, it.domain, it.lacks) for it in behind.rights],
+        unsaid=[KeyRight(VERBS[right], key) for right, key in behind.unsaid],
+        denied=[KeyRight(VERBS[right], key) for right, key in behind.denied],
+    )

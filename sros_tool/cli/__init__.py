@@ -2,7 +2,7 @@
 
 `program` lists the verbs; the modules of the verbs, by what they are about:
 
-- keystores: `keystore` (with the JSON of `written`), `inspect`, `life`, `zenoh` and `zenoh_from`
+- keystores: `keystore`, `inspect`, `life`, `zenoh` and `zenoh_from`
 - robots: `deployment`, `fleet`, `units`, `metrics`
 - processes: `running` (with `enclave_environment` and `containers`), `demo`
 - policies: `policy` (with `new_access`), `review`, `view`

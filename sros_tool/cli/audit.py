@@ -31,11 +31,11 @@ from sros_tool.cli.observing import (
     observing_options,
     why_empty,
 )
-from sros_tool.cli.written import file_change
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UnavailableError, UsageError, counted
 from sros_tool.terminal import echo
 from sros_tool.values import as_plain
+from sros_tool.written import file_change
 
 if TYPE_CHECKING:
     from sros_tool.explain.audit import Audit, AuditedEnclaves

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 from click.core import ParameterSource
@@ -39,6 +39,7 @@ from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines, visible
+from sros_tool.values import shows
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -479,28 +480,18 @@ def _relative(file: str) -> str:
 
 
 def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
-    from sros_tool.keystore.expiry import describe_lifetime, due_enclaves, parse_threshold
+    from sros_tool.keystore.expiry import (
+        describe_lifetime,
+        due_enclaves,
+        expiring_enclaves,
+        parse_threshold,
+    )
     from sros_tool.keystore.reader import load_settings
-    from sros_tool.validity import iso
 
     threshold = parse_threshold(text)
     due, unreadable, count = due_enclaves(root, threshold, moment, load_settings(root))
     if form == "json":
-        print_json(
-            {
-                "enclaves": [
-                    {
-                        "enclave": each.name,
-                        "certificate_until": iso(each.certificate.not_after),
-                        "permissions_until": iso(each.permissions.not_after),
-                    }
-                    for each in due
-                ],
-                "unreadable": [
-                    {"enclave": each.name, "problem": str(each.error)} for each in unreadable
-                ],
-            }
-        )
+        print_json(expiring_enclaves(due, unreadable))
     else:
         lines = [describe_lifetime(each, moment) for each in due]
         lines += [f"{other.name}  unknown: {other.error}" for other in unreadable]
@@ -595,7 +586,7 @@ def _print_text(chosen: ChosenFindings, fleet: Fleet | None = None) -> None:
 
 def findings_summary(chosen: ChosenFindings) -> str:
     """Return the number of findings, in words."""
-    counts = _counts(chosen)
+    counts = chosen.numbers()
     counted = [f"{number} {word}{'s' * (number != 1)}" for word, number in counts.items() if number]
     number = chosen.hidden
     hidden = f" (not shown: {number} note{'s' * (number != 1)}, --severity note)" if number else ""
@@ -607,36 +598,10 @@ def findings_summary(chosen: ChosenFindings) -> str:
     return f"{first} {accepted} (--strict makes them count){hidden}"
 
 
-def _counts(chosen: ChosenFindings) -> dict[str, int]:
-    words = [each.severity.word for each in chosen.shown]
-    return {word: words.count(word) for word in ("error", "warning", "note")}
-
-
 def _print_json(chosen: ChosenFindings, _selection: FindingFilter) -> None:
-    from sros_tool.checks.kind import by_cause
+    from sros_tool.checks.registry import shown_findings
 
-    place = {id(each): index for index, each in enumerate(chosen.shown)}
-    print_json(
-        {
-            "findings": [each.as_json() for each in chosen.shown],
-            "causes": [
-                {
-                    "title": group[0].cause.title,
-                    "text": group[0].cause.text,
-                    "remedy": group[0].cause.remedy,
-                    "findings": [place[id(each)] for each in group],
-                }
-                for group in by_cause(chosen.shown)
-                if len(group) > 1 and group[0].cause
-            ],
-            "accepted": [each.as_json() for each in chosen.accepted],
-            "counts": {
-                **_counts(chosen),
-                "accepted": len(chosen.accepted),
-                "hidden": chosen.hidden,
-            },
-        }
-    )
+    print_json(shown_findings(chosen))
 
 
 def _print_sarif(chosen: ChosenFindings, selection: FindingFilter) -> None:
@@ -649,15 +614,26 @@ def _print_sarif(chosen: ChosenFindings, selection: FindingFilter) -> None:
 
 def _print_kinds(selection: FindingFilter, form: str) -> None:
     """Print the kinds of findings that are selected."""
-    from sros_tool.checks.registry import select_kinds
+    from sros_tool.checks.registry import AllKinds, select_kinds
 
     kinds = list(select_kinds(selection))
     if form != "text":
-        print_json({"kinds": [each.as_json() for each in kinds]})
+        print_json(AllKinds(kinds))
         return
     width = max((len(each.id) for each in kinds), default=0)
     for each in kinds:
         echo(f"{each.id:{width}}  {each.severity.word:7}  {each.title}")
+
+
+@shows(spread=("diagnosis",))
+class MachineReport(NamedTuple):
+    """The DDS of this machine, and whether it enforces security."""
+
+    diagnosis: Diagnosis
+    ros2_security: SecurityProvider | None
+    """Whose command ``ros2 security`` is; null without ros2, or if no package has it."""
+    findings: Sequence[Finding]
+    """Findings of ``sros check runtime``."""
 
 
 _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
@@ -723,9 +699,7 @@ def doctor(report: Path | None, force: bool, as_json: bool) -> None:
     findings = _findings_here(os.environ, moment, insecure)
     provider = security_provider(os.environ)
     if as_json:
-        shown = [each.as_json() for each in findings]
-        ros2 = {"provider": provider.provider, "hidden": provider.hidden} if provider else None
-        print_json({**diagnosis.as_json(), "ros2_security": ros2, "findings": shown})
+        print_json(MachineReport(diagnosis, provider, findings))
     else:
         echo_lines(diagnosis_text(diagnosis))
         if provider:

@@ -335,8 +335,8 @@ def json_text(value: object) -> str:
     return visible_json(json.dumps(value, indent=2, ensure_ascii=False))
 
 
-def print_json(value: Mapping[str, Any]) -> None:
-    """Print what ``--json`` shows of a verb on stdout; docs/json.md has the keys."""
+def print_json(value: object) -> None:
+    """Print what ``--json`` shows of a verb on stdout; the type of ``value`` says the keys."""
     echo_lines(json_text(versioned(value)))
 
 

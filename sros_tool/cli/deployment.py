@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -35,15 +35,9 @@ from sros_tool.cli.common import (
     split_root,
 )
 from sros_tool.cli.progress import progress
-from sros_tool.cli.written import (
-    authority_json,
-    changes_json,
-    enclave_json,
-    file_change,
-    notes_json,
-)
 from sros_tool.errors import UsageError
 from sros_tool.terminal import Coloured, echo, echo_bytes
+from sros_tool.written import FileChange, file_change
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -51,10 +45,6 @@ if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
-    from sros_tool.keystore.delivery.answer import ImportedEnclave
-    from sros_tool.keystore.delivery.export import ExportSelection
-    from sros_tool.keystore.delivery.request import Requested
-    from sros_tool.keystore.delivery.signing import Certified, Signed
     from sros_tool.policy.model import Policy
 
 _STREAM = Path("-")
@@ -106,6 +96,7 @@ def distribute_key(
     """
     from sros_tool.keystore.delivery.archive import SUFFIXES
     from sros_tool.keystore.delivery.export import distribute, pack_enclaves, select
+    from sros_tool.keystore.outcomes import changes_below
 
     root, rest = split_root(words)
     names = rest[:-1]
@@ -121,7 +112,7 @@ def distribute_key(
             _refuse_terminal()
         with progress("exporting"):
             packed = pack_enclaves(root, selection.names, now=now(), keyless=keyless)
-        changes = [{"action": "send", "path": path} for path in packed.paths]
+        changes = tuple(FileChange("send", path) for path in packed.paths)
         notes = packed.notes
         if not dry_run:
             echo_bytes(packed.data)
@@ -143,7 +134,7 @@ def distribute_key(
         where, done = f"'{target}'", bool(export.changes) and not dry_run
         notes = export.notes
         below = target.parent if target.name.endswith(SUFFIXES) else target
-        changes = changes_json(below, export.changes)
+        changes = changes_below(below, export.changes)
         if dry_run and not as_json:
             print_plan(below, export.changes)
         elif not export.changes and not dry_run:
@@ -155,44 +146,17 @@ def distribute_key(
     for name in selection.names if done and not as_json else ():
         echo(f"exported enclave {name} to {where}", err=target == _STREAM)
     if as_json:
-        print_json(_export_json(root, target, selection, changes, notes, dry_run))
+        from sros_tool.keystore.delivery.shown import ExportedEnclaves, exported_outcomes
+
+        archive = target == _STREAM or target.name.endswith(SUFFIXES)
+        folder, names = Path() if archive else target, selection.names
+        outcomes = exported_outcomes(root, names, folder, changed=bool(changes))
+        left_out = selection.left_out
+        print_json(ExportedEnclaves(root, dry_run, target, outcomes, left_out, changes, notes))
     else:
         print_notes(notes)
     for name in selection.left_out:
         echo(f"left out enclave {name}: its key was made on its robot", err=True)
-
-
-def _export_json(
-    root: Path,
-    target: Path,
-    selection: ExportSelection,
-    changes: list[dict[str, str]],
-    notes: tuple[Note, ...],
-    dry_run: bool,
-) -> dict[str, Any]:
-    from sros_tool.keystore.delivery.archive import SUFFIXES
-    from sros_tool.keystore.layout import enclave_folder
-
-    archive = target == _STREAM or target.name.endswith(SUFFIXES)
-    outcome = "exported" if changes else "kept"
-    return {
-        "keystore": str(root),
-        "dry_run": dry_run,
-        "target": str(target),
-        "enclaves": [
-            enclave_json(
-                root,
-                name,
-                outcome,
-                written=True,
-                folder=(Path() if archive else target) / enclave_folder(name),
-            )
-            for name in selection.names
-        ],
-        "left_out": list(selection.left_out),
-        "changes": changes,
-        "notes": notes_json(notes),
-    }
 
 
 def _check_target(root: Path, word: str) -> None:
@@ -293,18 +257,18 @@ def verify(
             secrets=secrets() if tokens else None,
         )
     if as_json:
-        print_json({**arrival.as_json(), "at": iso(moment), "domain": wanted})
+        print_json(arrival.verified(moment, wanted))
         return 1 if arrival.findings else 0
     for each in arrival.enclaves:
-        until = f" until {iso(each.until)}" if each.until else ""
+        until = f" until {iso(each.valid_until)}" if each.valid_until else ""
         state = (
             f"loadable in domain {each.domains}{until}"
             if each.loadable
             else "its key is on its robot: verify it there"
-            if each.key_elsewhere
+            if each.key_on_robot
             else Coloured("NOT LOADABLE")
         )
-        place = f", key on the token {each.token.token}" if each.token else ""
+        place = f", key on the token {each.token}" if each.token else ""
         echo(f"{each.name}  ", state, place)
     for finding in arrival.findings:
         echo_findings([finding])
@@ -344,7 +308,9 @@ def create_request(
     folder = folder or keystore_from_environment()
     made = create(folder, name, again=again, key=key, secrets=secrets(), dry_run=dry_run)
     if as_json:
-        print_json(_requested_json(folder, made, again, dry_run))
+        from sros_tool.keystore.delivery.shown import shown_request
+
+        print_json(shown_request(folder, made, again=again, dry_run=dry_run))
         return
     if dry_run:
         print_plan(folder, made.changes)
@@ -361,26 +327,6 @@ def create_request(
     echo(f"  its SHA-256 is {made.key}")
     echo(f"  have '{made.file}' signed: sros sign_request")
     print_notes(made.notes)
-
-
-def _requested_json(folder: Path, made: Requested, again: bool, dry_run: bool) -> dict[str, Any]:
-    # A dry run makes a key, too, but does not keep it.
-    known = again or not dry_run
-    return {
-        "folder": str(folder),
-        "dry_run": dry_run,
-        "enclaves": [
-            {
-                "name": made.name,
-                "outcome": "requested_again" if again else "requested",
-                "folder": str(made.file.parent),
-                "request": str(made.file),
-                "key_sha256": made.key if known else None,
-            }
-        ],
-        "changes": changes_json(folder, made.changes),
-        "notes": notes_json(made.notes),
-    }
 
 
 @click.command(
@@ -510,10 +456,10 @@ def sign_request(
         dry_run=dry_run,
     )
     if as_json:
-        changes = changes_json(root, signed.changes)
-        if not stream:
-            changes += file_change(output, existed=existed)
-        print_json(_signed_json(root, signed, output, changes, dry_run))
+        from sros_tool.keystore.delivery.shown import shown_answer
+
+        more = () if stream else file_change(output, existed=existed)
+        print_json(shown_answer(root, signed, output, more, dry_run=dry_run))
     elif dry_run:
         print_plan(root, signed.changes)
         if not stream:
@@ -582,7 +528,9 @@ def _certify(
         dry_run=dry_run,
     )
     if as_json:
-        print_json(_certified_json(root, done, renew=renew, dry_run=dry_run))
+        from sros_tool.keystore.delivery.shown import shown_certified
+
+        print_json(shown_certified(root, done, renew=renew, dry_run=dry_run))
     elif dry_run:
         print_plan(root, done.changes)
     else:
@@ -595,65 +543,6 @@ def _certify(
     if not dry_run:
         print_closed(root, done.changes)
     print_notes(done.notes)
-
-
-def _certified_json(root: Path, done: Certified, *, renew: bool, dry_run: bool) -> dict[str, Any]:
-    from sros_tool.keystore.layout import PERMISSIONS
-    from sros_tool.keystore.reader import load_ca_certificate
-
-    outcome = "renewed" if renew else "created"
-    return {
-        "keystore": str(root),
-        "dry_run": dry_run,
-        "answer": None,
-        "enclaves": [
-            {
-                **enclave_json(
-                    root,
-                    name,
-                    "kept" if name in done.kept else outcome,
-                    written=name in done.kept or not dry_run,
-                ),
-                "key_sha256": key,
-            }
-            for name, key in done.keys.items()
-        ],
-        "authorities": _authorities_json(done.identity_ca, load_ca_certificate(root, PERMISSIONS)),
-        "changes": changes_json(root, done.changes),
-        "notes": notes_json(done.notes),
-    }
-
-
-def _signed_json(
-    root: Path, signed: Signed, answer: Path, changes: list[dict[str, str]], dry_run: bool
-) -> dict[str, Any]:
-    from sros_tool.keystore.layout import PERMISSIONS
-    from sros_tool.keystore.reader import load_ca_certificate
-
-    outcome = "renewed" if signed.renewed else "created"
-    enclave = enclave_json(root, signed.name, outcome, written=not dry_run)
-    permissions_ca = load_ca_certificate(root, PERMISSIONS)
-    return {
-        "keystore": str(root),
-        "dry_run": dry_run,
-        "answer": str(answer),
-        "enclaves": [{**enclave, "key_sha256": signed.key}],
-        "authorities": _authorities_json(signed.identity_ca, permissions_ca),
-        "changes": changes,
-        "notes": notes_json(signed.notes),
-    }
-
-
-def _authorities_json(
-    identity: x509.Certificate, permissions: x509.Certificate
-) -> list[dict[str, Any]]:
-    """Return the CAs that a robot trusts as JSON values; one for both roles, if it is one."""
-    from sros_tool.keystore.layout import ROLES
-
-    if identity == permissions:
-        return [authority_json(ROLES, identity)]
-    pairs = zip(ROLES, (identity, permissions), strict=True)
-    return [authority_json((role,), certificate) for role, certificate in pairs]
 
 
 @click.command(
@@ -715,7 +604,9 @@ def import_verb(
     if not dry_run:
         print_closed(folder, done.changes)
     if as_json:
-        print_json(_imported_json(folder, done, bool(pinned), dry_run))
+        from sros_tool.keystore.delivery.shown import shown_import
+
+        print_json(shown_import(folder, done, pinned=bool(pinned), dry_run=dry_run))
         return
     if dry_run:
         print_plan(folder, done.changes)
@@ -737,23 +628,6 @@ def import_verb(
     print_notes(done.notes)
     if done.restart_zenoh:
         print_restart((done.name,), exported=False)
-
-
-def _imported_json(
-    folder: Path, done: ImportedEnclave, pinned: bool, dry_run: bool
-) -> dict[str, Any]:
-    outcome = "imported" if done.changes else "kept"
-    known = not dry_run or not done.changes
-    return {
-        "folder": str(folder),
-        "dry_run": dry_run,
-        "enclaves": [enclave_json(folder, done.name, outcome, written=known)],
-        "authorities": _authorities_json(done.identity_ca, done.permissions_ca),
-        "authorities_verified": pinned or not done.first,
-        "restart_zenoh": [done.name] if done.restart_zenoh else [],
-        "changes": changes_json(folder, done.changes),
-        "notes": notes_json(done.notes),
-    }
 
 
 def _named(certificate: x509.Certificate) -> str:

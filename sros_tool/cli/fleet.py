@@ -29,9 +29,9 @@ from sros_tool.cli.common import (
 )
 from sros_tool.cli.metrics import check_suffix
 from sros_tool.cli.progress import progress
-from sros_tool.cli.written import file_change, notes_json
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
+from sros_tool.written import file_change
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -145,10 +145,9 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     input. It replaces the last one of the robot, and proves nothing about it: `sros fleet status`
     compares it with what the robot should have.
     """
-    from sros_tool.keystore.confirmation import MAX_BYTES, keep, receive
+    from sros_tool.keystore.confirmation import MAX_BYTES, KeptConfirmation, keep, receive
     from sros_tool.keystore.fleet import recorded_fleet
     from sros_tool.keystore.layout import confirmation_file
-    from sros_tool.validity import iso
 
     root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
     if len(rest) != 1:
@@ -166,10 +165,19 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     enclaves = confirmation.enclaves()
     notes = [Note("fleet.clock", f"{robot}: {text}")] if (text := received.clock_note()) else []
     if as_json:
-        shown = {"dry_run": dry_run, "changes": changes, "notes": notes_json(notes)}
-        moments = {"received": iso(received.time), "clock": iso(confirmation.time)}
-        numbers = {"enclaves": list(enclaves), "files": len(confirmation.files)}
-        print_json({"keystore": str(root), "robot": robot, **moments, **numbers, **shown})
+        print_json(
+            KeptConfirmation(
+                root,
+                robot,
+                received=received.time,
+                clock=confirmation.time,
+                enclaves=enclaves,
+                files=len(confirmation.files),
+                dry_run=dry_run,
+                changes=changes,
+                notes=notes,
+            )
+        )
     else:
         done = "would keep" if dry_run else "kept"
         echo(

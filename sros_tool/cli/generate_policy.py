@@ -25,10 +25,10 @@ from sros_tool.cli.observing import (
     observing_options,
     why_empty,
 )
-from sros_tool.cli.written import file_change
 from sros_tool.errors import SrosError, UsageError, counted
 from sros_tool.terminal import echo, echo_document
 from sros_tool.values import as_plain
+from sros_tool.written import FileChange, file_change
 
 if TYPE_CHECKING:
     from sros_tool.graph.document import Draft
@@ -265,7 +265,7 @@ def _json(
     return value
 
 
-def _created(path: Path) -> dict[str, str]:
+def _created(path: Path) -> FileChange:
     (change,) = file_change(path, existed=False)
     return change
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -39,7 +39,6 @@ from sros_tool.cli.common import (
 )
 from sros_tool.cli.findings import print_signed
 from sros_tool.cli.progress import progress
-from sros_tool.cli.written import authority_json, changes_json, enclave_json, notes_json
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo
 
@@ -306,7 +305,9 @@ def _show(
     signed = {*result.created, *result.changed, *result.kept}
     found = signed_findings(policies, signed, os.environ.get("ROS_DISTRO", ""))
     if as_json:
-        print_json(_creation_json(result, dry_run, [as_note(each) for each in found]))
+        from sros_tool.keystore.lifecycle.shown import shown_creation
+
+        print_json(shown_creation(result, [as_note(each) for each in found], dry_run=dry_run))
     elif dry_run:
         print_plan(result.root, result.changes)
     else:
@@ -344,27 +345,6 @@ def _show(
     print_notes(result.notes)
     if not as_json:
         print_signed(found, [each.file for each in policies])
-
-
-def _creation_json(result: Creation, dry_run: bool, found: Sequence[Note] = ()) -> dict[str, Any]:
-    from sros_tool.values import as_plain
-
-    names = ("created", "changed", "completed", "kept")
-    return {
-        "keystore": str(result.root),
-        "dry_run": dry_run,
-        "new_keystore": result.new_keystore,
-        "enclaves": [
-            enclave_json(result.root, name, each, written=not dry_run or each == "kept")
-            for each in names
-            for name in getattr(result, each)
-        ],
-        "rights": as_plain(result.replaced),
-        "restart": list(result.restart),
-        "restart_zenoh": list(result.zenoh.restart),
-        "changes": changes_json(result.root, result.changes),
-        "notes": notes_json((*result.notes, *result.remarks, *found)),
-    }
 
 
 def _show_rights(replaced: Sequence[ReplacedRights], dry_run: bool, *, err: bool = False) -> None:
@@ -422,8 +402,9 @@ def list_enclaves(
         hidden = hidden_enclaves(root, every)
         names = tuple(each for each in every if "/." not in each)
     if as_json:
-        found = {"keystore": str(root), "enclaves": names, "hidden": hidden}
-        print_json({**found, **_robots_of(root, names)})
+        from sros_tool.keystore.selection import EnclaveList, robots_of
+
+        print_json(EnclaveList(root, names, hidden, robots_of(root, names)))
         return
     for name in names:
         echo(name)
@@ -434,18 +415,6 @@ def list_enclaves(
             f"leaves out: {shown}. `sros check {quote(str(root))}` says what to do.",
             err=True,
         )
-
-
-def _robots_of(root: Path, names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return the robots of enclaves for --json; nothing for a keystore without a fleet."""
-    from sros_tool.fleet.enclaves import robot_of
-    from sros_tool.keystore.fleet import load_fleet
-
-    fleet = load_fleet(root)
-    if fleet is None:
-        return {}
-    found = ((name, robot_of(fleet, name)) for name in names)
-    return {"robots": {name: robot.name for name, robot in found if robot}}
 
 
 if TYPE_CHECKING:
@@ -566,39 +535,16 @@ def create_keystore(
     )
     print_notes(result.notes)
     if as_json:
-        print_json(_keystore_json(result, template, imported, dry_run))
+        from sros_tool.keystore.lifecycle.shown import shown_keystore
+
+        notes = _open_rights(root, template)
+        print_json(shown_keystore(result, template, imported, notes, dry_run=dry_run))
     elif dry_run:
         print_plan(root, result.changes)
     else:
         _print_new_keystore(root, template, result.domains, frozenset(imported))
     if not dry_run:
         _print_open_rights(root, template)
-
-
-def _keystore_json(
-    result: Creation, template: Template, imported: Mapping[str, bytes], dry_run: bool
-) -> dict[str, Any]:
-    from sros_tool.keystore.layout import ROLES
-    from sros_tool.keystore.reader import load_ca_certificate
-    from sros_tool.pki.certificates import load_certificate
-
-    authorities = []
-    for roles in [(each,) for each in ROLES] if template.separate_authorities else [ROLES]:
-        role, certificate = roles[0], None
-        if not dry_run:
-            certificate = load_ca_certificate(result.root, role)
-        elif role in imported:
-            certificate = load_certificate(imported[role], f"of the {role} CA")
-        authorities.append({**authority_json(roles, certificate), "imported": role in imported})
-    return {
-        "keystore": str(result.root),
-        "dry_run": dry_run,
-        "template": template.name,
-        "domains": str(result.domains),
-        "authorities": authorities,
-        "changes": changes_json(result.root, result.changes),
-        "notes": notes_json((*result.notes, *_open_rights(result.root, template))),
-    }
 
 
 _WITH_FROM = ("root", "earlier", "dry_run", "as_json", "verbose")
@@ -627,8 +573,15 @@ def _adopt(root: Path, earlier: Path, dry_run: bool, as_json: bool) -> None:
         )
     print_notes(result.notes)
     if as_json:
-        value = _keystore_json(result, result.template, {}, dry_run)
-        print_json({**_creation_json(result, dry_run), **value, "from": str(earlier)})
+        from sros_tool.keystore.lifecycle.shown import (
+            AdoptedKeystore,
+            shown_creation,
+            shown_keystore,
+        )
+
+        notes = _open_rights(root, result.template)
+        new = shown_keystore(result, result.template, {}, notes, dry_run=dry_run)
+        print_json(AdoptedKeystore(shown_creation(result, dry_run=dry_run), new, earlier))
     elif dry_run:
         print_plan(root, result.changes)
     else:
@@ -976,39 +929,11 @@ def _show_update(
     stage that is left.
     """
     from sros_tool.validity import iso
-    from sros_tool.values import as_plain
 
     if as_json:
-        print_json(
-            {
-                "keystore": str(update.root),
-                "dry_run": dry_run,
-                "needs_allow_looser": bool(update.looser()),
-                "template": {"before": update.before, "after": update.after},
-                "done": as_plain(update.done),
-                "left": as_plain(update.left),
-                "settings": as_plain(update.settings),
-                "rights": as_plain(update.rights),
-                "looser": list(update.looser()),
-                "enclaves": [
-                    enclave_json(update.root, name, outcome, written=not dry_run)
-                    for outcome, names in (("renewed", update.renewed), ("signed", update.signed))
-                    for name in names
-                ],
-                "replaced_work_until": as_plain(update.works_until),
-                "revoked": update.revoked,
-                "restart": list(update.restart),
-                "restart_zenoh": list(update.zenoh.restart),
-                "changes": changes_json(update.root, update.changes),
-                "notes": notes_json(
-                    (
-                        *(Note("keystore.edit-undone", each) for each in undone),
-                        *update.remarks,
-                        *update.notes,
-                    )
-                ),
-            }
-        )
+        from sros_tool.keystore.lifecycle.shown import shown_update
+
+        print_json(shown_update(update, undone, dry_run=dry_run))
         return
     if not (update.done or update.changes):
         echo("nothing is left to do", err=True)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -32,14 +32,12 @@ from sros_tool.cli.common import (
     split_root,
 )
 from sros_tool.cli.progress import progress
-from sros_tool.cli.written import changes_json, enclave_json, notes_json
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.keystore.lifecycle.renew import Renewal
-    from sros_tool.keystore.lifecycle.revoke import Revocation
     from sros_tool.pki.crl import RevocationList
 
 
@@ -121,7 +119,9 @@ def renew(
             progress=step,
         )
     if as_json:
-        print_json(_renewal_json(result, dry_run))
+        from sros_tool.keystore.lifecycle.shown import shown_renewal
+
+        print_json(shown_renewal(result, dry_run=dry_run))
     elif dry_run:
         print_plan(root, result.changes)
     else:
@@ -133,25 +133,6 @@ def renew(
         echo("no enclave needs to be renewed", err=True)
     print_notes(result.notes)
     _print_replaced(result)
-
-
-def _renewal_json(result: Renewal, dry_run: bool) -> dict[str, Any]:
-    from sros_tool.validity import iso
-
-    return {
-        "keystore": str(result.root),
-        "dry_run": dry_run,
-        "enclaves": [
-            enclave_json(result.root, name, "renewed", written=not dry_run)
-            for name in result.renewed
-        ],
-        "replaced_work_until": iso(result.works_until) if result.works_until else None,
-        "revoked": result.revoked,
-        "restart": list(result.restart),
-        "restart_zenoh": list(result.zenoh.restart),
-        "changes": changes_json(result.root, result.changes),
-        "notes": notes_json((*result.notes, *result.remarks)),
-    }
 
 
 def _print_replaced(result: Renewal) -> None:
@@ -255,7 +236,9 @@ def revoke(
         )
     result = replace(result, remarks=(*selection_notes, *result.remarks))
     if as_json:
-        print_json(_revocation_json(result, reason_text, dry_run))
+        from sros_tool.keystore.lifecycle.shown import shown_revocation
+
+        print_json(shown_revocation(result, reason_text, dry_run=dry_run))
     elif dry_run:
         print_plan(root, result.changes)
     else:
@@ -265,22 +248,6 @@ def revoke(
         print_closed(root, result.changes)
     print_restart(result.restart, result.zenoh)
     print_remarks(result.remarks)
-
-
-def _revocation_json(result: Revocation, reason: str, dry_run: bool) -> dict[str, Any]:
-    from sros_tool.validity import iso
-
-    return {
-        "keystore": str(result.root),
-        "dry_run": dry_run,
-        "enclaves": [{"name": name, "outcome": "revoked"} for name in result.revoked],
-        "reason": reason,
-        "next_update": iso(result.next_update),
-        "restart": list(result.restart),
-        "restart_zenoh": list(result.zenoh.restart),
-        "changes": changes_json(result.root, result.changes),
-        "notes": notes_json(result.remarks),
-    }
 
 
 @click.command(
@@ -332,7 +299,10 @@ def crl(
     lists = read_lists(root)
     soon = bool(lists) and min(each.next_update for each in lists) - now() < timedelta(days=30)
     if as_json:
-        print_json(_lists_json(root, lists, result, expires_soon=soon, dry_run=dry_run))
+        from sros_tool.keystore.lifecycle.shown import shown_lists
+
+        enclaves = _names(root)
+        print_json(shown_lists(root, lists, result, enclaves, expires_soon=soon, dry_run=dry_run))
     elif lists:
         for line in _list_lines(lists, _names(root)):
             echo(line)
@@ -371,51 +341,6 @@ def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> It
             f"{subject_text(other.list.issuer)}, until {iso(other.next_update)}: "
             f"{len(other.revoked)} revoked"
         )
-
-
-def _lists_json(
-    root: Path,
-    lists: Sequence[RevocationList],
-    refreshed: Revocation | None,
-    *,
-    expires_soon: bool,
-    dry_run: bool,
-) -> dict[str, Any]:
-    """Return the revocation lists as JSON values; null and empty if nothing was ever revoked."""
-    from sros_tool.pki.certificates import subject_text
-    from sros_tool.validity import iso
-
-    found, names = lists[0] if lists else None, _names(root)
-    return {
-        "keystore": str(root),
-        "dry_run": dry_run,
-        "number": found.number if found else None,
-        "this_update": iso(found.this_update) if found else None,
-        "next_update": iso(found.next_update) if found else None,
-        "expires_soon": expires_soon,
-        "revoked": [
-            {
-                "serial": f"{each.serial:x}",
-                "enclave": names.get(f"{each.serial:x}") or None,
-                "date": iso(each.date),
-                "reason": each.reason,
-            }
-            for each in (found.revoked if found else ())
-        ],
-        "other_lists": [
-            {
-                "issuer": subject_text(each.list.issuer),
-                "number": each.number,
-                "this_update": iso(each.this_update),
-                "next_update": iso(each.next_update),
-                "revoked": [f"{one.serial:x}" for one in each.revoked],
-            }
-            for each in lists[1:]
-        ],
-        "restart": list(refreshed.restart) if refreshed else [],
-        "changes": changes_json(root, refreshed.changes) if refreshed else [],
-        "notes": notes_json(refreshed.remarks) if refreshed else [],
-    }
 
 
 if TYPE_CHECKING:
@@ -559,8 +484,10 @@ def rotate_ca(
                 progress=tick,
             )
     if as_json:
+        from sros_tool.keystore.lifecycle.shown import shown_step
+
         remarks = () if dry_run else rotation_status(root, now=now()).remarks
-        print_json(_step_json(step, remarks, dry_run))
+        print_json(shown_step(step, remarks, dry_run=dry_run))
     elif dry_run:
         print_plan(root, step.changes)
     else:
@@ -575,27 +502,6 @@ def rotate_ca(
             err=True,
         )
     print_notes(step.notes)
-
-
-def _step_json(step: RotationStep, remarks: Sequence[str], dry_run: bool) -> dict[str, Any]:
-    outcome = (
-        "reissued" if any(each.path.endswith("/cert.pem") for each in step.changes) else "kept"
-    )
-    return {
-        "keystore": str(step.root),
-        "dry_run": dry_run,
-        "stage": step.stage.value,
-        "authorities": list(step.files),
-        "enclaves": [
-            enclave_json(step.root, name, outcome, written=not dry_run or outcome == "kept")
-            for name in step.enclaves
-        ],
-        "old_keys_elsewhere": list(step.kept_elsewhere),
-        "cut_off": list(step.cut_off),
-        "remarks": list(remarks),
-        "changes": changes_json(step.root, step.changes),
-        "notes": notes_json(step.notes),
-    }
 
 
 def _print_step(
@@ -658,28 +564,9 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
 
     rotation = status.rotation
     if as_json:
-        print_json(
-            {
-                "stage": rotation.stage,
-                "next": rotation.next_stage(),
-                "enclaves": status.enclaves,
-                "authorities": [
-                    {
-                        "roles": list(each.roles),
-                        "state": each.state,
-                        "subject": each.subject,
-                        "serial": each.serial,
-                        "sha256": each.sha256,
-                        "not_before": iso(each.validity.not_before),
-                        "not_after": iso(each.validity.not_after),
-                        "enclaves": each.enclaves,
-                    }
-                    for each in status.authorities
-                ],
-                "unconfirmed": None if isinstance(unconfirmed, str) else list(unconfirmed),
-                "remarks": list(status.remarks),
-            }
-        )
+        from sros_tool.keystore.lifecycle.shown import shown_status
+
+        print_json(shown_status(status, None if isinstance(unconfirmed, str) else unconfirmed))
         return
     echo(f"stage: {rotation.stage}, next: {rotation.next_stage()}")
     for each in status.authorities:

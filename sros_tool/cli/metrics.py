@@ -24,10 +24,9 @@ from sros_tool.cli.common import (
     save,
 )
 from sros_tool.cli.progress import progress
-from sros_tool.cli.written import file_change
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo, echo_document
-from sros_tool.values import as_plain
+from sros_tool.written import file_change
 
 if TYPE_CHECKING:
     from sros_tool.prometheus import Metric
@@ -83,7 +82,7 @@ def metrics(
     """
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.keystores.metrics import keystore_metrics
-    from sros_tool.prometheus import render_metrics
+    from sros_tool.prometheus import KeystoreMetrics, render_metrics
 
     root, moment = root or keystore_from_environment(), now()
     if output:
@@ -97,11 +96,10 @@ def metrics(
         found = keystore_metrics(root, findings, now=moment, each_enclave=not earliest)
         found += _of_processes(moment) if runtime else ()
     text = render_metrics(found)
-    changes = file_change(output, existed=output.exists()) if output else []
+    changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, text.encode()) if output and not dry_run else ""
     if as_json:
-        shown = {"dry_run": dry_run, "changes": changes, "notes": []}
-        print_json({"keystore": str(root), "metrics": as_plain(found), **shown})
+        print_json(KeystoreMetrics(root, found, dry_run, changes, ()))
     elif dry_run:
         echo(f"would write {output or 'to standard output'}: {len(text)} characters")
     elif output:

@@ -28,10 +28,10 @@ from sros_tool.cli.common import (
     save,
 )
 from sros_tool.cli.progress import progress
-from sros_tool.cli.written import file_change, notes_json
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import as_plain
+from sros_tool.written import FileChange, file_change
 
 if TYPE_CHECKING:
     from sros_tool.errors import Note
@@ -82,7 +82,7 @@ def merge_policy(
     the policies are reported.
     """
     from sros_tool.policy.document import read_policy
-    from sros_tool.policy.merge import EditedText, merge_all, merge_notes
+    from sros_tool.policy.merge import EditedText, MergedPolicy, merge_all, merge_notes
 
     if in_place and output:
         raise UsageError("--in-place and --output exclude each other")
@@ -93,16 +93,24 @@ def merge_policy(
     if output:
         _check_includes(policy, output, merged.document)
     saved = ""
-    changes = []
+    changes: Sequence[FileChange] = ()
     if target and (merged.added or output):
         changes = file_change(target, existed=target.exists())
         saved = "" if dry_run else save(target, merged.document)
     if as_json:
-        value = _merged_json(policy, merged, target if saved else None)
-        if target is None and not dry_run:
-            value["document"] = EditedText(merged.document, str(policy)).text
-        notes = notes_json(merge_notes(merged.contradictions))
-        print_json({**value, "dry_run": dry_run, "changes": changes, "notes": notes})
+        to_show = target is None and not dry_run
+        print_json(
+            MergedPolicy(
+                policy,
+                merged.added,
+                merged.contradictions,
+                output=target if saved else None,
+                document=EditedText(merged.document, str(policy)).text if to_show else None,
+                dry_run=dry_run,
+                changes=changes,
+                notes=merge_notes(merged.contradictions),
+            )
+        )
     elif dry_run:
         for right in merged.added:
             echo(f"would add {right}")
@@ -127,15 +135,6 @@ def _print_added(merged: Merged) -> None:
     echo(f"added {count} right{'s' if count > 1 else ''}", err=True)
     for right in merged.added:
         echo(f"  {right}", err=True)
-
-
-def _merged_json(policy: Path, merged: Merged, written: Path | None) -> dict[str, Any]:
-    return {
-        "policy": str(policy),
-        "added": as_plain(merged.added),
-        "contradictions": as_plain(merged.contradictions),
-        "output": str(written) if written else None,
-    }
 
 
 def _check_includes(policy: Path, output: Path, document: bytes) -> None:
@@ -500,11 +499,11 @@ def minimize_policy(
             "Nothing was written.",
             "This is a defect of sros: please report it with the policy.",
         )
-    changes = file_change(output, existed=output.exists()) if output else []
+    changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, document) if output and not dry_run else ""
     if as_json:
         value = _minimized_json(policy, result, measured, output if not dry_run else None)
-        value |= {"dry_run": dry_run, "changes": changes, "notes": notes_json(notes)}
+        value |= {"dry_run": dry_run, "changes": changes, "notes": notes}
         print_json(_as_written(value))
     else:
         for use in result.uses:
@@ -850,7 +849,7 @@ def _convert(
             "This is a defect of sros: please report it with the policy.",
         )
     names = ", ".join(each.path for each in policy.enclaves)
-    changes = file_change(output, existed=output.exists()) if output else []
+    changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, document) if output and not dry_run else ""
     if as_json:
         value: dict[str, Any] = {
@@ -860,7 +859,7 @@ def _convert(
             "output": str(output) if saved else None,
             "dry_run": dry_run,
             "changes": changes,
-            "notes": notes_json(converted.notes),
+            "notes": converted.notes,
         }
         print_json(value if output or dry_run else {**value, "document": document.decode()})
     elif output is None and not dry_run:

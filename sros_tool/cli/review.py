@@ -229,7 +229,24 @@ def review(
         outputs.write_error(error)
         raise
     if as_json:
-        print_json(_as_json(result))
+        from sros_tool.proof.review import ReviewResult, StepResult
+
+        steps = [
+            StepResult(
+                each.kind, result.shown(each.subject) or None, each.status, _sentence(result, each)
+            )
+            for each in result.steps
+        ]
+        print_json(
+            ReviewResult(
+                result.base or None,
+                result.head,
+                result.status,
+                steps,
+                findings=[result.shown_finding(each) for each in _all(result)],
+                left_out=result.left_out,
+            )
+        )
     else:
         for line in _text(result):
             echo(line)
@@ -459,25 +476,6 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             return f"### {_TITLES[step.kind]}\n\n{bounded(said, 6000, rest)}"
         case error:
             return f"### {_TITLES[step.kind]}: could not be decided\n\n{code(str(error))}"
-
-
-def _as_json(result: Review) -> dict[str, Any]:
-    return {
-        "base": result.base or None,
-        "head": result.head,
-        "status": result.status,
-        "steps": [
-            {
-                "step": each.kind,
-                "subject": result.shown(each.subject) or None,
-                "status": each.status,
-                "result": _sentence(result, each),
-            }
-            for each in result.steps
-        ],
-        "findings": [result.shown_finding(each).as_json() for each in _all(result)],
-        "left_out": list(result.left_out),
-    }
 
 
 assert max(_SIGNS) == NOT_DONE

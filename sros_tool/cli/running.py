@@ -25,7 +25,6 @@ from sros_tool.cli.common import (
 )
 from sros_tool.cli.containers import INSTALLED, container_text, target_path
 from sros_tool.cli.enclave_environment import RMWS, loadable_environment
-from sros_tool.cli.written import notes_json
 from sros_tool.errors import Note, UnavailableError, UsageError
 from sros_tool.runtime.containers import COMPOSE, KUBERNETES
 from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
@@ -103,10 +102,10 @@ def _refusal_printed(form: str, as_json: bool) -> Iterator[None]:
     except click.exceptions.Exit:  # --help
         raise
     except BaseException:
-        from sros_tool.runtime.environment import REFUSING, render_refusal
+        from sros_tool.runtime.environment import REFUSING, PrintedEnvironment, render_refusal
 
         if as_json:
-            print_json({"keystore": None, "enclave": None, "variables": REFUSING, "notes": []})
+            print_json(PrintedEnvironment(None, None, REFUSING, ()))
         else:
             echo_document(render_refusal(form))
         raise
@@ -193,7 +192,7 @@ def env(
     A container gets the files of the enclave from an export in DIR (Compose), or from a Secret
     (Kubernetes). Without --image, what is printed is to be merged with a definition that has one.
     """
-    from sros_tool.runtime.environment import render_environment
+    from sros_tool.runtime.environment import PrintedEnvironment, render_environment
 
     check_one_format()
     root, rest = split_root(words)
@@ -220,14 +219,7 @@ def env(
     if found.needs_pin:
         notes.append(Note("token.no-pin", _NO_PIN))
     if as_json:
-        print_json(
-            {
-                "keystore": str(root),
-                "enclave": rest[0],
-                "variables": found.variables,
-                "notes": notes_json(notes),
-            }
-        )
+        print_json(PrintedEnvironment(root, rest[0], found.variables, notes))
     else:
         echo_document(text)
         print_notes(notes)

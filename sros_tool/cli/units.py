@@ -28,11 +28,11 @@ from sros_tool.cli.containers import INSTALLED, target_path
 from sros_tool.cli.enclave_environment import loadable_environment
 from sros_tool.cli.progress import progress
 from sros_tool.cli.running import ACCEPT_KEY, COMMAND, DOMAIN, RMW, WithCommand
-from sros_tool.cli.written import notes_json
 from sros_tool.errors import UsageError
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.runtime.units import Job
 from sros_tool.terminal import echo
+from sros_tool.written import FileChange
 
 if TYPE_CHECKING:
     from sros_tool.errors import Note
@@ -133,6 +133,7 @@ def units(
     from sros_tool.keystore.layout import enclaves_below
     from sros_tool.runtime.units import (
         TEMPLATE,
+        WrittenUnits,
         job_units,
         node_settings,
         node_template,
@@ -195,17 +196,9 @@ def units(
     changes = _changes(folder, files, force=force)
     if not dry_run:
         _write(folder, files, changes)
-    shown = [{"action": action, "path": str(folder / path)} for path, action in changes.items()]
     if as_json:
-        print_json(
-            {
-                "keystore": str(root),
-                "dry_run": dry_run,
-                "enclaves": list(names),
-                "changes": shown,
-                "notes": notes_json(notes),
-            }
-        )
+        written = [FileChange(action, str(folder / path)) for path, action in changes.items()]
+        print_json(WrittenUnits(root, dry_run, names, written, notes))
         return
     for path, action in changes.items():
         word = f"would {action}" if dry_run else {"create": "wrote", "replace": "replaced"}[action]

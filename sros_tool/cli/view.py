@@ -28,10 +28,10 @@ from sros_tool.cli.common import (
     save,
 )
 from sros_tool.cli.progress import progress
-from sros_tool.cli.written import file_change
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo, echo_document
 from sros_tool.values import as_plain, versioned
+from sros_tool.written import file_change
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterator, Mapping, Sequence
@@ -204,7 +204,7 @@ def view(
         for line in picture.headlines:
             echo(line, err=True)
     if dry_run and as_json:
-        changes = file_change(output, existed=output.exists()) if output else []
+        changes = file_change(output, existed=output.exists()) if output else ()
         print_json({"dry_run": True, "changes": changes, "notes": []})
         return
     if dry_run:

@@ -47,7 +47,7 @@ def watch_processes(
                 )
                 for change in news.changes(selection.choose(found).shown, moment):
                     if as_json:
-                        line = json.dumps(versioned(change.as_json()), ensure_ascii=False)
+                        line = json.dumps(versioned(change), ensure_ascii=False)
                         echo_lines(visible_json(line))
                     else:
                         echo(str(change))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -24,13 +24,11 @@ from sros_tool.cli.common import (
     print_restart,
 )
 from sros_tool.cli.progress import progress
-from sros_tool.cli.written import changes_json, notes_json
 from sros_tool.cli.zenoh_from import show_from
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.template import Template
     from sros_tool.zenoh.network import ZenohNetwork
 
@@ -145,7 +143,9 @@ def zenoh(
     }
     changed = dict.fromkeys(map(_document, actions))
     if as_json:
-        print_json(_json(result, network, changed, dry_run=dry_run or only_check))
+        from sros_tool.keystore.lifecycle.shown import shown_zenoh
+
+        print_json(shown_zenoh(result, network, changed, dry_run=dry_run or only_check))
     elif dry_run and not only_check:
         print_plan(root, result.changes)
     else:
@@ -194,29 +194,3 @@ def _domains(text: str | None) -> str:
 def _document(path: str) -> str:
     """Return the path of the document to which a file of Zenoh belongs."""
     return path.removesuffix(".p7s").removesuffix(".json5") + ".json5"
-
-
-def _json(
-    result: Creation, network: ZenohNetwork | None, changed: dict[str, None], *, dry_run: bool
-) -> dict[str, Any]:
-    return {
-        "keystore": str(result.root),
-        "dry_run": dry_run,
-        "network": {
-            "router": network.router,
-            "endpoints": list(network.endpoints),
-            "listen": list(network.listening()),
-            "mode": network.mode.value,
-            "domains": list(network.domains or result.domains),
-        }
-        if network
-        else None,
-        "files": [
-            {"enclave": name, "path": str(result.root / path), "current": path not in changed}
-            for name, path in result.zenoh.files.items()
-        ],
-        "created": list(result.created),
-        "restart": list(result.restart),
-        "changes": changes_json(result.root, result.changes),
-        "notes": notes_json(result.notes),
-    }

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sros_tool.cli.common import check_output, print_json, print_notes, save
 from sros_tool.cli.findings import echo_findings
-from sros_tool.cli.written import file_change, notes_json
 from sros_tool.errors import Note, PolicyError
 from sros_tool.terminal import echo
+from sros_tool.written import FileChange, file_change
 
 if TYPE_CHECKING:
-    from sros_tool.checks.kind import Finding
     from sros_tool.translate_from_zenoh import RightsBehindRules
     from sros_tool.zenoh.document import ConfigurationDocument
 
-_VERBS = {"publish": "publish", "subscribe": "subscribe", "request": "call", "reply": "serve"}
 _MOST_KEYS = 5
 
 
@@ -27,7 +25,7 @@ def show_from(file: Path, output: Path | None, *, force: bool, dry_run: bool, as
     Returns 1 if the configuration is open or does not work (a finding that is an error), else 0.
     """
     from sros_tool.checks.kind import ERROR, WARNING
-    from sros_tool.checks.zenoh import document_findings
+    from sros_tool.checks.zenoh import ReadConfiguration, document_findings, subject_rights
     from sros_tool.policy.document import write_policy
     from sros_tool.translate_from_zenoh import policy_of, rights_behind
     from sros_tool.xml import read_bytes
@@ -43,7 +41,7 @@ def show_from(file: Path, output: Path | None, *, force: bool, dry_run: bool, as
     shown = [each for each in findings if each.severity >= WARNING]
     notes: tuple[Note, ...] = ()
     saved = ""
-    changes: list[dict[str, str]] = []
+    changes: Sequence[FileChange] = ()
     if output:
         policy = policy_of(rights)
         if not policy.enclaves:
@@ -58,13 +56,17 @@ def show_from(file: Path, output: Path | None, *, force: bool, dry_run: bool, as
         saved = "" if dry_run else save(output, write_policy(policy))
     if as_json:
         print_json(
-            {
-                **_json(document, rights, shown),
-                "output": str(output) if saved else None,
-                "dry_run": dry_run,
-                "changes": changes,
-                "notes": notes_json(notes),
-            }
+            ReadConfiguration(
+                document.name,
+                document.mode,
+                document.access.enabled,
+                subjects=[subject_rights(behind) for behind in rights],
+                findings=shown,
+                output=output if saved else None,
+                dry_run=dry_run,
+                changes=changes,
+                notes=notes,
+            )
         )
     else:
         for line in _lines(document, rights):
@@ -72,7 +74,7 @@ def show_from(file: Path, output: Path | None, *, force: bool, dry_run: bool, as
         for each in shown:
             echo_findings([each])
         if output and dry_run:
-            echo(f"would {changes[0]['action']} {output}")
+            echo(f"would {changes[0].action} {output}")
     print_notes(notes)
     if saved:
         echo(saved, err=True)
@@ -80,24 +82,28 @@ def show_from(file: Path, output: Path | None, *, force: bool, dry_run: bool, as
 
 
 def _lines(document: ConfigurationDocument, found: Sequence[RightsBehindRules]) -> Iterator[str]:
+    from sros_tool.checks.zenoh import VERBS
+
     yield f"{document.name}: the configuration of a {_kind(document)}"
     for each in found:
         if not (each.rights or each.unsaid or each.denied):
             continue
         obeys = ", by rules that bind only itself" if each.own else ""
         yield f"{_who(each)}{obeys}"
-        for right in _VERBS:
+        for right in VERBS:
             stated = [one for one in each.rights if one.right == right]
             for one in stated:
                 domain = "" if one.domain == "0" else f" (domain {one.domain})"
                 lacks = f" (of no use without {', '.join(one.lacks)})" if one.lacks else ""
-                yield f"  may {_VERBS[right]} {one.name}{domain}{lacks}"
+                yield f"  may {VERBS[right]} {one.name}{domain}{lacks}"
         yield from _keys("may also", each.unsaid)
         yield from _keys("is denied, if no wildcard is used,", each.denied)
 
 
 def _keys(what: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
-    for right, verb in _VERBS.items():
+    from sros_tool.checks.zenoh import VERBS
+
+    for right, verb in VERBS.items():
         keys = [key for of, key in pairs if of == right]
         more = f" and {len(keys) - _MOST_KEYS} more" if len(keys) > _MOST_KEYS else ""
         if keys:
@@ -158,35 +164,3 @@ def _left_out(found: Sequence[RightsBehindRules]) -> Iterator[Note]:
         "the rules name no nodes: each profile has the last part of its enclave's name, and "
         "absolute names",
     )
-
-
-def _json(
-    document: ConfigurationDocument,
-    found: Sequence[RightsBehindRules],
-    findings: Sequence[Finding],
-) -> dict[str, Any]:
-    return {
-        "file": document.name,
-        "mode": document.mode.value,
-        "enforced": document.access.enabled,
-        "subjects": [
-            {
-                "id": each.subject or None,
-                "names": None if each.names is None else list(each.names),
-                "own": each.own,
-                "rights": [
-                    {
-                        "right": _VERBS[one.right],
-                        "name": one.name,
-                        "domain": one.domain,
-                        "lacks": list(one.lacks),
-                    }
-                    for one in each.rights
-                ],
-                "unsaid": [{"right": _VERBS[right], "key": key} for right, key in each.unsaid],
-                "denied": [{"right": _VERBS[right], "key": key} for right, key in each.denied],
-            }
-            for each in found
-        ],
-        "findings": [each.as_json() for each in findings],
-    }

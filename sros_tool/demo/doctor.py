@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
@@ -17,27 +16,36 @@ from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
 from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.stacks import ROS_ADVICE, Stack, survey
-from sros_tool.values import as_plain
+from sros_tool.values import shows
 
 _PROBE_DOMAIN = 80
 _TEMPLATE = "production"
 
 
+@shows("enforces", "ros_enforces", "stacks", "advice")
 @dataclass(frozen=True)
 class Diagnosis:
     """The stacks of this machine, and advice if none enforces security."""
 
     stacks: tuple[Stack, ...]
+    """What was tried."""
 
     @property
     def enforces(self) -> bool:
-        """Whether at least one stack here enforces security."""
+        """Whether at least one DDS here enforces security."""
         return any(stack.enforces for stack in self.stacks)
 
     @property
     def ros(self) -> Stack | None:
         """The RMW that ROS nodes use here, or None if no RMW is installed."""
         return next((each for each in self.stacks if each.kind == "rmw" and each.present), None)
+
+    @property
+    def ros_enforces(self) -> bool | None:
+        """Whether the RMW that ROS nodes use here enforces security; null if there is none, or if
+        it could not be tried.
+        """
+        return self.ros.enforces if self.ros else None
 
     @property
     def sound(self) -> bool:
@@ -63,17 +71,8 @@ class Diagnosis:
 
     @property
     def advice(self) -> str:
-        """The packages to install if no stack enforces security, else ""."""
+        """What to install if nothing here enforces security, or an empty string."""
         return "" if self.enforces else f"{INSTALL_ADVICE} {ROS_ADVICE}"
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the diagnosis as `sros doctor --json` shows it."""
-        return {
-            "enforces": self.enforces,
-            "ros_enforces": self.ros.enforces if self.ros else None,
-            "stacks": as_plain(self.stacks),
-            "advice": self.advice,
-        }
 
 
 def examine(now: datetime) -> Diagnosis:

@@ -30,16 +30,19 @@ class Effect(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SettingChange:
-    """A setting that changes.
-
-    ``key`` is its key in the settings (``sros.toml``); ``meaning`` is a clause in ROS terms.
-    """
+    """A setting that changes."""
 
     effect: Effect
+    """``looser``: something becomes possible; ``tighter``: something is no longer possible;
+    ``later``: it holds for what is made later."""
     key: str
+    """Its key in sros.toml, or ``domain``."""
     before: str
+    """The value before."""
     after: str
+    """The value after."""
     meaning: str
+    """What that means in ROS terms, as a clause."""
 
     def __str__(self) -> str:
         return f"{self.key} {self.before} -> {self.after}: {self.meaning}"

@@ -12,11 +12,11 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sros_tool.errors import DocumentError, InvalidNameError
 from sros_tool.files import staged_file
@@ -39,6 +39,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.names import check_enclave_name
 from sros_tool.validity import elapsed, iso, parse_iso
 from sros_tool.values import parse_json
+from sros_tool.written import DryRun, FileChange, NamedKeystore, Notes
 from sros_tool.xml import read_bytes
 
 _FORMAT = 1
@@ -183,6 +184,26 @@ class Received:
             return f"its clock is {elapsed(ahead)} ahead"
         late = "or its confirmation was on its way that long"
         return f"its clock is {elapsed(-ahead)} behind, {late}"
+
+
+class KeptConfirmation(NamedTuple):
+    """What a robot confirmed that it has, which the keystore keeps."""
+
+    keystore: NamedKeystore
+    robot: str
+    """The robot."""
+    received: datetime
+    """When it was received, by the clock at home, in UTC."""
+    clock: datetime
+    """When it was made, by the clock of the robot, in UTC."""
+    enclaves: Sequence[str]
+    """The enclaves that the robot has, sorted."""
+    files: int
+    """The number of their files, without keys."""
+    dry_run: DryRun
+    changes: Sequence[FileChange]
+    """The file that was written or, with ``--dry-run``, would be."""
+    notes: Notes
 
 
 def receive(data: bytes, robot: str, what: str, *, now: datetime) -> Received:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 
 from cryptography import x509
 
@@ -84,6 +86,45 @@ class UnreadableEnclave:
 
     name: str
     error: SrosError
+
+
+class DueEnclave(NamedTuple):
+    """An enclave that expires."""
+
+    enclave: str
+    """The enclave."""
+    certificate_until: datetime
+    """Expiry of its certificate, in UTC."""
+    permissions_until: datetime
+    """Expiry of its permissions, in UTC."""
+
+
+class EnclaveProblem(NamedTuple):
+    """An enclave whose expiry cannot be read."""
+
+    enclave: str
+    """The enclave."""
+    problem: str
+    """Why."""
+
+
+class ExpiringEnclaves(NamedTuple):
+    """The enclaves that expire."""
+
+    enclaves: Sequence[DueEnclave]
+    """The enclaves that are due."""
+    unreadable: Sequence[EnclaveProblem]
+    """Enclaves whose expiry cannot be read."""
+
+
+def expiring_enclaves(
+    due: Sequence[Lifetime], unreadable: Sequence[UnreadableEnclave]
+) -> ExpiringEnclaves:
+    """Return what ``--json`` prints of enclaves that are due."""
+    return ExpiringEnclaves(
+        [DueEnclave(it.name, it.certificate.not_after, it.permissions.not_after) for it in due],
+        [EnclaveProblem(enclave.name, str(enclave.error)) for enclave in unreadable],
+    )
 
 
 def parse_threshold(text: str) -> Threshold:

@@ -6,11 +6,36 @@ from collections.abc import Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 
 from sros_tool.errors import KeystoreError, Note
-from sros_tool.fleet.enclaves import Unrecorded, unrecorded_enclaves
+from sros_tool.fleet.enclaves import Unrecorded, robot_of, unrecorded_enclaves
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_fleet, words_for
 from sros_tool.keystore.layout import PRIVATE, SETTINGS, check_keystore, list_enclaves
+from sros_tool.values import shows
+from sros_tool.written import NamedKeystore
+
+
+@shows(optional=("robots",))
+class EnclaveList(NamedTuple):
+    """The enclaves of a keystore."""
+
+    keystore: NamedKeystore
+    enclaves: Sequence[str]
+    """Their names, sorted."""
+    hidden: Sequence[str]
+    """Enclaves in hidden folders, which DDS loads and the verbs of sros leave out, sorted."""
+    robots: Mapping[str, str] | None
+    """The robots of those that belong to one, in a keystore with a fleet."""
+
+
+def robots_of(root: Path, names: Sequence[str]) -> dict[str, str] | None:
+    """Return the robots of the enclaves that belong to one; None without a fleet."""
+    fleet = load_fleet(root)
+    if fleet is None:
+        return None
+    owners = ((name, robot_of(fleet, name)) for name in names)
+    return {name: robot.name for name, robot in owners if robot}
 
 
 def select_enclaves(

@@ -17,6 +17,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
+from typing import NamedTuple
 
 from lxml import etree
 
@@ -36,6 +37,8 @@ from sros_tool.policy.rights import (
     policy_rights,
 )
 from sros_tool.policy.stated import stated_protections
+from sros_tool.values import shows
+from sros_tool.written import DryRun, FileChanges, Notes
 from sros_tool.xml import parse, read_bytes, tag_of
 
 _SHOWN = 3
@@ -50,8 +53,11 @@ class Contradiction:
     """
 
     denied: Right
+    """The denial."""
     allowed: Right
+    """The right."""
     new: bool
+    """Whether the denial is new in the file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,6 +346,25 @@ class Merged:
     document: bytes
     added: tuple[Right, ...]
     contradictions: tuple[Contradiction, ...]
+
+
+@shows(optional=("document",))
+class MergedPolicy(NamedTuple):
+    """The rights that were added to a policy."""
+
+    policy: Path
+    """POLICY, as it was named."""
+    added: Sequence[Right]
+    """The rights that POLICY did not have."""
+    contradictions: Sequence[Contradiction]
+    """Rights that one side allows and the other denies; the denial wins."""
+    output: Path | None
+    """The file that was written, or null."""
+    document: str | None
+    """The merged policy, if no file was to be written."""
+    dry_run: DryRun
+    changes: FileChanges
+    notes: Notes
 
 
 def merge_into(path: Path, additions: Policy) -> Merged:

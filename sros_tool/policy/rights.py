@@ -10,16 +10,18 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from sros_tool.names import expand
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Profile, Qualifier
 from sros_tool.policy.patterns import ComparisonLimit, Names
 from sros_tool.topics import ACTION_PARTS, GOAL
-from sros_tool.values import shows
+from sros_tool.values import Words, shows
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
 """The kind of group for each right, such as topics for publish."""
+
+KindOfName = Annotated[str, Words((*RIGHTS, "dds"))]
 
 RIGHT_ORDER = {right: number for number, right in enumerate(KIND_OF)}
 """The order in which rights are listed: publish, subscribe, request, reply, call, execute."""
@@ -30,20 +32,24 @@ WHOLE = {"request": "call", "reply": "execute"}
 
 @shows("enclave", "qualifier", "kind", "right", "name")
 class Right(NamedTuple):
-    """One right or denial of an enclave; ``name`` is absolute, perhaps with wildcards.
+    """A right or a denial of an enclave.
 
     A name without a leading "/" is a DDS topic without a ROS name; it occurs only in permissions
     that sros did not make.
     """
 
     enclave: str
+    """The enclave."""
     qualifier: Qualifier
-    right: str
+    """Whether it is a right or a denial."""
+    right: Annotated[str, Words(KIND_OF)]
+    """The right in the words of the policy language."""
     name: str
+    """The absolute ROS name, perhaps with wildcards."""
 
     @property
-    def kind(self) -> str:
-        """Topics, services or actions; dds for a topic without a ROS name."""
+    def kind(self) -> KindOfName:
+        """The kind of the name; ``dds`` is a DDS topic without a ROS name."""
         return KIND_OF[self.right] if self.name.startswith("/") else "dds"
 
     def __str__(self) -> str:

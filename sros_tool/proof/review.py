@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from functools import partial
 from pathlib import Path
+from typing import Annotated, NamedTuple
 
 from sros_tool.checks.kind import WARNING, Finding
 from sros_tool.checks.registry import ChosenFindings, FindingFilter
@@ -48,6 +49,7 @@ from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeE
 from sros_tool.proof.requirements import Requirement, read_requirements
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
 from sros_tool.proof.system import System, load_system, policy_system
+from sros_tool.values import Words
 
 _HEAD, _BASE = "HEAD", "BASE"
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
@@ -196,6 +198,42 @@ class Review:
             own_remedy=self.shown(finding.own_remedy),
             related=related,
         )
+
+
+_STEPS = (
+    *("files", "policy", "requirements", "requirements-before", "new-access", "rights"),
+    *("keystore", "expiry"),
+)
+
+
+class StepResult(NamedTuple):
+    """A step."""
+
+    step: Annotated[str, Words(_STEPS)]
+    """What it decides; ``requirements-before`` are those of the base that the change drops."""
+    subject: str | None
+    """The paths that it is about; null for the whole commit."""
+    status: int
+    """Its exit status, as above."""
+    result: str
+    """What it found, or why it could not be decided, in a sentence."""
+
+
+class ReviewResult(NamedTuple):
+    """The review of a change of policies, requirements and keystores in git."""
+
+    base: str | None
+    """The full id of the commit with the access of before; null without a comparison."""
+    head: str
+    """The full id of the commit that was reviewed."""
+    status: int
+    """The exit status: 0 nothing found, 1 something found, 2 something could not be decided."""
+    steps: Sequence[StepResult]
+    """The steps of the review."""
+    findings: Sequence[Finding]
+    """The findings on the commit that was reviewed."""
+    left_out: Sequence[str]
+    """What the review did not look at, as clauses."""
 
 
 def review(request: ReviewRequest, folder: Path) -> Review:

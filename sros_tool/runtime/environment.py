@@ -15,6 +15,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, UsageError
@@ -22,6 +23,21 @@ from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.runtime.zenoh_environment import REFUSING_ZENOH
 from sros_tool.values import yaml_text
+from sros_tool.written import Notes
+
+
+class PrintedEnvironment(NamedTuple):
+    """The environment of an enclave. ``--format json`` prints the object in ``variables`` alone.
+    After an error, the variables let no node start.
+    """
+
+    keystore: Path | None
+    """The keystore, as it was named; null after an error."""
+    enclave: str | None
+    """The enclave; null after an error."""
+    variables: Mapping[str, str]
+    """The environment variables and their values."""
+    notes: Notes
 
 
 def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:

@@ -31,7 +31,9 @@ class SecurityProvider:
     """The distribution whose `ros2 security` runs, and those whose command it hides."""
 
     provider: str
+    """The Python package whose command runs: ``sros_tool`` or ``sros_ros2_security`` are sros."""
     hidden: tuple[str, ...]
+    """Other packages that have the command, which does not run."""
 
     @property
     def ours(self) -> bool:

@@ -21,6 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated
 
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
 from sros_tool.runtime.events import Event, EventKind, ProcessStage, read_events
@@ -32,6 +33,7 @@ from sros_tool.runtime.vendor_log import (
     participant_refusal,
     plain_text,
 )
+from sros_tool.values import Words
 
 _LOG = logging.getLogger(__name__)
 
@@ -59,22 +61,28 @@ class ProbeEnclave:
 
 @dataclass(frozen=True)
 class Stack:
-    """One DDS or RMW; ``enforces`` says whether it enforces security (None: could not be tried).
-
-    ``kind`` is "cyclone" (the libddsc that sros uses), "rmw" (used by rclpy) or "cyclonedds"
-    (the Python package).  ``evidence`` says what was tried and observed.
-    """
+    """A DDS or RMW."""
 
     name: str
-    kind: str
+    """Its name."""
+    kind: Annotated[str, Words(("cyclone", "rmw", "cyclonedds"))]
+    """What it is: libddsc, an RMW of rclpy, or the Python package."""
     dds: str
+    """The DDS."""
     version: str
+    """Its version, or an empty string."""
     where: str
+    """Its library, or an empty string."""
     present: bool
+    """Whether it is installed."""
     enforces: bool | None
+    """Whether it enforces security; null if it could not be tried."""
     evidence: str
+    """What was tried and observed."""
     advice: str = ""
+    """What to do, or an empty string."""
     rmw: str = ""
+    """The RMW, or an empty string."""
 
 
 # ── the stacks ──────────────────────────────────────────────────────────────────────────

@@ -11,10 +11,24 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
+from typing import NamedTuple
 
 from sros_tool.errors import UsageError
 from sros_tool.runtime.environment import render_environment
 from sros_tool.runtime.variables import DOMAIN, ENABLE, KEYSTORE, STRATEGY
+from sros_tool.written import DryRun, FileChanges, NamedKeystore, Notes
+
+
+class WrittenUnits(NamedTuple):
+    """The units of systemd that were written."""
+
+    keystore: NamedKeystore
+    dry_run: DryRun
+    enclaves: Sequence[str]
+    """The enclaves of the nodes."""
+    changes: FileChanges
+    notes: Notes
+
 
 TEMPLATE = "sros@.service"
 """The unit of all nodes; its instance name is the enclave, as `unit_instance` writes it."""

@@ -140,13 +140,13 @@ def test_an_unchanged_export_has_no_findings(arrived: Path) -> None:
         ("/arm/camera", True, "5-6"),
         ("/base", True, "5-6"),
     ]
-    until = arrival.enclaves[0].until
+    until = arrival.enclaves[0].valid_until
     assert until
     assert until - NOW > timedelta(days=179)
     one = verify_arrival(arrived / "enclaves/arm/camera", now=NOW)
     assert (one.kind, [each.name for each in one.enclaves]) == ("enclave", ["/arm/camera"])
     assert not one.findings
-    assert arrival.as_json()["ok"] is True
+    assert arrival.verified(NOW, None).ok
 
 
 def _mix_up(robot: Path) -> None:
@@ -221,7 +221,7 @@ def test_findings(case: str, arrived: Path) -> None:
     spoil, enclave, file, text = FINDINGS[case]
     spoil(arrived)
     arrival = verify_arrival(arrived, now=NOW)
-    assert arrival.as_json()["ok"] is False
+    assert not arrival.verified(NOW, None).ok
     found = [
         each
         for each in arrival.findings
@@ -256,7 +256,7 @@ def test_a_copy_of_the_whole_keystore_has_ca_keys(fleet: Path) -> None:
     assert "private/identity_ca.key.pem, private/permissions_ca.key.pem" in said.text
     assert said.remedy.startswith("Where the keystore is kept, keep the keys")
     # The enclave whose key is on its robot is no finding at home.
-    assert [each.name for each in arrival.enclaves if each.key_elsewhere] == [BORN]
+    assert [each.name for each in arrival.enclaves if each.key_on_robot] == [BORN]
     assert not [each for each in findings if each not in keys]
     # The enclave's links lead to other folders of the same keystore.
     assert not verify_arrival(fleet / "enclaves/base", now=NOW).findings

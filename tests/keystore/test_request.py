@@ -410,7 +410,7 @@ def test_an_answer_completes_the_enclave(home: Path, robot: Path, free_umask: No
     assert present == INSTALLED | {"key.pem", "request.pem"}
     arrival = verify_arrival(robot, now=NOW)
     assert not arrival.findings
-    assert arrival.enclaves[0].until == done.until
+    assert arrival.enclaves[0].valid_until == done.until
     assert not import_answer(robot, signed.archive, now=NOW).changes
     assert not remains(robot)
 

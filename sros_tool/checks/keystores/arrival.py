@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import Annotated, NamedTuple
 
 from sros_tool.checks.keystores.enclaves import WAITS
 from sros_tool.checks.keystores.keystore import keystore_findings
@@ -41,27 +41,70 @@ from sros_tool.keystore.participant import (
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.pki.token import Secrets, open_enclave_key
 from sros_tool.pki.token_uri import TokenUri
-from sros_tool.validity import iso
+from sros_tool.values import Words, shows
 
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
 _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES)
 
 
+class ArrivalFinding(NamedTuple):
+    """A finding about a robot's folder."""
+
+    enclave: str | None
+    """The enclave that it is about, or null."""
+    file: str
+    """Its file, relative to the enclave's folder or to DIR."""
+    text: str
+    """What was found."""
+
+
+class VerifiedFolder(NamedTuple):
+    """Whether the enclaves of a robot can be used."""
+
+    path: Path
+    """DIR, as it was named."""
+    kind: Annotated[str, Words(("keystore", "enclave"))]
+    """What DIR is."""
+    ok: bool
+    """Whether there is no finding: the exit status is 0."""
+    enclaves: Sequence[ArrivedEnclave]
+    """The enclaves."""
+    findings: Sequence[ArrivalFinding]
+    """What is wrong."""
+    at: datetime
+    """The moment that was checked, in UTC."""
+    domain: int | None
+    """The domain that was asked for, or null."""
+
+
+@shows(
+    *("name", "loadable", "domains", "valid_until", "key_on_robot", "token"),
+    null_if_empty=("domains",),
+)
 @dataclass(frozen=True, slots=True)
 class ArrivedEnclave:
     """An enclave on a robot: whether a process can run in it, in which domain, and until when.
 
     It can if it can on one of the measured vendors; what the others refuse is a finding.
-    ``key_elsewhere`` says that only its key is missing here, because it was made on its robot;
-    ``token`` is the place of a key on a token.
+    ``place`` is that of a key on a token.
     """
 
     name: str
+    """The enclave."""
     loadable: bool
+    """Whether a process can run in it."""
     domains: str
-    until: datetime | None
-    key_elsewhere: bool = False
-    token: TokenUri | None = None
+    """The ROS domains that it can join, or null."""
+    valid_until: datetime | None
+    """First expiry of its certificates and permissions, in UTC, or null."""
+    key_on_robot: bool = False
+    """Whether only its key is missing here, because it was made on its robot."""
+    place: TokenUri | None = None
+
+    @property
+    def token(self) -> str | None:
+        """The token that has its key, or null for a key in a file."""
+        return self.place.token if self.place else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,29 +120,18 @@ class Arrival:
     enclaves: tuple[ArrivedEnclave, ...]
     findings: tuple[Finding, ...]
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the JSON value that `sros verify --json` prints."""
-        return {
-            "path": str(self.path),
-            "kind": self.kind,
-            "ok": not self.findings,
-            "enclaves": [
-                {
-                    "name": each.name,
-                    "loadable": each.loadable,
-                    "domains": each.domains or None,
-                    "valid_until": iso(each.until) if each.until else None,
-                    "key_on_robot": each.key_elsewhere,
-                    "token": each.token.token if each.token else None,
-                }
-                for each in self.enclaves
-            ],
-            "findings": [
-                {"enclave": self.enclave_of(each) or None, "file": self.file_of(each), "text": text}
-                for each in self.findings
-                for text in (f"{each.kind.title}: {each.text}",)
-            ],
-        }
+    def verified(self, moment: datetime, domain: int | None) -> VerifiedFolder:
+        """Return what ``--json`` prints of the folder at a moment, for a ROS domain or all."""
+        findings = [
+            ArrivalFinding(
+                self.enclave_of(finding) or None,
+                self.file_of(finding),
+                f"{finding.kind.title}: {finding.text}",
+            )
+            for finding in self.findings
+        ]
+        ok = not findings
+        return VerifiedFolder(self.path, self.kind, ok, self.enclaves, findings, moment, domain)
 
     def enclave_of(self, finding: Finding) -> str:
         """Return the enclave that a finding is about, or ""."""
@@ -163,7 +195,7 @@ def verify_arrival(
         )
     enclaves = tuple(_enclave(root, name, now, domain, zone) for name in names)
     elsewhere = {
-        str(enclave_path(root, each.name) / KEY_FILE) for each in enclaves if each.key_elsewhere
+        str(enclave_path(root, each.name) / KEY_FILE) for each in enclaves if each.key_on_robot
     }
     found = [
         each

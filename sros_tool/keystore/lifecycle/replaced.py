@@ -37,20 +37,24 @@ class EarlierPermissions:
 
 @dataclass(frozen=True, slots=True)
 class ReplacedRights:
-    """The rights of an enclave that changed with its permissions.
+    """What an enclave gains and loses with its new permissions.
 
-    ``lost`` and ``gained`` are rights and denials as their statement would read: a new denial is
-    lost as ``ALLOW`` is.  ``works_until`` is when the replaced permissions expire for whoever kept
-    them with the certificate of that time, or None if they no longer work.  ``lost_domains`` and
-    ``gained_domains`` are ROS domains, as ``0,7``, or "" for none.
+    Rights and denials are as their statement would read: a new denial is lost as ``ALLOW`` is.
     """
 
     enclave: str
+    """The enclave."""
     lost: tuple[Right, ...]
+    """Rights that were taken away, and denials that were added."""
     gained: tuple[Right, ...]
+    """Rights that were added, and denials that were taken away."""
     works_until: datetime | None
+    """Until when the replaced permissions work, in UTC, for whoever kept them with the certificate
+    of that time; null if they no longer do."""
     lost_domains: str = ""
+    """ROS domains for which it had permissions, such as 0,7, and has none any more."""
     gained_domains: str = ""
+    """ROS domains for which it had no permissions, and has them now."""
 
     def revoked(self) -> ReplacedRights:
         """Return the same rights, for a certificate that was revoked."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
+from typing import Annotated
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -22,6 +23,7 @@ from sros_tool.keystore.layout import (
     IDENTITY,
     PERMISSIONS,
     RETIRED,
+    ROLES,
     ROTATION,
     enclave_folder,
     list_enclaves,
@@ -40,7 +42,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.validity import Window, iso
-from sros_tool.values import as_plain, parse_json
+from sros_tool.values import Words, as_plain, parse_json, shows
 from sros_tool.xml import read_bytes
 
 _SOON = timedelta(days=90)
@@ -93,22 +95,27 @@ class Rotation:
         return order[order.index(self.stage) + 1]
 
 
+@shows(
+    *("roles", "state", "subject", "serial", "sha256", "validity", "enclaves"), spread=("validity",)
+)
 @dataclass(frozen=True, slots=True)
 class AuthorityStatus:
-    """A trusted CA, and its state in a rotation.
-
-    ``state`` is "issuing", "next" or "old".  ``enclaves`` is the number of enclaves with a
-    certificate or permissions of this CA.
-    """
+    """A trusted CA, and its state in a rotation."""
 
     file: str
-    roles: tuple[str, ...]
-    state: str
+    roles: tuple[Annotated[str, Words(ROLES)], ...]
+    """What the CA signs."""
+    state: Annotated[str, Words(("issuing", "next", "old"))]
+    """Whether it issues now, will issue next, or issued before."""
     subject: str
+    """Its subject."""
     serial: str
+    """Serial number of its certificate, in hexadecimal."""
     sha256: str
+    """SHA-256 of its certificate, which tells it from another one of that name."""
     validity: Window
     enclaves: int
+    """Number of enclaves with a certificate or permissions of this CA."""
 
 
 @dataclass(frozen=True, slots=True)
