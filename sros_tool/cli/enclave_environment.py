@@ -182,29 +182,19 @@ def _check_joining(
     """
     from sros_tool.dds.decision.vendors import MEASURED
     from sros_tool.faults import Fault
-    from sros_tool.keystore.participant import (
-        JoinContext,
-        VendorParticipant,
-        accepted_state,
-        loaded,
-    )
+    from sros_tool.keystore.participant import evaluated
     from sros_tool.runtime.rmw import chosen_rmw, vendor_of
 
-    vendor, moment = vendor_of(chosen_rmw(rmw, os.environ)), now()
-    there, context = loaded(name, folder, state, at=moment), JoinContext(domain, moment)
-    made = [VendorParticipant(each, there, context) for each in ([vendor] if vendor else MEASURED)]
-    state = accepted_state(state, made)
-    token = Fault.KEY_ON_TOKEN.id  # `_check_token_used` says it
-    refusing = {
-        each.vendor.title: [cause.text for cause in each.causes() if cause.reason != token]
-        for each in made
-    }
-    if state.problems or not all(refusing.values()):
-        return state
-    texts = (f"{title} refuses it: {'; '.join(some)}" for title, some in refusing.items())
+    vendor = vendor_of(chosen_rmw(rmw, os.environ))
+    vendors = (vendor,) if vendor else MEASURED
+    evaluation = evaluated(name, folder, state, at=now(), domain=domain, vendors=vendors)
+    # `_check_token_used` says that a vendor reads no token.
+    refusals = evaluation.stopped(ignored=(Fault.KEY_ON_TOKEN.id,))
+    if evaluation.state.problems or not refusals:
+        return evaluation.state
     raise KeystoreError(
         f"a process cannot run in enclave {name}",
-        f"{'. '.join(texts)}.",
+        refusals,
         f"See `sros check {quote(str(folder))}`.",
     )
 

@@ -24,11 +24,13 @@ from sros_tool.keystore.layout import (
     ZENOH_SIGNED,
     ca_certificate,
     ca_key,
+    enclave_path,
     is_keystore,
     permissions_ca_for,
     refuse_earlier,
     search_enclaves,
 )
+from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
@@ -72,7 +74,7 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
             return {
                 "kind": "enclave",
                 "path": str(path),
-                **_describe_enclave(open_enclave(path, now=now)),
+                **_describe_enclave(evaluated("", path, open_enclave(path, now=now), at=now)),
                 **_zenoh(path, now),
             }
         refuse_earlier(path)
@@ -141,7 +143,10 @@ def _keystore(root: Path, now: datetime) -> Description:
         except SrosError as error:
             authorities[role] = {"error": str(error)}
     names, unread = search_enclaves(root)
-    enclaves = [_enclave(name, keystore.enclave(name, now=now)) for name in names]
+    enclaves = [
+        _enclave(enclave_path(root, name), name, keystore.enclave(name, now=now), now)
+        for name in names
+    ]
     governance: Description | None = None
     if (root / GOVERNANCE_P7S).exists():
         try:
@@ -201,19 +206,21 @@ def _zenoh(folder: Path, now: datetime) -> Description:
     }
 
 
-def _enclave(name: str, state: OpenedEnclave) -> Description:
+def _enclave(folder: Path, name: str, state: OpenedEnclave, now: datetime) -> Description:
     """Describe an enclave of a keystore; a key that stays on its robot is not a problem there."""
-    described = _describe_enclave(state)
-    described["problems"] = [str(problem) for problem in state.problems_at_home]
+    evaluation = evaluated(name, folder, state, at=now)
+    described = {**_describe_enclave(evaluation), "problems": list(evaluation.problems)}
     return {"name": name, "key_on_robot": state.key_on_robot, **described}
 
 
-def _describe_enclave(state: OpenedEnclave) -> Description:
+def _describe_enclave(evaluation: EvaluatedEnclave) -> Description:
     """Describe an enclave; ``loadable`` says whether a process can run in it now."""
+    state = evaluation.state
     domains = state.domains()
+    problems = [str(each) for each in state.problems] or list(evaluation.problems)
     return {
-        "loadable": not state.problems,
-        "problems": [str(problem) for problem in state.problems],
+        "loadable": not problems,
+        "problems": problems,
         "subject": state.subject or None,
         "valid_until": iso(validity_of(state.certificate).not_after) if state.certificate else None,
         "expires": iso(until) if (until := state.valid_until()) else None,

@@ -7,7 +7,7 @@ reads the documents, and whether it and its peers then let the participant join.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
@@ -19,7 +19,7 @@ from cryptography import x509
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.vendors import Vendor, VendorTraits
+from sros_tool.dds.decision.vendors import MEASURED, Vendor, VendorTraits
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import Permissions, render_permissions
@@ -354,6 +354,53 @@ class VendorParticipant:
         # Its own process may still refuse the documents.
         joined = access.join()
         return joined if joined.outcome in (Outcome.REFUSED, Outcome.CRASHES) else late
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedEnclave:
+    """An enclave as it is for some vendors, and the participants that they make of it."""
+
+    state: OpenedEnclave
+    participants: tuple[VendorParticipant, ...]
+
+    def stopped(self, ignored: Collection[str] = ()) -> str:
+        """Return why none of the vendors runs a process in it, as sentences; "" if some do.
+
+        Causes with a reason in ``ignored`` are none.
+        """
+        sentences = []
+        for each in self.participants:
+            causes = [cause.text for cause in each.causes() if cause.reason not in ignored]
+            if not causes:
+                return ""
+            sentences.append(f"{each.vendor.title} refuses it: {'; '.join(causes)}.")
+        return " ".join(sentences)
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What keeps a process from running in it, apart from a key that is on its robot."""
+        named = tuple(map(str, self.state.problems_at_home))
+        return named or tuple(filter(None, (self.stopped().removesuffix("."),)))
+
+
+def evaluated(
+    name: str,
+    folder: Path,
+    state: OpenedEnclave,
+    *,
+    at: datetime,
+    domain: int | None = None,
+    zone: tzinfo = UTC,
+    vendors: Sequence[Vendor] = MEASURED,
+) -> EvaluatedEnclave:
+    """Return what vendors make of an enclave that was opened at the time ``at``.
+
+    ``domain`` is the ROS domain to join, None for the first of its documents.
+    """
+    number = domain if domain is not None else next(iter(state.joined_domains() or ()), 0)
+    there, context = loaded(name, folder, state, at=at), JoinContext(number, at, zone)
+    made = tuple(VendorParticipant(each, there, context) for each in vendors)
+    return EvaluatedEnclave(accepted_state(state, made), made)
 
 
 def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> OpenedEnclave:

@@ -209,7 +209,7 @@ def _bad_kind(bench: Bench) -> None:
         (lambda _: None, "rmw_fastrtps_cpp", True, True),
     ],
 )
-def test_run_and_verify_start_what_the_vendor_starts(
+def test_every_verb_starts_what_the_vendor_starts(
     work: Callable[[Bench], object], rmw: str, starts: bool, loadable: bool, bench: Bench
 ) -> None:
     work(bench)
@@ -219,6 +219,11 @@ def test_run_and_verify_start_what_the_vendor_starts(
     assert ("a process cannot run in enclave /base" in ended.err) is not starts
     found = json.loads(sros("verify", robot, "--json").out)
     assert {each["loadable"] for each in found["enclaves"]} == {loadable}
+    for folder in (robot, bench.root):
+        shown = json.loads(sros("inspect", folder / "enclaves/base", "--json").out)
+        assert (shown["loadable"], not shown["problems"]) == (loadable, loadable)
+    sent = sros("distribute_key", bench.root, "/base", robot.with_name("another robot"))
+    assert sent.status == (0 if loadable else 2), sent
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from sros_tool.checks.keystores.enclaves import WAITS
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, Finding, FindingKind
 from sros_tool.checks.registry import FindingFilter
-from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.delivery.archive import SUFFIXES
@@ -32,12 +31,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
     waits_for_answer,
 )
-from sros_tool.keystore.participant import (
-    JoinContext,
-    VendorParticipant,
-    accepted_state,
-    loaded,
-)
+from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.pki.token import Secrets, open_enclave_key
 from sros_tool.pki.token_uri import TokenUri
@@ -259,11 +253,9 @@ def _enclave(
         return ArrivedEnclave(name, False, "", None)
     state = open_enclave(folder, now=now, domain=domain)
     domains = state.joined_domains()
-    number = domain if domain is not None else next(iter(domains or ()), 0)
-    there, context = loaded(name, folder, state, at=now), JoinContext(number, now, zone)
-    made = [VendorParticipant(each, there, context) for each in MEASURED]
-    state = accepted_state(state, made)
-    loadable = not (state.problems or all(each.causes() for each in made))
+    evaluation = evaluated(name, folder, state, at=now, domain=domain, zone=zone)
+    state = evaluation.state
+    loadable = not (state.problems or evaluation.stopped())
     # On the robot, where there is no ledger, a key that is missing is lost.
     at_home = (root / LEDGER).is_file()
     elsewhere = at_home and state.key_on_robot and not state.problems_at_home

@@ -33,6 +33,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.missing import no_such_enclave
+from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave
 from sros_tool.keystore.selection import select_enclaves
 from sros_tool.keystore.transaction.stage import Change
@@ -199,12 +200,12 @@ def exported_files(
                 _ANSWER_AGAIN,
             )
         folder = enclave_path(root, name)
-        state = open_enclave(folder, now=now)
-        problems = state.problems_at_home if at_robot else state.problems
-        if problems:
+        evaluation = evaluated(name, folder, open_enclave(folder, now=now), at=now)
+        state = evaluation.state
+        if evaluation.problems:
             raise KeystoreError(
                 f"enclave {name} would not run on a robot",
-                "; ".join(map(str, problems)) + ".",
+                "; ".join(evaluation.problems) + ".",
                 f"See `sros inspect {quote(str(folder))}`.",
             )
         _check_zenoh(root, folder, name, state)
