@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, settings
 from sros_tool.pki import keys
 from tests.support.children import LONG
 from tests.support.harness import policy_text, publish, sros
+from tests.support.long_form import SEED
 
 POLICY = policy_text({"/a": publish("old_a"), "/b": publish("old_b")})
 
@@ -65,6 +66,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the slowest modules."""
     rank = {name: number for number, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+def pytest_report_header() -> str:
+    """Say by what a run can be repeated."""
+    return f"what is drawn: SROS_SEED={SEED}"
 
 
 def pytest_collection_finish() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import os
 import re
@@ -38,13 +39,34 @@ def fastdds_vendor() -> Vendor:
     return Vendor.FAST if minor and int(minor[1]) >= 14 else Vendor.FAST_2_9
 
 
+@cache
+def fastdds_stack() -> str:
+    """The name under which the replies of this Fast DDS are kept; skips the test without it."""
+    skip_without_fastdds()
+    folders = [Path(OWN_FASTDDS, "lib")] if OWN_FASTDDS else Path("/usr/lib").glob("*-linux-gnu")
+    (library, *_) = (each for folder in folders for each in folder.glob("libfastrtps.so"))
+    return f"fast-{library.resolve().name.partition('.so.')[2]}-{openssl()}"
+
+
+@cache
+def openssl() -> str:
+    """The OpenSSL of this system, which decides about certificates for all vendors."""
+    library = ctypes.CDLL("libcrypto.so.3")
+    library.OpenSSL_version.restype = ctypes.c_char_p
+    return "-".join(library.OpenSSL_version(0).decode().lower().split()[:2])
+
+
+def skip_without_fastdds() -> None:
+    if not shutil.which("g++") or not Path(OWN_FASTDDS or "/usr", "include/fastdds").is_dir():
+        pytest.skip("g++ and libfastrtps-dev are not installed")
+
+
 def build(source: str, folder: Path) -> Path:
     """The program of a source that lies here; skips the test where it cannot be built.
 
     It is made in the run's common folder above ``folder``, which is a temporary one of the test's.
     """
-    if not shutil.which("g++") or not Path(OWN_FASTDDS or "/usr", "include/fastdds").is_dir():
-        pytest.skip("g++ and libfastrtps-dev are not installed")
+    skip_without_fastdds()
     common = (each for each in folder.parents if each.parent.name.startswith("pytest-of-"))
     program = next(common, folder) / Path(source).stem
     with program.with_suffix(".lock").open("w") as lock:

@@ -19,8 +19,10 @@ from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.policy.document import read_policy
 from tests.integration.converse import ENOUGH, converse, listener, talker
-from tests.integration.fastdds import build, fastdds_vendor, isolated
-from tests.integration.vendor_oracle import MATCH_SECONDS
+from tests.integration.fastdds import build, fastdds_stack, fastdds_vendor, isolated
+from tests.integration.kept.forms import form_of
+from tests.integration.kept.replies import answered
+from tests.integration.vendor_oracle import MATCH_SECONDS, cyclone_stack
 from tests.support.children import LATE, run
 from tests.support.harness import policy_text, publish
 from tests.support.long_form import ONLY_LONG
@@ -53,6 +55,30 @@ Ask = Callable[[Expected], None]
 
 
 def ask_cyclone(questions: Expected) -> list[str]:
+    """Who hears whom on Cyclone DDS: the replies that are kept, and those to what is asked."""
+    return kept_or_asked(cyclone_stack(), questions, converse_all)
+
+
+def kept_or_asked(
+    stack: str, questions: Expected, ask: Callable[[Expected], list[str]], domain: int = DOMAIN
+) -> list[str]:
+    """The answers; a kept reply that is not the expected one is asked for again."""
+    now, listed = datetime.now(UTC), list(questions.items())
+
+    def form(question: Question) -> str:
+        folders = enclave_path(*question.talker), enclave_path(*question.listener)
+        return f"{question.topic} {domain}\n{form_of(folders, now)}"
+
+    replies = answered(
+        stack,
+        [form(question) for question, _ in listed],
+        lambda places: [(each,) for each in ask(dict(listed[place] for place in places))],
+        believe=lambda place, reply: reply[0] in listed[place][1].split(" or "),
+    )
+    return [reply for (reply,) in replies]
+
+
+def converse_all(questions: Expected) -> list[str]:
     """All at once, each on a topic of its own: every node is a process."""
     nodes = []
     for number, (question, expected) in enumerate(questions.items()):
@@ -81,6 +107,13 @@ def probe(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def ask_fast(program: Path, questions: Expected, domain: int = DOMAIN) -> list[str]:
+    """Who hears whom on Fast DDS: the replies that are kept, and those to what is asked."""
+    return kept_or_asked(
+        fastdds_stack(), questions, lambda some: probe_all(program, some, domain), domain
+    )
+
+
+def probe_all(program: Path, questions: Expected, domain: int) -> list[str]:
     """One after the other; who is not heard at once gets longer if that is what is expected."""
     lines = [
         f"{enclave_path(*question.talker)} {enclave_path(*question.listener)} rt{question.topic} "

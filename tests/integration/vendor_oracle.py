@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,8 +20,11 @@ from typing import Any, TypeVar
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, common_name, issue_ca, parse_subject, pem
 from sros_tool.pki.keys import generate_key, key_pem
+from sros_tool.runtime.cyclone import load_cyclone
 from sros_tool.validity import Window
-from tests.integration.fastdds import build, isolated
+from tests.integration.fastdds import build, fastdds_stack, isolated, openssl
+from tests.integration.kept.forms import form_of, form_of_text
+from tests.integration.kept.replies import answered
 from tests.support.children import LATE, python, run
 
 HERE = Path(__file__).parent
@@ -72,6 +76,7 @@ class Workshop:
     root: Path
     _identities: dict[str, Path] = field(default_factory=dict)
     _documents: dict[bytes, Path] = field(default_factory=dict)
+    _form: str = ""
 
     def __post_init__(self) -> None:
         now = datetime.now(UTC).replace(microsecond=0)
@@ -106,6 +111,15 @@ class Workshop:
             if not link.exists():
                 link.hardlink_to(self._signed(document))
         return folder
+
+    def form(self, case: Case) -> str:
+        """What the answer to a case depends on: texts, and the form of what this workshop makes."""
+        if not self._form:
+            sample = self.identity("CN=/sample"), self.documents(b"<dds></dds>", PEER_PERMISSIONS)
+            self._form = form_of(sample, datetime.now(UTC))
+        texts = [case.governance.decode("latin-1"), case.permissions.decode("latin-1")]
+        asked = repr((case.questions, case.subject, case.domain, case.zone, case.peer))
+        return "\n".join([self._form, asked, form_of_text("\n".join(texts), datetime.now(UTC))])
 
     def _signed(self, document: bytes) -> Path:
         if document not in self._documents:
@@ -175,9 +189,13 @@ def ask_fastdds(
 
     A match is waited for so many seconds.
     """
-    program = build("fastdds_oracle.cpp", workshop.root)
-    lines = [_line(workshop, case, seconds) for case in cases]
-    return _spread(lines, at_once, lambda some: _ask_one_program(program, some))
+
+    def ask(places: list[int]) -> list[Reply]:
+        program = build("fastdds_oracle.cpp", workshop.root)
+        lines = [_line(workshop, cases[place], seconds) for place in places]
+        return _spread(lines, at_once, lambda some: _ask_one_program(program, some))
+
+    return _replies(fastdds_stack(), [workshop.form(case) for case in cases], ask, seconds)
 
 
 def _line(workshop: Workshop, case: Case, seconds: float) -> str:
@@ -219,6 +237,12 @@ def _reply(line: str) -> Reply:
 # ── Cyclone DDS ────────────────────────────────────────────────────────────────────────────
 
 
+@cache
+def cyclone_stack() -> str:
+    """The name under which the replies of this Cyclone DDS are kept."""
+    return f"cyclone-{load_cyclone().version}-{openssl()}"
+
+
 def ask_cyclone(
     workshop: Workshop,
     cases: Sequence[Case],
@@ -227,8 +251,12 @@ def ask_cyclone(
     seconds: float = MATCH_SECONDS,
 ) -> list[Reply]:
     """What Cyclone DDS does with each case; every participant is a process of its own."""
-    records = [_record(workshop, case, seconds) for case in cases]
-    return _spread(records, at_once, ask_cyclone_records)
+
+    def ask(places: list[int]) -> list[Reply]:
+        records = [_record(workshop, cases[place], seconds) for place in places]
+        return _spread(records, at_once, ask_cyclone_records)
+
+    return _replies(cyclone_stack(), [workshop.form(case) for case in cases], ask, seconds)
 
 
 def ask_cyclone_records(records: Sequence[dict[str, Any]]) -> list[Reply]:
@@ -273,12 +301,17 @@ def ask_fastdds_folders(
     at_once: int = 6,
 ) -> list[Reply]:
     """What Fast DDS does with each pair of enclaves."""
-    program = build("fastdds_oracle.cpp", program_folder)
     lines = [
         f"{own}\t{own}\t{domain}\t{zone}\t{peer}\t{peer}\t{int(seconds * 1000)}\tpublish\x1f{topic}"
         for own, peer, zone in pairs
     ]
-    return _spread(lines, at_once, lambda some: _ask_one_program(program, some))
+
+    def ask(places: list[int]) -> list[Reply]:
+        program = build("fastdds_oracle.cpp", program_folder)
+        asked = [lines[place] for place in places]
+        return _spread(asked, at_once, lambda some: _ask_one_program(program, some))
+
+    return _replies(fastdds_stack(), _forms_of_pairs(pairs, topic, domain), ask, seconds)
 
 
 def ask_cyclone_folders(
@@ -304,7 +337,32 @@ def ask_cyclone_folders(
         }
         for own, peer, zone in pairs
     ]
-    return _spread(records, at_once, ask_cyclone_records)
+
+    def ask(places: list[int]) -> list[Reply]:
+        return _spread([records[place] for place in places], at_once, ask_cyclone_records)
+
+    return _replies(cyclone_stack(), _forms_of_pairs(pairs, topic, domain), ask, seconds)
+
+
+def _forms_of_pairs(pairs: Sequence[Pair], topic: str, domain: int) -> list[str]:
+    now = datetime.now(UTC)
+    return [f"{topic} {domain} {zone}\n{form_of((own, peer), now)}" for own, peer, zone in pairs]
+
+
+# ── both ───────────────────────────────────────────────────────────────────────────────────
+
+
+def _replies(
+    stack: str, forms: list[str], ask: Callable[[list[int]], list[Reply]], seconds: float
+) -> list[Reply]:
+    """The kept replies, and those to what is asked; who waits longer than usual asks for all."""
+
+    def words(places: list[int]) -> list[tuple[str, ...]]:
+        return [(each.end, each.log, *each.answers) for each in ask(places)]
+
+    patient = seconds > MATCH_SECONDS
+    found = answered(stack, forms, words, believe=lambda place, reply: not patient)
+    return [Reply(end, tuple(answers), log) for end, log, *answers in found]
 
 
 def _spread(items: Sequence[Any], at_once: int, ask: Any) -> list[Reply]:
