@@ -36,6 +36,7 @@ from tests.support.harness import (
     sros,
     topics_of,
 )
+from tests.support.long_form import some
 
 VERBS = [name for family in FAMILIES.values() for name in family]
 PROGRAM = [sys.executable, "-m", "sros_tool"]
@@ -185,7 +186,7 @@ ROOTS = {
 }
 
 
-@pytest.mark.parametrize("name", ROOTS)
+@pytest.mark.parametrize("name", some([*ROOTS], 4))
 def test_root_with_any_name(name: str, tmp_path: Path) -> None:
     (tmp_path / "x").mkdir()
     root = ROOTS[name]

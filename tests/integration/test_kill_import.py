@@ -21,9 +21,8 @@ from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child
-from tests.support.children import some_steps
 from tests.support.harness import remains, snapshot
-from tests.support.long_form import ONLY_LONG
+from tests.support.long_form import ONLY_LONG, few_steps
 
 __all__ = ["server"]
 
@@ -86,7 +85,7 @@ def test_death_at_every_step(
     assert status == 0
     expected = settled(work)
     outcomes = set()
-    for step in some_steps(range(1, steps + 1)):
+    for step in few_steps(range(1, steps + 1)):
         copy(folder, work)
         assert in_child(run, step) == (DIED, 0), step
         outcomes.add(see(work, folder))

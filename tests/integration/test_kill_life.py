@@ -21,9 +21,8 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import open_enclave, read_crl
 from tests.integration.kills import Moments, Server, server
-from tests.support.children import some_steps
 from tests.support.harness import check_whole, remains
-from tests.support.long_form import ONLY_LONG
+from tests.support.long_form import ONLY_LONG, few_steps
 
 __all__ = ["server"]
 
@@ -177,7 +176,7 @@ def test_death_at_every_step(
     assert status == 0
     check_end(verb, before, settled(work))
     outcomes = set()
-    for step in some_steps(range(1, steps + 1)):
+    for step in few_steps(range(1, steps + 1)):
         copy(life, work)
         assert in_child(lambda: VERBS[verb](work), step) == (DIED, 0), step
         now = see(work)

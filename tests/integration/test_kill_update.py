@@ -17,9 +17,8 @@ from sros_tool.keystore.reader import authority_files, open_enclave, read_crl
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child
-from tests.support.children import some_steps
 from tests.support.harness import check_enclave_whole, check_whole, remains
-from tests.support.long_form import ONLY_LONG
+from tests.support.long_form import ONLY_LONG, few_steps
 
 __all__ = ["server"]
 
@@ -101,7 +100,7 @@ def test_death_at_every_step(life: Path, tmp_path: Path, monkeypatch: pytest.Mon
     assert before == ("sros2", "SIGN", ((1, 3650), (1, 3650)), 0)
     assert expected == ("production", "ENCRYPT", ((2, 180), (2, 180)), 1)
     outcomes = set()
-    for step in some_steps(range(1, steps + 1)):
+    for step in few_steps(range(1, steps + 1)):
         copy(life, work)
         assert in_child(run, step) == (DIED, 0), step
         now = see(work)

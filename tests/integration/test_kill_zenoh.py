@@ -12,8 +12,8 @@ from sros_tool.keystore.reader import load_ca_certificate
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
 from tests.integration.test_kill_life import DIED, copy, in_child
-from tests.support.children import some_steps
 from tests.support.harness import policy_text, publish, remains, sros
+from tests.support.long_form import few_steps
 
 LATER = datetime.now(UTC) + timedelta(hours=1)
 
@@ -53,7 +53,7 @@ def test_death_at_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     status, steps = in_child(change)
     assert (status, see(work)) == (0, True)
     outcomes = set()
-    for step in some_steps(range(1, steps + 1)):
+    for step in few_steps(range(1, steps + 1)):
         copy(life, work)
         assert in_child(change, step) == (DIED, 0), step
         outcomes.add(see(work))

@@ -31,3 +31,16 @@ def some(items: Sequence[_Item], number: int) -> list[_Item]:
         return list(items)
     places = random.Random(SEED).sample(range(len(items)), number)
     return [items[place] for place in sorted(places)]
+
+
+def few_steps(steps: Sequence[int]) -> Sequence[int]:
+    """Return the first step, the last and one that is drawn; in the long form all.
+
+    That nothing is left half done after any step, the tests of the transaction itself show.
+    """
+    return list(steps) if LONG else [steps[0], *some(steps[1:-1], 1), *steps[1:][-1:]]
+
+
+def sometimes(name: str) -> pytest.MarkDecorator:
+    """Mark a test that the short form runs every fourth time; the long form always does."""
+    return pytest.mark.skipif(not drawn(name, 1 / 4), reason=f"not drawn by SROS_SEED={SEED}")
