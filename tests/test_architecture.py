@@ -52,9 +52,15 @@ def tree_of(source: str) -> ast.Module:
     return ast.parse(source)
 
 
+@cache
+def nodes_of(tree: ast.Module) -> tuple[ast.AST, ...]:
+    """Return all nodes of a module, which several tests go through."""
+    return tuple(ast.walk(tree))
+
+
 def imported(source: str, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
     """Line and absolute name of each import in the text of `module`; also inside functions."""
-    for node in ast.walk(tree_of(source)):
+    for node in nodes_of(tree_of(source)):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, name.name) for name in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -137,7 +143,7 @@ def clocks(source: str) -> list[int]:
     """The lines that ask what time it is."""
     return [
         node.lineno
-        for node in ast.walk(tree_of(source))
+        for node in nodes_of(tree_of(source))
         if isinstance(node, ast.Attribute)
         and f"{ast.unparse(node.value).rpartition('.')[2]}.{node.attr}" in CLOCKS
     ]
@@ -332,7 +338,7 @@ def writing(source: str) -> list[int]:
     """The lines that change what is at a path, or import a function that can under a new name."""
     return sorted(
         node.lineno
-        for node in ast.walk(tree_of(source))
+        for node in nodes_of(tree_of(source))
         if (isinstance(node, ast.Call) and is_writing(node))
         or (
             isinstance(node, ast.ImportFrom)
@@ -349,7 +355,7 @@ def writing(source: str) -> list[int]:
 def unsafe_pythons(source: str) -> list[int]:
     """Lines that start Python so that it imports modules from the working folder."""
     found = []
-    for node in ast.walk(tree_of(source)):
+    for node in nodes_of(tree_of(source)):
         words = [ast.unparse(each) for each in getattr(node, "elts", ())]
         for place, word in enumerate(words):
             if word == "sys.executable" and words[place + 1 : place + 2] != ["'-P'"]:
@@ -426,7 +432,7 @@ _LOGGING = {"StreamHandler", "basicConfig", "lastResort"}
 
 def printing(source: str) -> list[int]:
     """The lines that write to the terminal, or import what does under another name."""
-    return sorted({node.lineno for node in ast.walk(tree_of(source)) if _is_printing(node)})  # type: ignore[attr-defined]
+    return sorted({node.lineno for node in nodes_of(tree_of(source)) if _is_printing(node)})  # type: ignore[attr-defined]
 
 
 def _is_printing(node: ast.AST) -> bool:
@@ -541,7 +547,7 @@ def public_names(tree: ast.Module) -> set[str]:
 
 def used_names(name: str, modules: Modules, known: Modules) -> set[tuple[str, str]]:
     """Return what the module `name` takes from each of the `known` modules, also later on."""
-    nodes = list(ast.walk(modules[name]))
+    nodes = nodes_of(modules[name])
     found: set[tuple[str, str]] = set()
     aliases: dict[str, str] = {}
     for node in nodes:

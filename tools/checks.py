@@ -26,20 +26,20 @@ LONG = "--long"
 WITH_DDS = ("tests/integration", "tests/explain")
 """The folders with tests that start DDS processes; pytest imports only these for them."""
 
-RUFF = {
+LINT = {
     "ruff check": ["-m", "ruff", "check", "--quiet"],
     "ruff format": ["-m", "ruff", "format", "--check", "--quiet"],
+    "mypy": ["-m", "mypy", "--no-error-summary"],
 }
-MYPY = {"mypy": ["-m", "mypy", "--no-error-summary"]}
 
 
 def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> int:
     """Run every check, even after failures; return the worst exit status.
 
-    Without ``arguments``, mypy and the tests that start DDS processes run at the same time as the
-    other tests; their output is shown after that of the other tests.  There is one process more
-    for DDS tests than there are cores: each has a separate network and often waits.  With
-    ``arguments``, pytest runs once, with these arguments.
+    Ruff and mypy run beside the tests; their output is shown after that of the tests.  Without
+    ``arguments``, so do the tests that start DDS processes, with one process more than there are
+    cores: each has a separate network and often waits.  With ``arguments``, pytest runs once, with
+    these arguments.
     """
     started = time.monotonic()
     if read_record().ros_around:
@@ -48,11 +48,11 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     if LONG in arguments:
         arguments = [each for each in arguments if each != LONG]
         env = {**env, "SROS_LONG": "1"}
-    results = {name: _Step(name, words, env).end() for name, words in RUFF.items()}
-    if not with_tests or arguments:
-        steps = MYPY | ({"pytest": ["-m", "pytest", *arguments]} if with_tests else {})
-        results |= {name: _Step(name, words, env).end() for name, words in steps.items()}
-        return _conclude(results, Counter(), started)
+    if not with_tests:
+        return _conclude(_run_together(LINT, "mypy", env), Counter(), started)
+    if arguments:
+        steps = LINT | {"pytest": ["-m", "pytest", *arguments]}
+        return _conclude(_run_together(steps, "pytest", env), Counter(), started)
     cores = len(os.sched_getaffinity(0))
     parts = {
         "tests": ["-m", "not dds", "-n", str(cores), "--dist", "worksteal"],
@@ -65,25 +65,33 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     reports = {name: VENV / f"{name.replace(' ', '-')}.xml" for name in parts}
     for report in reports.values():
         report.unlink(missing_ok=True)
-    steps = MYPY | {
+    steps = LINT | {
         name: ["-m", "pytest", *words, f"--junit-xml={reports[name]}"]
         for name, words in parts.items()
     }
-    with ExitStack() as running:
-        # The step with direct output is started last, and usually ends first.
-        order = sorted(steps, key=lambda name: name == "tests")
-        begun = {
-            name: running.enter_context(_Step(name, steps[name], env, aside=name != "tests"))
-            for name in order
-        }
-        ended = {name: begun[name].end() for name in reversed(order)}
-    for name in steps:
-        empty = name in parts and ended[name] == _NOTHING_COLLECTED
-        results[name] = 0 if empty else ended[name]
+    results = _run_together(steps, "tests", env)
+    for name in parts:
+        if results[name] == _NOTHING_COLLECTED:
+            results[name] = 0
     counts: Counter[str] = Counter()
     for report in reports.values():
         counts += count(report)
     return _conclude(results, counts, started)
+
+
+def _run_together(
+    steps: Mapping[str, list[str]], shown: str, env: Mapping[str, str]
+) -> dict[str, int]:
+    """Run steps at the same time; show the output of one as it comes, and of the others later."""
+    with ExitStack() as running:
+        # The step with direct output is started last, and usually ends first.
+        order = sorted(steps, key=lambda name: name == shown)
+        begun = {
+            name: running.enter_context(_Step(name, steps[name], env, aside=name != shown))
+            for name in order
+        }
+        ended = {name: begun[name].end() for name in reversed(order)}
+    return {name: ended[name] for name in steps}
 
 
 def _conclude(results: Mapping[str, int], counts: Counter[str], started: float) -> int:

@@ -13,6 +13,7 @@ import pytest
 
 from sros_tool.xml import parse
 from tests.support.checkout import CHECKOUT, known_files
+from tests.support.long_form import sometimes
 
 PROJECT = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
 SECURITY = """
@@ -58,6 +59,7 @@ def sourced(workspace: Path, command: str, **env: str) -> str:
     return ended.stdout
 
 
+@sometimes("the program of a workspace")
 def test_the_program_of_the_workspace_works(workspace: Path) -> None:
     assert sourced(workspace, "command -v sros").startswith(f"{workspace}/install/")
     program = "-P -c 'import sros_tool.cli as cli; print(cli.__file__); cli.main()'"

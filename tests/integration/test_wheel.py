@@ -12,6 +12,7 @@ import pytest
 
 from sros_tool.cli.ros2 import SecurityCommand
 from tests.support.checkout import CHECKOUT, known_files
+from tests.support.long_form import sometimes
 from tools import release
 
 
@@ -93,6 +94,7 @@ def test_every_file_of_the_package_is_in_it(unpacked: Path) -> None:
     assert [name for name in places if not (unpacked / name).is_file()] == []
 
 
+@sometimes("the verbs with the wheel")
 def test_the_verbs_work_with_what_is_in_it(unpacked: Path, tmp_path: Path) -> None:
     def sros(*words: str) -> str:
         return run(unpacked, tmp_path, *words)

@@ -16,7 +16,7 @@ import pytest
 
 from tests.support.children import run
 from tests.support.harness import policy_text, publish, sros
-from tests.support.long_form import ONLY_LONG
+from tests.support.long_form import ONLY_LONG, sometimes
 
 pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
 
@@ -28,7 +28,7 @@ PROCESS = Path(__file__).with_name("zenoh_process.py")
     ("mode", "name"),
     [
         pytest.param("client", "ks", marks=ONLY_LONG),
-        ("peer", "ks"),
+        pytest.param("peer", "ks", marks=sometimes("the environment of a peer")),
         ("client", 'a|b="c" \\d=é\n#$x\u2028'),
     ],
 )
