@@ -413,6 +413,9 @@ CASES |= {
     "governance.domain-range": lambda b: b.governance(
         ("<id>0</id>", "<id_range><max>3</max></id_range>")
     ),
+    "governance.open-range": lambda b: b.governance(
+        ("<id>0</id>", "<id_range><min>0</min></id_range>")
+    ),
     "governance.xml-differs": lambda b: b.path("enclaves/governance.xml").write_text("<dds/>"),
 }
 

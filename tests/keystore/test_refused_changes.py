@@ -141,6 +141,23 @@ def test_during_a_rotation_the_old_ca_has_to_go_first(corporate: Path) -> None:
     assert refused_by(corporate, "/a") == set()
 
 
+def test_a_first_list_shuts_out_nobody_who_has_a_certificate_of_the_old_ca(
+    corporate: Path,
+) -> None:
+    """Fast DDS 2.9.1 was seen to stop matching such a process; with cRLSign it goes on."""
+    key = ("--identity-key", f"file:{corporate.parent / 'new.key'}")
+    sros("rotate_ca", corporate, "--identity", *key, "--next").ok()
+    sros("rotate_ca", corporate, "--next").ok()
+    before = contents(corporate)
+    ended = sros("revoke", corporate, "/lost")
+    assert ended.status == 2 and "cRLSign" in ended.err and "shut out" in ended.err, ended
+    assert f"sros rotate_ca {corporate} --finish" in ended.err
+    assert contents(corporate) == before
+    allowed = ("--allow-refusal", "fastdds", "--allow-refusal", "fastdds-2.9")
+    sros("revoke", corporate, "/lost", *allowed).ok()
+    sros("crl", corporate, "--refresh").ok()
+
+
 def test_the_user_may_name_the_vendors_on_which_nodes_stop(corporate: Path) -> None:
     allowed = [word for vendor in ALL for word in ("--allow-refusal", vendor)]
     ended = sros("revoke", corporate, "/lost", *allowed[:-2])

@@ -443,9 +443,17 @@ GOVERNANCE_DOMAIN_RANGE = FindingKind(
     "governance.domain-range",
     ERROR,
     "a range of domains that vendors read differently",
-    "Fast DDS and Cyclone DDS read a range without <max> as a single domain. Cyclone DDS refuses "
-    "a range without <min>, and domains above 230.",
+    "Cyclone DDS refuses a range without <min>, and domains above 230; Fast DDS accepts them.",
     "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Write <id>, or <min> and <max> up to 230.",
+)
+GOVERNANCE_OPEN_RANGE = FindingKind(
+    "governance.open-range",
+    WARNING,
+    "a range of domains without an end, which counts as one domain",
+    "Fast DDS and Cyclone DDS read a range without <max> as the domain <min> alone; by the "
+    "standard it has no end.",
+    "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
 DIFFERS = FindingKind(
@@ -527,8 +535,10 @@ def governance_findings(
             own = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
             by = "" if own else keystore.accepts(kind, _Chosen(kind, text, domains))
             yield kind.found(subject, text, file, accepted=by)
-        for problem in _domain_problems(rule.domains):
-            yield GOVERNANCE_DOMAIN_RANGE.found(subject, f"the range {problem}", file)
+        for part in rule.domains.ranges:
+            kind = GOVERNANCE_DOMAIN_RANGE if part.last is not None else GOVERNANCE_OPEN_RANGE
+            for problem in _domain_problems(DomainSet((part,))):
+                yield kind.found(subject, f"the range {problem}", file)
 
 
 def _reach_of_unauthenticated(rule: DomainRule) -> str:

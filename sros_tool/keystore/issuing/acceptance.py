@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from cryptography import x509
+
 from sros_tool.dds.decision.answers import Decision
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.dds.domains import DomainSet
@@ -33,6 +35,7 @@ from sros_tool.keystore.layout import (
     ENCLAVES,
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
+    IDENTITY,
     IDENTITY_CA_FILE,
     KEY_URI_FILE,
     PERMISSIONS_CA_FILE,
@@ -49,12 +52,15 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     enclave_subject,
+    is_self_issued,
+    issued_by,
     load_certificate,
+    load_certificates,
     pem,
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import read_list, sign_crl
+from sros_tool.pki.crl import may_sign_lists, read_list, sign_crl
 from sros_tool.pki.keys import algorithm, generate_key
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
@@ -120,6 +126,9 @@ def refuse_stopping(
     found = _stopped_enclaves(transaction, now)
     if refused := {vendor: each for vendor, each in found.items() if vendor not in allowed}:
         raise _would_stop(transaction.root, refused, remedy)
+    old = _authority_without_list(transaction)
+    if old and (cut_off := [each for each in _READ_SEVERAL if each not in allowed]):
+        raise _would_be_shut_out(transaction.root, old, cut_off, remedy)
     notes = [
         Note(
             "vendor.refuses",
@@ -195,6 +204,41 @@ def _would_stop(root: Path, found: Mapping[Vendor, _Refusals], remedy: str) -> K
         f"{_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
         f"{remedy or 'Replace the file that is named.'} If no node runs on "
         f"{_list([each.title for each in found])}, add {options}.",
+    )
+
+
+_READ_SEVERAL = tuple(each for each in MEASURED if not each.traits.reads_first_authority)
+
+
+def _authority_without_list(transaction: Transaction) -> x509.Certificate | None:
+    """Return a CA before the present one that may not sign lists, where a first list is added.
+
+    Where there is a list, OpenSSL asks for one of the CA of a certificate.
+    """
+    if not transaction.content_after(CRL) or _content(transaction.root / CRL):
+        return None
+    data = transaction.content_after(ca_certificate(IDENTITY)) or b""
+    present, *others = load_certificates(data, "of the identity CA")
+    return next(
+        (
+            each
+            for each in others
+            if is_self_issued(each) and not may_sign_lists(each) and not issued_by(present, each)
+        ),
+        None,
+    )
+
+
+def _would_be_shut_out(
+    root: Path, old: x509.Certificate, vendors: Sequence[Vendor], remedy: str
+) -> KeystoreError:
+    name, titles = subject_text(old.subject), _list([each.title for each in vendors])
+    options = " ".join(f"--allow-refusal {vendor.value}" for vendor in vendors)
+    return KeystoreError(
+        f"processes that still run with certificates of {name} would be shut out of '{root}'",
+        f"Where there is a revocation list, {titles} ask for one of each CA, and the keyUsage of "
+        f"{name} lacks cRLSign. Nothing was changed.",
+        f"{remedy} If no process runs with such a certificate, add {options}.",
     )
 
 
