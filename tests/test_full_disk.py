@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import POLICY
-from tests.support.children import LONG
 from tests.support.harness import check_enclave_whole, forked, remains, snapshot, sros
+from tests.support.long_form import some
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="mounts small disks; needs root")
 
@@ -79,8 +79,9 @@ def small_disk(folder: Path, blocks: int) -> Iterator[None]:
         subprocess.run(["umount", folder], check=True)
 
 
-@pytest.mark.parametrize("free", [0, 1, 2, 5, 12, 25] if LONG else [0, 2, 12])
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize(
+    ("verb", "free"), some([(verb, free) for verb in VERBS for free in (0, 1, 2, 5, 12, 25)], 24)
+)
 def test_full_disk(verb: str, free: int, made: Path, tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     words = verb.split()

@@ -10,6 +10,7 @@ import pytest
 
 from sros_tool.keystore.template import load_template, parse_template, settings_values, with_values
 from tests.support.children import python
+from tests.support.long_form import some, sometimes
 from tests.support.pages import PROJECT, PageError, alike, blocks, fits, outcome_of
 from tools import man_page
 from tools.reference_pages import FOLDER, pages
@@ -26,12 +27,13 @@ PAGES = sorted(
 )
 
 
-@pytest.mark.parametrize("page", PAGES, ids=str)
+@pytest.mark.parametrize("page", some(PAGES, 9), ids=str)
 def test_the_commands_of_a_page_do_what_it_shows(page: Path, tmp_path: Path) -> None:
     wrong = outcome_of(PROJECT / page, tmp_path)
     assert not wrong, wrong
 
 
+@sometimes("the site")
 def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
     pytest.importorskip("furo")
     python("-m", "sphinx", "-q", "-W", "--keep-going", "-d", tmp_path / "trees", "-c", "docs", ".",

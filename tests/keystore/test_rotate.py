@@ -40,6 +40,7 @@ from sros_tool.policy.document import read_policy
 from tests.keystore.test_transaction import DIED, in_child
 from tests.support import made_by_ros2
 from tests.support.harness import check_enclave_whole, policy_text, publish, remains, snapshot, sros
+from tests.support.long_form import some
 
 NOW = datetime.now(UTC)
 STAGES = (RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE)
@@ -505,7 +506,7 @@ def shape(root: Path) -> tuple[object, ...]:
     return frozenset(files), tuple(kept), tuple(states(root)), len(read_ledger(root).entries)
 
 
-@pytest.mark.parametrize("stage", [*STAGES, None])
+@pytest.mark.parametrize("stage", some([*STAGES, None], 1))
 def test_death_at_every_step(stage: RotationStage | None, tmp_path: Path) -> None:
     """Killed at any step, and run again: the same end state (None is all stages at once)."""
     base = make(tmp_path, "production")

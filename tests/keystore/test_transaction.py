@@ -38,6 +38,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from tests.support.children import some_steps
 from tests.support.harness import check_whole, policy_text, publish, remains, snapshot, topics_of
+from tests.support.long_form import some
 
 NOW = datetime.now(UTC)
 TEMPLATE = load_template("development")
@@ -382,7 +383,7 @@ def test_death_while_recovering_from_death(name: str, stage: Stage) -> None:
         shutil.rmtree(stopped)
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", some([*SCENARIOS], 4))
 def test_no_space_at_every_step(name: str, stage: Stage) -> None:
     """An error leaves everything as it was, byte by byte; or else the verb succeeds."""
     scenario = SCENARIOS[name]
@@ -416,8 +417,13 @@ def cannot_exchange(monkeypatch: pytest.MonkeyPatch, *, hard_links: bool) -> lis
     return asked
 
 
-@pytest.mark.parametrize("hard_links", [True, False])
-@pytest.mark.parametrize("name", ["create_permission", "completion", "links"])
+@pytest.mark.parametrize(
+    ("name", "hard_links"),
+    some(
+        [(n, link) for n in ("create_permission", "completion", "links") for link in (True, False)],
+        3,
+    ),
+)
 def test_death_without_exchange(
     name: str, hard_links: bool, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
