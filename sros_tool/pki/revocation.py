@@ -88,7 +88,7 @@ def list_refusal(
     crl, issuer, score = found
     name = subject_text(issuer.subject)
     if not may_sign_lists(issuer):
-        text = f"the keyUsage of {name} lacks cRLSign, so its revocation lists do not count"
+        text = f"the keyUsage of {name} lacks cRLSign"
         return ListRefusal(Obstacle.USAGE, crl, text)
     if not score.in_scope:
         return ListRefusal(Obstacle.SCOPE, crl, "it is not for all certificates of its CA")
