@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 
-from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import Decision, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
@@ -89,4 +89,4 @@ def _access(vendor: Vendor, topics: int, wildcards: int) -> Access:
     topic_rule = TopicRule("*", True, True, True, True, kind, kind)
     domain_rule = DomainRule(_DOMAINS, False, True, kind, kind, kind, (topic_rule,))
     governance = Governance((domain_rule,))
-    return Access(vendor, governance, permissions, "CN=/robot", domain=0, at=_NOW)
+    return Access(GovernedDomain(vendor, governance, 0), permissions, "CN=/robot", at=_NOW)

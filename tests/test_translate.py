@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import Style, Vendor
@@ -187,10 +187,8 @@ def test_a_large_document_decides_as_a_small_one(enclave: Enclave) -> None:
         name for each in listed for name in example_topics([each])
     }
     for vendor in Vendor:
-        governed = governance_for(DomainProtection(), DOMAINS)
-        one, other = (
-            Access(vendor, governed, each, "CN=/e", domain=7, at=NOW) for each in (full, short)
-        )
+        governed = GovernedDomain(vendor, governance_for(DomainProtection(), DOMAINS), 7)
+        one, other = (Access(governed, each, "CN=/e", at=NOW) for each in (full, short))
         assert one.join().outcome is other.join().outcome is Outcome.ALLOWED
         for name, verb in product(names, ("publish", "subscribe")):
             before, after = (each.decide(AccessVerb(verb), name).outcome for each in (one, other))

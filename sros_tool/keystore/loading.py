@@ -7,6 +7,7 @@ are found by `sros_tool.keystore.reader` and not checked here again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
 from itertools import dropwhile
@@ -111,6 +112,8 @@ def vendor_problems(
         for each in sorted(_faults(traits, state, at), key=_when_met)
         if each.file not in known or each.fault in CRASHES
     ]
+    if not faults:
+        return tuple(sorted(kept, key=_when_met))
     kept += [each for each in faults if _is_of_list(each)]
     specific = [each for each in specific if not _is_of_list(each)]
     faults = [each for each in faults if not _is_of_list(each)]
@@ -155,61 +158,108 @@ def _is_specific(problem: Problem, state: OpenedEnclave) -> bool:
     )
 
 
-def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterator[Problem]:
+@dataclass(frozen=True, slots=True)
+class _Trust:
+    """What a vendor makes of the CAs and the governance that the enclaves of a keystore share.
+
+    ``authorities`` and ``signers`` are the certificates of the identity CA's and the permissions
+    CA's file, in order; none if it cannot be read.
+    """
+
+    authorities: Certificates
+    signers: Certificates
+    unreadable: tuple[Problem, ...]
+    refused: tuple[Problem, ...]
+    governance: tuple[Problem, ...]
+
+
+@lru_cache(maxsize=16)  # of some keystores, for all vendors
+def _trust(
+    traits: VendorTraits,
+    identity_ca: bytes | None,
+    permissions_ca: bytes | None,
+    governance: bytes | None,
+    at: datetime,
+) -> _Trust:
     read: dict[str, Certificates] = {}
-    for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, CERTIFICATE_FILE):
-        if file in state.files:
-            data = _content(traits, state, file)
+    unreadable = []
+    for file, data in ((IDENTITY_CA_FILE, identity_ca), (PERMISSIONS_CA_FILE, permissions_ca)):
+        if data is not None:
             try:
                 read[file] = _certificates(traits, data, file)
             except PkiError as error:
-                cut = ", because it has a zero byte" if data != state.files[file] else ""
-                yield Problem(file, f"{error.why.rstrip('.')}{cut}", Fault.CERTIFICATE_FILE)
-    identity = read.pop(CERTIFICATE_FILE, None)
-    for file, certificates in read.items():
-        if fault := _authority_fault(traits, certificates, at):
-            yield Problem(file, *fault)
-    authorities = read.get(IDENTITY_CA_FILE)
-    if authorities and identity:
-        yield from _identity_faults(traits, identity[0], state.public_key, authorities, at)
-        yield from _list_faults(traits, state, identity[0], authorities, at)
-    signers = read.get(PERMISSIONS_CA_FILE)
-    for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
-        if not signers or file not in state.files:
-            continue
-        if text := _signature_fault(traits, state.files[file], signers, at):
-            yield Problem(file, text, Fault.SIGNATURE)
+                unreadable.append(_unreadable(traits, data, file, error))
+    refused = [
+        Problem(file, *fault)
+        for file, certificates in read.items()
+        if (fault := _authority_fault(traits, certificates, at))
+    ]
+    signers = read.get(PERMISSIONS_CA_FILE, ())
+    return _Trust(
+        read.get(IDENTITY_CA_FILE, ()),
+        signers,
+        tuple(unreadable),
+        tuple(refused),
+        tuple(_signature_problems(traits, GOVERNANCE_FILE, governance, signers, at)),
+    )
+
+
+def _unreadable(traits: VendorTraits, data: bytes, file: str, error: PkiError) -> Problem:
+    cut = ", because it has a zero byte" if _content(traits, data) != data else ""
+    return Problem(file, f"{error.why.rstrip('.')}{cut}", Fault.CERTIFICATE_FILE)
+
+
+def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterator[Problem]:
+    files = state.files
+    shared = (files.get(IDENTITY_CA_FILE), files.get(PERMISSIONS_CA_FILE))
+    trust = _trust(traits, *shared, files.get(GOVERNANCE_FILE), at)
+    yield from trust.unreadable
+    identity: Certificates = ()
+    if CERTIFICATE_FILE in files:
+        try:
+            identity = _certificates(traits, files[CERTIFICATE_FILE], CERTIFICATE_FILE)
+        except PkiError as error:
+            yield _unreadable(traits, files[CERTIFICATE_FILE], CERTIFICATE_FILE, error)
+    yield from trust.refused
+    if trust.authorities and identity:
+        yield from _identity_faults(traits, identity[0], state.public_key, trust.authorities, at)
+        yield from _list_faults(traits, state, identity[0], trust.authorities, at)
+    yield from trust.governance
+    permissions = files.get(PERMISSIONS_FILE)
+    yield from _signature_problems(traits, PERMISSIONS_FILE, permissions, trust.signers, at)
     largest = traits.largest_document
     if largest is not None and state.permissions_bytes > largest:
         text = f"it has {state.permissions_bytes} bytes, and from {largest + 1} on the "
         yield Problem(PERMISSIONS_FILE, f"{text}handshake may never finish", Fault.DOCUMENT_SIZE)
 
 
-def _content(traits: VendorTraits, state: OpenedEnclave, file: str) -> bytes:
+def _content(traits: VendorTraits, data: bytes) -> bytes:
     """Return what the vendor reads of a file with certificates or lists."""
-    data = state.files[file]
     return read_as_text(data) if traits.reads_files_as_text else data
 
 
 def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
     """Return the certificates that the vendor reads from a file; raise `PkiError` if it cannot."""
+    data = _content(traits, data)
     if traits.reads_first_authority or file == CERTIFICATE_FILE:
         return (load_certificate(data, file, trusted=traits.reads_trusted_certificates),)
     return load_certificates(data, file)
 
 
-@lru_cache(maxsize=8)
-def _signature_fault(
-    traits: VendorTraits, message: bytes, signers: Certificates, at: datetime
-) -> str:
-    # All enclaves of a keystore share one governance.
+def _signature_problems(
+    traits: VendorTraits, file: str, message: bytes | None, signers: Certificates, at: datetime
+) -> Iterator[Problem]:
+    """Yield why the vendor refuses the signature of a document, if the document is there."""
+    if message is None or not signers:
+        return
     try:
-        return _signer_fault(traits, smime.parse(message), signers, at)
+        text = _signer_fault(traits, smime.parse(message), signers, at)
     except PkiError as error:
-        return str(error)
+        text = str(error)
+    if text:
+        yield Problem(file, text, Fault.SIGNATURE)
 
 
-@lru_cache(maxsize=16)
 def _authority_fault(
     traits: VendorTraits, certificates: Certificates, at: datetime
 ) -> tuple[str, Fault] | None:
@@ -373,10 +423,10 @@ def _list_faults(
     try:
         if traits.reads_lists_of_authorities:
             file = IDENTITY_CA_FILE
-            lists += [(each, file) for each in _lists(_content(traits, state, file), file)]
+            lists += [(each, file) for each in _lists(_content(traits, state.files[file]), file)]
         file = CRL_FILE
         if file in state.files:
-            lists.append((_list(_content(traits, state, file), file), file))
+            lists.append((_list(_content(traits, state.files[file]), file), file))
     except PkiError:
         text = "it is not a revocation list, so DDS refuses every participant"
         if file == IDENTITY_CA_FILE:

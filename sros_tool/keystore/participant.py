@@ -6,7 +6,6 @@ reads the documents, and whether it and its peers then let the participant join.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.vendors import MEASURED, Vendor, VendorTraits
@@ -158,33 +157,35 @@ def plan_enclave(policy: Enclave, governance: Governance, *, at: datetime) -> Lo
 
 def _portable(permissions: Permissions | None, document: bytes) -> Permissions | None:
     """Return permissions whose document is as sros writes it, of names that are read in one way."""
-    if permissions is None or _ODD_TEXT.search(document):
+    if permissions is None or not _is_plain(permissions):
         return None
-    criteria = [
-        some
-        for grant in permissions.grants
-        for rule in grant.rules
-        for some in (*rule.publish, *rule.subscribe)
-    ]
-    ends = [
-        end
-        for grant in permissions.grants
-        for rule in grant.rules
-        for part in rule.domains.ranges
-        for end in (part.first, part.last)
-    ]
-    plain = (
-        all(each.topics and all(each.topics) and not each.partitions for each in criteria)
-        and all(end is not None and end <= MAX_DOMAIN for end in ends)
-        and all(rule.domains.ranges for grant in permissions.grants for rule in grant.rules)
-        and all(grant.name and grant.rules for grant in permissions.grants)
-    )
-    written = document.replace(b"\r\n", b"\n").strip()
-    return permissions if plain and render_permissions(permissions).strip() == written else None
+    written = document.replace(b"\r\n", b"\n").strip(b"\n")
+    return permissions if render_permissions(permissions).strip(b"\n") == written else None
 
 
-_ODD_TEXT = re.compile(rb"[^\x20-\x7e\r\n]|&|>[ \t]|\S[ \t]+</")
-"""Characters, references and blanks that a vendor may read in its own way."""
+def _is_plain(permissions: Permissions) -> bool:
+    """Return whether no vendor reads a text, or a range of domains, in its own way."""
+    texts = []
+    for grant in permissions.grants:
+        if not (grant.name and grant.rules):
+            return False
+        texts += [grant.name, grant.subject, grant.not_before, grant.not_after]
+        for rule in grant.rules:
+            ends = [end for part in rule.domains.ranges for end in (part.first, part.last)]
+            if not ends or any(end is None or end > MAX_DOMAIN for end in ends):
+                return False
+            if rule.relay:
+                return False
+            for criteria in (*rule.publish, *rule.subscribe):
+                if criteria.partitions or criteria.data_tags or not all(criteria.topics or ("",)):
+                    return False
+                texts += criteria.topics
+    joined = f"|{'|'.join(texts)}|"
+    odd = "| " in joined or " |" in joined or any(each in joined for each in _MARKUP)
+    return joined.isascii() and joined.isprintable() and not odd
+
+
+_MARKUP = '&<>"'
 
 
 def _document(message: bytes) -> bytes:
@@ -226,8 +227,14 @@ _ONLY_PEERS_NOTICE = {
 }
 """Faults that a vendor does not notice in its own process, but all peers do."""
 
-# All enclaves of a keystore have the same governance.
-_governance_as = lru_cache(maxsize=16)(read_governance_as)
+
+@lru_cache(maxsize=64)  # all enclaves of a keystore have the same governance
+def _governed_as(vendor: Vendor, document: bytes, domain: int) -> GovernedDomain | Refusal:
+    """Return what a governance document says of a domain to a vendor, or why it refuses it."""
+    governance = read_governance_as(vendor, document)
+    if isinstance(governance, Refusal):
+        return governance
+    return GovernedDomain(vendor, governance, domain)
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,11 +268,11 @@ _OF_GOVERNANCE = {
 """The reasons that lie in the governance, where no fault names the file."""
 
 
-def _crashes_before(problem: Problem, governance: Governance | Refusal) -> bool:
+def _crashes_before(problem: Problem, governed: GovernedDomain | Refusal) -> bool:
     """Return whether a process crashes on its governance before it meets a problem."""
     return (
-        isinstance(governance, Refusal)
-        and governance.outcome is Outcome.CRASHES
+        isinstance(governed, Refusal)
+        and governed.outcome is Outcome.CRASHES
         and problem.file == PERMISSIONS_FILE
         and problem.fault not in BEFORE_DDS
     )
@@ -321,11 +328,11 @@ class VendorParticipant:
     def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
         """Return the access of the vendor's process, or the decision that keeps it from running."""
         late: Decision | None = None
-        governance = _governance_as(self.vendor, enclave.governance)
+        governed = _governed_as(self.vendor, enclave.governance, context.domain)
         noticed = [
             each for each in self.problems if (self.vendor, each.fault) not in _ONLY_PEERS_NOTICE
         ]
-        if noticed and not _crashes_before(noticed[0], governance):
+        if noticed and not _crashes_before(noticed[0], governed):
             first = noticed[0]
             outcome = Outcome.CRASHES if first.fault in CRASHES else Outcome.REFUSED
             return Decision(outcome, first.fault.id, f"{self.vendor.title}: {first}.")
@@ -333,22 +340,14 @@ class VendorParticipant:
             first = self.problems[0]
             text = f"{self.vendor.title}: {first}."
             late = Decision(Outcome.PEER_DENIES, first.fault.id, text)
-        if isinstance(governance, Refusal):
-            return replace(governance.decision(), reason=Fault.GOVERNANCE_MALFORMED.id)
-        self.governance = governance
+        if isinstance(governed, Refusal):
+            return replace(governed.decision(), reason=Fault.GOVERNANCE_MALFORMED.id)
+        self.governance = governed.governance
         permissions = enclave.portable or read_permissions_as(self.vendor, enclave.permissions)
         if isinstance(permissions, Refusal):
             return replace(permissions.decision(), reason=Fault.PERMISSIONS_MALFORMED.id)
         self.permissions = permissions
-        access = Access(
-            self.vendor,
-            governance,
-            permissions,
-            enclave.subject,
-            domain=context.domain,
-            at=context.at,
-            zone=context.zone,
-        )
+        access = Access(governed, permissions, enclave.subject, at=context.at, zone=context.zone)
         if late is None:
             return access
         # Its own process may still refuse the documents.

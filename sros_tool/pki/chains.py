@@ -51,13 +51,19 @@ _CRITICAL = frozenset(
 """The critical extensions that are accepted (X509_supported_extension); any other is refused."""
 _NO_USAGE = x509.KeyUsage(*[False] * 9)
 _RESTRICTING = {
-    "1.3.6.1.5.5.7.1.7": "sbgp-ipAddrBlock",
-    "1.3.6.1.5.5.7.1.8": "sbgp-autonomousSysNum",
-    "1.3.6.1.5.5.7.1.14": "proxyCertInfo",
+    ObjectIdentifier("1.3.6.1.5.5.7.1.7"): "sbgp-ipAddrBlock",
+    ObjectIdentifier("1.3.6.1.5.5.7.1.8"): "sbgp-autonomousSysNum",
+    ObjectIdentifier("1.3.6.1.5.5.7.1.14"): "proxyCertInfo",
 }
 """Extensions by which OpenSSL may refuse a chain, and which sros does not decide."""
 _SSL_CLIENT, _SMIME, _SMIME_CA, _ANY_NETSCAPE_CA = 0x80, 0x20, 0x02, 0x07
 _ANY_POLICY = ObjectIdentifier("2.5.29.32.0")
+_OF_POLICIES = {
+    ExtensionOID.CERTIFICATE_POLICIES,
+    ExtensionOID.POLICY_CONSTRAINTS,
+    ExtensionOID.POLICY_MAPPINGS,
+    ExtensionOID.INHIBIT_ANY_POLICY,
+}
 _DEEPEST = 100
 _WITH_EXTENSIONS = 3
 """The version of X.509 certificates that brought extensions (RFC 5280, 4.1.2.1)."""
@@ -89,34 +95,60 @@ def chain_fault(
 
     ``others`` are possible intermediate certificates; validities are checked at the time ``at``.
     """
-    return _chain_fault(start, tuple(dict.fromkeys(authorities)), tuple(others), at, checks)
+    chain = _chain_of(start, tuple(dict.fromkeys(authorities)), tuple(others), at)
+    return chain.missing or chain.fault(checks)
+
+
+class _Chain:
+    """A chain of certificates, which is asked with several checks; see `build_chain`."""
+
+    def __init__(self, certificates: list[x509.Certificate], missing: str, at: datetime) -> None:
+        self.missing = missing
+        self._certificates = certificates
+        self._at = at
+        self._known: dict[Checks, str] = {}
+
+    def fault(self, checks: Checks) -> str:
+        """Return why the chain is not valid, or ""."""
+        if checks not in self._known:
+            # Of a chain that all vendors find valid, only what the checks add is left to ask.
+            new = not checks or bool(self.fault(Checks.NONE))
+            self._known[checks] = next(self._faults(checks, new=new), "")
+        return self._known[checks]
+
+    def _faults(self, checks: Checks, *, new: bool) -> Iterator[str]:
+        chain = self._certificates
+        if new:
+            for each in chain:
+                yield from _extension_faults(each)
+        if new or Checks.STRICT in checks:
+            yield from _authority_faults(chain, checks)
+        if Checks.DOCUMENTS in checks:
+            yield from purpose_faults(chain)
+        if Checks.STRICT in checks:
+            yield from _strict_faults(chain)
+        if new:
+            yield from _time_faults(chain, self._at)
+        if new or Checks.ROOT_SIGNATURE in checks:
+            yield from _signature_faults(chain, checks)
+        if new:
+            yield from name_faults(chain)
+        if Checks.POLICIES in checks:
+            yield from _policy_faults(chain)
 
 
 @lru_cache(maxsize=64)  # vendors check the same chain, and all documents have the same signer
-def _chain_fault(
+def _chain_of(
     start: x509.Certificate,
     authorities: tuple[x509.Certificate, ...],
     others: tuple[x509.Certificate, ...],
     at: datetime,
-    checks: Checks,
-) -> str:
-    chain, missing = build_chain(start, authorities, others, at)
+) -> _Chain:
+    certificates, missing = build_chain(start, authorities, others, at)
     if missing:
         unread = (fault for each in (start, *authorities) for fault in _unread_faults(each))
-        return next(unread, missing)
-    # Of a chain that all vendors find valid, only what the checks add is left to ask.
-    new = not checks or bool(_chain_fault(start, authorities, others, at, Checks.NONE))
-    faults = (
-        *(fault for each in chain if new for fault in _extension_faults(each)),
-        *(_authority_faults(chain, checks) if new or Checks.STRICT in checks else ()),
-        *(purpose_faults(chain) if Checks.DOCUMENTS in checks else ()),
-        *(_strict_faults(chain) if Checks.STRICT in checks else ()),
-        *(_time_faults(chain, at) if new else ()),
-        *(_signature_faults(chain, checks) if new or Checks.ROOT_SIGNATURE in checks else ()),
-        *(name_faults(chain) if new else ()),
-        *(_policy_faults(chain) if Checks.POLICIES in checks else ()),
-    )
-    return next(iter(faults), "")
+        missing = next(unread, missing)
+    return _Chain(certificates, missing, at)
 
 
 def build_chain(
@@ -184,17 +216,16 @@ def _may_sign_certificates(certificate: x509.Certificate) -> bool:
 def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
     """Return the extensions for which OpenSSL, or sros, refuses a certificate in any chain."""
     name = subject_text(certificate.subject)
-    faults = []
-    faults += _unread_faults(certificate)
+    faults = [*_unread_faults(certificate)]
     if extension(certificate, x509.KeyUsage) == _NO_USAGE:
         faults.append(f"the keyUsage of {name} is empty")
     if _netscape_type(certificate) == -1:
         faults.append(f"the nsCertType of {name} cannot be read")
     for found in certificate.extensions:
-        oid = found.oid.dotted_string
-        if oid in _RESTRICTING:
-            faults.append(f"{name} has {_RESTRICTING[oid]}, not known to sros")
+        if found.oid in _RESTRICTING:
+            faults.append(f"{name} has {_RESTRICTING[found.oid]}, not known to sros")
         elif found.critical and found.oid not in _CRITICAL:
+            oid = found.oid.dotted_string
             faults.append(f"{name} has the unknown critical extension {oid}")
     return tuple(faults)
 
@@ -370,6 +401,8 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 
     Also where a certificate has a policy twice, or translates policies, which sros does not follow.
     """
+    if not any(_OF_POLICIES & {each.oid for each in below.extensions} for below in chain[:-1]):
+        return
     demanded = len(chain)
     valid: set[ObjectIdentifier] = {_ANY_POLICY}
     for each in reversed(chain[:-1]):

@@ -24,7 +24,13 @@ _SPACES = re.compile(rb"[ \t\n\v\f\r]+")
 
 def same_name(one: x509.Name, other: x509.Name) -> bool:
     """Return whether two names are equal: string types, case and blanks do not count."""
-    return canonical(one) == canonical(other)
+    return len(one.rdns) == len(other.rdns) and canonical(one) == canonical(other)
+
+
+@lru_cache(maxsize=64)  # all documents of a keystore have the same signer
+def canonical_issuer(certificate: x509.Certificate) -> tuple[bytes, ...]:
+    """Return the parts of the name of a certificate's issuer, as `canonical` does."""
+    return canonical(certificate.issuer)
 
 
 def canonical(name: x509.Name) -> tuple[bytes, ...]:

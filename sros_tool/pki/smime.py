@@ -30,7 +30,7 @@ from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki.certificates import load_der_certificate
 from sros_tool.pki.keys import PrivateKey
-from sros_tool.pki.names import canonical, canonical_der
+from sros_tool.pki.names import canonical_der, canonical_issuer
 from sros_tool.pki.reading import read_name_der
 
 _BOM = "\ufeff".encode()
@@ -128,7 +128,7 @@ class Signature:
         """Return the first certificate with the signer's issuer and serial number, or None."""
         issuer, serial = self._issuer_and_serial
         for each in certificates:
-            if each.serial_number == serial and canonical(each.issuer) == issuer:
+            if each.serial_number == serial and canonical_issuer(each) == issuer:
                 return each
         return None
 

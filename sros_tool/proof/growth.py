@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from itertools import islice, product
 
 from sros_tool.automata import NameSet, SearchLimit
-from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import ExpressionIndex, matches, names_of
 from sros_tool.dds.decision.subjects import (
@@ -290,7 +290,8 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
         """
         granted = (each.subject for each in side.permissions[name].grants[:1])
         subject = subject if _fits(vendor, side, name, subject) else next(granted, "")
-        found = Access(vendor, governance, side.permissions[name], subject, domain=at, at=AT)
+        governed = GovernedDomain(vendor, governance, at)
+        found = Access(governed, side.permissions[name], subject, at=AT)
         if found.join().reason in ("no-grant", "malformed") or found.join().outcome == "crashes":
             raise DocumentError(
                 f"the permissions of {name} in '{side.shown}' cannot be compared",

@@ -12,7 +12,7 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.automata import NameSet
-from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.subjects import also_fitting
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
@@ -160,8 +160,9 @@ def policy_system(
     worlds = []
     for vendor in MEASURED:
         if world in ("", vendor.value):
+            governed = GovernedDomain(vendor, governance, domain)
             access = {
-                name: (Access(vendor, governance, each, subjects[name], domain=domain, at=at),)
+                name: (Access(governed, each, subjects[name], at=at),)
                 for name, each in signed.items()
             }
             granted = {} if unique else {name: (each,) for name, each in subjects.items()}

@@ -11,7 +11,7 @@ import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.registry import FindingFilter
-from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
@@ -172,7 +172,13 @@ def test_local_time_is_standard_time_in_summer_too(
     assert state.governance and state.permissions and state.certificate
     subject = subject_text(state.certificate.subject)
     fast, cyclone = (
-        Access(vendor, state.governance, state.permissions, subject, domain=0, at=at, zone=zone)
+        Access(
+            GovernedDomain(vendor, state.governance, 0),
+            state.permissions,
+            subject,
+            at=at,
+            zone=zone,
+        )
         for vendor in (Vendor.FAST, Vendor.CYCLONE)
     )
     assert cyclone.join().outcome.ok

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
-from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import _REASONS, Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.vendors import Vendor
@@ -74,17 +74,10 @@ def test_an_allow_rule_at_the_end_takes_no_right_away(
     more = Permissions(
         tuple(replace(each, rules=(*each.rules, rule)) for each in permissions.grants)
     )
+    governed = GovernedDomain(vendor, governance, case.domain)
     for question in case.questions:
         before, after = (
-            Access(
-                vendor,
-                governance,
-                each,
-                case.subject,
-                domain=case.domain,
-                at=NOW,
-                zone=ZoneInfo(case.zone),
-            ).decide(*question)
+            Access(governed, each, case.subject, at=NOW, zone=ZoneInfo(case.zone)).decide(*question)
             for each in (permissions, more)
         )
         assert after.outcome.ok or not before.outcome.ok

@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import Style, Subjects, Vendor
@@ -485,9 +485,8 @@ class Side:
                 domains=domains,
             )
             governance = self.own.governance or _STRICT
-            self._access[key] = Access(
-                vendor, governance, permissions, f"CN={enclave}", domain=domain, at=AT
-            )
+            governed = GovernedDomain(vendor, governance, domain)
+            self._access[key] = Access(governed, permissions, f"CN={enclave}", at=AT)
         return self._access[key].decide(verb, topic).outcome.ok
 
     def on_zenoh(self, enclave: str, domain: int, verb: AccessVerb, topic: str) -> bool:

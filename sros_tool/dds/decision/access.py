@@ -2,7 +2,7 @@
 
 A decision chooses the grant of the subject (`_choose_grant`), takes its rules for the domain
 (`_rules_for`), applies them to a topic (`_GrantRules`), and combines the result with the access
-control that the governance requires (`_GovernedDomain`, `_decide_join`, `Access`).
+control that the governance requires (`GovernedDomain`, `_decide_join`, `Access`).
 """
 
 from __future__ import annotations
@@ -317,11 +317,17 @@ def _partitions(
     return tuple(dict.fromkeys(_trimmed(traits, text) for text in found))
 
 
-class _GovernedDomain:
-    """The first domain rule that lists the domain (``rule``, or None), and its topic rules."""
+class GovernedDomain:
+    """What a governance says of a domain to a vendor; prepared once for many subjects.
 
-    def __init__(self, traits: VendorTraits, governance: Governance, domain: int) -> None:
-        self._traits = traits
+    ``rule`` is the first domain rule that lists the domain, or None.
+    """
+
+    def __init__(self, vendor: Vendor, governance: Governance, domain: int) -> None:
+        self.vendor = vendor
+        self.governance = governance
+        self.domain = domain
+        self._traits = traits = vendor.traits
         self.rule: DomainRule | None = None
         for rule in governance.domain_access_rules:
             if holds_for(traits.open_range, rule.domains, domain):
@@ -392,14 +398,13 @@ class _Joining:
 
 def _decide_join(
     traits: VendorTraits,
-    governed: _GovernedDomain,
+    governed: GovernedDomain,
     grant: Grant,
     rules: list[NumberedRule],
     otherwise: RuleVerdict,
-    domain: int,
 ) -> _Joining:
     """Return whether the participant may join; without matching ``rules``, ``otherwise`` counts."""
-    where = f"domain {domain}"
+    where = f"domain {governed.domain}"
     if traits.always_needs_allow_rule and not any(rule.allow for rule in grant.rules):
         text = "the grant has no allow rule, so the participant does not start"
         return _Joining(Outcome.REFUSED, "no-rule", text)
@@ -423,16 +428,15 @@ def _decide_join(
     opened = not governed.all_controlled() and otherwise.outcome is not Outcome.ALLOWED
     if opened and otherwise.outcome is Outcome.CRASHES:
         # With a topic that is free it starts without a look at its rules; its peers look at them.
-        text = _verdict_text(otherwise, f"joining {where}", domain)
+        text = _verdict_text(otherwise, f"joining {where}", governed.domain)
         text = text.replace("crashes the process", "crashes the processes of its peers")
         return _Joining(Outcome.CRASHES, otherwise.reason, text, hits_peers=True)
     if traits.always_needs_allow_rule or opened:
         return _Joining(Outcome.PEER_DENIES, "no-rule", f"{missing}, so peers refuse it")
     if otherwise.outcome is Outcome.DENIED:
         return _Joining(Outcome.REFUSED, "no-rule", missing)
-    return _Joining(
-        otherwise.outcome, otherwise.reason, _verdict_text(otherwise, f"joining {where}", domain)
-    )
+    text = _verdict_text(otherwise, f"joining {where}", governed.domain)
+    return _Joining(otherwise.outcome, otherwise.reason, text)
 
 
 class _Kind(Enum):
@@ -468,22 +472,19 @@ class Access:
 
     def __init__(
         self,
-        vendor: Vendor,
-        governance: Governance,
+        governed: GovernedDomain,
         permissions: Permissions,
         subject: str,
         *,
-        domain: int,
         at: datetime,
         zone: tzinfo = UTC,
     ) -> None:
-        """Prepare the decisions on ``subject`` (RFC 4514) on ``domain`` at the aware moment ``at``.
+        """Prepare the decisions on ``subject`` (RFC 4514) in a domain at the aware moment ``at``.
 
         ``zone`` is the host's time zone.  Nothing is raised: the decisions report every fault.
         """
-        self._traits = vendor.traits
-        self._domain = domain
-        self._governed = _GovernedDomain(self._traits, governance, domain)
+        self._traits = governed.vendor.traits
+        self._governed = governed
         self._grant: int | None = None
         chosen = _choose_grant(self._traits, permissions, subject, at=at, zone=zone)
         if isinstance(chosen, Refusal):
@@ -511,7 +512,8 @@ class Access:
         permissions = read_permissions_as(vendor, permissions_xml)
         if isinstance(permissions, Refusal):
             return permissions
-        return cls(vendor, governance, permissions, subject, domain=domain, at=at, zone=zone)
+        governed = GovernedDomain(vendor, governance, domain)
+        return cls(governed, permissions, subject, at=at, zone=zone)
 
     def decide(
         self, verb: AccessVerb, topic: str = "", partitions: tuple[str, ...] = ()
@@ -590,23 +592,38 @@ class Access:
 
     def _prepare(self, grant: Grant) -> None:
         traits = self._traits
-        rules, otherwise = _rules_for(traits, grant, self._domain)
-        joining = _decide_join(traits, self._governed, grant, rules, otherwise, self._domain)
+        rules, otherwise = _rules_for(traits, grant, self._governed.domain)
+        joining = _decide_join(traits, self._governed, grant, rules, otherwise)
         self._join = replace(
             self._answer(joining.outcome, joining.reason, joining.text),
             hits_peers=joining.hits_peers,
         )
-        self._peers = {verb: _GrantRules(traits, rules, otherwise, verb) for verb in _ENDPOINTS}
-        self._own = self._peers
-        if not traits.filters_own_domain:
-            everywhere = list(enumerate(grant.rules))
-            self._own = {
-                verb: _GrantRules(traits, everywhere, otherwise, verb) for verb in _ENDPOINTS
-            }
-        if traits.relays_count_for_readers:
-            readers = _GrantRules(traits, rules, otherwise, AccessVerb.SUBSCRIBE, "relay")
-            self._peers = {**self._peers, AccessVerb.SUBSCRIBE: readers}
-        self._either = _GrantRules(traits, rules, otherwise, *_ENDPOINTS)
+        self._rules, self._otherwise = rules, otherwise
+        self._own_rules = rules if traits.filters_own_domain else list(enumerate(grant.rules))
+
+    @cached_property
+    def _own(self) -> dict[AccessVerb, _GrantRules]:
+        """The rules by which its own participant decides."""
+        return {verb: self._deciding(self._own_rules, verb) for verb in _ENDPOINTS}
+
+    @cached_property
+    def _peers(self) -> dict[AccessVerb, _GrantRules]:
+        """The rules by which its peers decide; the same value as `_own` if they are the same."""
+        relays = ("relay",) if self._traits.relays_count_for_readers else ()
+        if self._own_rules is self._rules and not relays:
+            return self._own
+        return {
+            AccessVerb.PUBLISH: self._deciding(self._rules, AccessVerb.PUBLISH),
+            AccessVerb.SUBSCRIBE: self._deciding(self._rules, AccessVerb.SUBSCRIBE, *relays),
+        }
+
+    @cached_property
+    def _either(self) -> _GrantRules:
+        """The rules that decide on a topic, whatever the direction."""
+        return self._deciding(self._rules, *_ENDPOINTS)
+
+    def _deciding(self, rules: Sequence[NumberedRule], *verbs: str) -> _GrantRules:
+        return _GrantRules(self._traits, rules, self._otherwise, *verbs)
 
     # ── deciding ───────────────────────────────────────────────────────────────────────────
 
@@ -690,19 +707,21 @@ class Access:
 
     def _without_topic_rule(self, topic: str) -> Decision:
         if self._governed.rule is None:
-            text = f"the governance does not list domain {self._domain}"
+            text = f"the governance does not list domain {self._governed.domain}"
             return self._answer(Outcome.DENIED, "domain-not-in-governance", text)
         text = f"the governance has no topic rule for {topic}"
         return self._answer(Outcome.DENIED, "no-topic-rule", text)
 
     def _peers_refuse(self, rule: TopicRule) -> Decision:
-        text = f"no allow rule of the grant covers domain {self._domain}, so peers refuse it"
+        text = (
+            f"no allow rule of the grant covers domain {self._governed.domain}, so peers refuse it"
+        )
         return self._answer(Outcome.PEER_DENIES, "peer-refuses-participant", text, topic_rule=rule)
 
     def _verdict(
         self, verdict: RuleVerdict, asked: str, topic_rule: TopicRule, *, by_peers: bool = False
     ) -> Decision:
-        text = _verdict_text(verdict, asked, self._domain, by_peers=by_peers)
+        text = _verdict_text(verdict, asked, self._governed.domain, by_peers=by_peers)
         outcome = Outcome.PEER_DENIES if by_peers else verdict.outcome
         return self._answer(outcome, verdict.reason, text, verdict, topic_rule)
 

@@ -113,7 +113,11 @@ def _part_end(text: bytes, start: int) -> int:
 
 
 _MOST_ATTRIBUTES = 20  # the ones that Fast DDS 2.14 uses
-_UNQUOTED = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\])', re.DOTALL)
+_BEFORE = {
+    wanted: re.compile(rf'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\{wanted}])*', re.DOTALL)
+    for wanted in "=,"
+}
+"""What stands before the first such character outside of escapes and quotes."""
 
 
 def _any_order(granted: str, certified: str) -> bool:
@@ -145,15 +149,9 @@ def _types_and_values(name: str) -> list[tuple[str, str]]:
 
 def _outside_quotes(text: str, wanted: str) -> int:
     """Return the index of the first such character outside of escapes and quotes, else -1."""
-    index = 0
-    while index < len(text):
-        found = _UNQUOTED.match(text, index)
-        if not found:
-            break
-        if found[0] == wanted:
-            return index
-        index = found.end()
-    return -1
+    before = _BEFORE[wanted].match(text)
+    end = before.end() if before else 0
+    return end if text[end : end + 1] == wanted else -1
 
 
 _PART = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^,"\\])*', re.DOTALL)

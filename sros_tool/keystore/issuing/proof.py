@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 
-from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.matching import ExpressionIndex
 from sros_tool.dds.decision.matching import matches as dds_matches
@@ -296,8 +296,8 @@ def _access(vendor: Vendor, permissions: Permissions, domain: int) -> Access:
     window = grant.validity
     middle = window.not_before + (window.not_after - window.not_before) / 2
     at = datetime.fromtimestamp(int(middle.timestamp()), UTC) + timedelta(seconds=1)
-    governance = _everything_controlled(domain)
-    return Access(vendor, governance, permissions, grant.subject, domain=domain, at=at)
+    governed = GovernedDomain(vendor, _everything_controlled(domain), domain)
+    return Access(governed, permissions, grant.subject, at=at)
 
 
 def _everything_controlled(domain: int) -> Governance:
