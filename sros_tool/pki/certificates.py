@@ -381,12 +381,17 @@ def is_for_pss(certificate: x509.Certificate) -> bool:
     return certificate.public_key_algorithm_oid == PublicKeyAlgorithmOID.RSASSA_PSS
 
 
+def _in_der(certificate: x509.Certificate, part: bytes) -> bytes:
+    """Return a part of a certificate in DER; what `cryptography` reads has nothing else."""
+    return der.normalized(part) if tolerant.is_tolerated(certificate) else part
+
+
 @lru_cache(maxsize=256)
 def has_explicit_curve(certificate: x509.Certificate) -> bool:
     """Return whether the elliptic curve of a certificate's key is given by its parameters."""
     if certificate.public_key_algorithm_oid != PublicKeyAlgorithmOID.EC_PUBLIC_KEY:
         return False
-    parts = der.children(der.first(der.normalized(certificate.tbs_certificate_bytes)).content)
+    parts = der.children(der.first(_in_der(certificate, certificate.tbs_certificate_bytes)).content)
     key = parts[6 if parts[0].tag == der.CONTEXT_0 else 5]
     algorithm_of_key = der.children(der.first(key.content).content)
     return algorithm_of_key[-1].tag == der.SEQUENCE
@@ -398,7 +403,7 @@ def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
 
     OpenSSL compares them when it verifies the signature, which it does not of a self-signed CA.
     """
-    whole = der.first(der.normalized(certificate.public_bytes(serialization.Encoding.DER)))
+    whole = der.first(_in_der(certificate, certificate.public_bytes(serialization.Encoding.DER)))
     signed, outer, _ = der.children(whole.content)
     parts = der.children(signed.content)
     return parts[2 if parts[0].tag == der.CONTEXT_0 else 1], outer

@@ -68,7 +68,7 @@ def split(data: bytes) -> tuple[bytes, bytes]:
     Raises:
         PkiError: the value is truncated, or has a form that this reader does not support.
     """
-    end = _normalized(data, 0, 0)[1]
+    end = _header(data, 0)[2] or _normalized(data, 0, 0)[1]
     return data[:end], data[end:]
 
 
