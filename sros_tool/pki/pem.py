@@ -22,6 +22,11 @@ _BEGIN = re.compile(rb"-----BEGIN (.*)-----", re.DOTALL)
 _END = b"-----END "
 _NOT_AT_START = re.compile(rb"[^\n]-----BEGIN ")
 _BASE64 = re.compile(rb"[A-Za-z0-9+/]*={0,2}")
+_ALONE = re.compile(
+    rb"-----BEGIN ([A-Z0-9 ]{1,60})-----\n((?:[A-Za-z0-9+/]{1,76}\n)*[A-Za-z0-9+/]{1,76}={0,2}\n)"
+    rb"-----END \1-----\n"
+)
+"""A file of one block without headers, as almost all programs write it."""
 _BLANKS = bytes(range(0x21))
 _BETWEEN = b" \t\r\n"
 _BOM = b"\xef\xbb\xbf"
@@ -43,6 +48,10 @@ def blocks(data: bytes) -> Iterator[Block]:
         PkiError: a block is damaged, so OpenSSL does not read what follows; or its first line ends
             with a byte beyond ASCII, which OpenSSL drops on some processors only.
     """
+    if alone := _ALONE.fullmatch(data):
+        label = alone[1].decode("ascii")
+        yield Block(label, b"", _decoded(alone[2], label))
+        return
     pieces = iter(_PIECE.findall(data))
     start = True  # a byte order mark is dropped here, and behind each block
     for piece in pieces:

@@ -10,7 +10,6 @@ evaluated for all.
 
 from __future__ import annotations
 
-import re
 import tempfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -54,14 +53,14 @@ from sros_tool.pki.certificates import (
     enclave_subject,
     is_self_issued,
     issued_by,
-    load_certificate,
     load_certificates,
     pem,
     subject_text,
     validity_of,
 )
 from sros_tool.pki.crl import may_sign_lists, read_list, sign_crl
-from sros_tool.pki.keys import algorithm, generate_key
+from sros_tool.pki.forms import holds_at, read_form
+from sros_tool.pki.keys import generate_key
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
 from sros_tool.xml import read_bytes
@@ -79,7 +78,6 @@ _LOADED = (
 _NEEDED = _LOADED[:5]
 _ONLY_IDENTITY = {IDENTITY_CA_FILE, CRL.rpartition("/")[2]}
 """Shared files with which vendors verify no governance and no permissions."""
-_UNUSUAL = re.compile(r"[^A-Za-z0-9/_]")
 _CHOSEN = {Fault.DOCUMENT_SIZE, Fault.KEY_ON_TOKEN}
 """Faults that follow from what the user asked for, and of which notes tell."""
 _SHOWN = 5
@@ -417,24 +415,12 @@ def _content(path: Path) -> bytes:
         return b""
 
 
-def _certificate_kind(
-    data: bytes, listed: frozenset[int], now: datetime
-) -> tuple[object, ...] | None:
+def _certificate_kind(data: bytes, listed: frozenset[int], now: datetime) -> tuple[object, ...]:
     """Return all of a certificate in which vendors could see a difference, but its name and key."""
-    try:
-        found = load_certificate(data, "")
-    except SrosError:
-        return None
-    return (
-        found.issuer.public_bytes(),
-        found.signature_algorithm_oid,
-        algorithm(found.public_key()),
-        tuple((each.oid, each.critical) for each in found.extensions),
-        tuple(each.oid for each in found.subject),
-        frozenset(_UNUSUAL.findall(subject_text(found.subject))),
-        validity_of(found).contains(now),
-        found.serial_number in listed,
-    )
+    form = read_form(data)
+    if form is None:
+        return (data,)
+    return (form.common, holds_at(form, now), form.serial in listed)
 
 
 def _listed(crl: bytes) -> frozenset[int]:
