@@ -50,10 +50,11 @@ def fastdds_stack() -> str:
 
 @cache
 def openssl() -> str:
-    """The OpenSSL of this system, which decides about certificates for all vendors."""
+    """The series of OpenSSL of this system, which decides about certificates for all vendors."""
     library = ctypes.CDLL("libcrypto.so.3")
     library.OpenSSL_version.restype = ctypes.c_char_p
-    return "-".join(library.OpenSSL_version(0).decode().lower().split()[:2])
+    name, version, *_ = library.OpenSSL_version(0).decode().lower().split()
+    return f"{name}-{version.rpartition('.')[0]}"
 
 
 def skip_without_fastdds() -> None:

@@ -1,9 +1,9 @@
 """What vendors replied to the forms of earlier runs, and who is asked again.
 
-`kept/STACK.txt`, whose name has the versions of a vendor and of OpenSSL, has a line for each form:
-its hash and the reply.  A form without a line is asked about; of the others a random twentieth, in
-the long form all (`tests.support.long_form`).  With $SROS_KEEP_REPLIES all are asked about, and
-what comes is written into the file.
+`kept/STACK.txt`, whose name has the version of a vendor and the series of OpenSSL, has a line for
+each form: its hash and the reply.  A form without a line is asked about; of the others a random
+twentieth, in the long form all (`tests.support.long_form`).  With $SROS_KEEP_REPLIES all are asked
+about, and what comes is written into the file.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def answered(
     *,
     believe: Callable[[int, Reply], bool] = lambda place, reply: True,
 ) -> list[Reply]:
-    """Return the reply of a stack ("cyclone-0.10.2-openssl-3.0.20") to each form.
+    """Return the reply of a stack ("cyclone-0.10.2-openssl-3.0") to each form.
 
     ``ask`` is given the places of the forms that the stack itself has to answer: those that are
     new, that were drawn, and those whose kept reply ``believe`` does not accept.
