@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from sros_tool.errors import Note
 from sros_tool.values import Words
@@ -29,6 +29,15 @@ FileChanges = Annotated[
     Sequence[FileChange], "The files that were written or, with `--dry-run`, would be."
 ]
 Notes = Annotated[Sequence[Note], "Notes, which text output prints on standard error."]
+
+
+class PlannedFiles(NamedTuple):
+    """What would be written."""
+
+    changes: FileChanges
+    notes: Notes
+    dry_run: Literal[True] = True
+    """Nothing was written."""
 
 
 def file_change(path: Path, *, existed: bool) -> tuple[FileChange]:

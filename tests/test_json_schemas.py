@@ -19,17 +19,13 @@ from tools.json_page import SCHEMAS
 from tools.json_schemas import object_schema, schemas, text_of
 
 BY_HAND = {
-    "audit.json",
     "confirmation.json",
     "demo.json",
     "diff_policy.json",
     "explain.json",
-    "fleet_status.json",
     "generate_policy.json",
     "inspect.json",
     "minimize_policy.json",
-    "policies.json",
-    "view.json",
 }
 """The schemas that no type makes: the confirmation, which robots write, and verbs not done yet."""
 

@@ -69,6 +69,23 @@ VERBS: Mapping[str, str | Shapes] = {
     "doctor": "sros_tool.cli.check:MachineReport",
     "review": "sros_tool.proof.review:ReviewResult",
     "verify": "sros_tool.checks.keystores.arrival:VerifiedFolder",
+    "audit": "sros_tool.explain.audit:AuditResult",
+    "fleet status": "sros_tool.keystore.fleet_status:ComparedFleet",
+    "view": Shapes(
+        "Who may do what; `-o FILE` writes it to FILE instead.",
+        {
+            "the picture": "sros_tool.report.picture:Picture",
+            "--dry-run": "sros_tool.written:PlannedFiles",
+        },
+    ),
+    "policies": Shapes(
+        "The policies that ship with sros.",
+        {
+            "the list": "sros_tool.policy.document:ShippedPolicies",
+            "--copy": "sros_tool.policy.document:CopiedPolicies",
+            "--convert": "sros_tool.policy.document:PrintedConversion",
+        },
+    ),
     "list_enclaves": "sros_tool.keystore.selection:EnclaveList",
     "env": "sros_tool.runtime.environment:PrintedEnvironment",
     "zenoh": Shapes(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -34,13 +34,11 @@ from sros_tool.cli.observing import (
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UnavailableError, UsageError, counted
 from sros_tool.terminal import echo
-from sros_tool.values import as_plain
 from sros_tool.written import file_change
 
 if TYPE_CHECKING:
     from sros_tool.explain.audit import Audit, AuditedEnclaves
     from sros_tool.graph.observation import Observation
-    from sros_tool.keystore.participant import JoinContext
 
 
 @click.command(
@@ -144,10 +142,29 @@ def audit(
     existed = patch is not None and patch.exists()
     written = _write_patch(found, patch, dry_run=dry_run)
     if as_json:
-        value = _json(source, enclaves, found, patch if written else None, dry_run=dry_run)
-        value |= {"allowed": fine, "settled": snapshot.settled, "partial": partial}
-        changes = file_change(patch, existed=existed) if patch and written else []
-        print_json({**value, "changes": changes})
+        from sros_tool.explain.audit import AuditResult, RefusedEnclave
+
+        refused = sorted(found.refused.items())
+        print_json(
+            AuditResult(
+                source,
+                enclaves.what,
+                enclaves.vendor,
+                enclaves.context.domain,
+                fine,
+                denied=found.denied,
+                refused=[RefusedEnclave(name, reason) for name, reason in refused],
+                unseen=found.unseen,
+                unjudged=found.unjudged,
+                observation=found.observation,
+                settled=snapshot.settled,
+                partial=partial,
+                patch=patch if written else None,
+                dry_run=dry_run,
+                changes=file_change(patch, existed=existed) if patch and written else (),
+                notes=(*found.notes, *found.missing.notes),
+            )
+        )
     else:
         _show(found, enclaves, kept_changing)
     print_notes((*found.notes, *found.missing.notes))
@@ -257,38 +274,3 @@ def _show(found: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None
     echo(verdict, err=True)
     if any(each.by_rule for each in found.denied):
         echo("a DENY denies some of it; no right that is added changes that", err=True)
-
-
-def _json(
-    source: Path, enclaves: AuditedEnclaves, found: Audit, patch: Path | None, *, dry_run: bool
-) -> dict[str, Any]:
-    from sros_tool.graph.observation import to_json
-
-    context: JoinContext = enclaves.context
-    return {
-        "source": str(source),
-        "kind": enclaves.what,
-        "vendor": enclaves.vendor.value,
-        "domain": context.domain,
-        "allowed": found.allowed,
-        "denied": [
-            {
-                **as_plain(each.right),
-                "nodes": list(each.nodes),
-                "reason": each.reason,
-                "by_rule": each.by_rule,
-                "new_enclave": each.new_enclave,
-                "endpoints": as_plain(each.endpoints),
-            }
-            for each in found.denied
-        ],
-        "refused": [
-            {"enclave": name, "reason": reason} for name, reason in sorted(found.refused.items())
-        ],
-        "unseen": as_plain(found.unseen),
-        "unjudged": list(found.unjudged),
-        **to_json(found.observation),
-        "patch": str(patch) if patch else None,
-        "dry_run": dry_run,
-        "notes": as_plain((*found.notes, *found.missing.notes)),
-    }

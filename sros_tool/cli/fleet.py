@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -232,7 +232,7 @@ def _status(
     unknown, which the keystore never issued. Files on a robot take effect when its processes are
     restarted, which a confirmation does not tell.
     """
-    from sros_tool.keystore.fleet_status import fleet_status
+    from sros_tool.keystore.fleet_status import ComparedFleet, fleet_status
     from sros_tool.validity import parse_duration
 
     if as_json + prometheus + html > 1:
@@ -250,7 +250,7 @@ def _status(
     if oldest:
         found = found.with_overdue(oldest, moment)
     if as_json:
-        print_json(_status_json(found, moment))
+        print_json(ComparedFleet(moment, found))
         return 0 if found.complete else 1
     if prometheus:
         from sros_tool.keystore.fleet_metrics import fleet_metrics
@@ -259,8 +259,9 @@ def _status(
         text = render_metrics(fleet_metrics(found, now=moment))
     elif html:
         from sros_tool.report.fleet_page import render_fleet_page
+        from sros_tool.values import as_plain
 
-        text = render_fleet_page(_status_json(found, moment))
+        text = render_fleet_page(as_plain(ComparedFleet(moment, found)))
     else:
         text = "".join(f"{visible_line(line)}\n" for line in _lines(found, moment, robots))
     if output and not dry_run:
@@ -352,7 +353,7 @@ def _details(robot: RobotStatus) -> Iterator[str]:
     """Yield the files of a robot: their number by kind and state, and those that differ."""
     yield f"{robot.robot}:"
     where = ("in its folder", "elsewhere, with its name in the path")
-    for names, place in zip(robot.unrecorded, where, strict=True):
+    for names, place in zip(robot.others, where, strict=True):
         others = f" and {len(names) - _MOST_GROUPS} more, see --json"
         if names:
             yield (
@@ -364,8 +365,7 @@ def _details(robot: RobotStatus) -> Iterator[str]:
     for each in robot.pending[:_MOST_LINES]:
         issued = f" of {each.since}" if each.since else ""
         whose = f" of {each.robot or each.enclave}" if each.enclave else ""
-        action = "remove" if each.surplus else "deliver"
-        yield f"  {action} {each.path}: {each.state}{issued}{whose}"
+        yield f"  {each.action} {each.path}: {each.state}{issued}{whose}"
     if (more := len(robot.pending) - _MOST_LINES) > 0:
         yield f"  and {more} more, see --json"
 
@@ -382,45 +382,3 @@ def _word(state: str) -> str:
 
 def _number(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
-def _status_json(found: FleetStatus, moment: datetime) -> dict[str, Any]:
-    from sros_tool.validity import iso
-
-    return {
-        "keystore": str(found.root),
-        "at": iso(moment),
-        "complete": found.complete,
-        "stage": found.stage,
-        "counts": dict(found.counts),
-        "unassigned": found.unassigned,
-        "overdue": sorted(found.overdue),
-        "robots": [
-            {
-                "robot": each.robot,
-                "state": each.state,
-                "enclaves": each.enclaves,
-                "revoked": list(each.revoked),
-                "unrecorded": list(each.unrecorded.below),
-                "sharing_name": list(each.unrecorded.naming),
-                "received": iso(each.received) if each.received else None,
-                "clock": iso(each.clock) if each.clock else None,
-                "stage": each.stage or None,
-                "files": {kind: dict(states) for kind, states in each.files.items()},
-                "pending": [
-                    {
-                        "path": file.path,
-                        "kind": file.kind,
-                        "state": file.state,
-                        "since": file.since or None,
-                        "enclave": file.enclave or None,
-                        "robot": file.robot or None,
-                        "action": "remove" if file.surplus else "deliver",
-                    }
-                    for file in each.pending
-                ],
-                "notes": list(each.notes),
-            }
-            for each in found.robots
-        ],
-    }

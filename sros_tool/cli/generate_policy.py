@@ -235,7 +235,6 @@ def _json(
     plan: Draft | None, file: Path | None, learned: Learned, observation: Observation, dry_run: bool
 ) -> dict[str, Any]:
     """Return what was learned as JSON values; without a ``plan``, no file changes."""
-    from sros_tool.graph.observation import to_json
     from sros_tool.policy.merge import merge_notes
     from sros_tool.policy.rights import order, policy_rights
 
@@ -245,7 +244,7 @@ def _json(
         "created": False,
         "changed": False,
         "dry_run": dry_run,
-        **to_json(observation),
+        **as_plain(observation),
         "added": as_plain(sorted(policy_rights(learned.policy()), key=order)),
         "copied": [],
         "changes": [],

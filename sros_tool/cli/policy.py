@@ -742,7 +742,7 @@ def policies(
     more, which --with-node-rights adds. The result is one file: includes are resolved, and comments
     are lost. The exit status is 1 if a part was left out.
     """
-    from sros_tool.policy.document import read_policy
+    from sros_tool.policy.document import PolicyFile, ShippedPolicies, read_policy
     from sros_tool.resources import policies_dir
 
     if earlier is not None:
@@ -759,14 +759,11 @@ def policies(
         return 0
     found = {path: read_policy(path) for path in sorted(source.glob("*.xml"))}
     if as_json:
-        print_json(
-            {
-                "policies": [
-                    {"file": str(path), "enclaves": [each.path for each in policy.enclaves]}
-                    for path, policy in found.items()
-                ]
-            }
-        )
+        listed = [
+            PolicyFile(path, [enclave.path for enclave in policy.enclaves])
+            for path, policy in found.items()
+        ]
+        print_json(ShippedPolicies(listed))
         return 0
     width = max(len(path.name) for path in found)
     for path, policy in found.items():
@@ -779,7 +776,7 @@ def _copy(source: Path, target: Path, *, as_json: bool, dry_run: bool) -> None:
     """Copy the shipped policies, or the common parts to a folder ``common``, to a folder."""
     from sros_tool.files import new_files, write_new_folder
     from sros_tool.keystore.layout import is_keystore
-    from sros_tool.policy.document import COMMON
+    from sros_tool.policy.document import COMMON, CopiedPolicies
     from sros_tool.xml import read_bytes
 
     what = "policies"
@@ -809,8 +806,8 @@ def _copy(source: Path, target: Path, *, as_json: bool, dry_run: bool) -> None:
         else:
             write_new_folder(target, missing)
     if as_json:
-        changes = [{"action": "create", "path": str(target / each)} for each in missing]
-        print_json({"folder": str(target), "dry_run": dry_run, "changes": changes, "notes": []})
+        changes = [FileChange("create", str(target / each)) for each in missing]
+        print_json(CopiedPolicies(target, dry_run, changes, ()))
     elif not missing:
         echo(f"nothing to copy: '{target}' has the {what}")
     else:
@@ -828,6 +825,7 @@ def _convert(
 ) -> int:
     """Convert a policy; return the exit status."""
     from sros_tool.policy.document import (
+        PrintedConversion,
         convert_policy,
         read_policy,
         with_node_rights,
@@ -852,16 +850,18 @@ def _convert(
     changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, document) if output and not dry_run else ""
     if as_json:
-        value: dict[str, Any] = {
-            "policy": str(earlier),
-            "enclaves": [each.path for each in policy.enclaves],
-            "left_out": [each.text for each in converted.left_out],
-            "output": str(output) if saved else None,
-            "dry_run": dry_run,
-            "changes": changes,
-            "notes": converted.notes,
-        }
-        print_json(value if output or dry_run else {**value, "document": document.decode()})
+        print_json(
+            PrintedConversion(
+                earlier,
+                [enclave.path for enclave in policy.enclaves],
+                [each.text for each in converted.left_out],
+                output=output if saved else None,
+                dry_run=dry_run,
+                document=None if output or dry_run else document.decode(),
+                changes=changes,
+                notes=converted.notes,
+            )
+        )
     elif output is None and not dry_run:
         echo_document(document)
     count = len(policy.enclaves)

@@ -31,7 +31,7 @@ from sros_tool.cli.progress import progress
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo, echo_document
 from sros_tool.values import as_plain, versioned
-from sros_tool.written import file_change
+from sros_tool.written import PlannedFiles, file_change
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterator, Mapping, Sequence
@@ -205,7 +205,7 @@ def view(
             echo(line, err=True)
     if dry_run and as_json:
         changes = file_change(output, existed=output.exists()) if output else ()
-        print_json({"dry_run": True, "changes": changes, "notes": []})
+        print_json(PlannedFiles(changes, ()))
         return
     if dry_run:
         echo(f"would write {output or 'to standard output'}: {len(document)} characters")

@@ -17,6 +17,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Annotated, NamedTuple
 
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
@@ -51,6 +53,8 @@ from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, order
 from sros_tool.topics import dds_names
+from sros_tool.values import Words, shows
+from sros_tool.written import DryRun, FileChanges, Notes
 
 _DENY_RULE = "deny-rule"
 _USE = "use"
@@ -89,7 +93,10 @@ class EnclaveNode:
     """A node that an enclave is for; ``node`` is "" if nothing tells the enclave's nodes."""
 
     enclave: str
+    """The enclave that is for it."""
     node: str
+    """Its full name, perhaps with wildcards; empty if nothing tells the nodes of the enclave, and
+    none of its nodes was seen."""
 
     def __str__(self) -> str:
         """Return text like ``node /talker of enclave /robot/talker``."""
@@ -160,6 +167,7 @@ def keystore_enclaves(
 # ── the audit ────────────────────────────────────────────────────────────────────────────────
 
 
+@shows(spread=("right",))
 @dataclass(frozen=True, slots=True)
 class DeniedRight:
     """A right that nodes of an enclave use, and that DDS would deny them.
@@ -171,16 +179,66 @@ class DeniedRight:
     """
 
     right: Right
+    """The right in the words of the policy language."""
     nodes: tuple[str, ...]
+    """The nodes that use it."""
     reason: str
+    """Why, as a sentence."""
     by_rule: bool
+    """Whether a rule denies it, so that no right that is added allows it."""
     new_enclave: bool
+    """Whether the policy does not have the enclave."""
     endpoints: tuple[Endpoint, ...]
+    """The DDS endpoints."""
 
     def __str__(self) -> str:
         """Return text like ``/robot publish topic /chatter (/talker): no rule allows it``."""
         nodes = ", ".join(self.nodes)
         return f"{self.right.enclave} {self.right.describe()} ({nodes}): {self.reason}"
+
+
+class RefusedEnclave(NamedTuple):
+    """An enclave in which no process would start."""
+
+    enclave: str
+    """The enclave."""
+    reason: str
+    """Why, as a sentence."""
+
+
+@shows(spread=("observation",))
+class AuditResult(NamedTuple):
+    """What a policy or keystore would deny to the running nodes."""
+
+    source: Path
+    """The policy or keystore."""
+    kind: Annotated[str, Words(("policy", "keystore"))]
+    """What it is."""
+    vendor: Vendor
+    """The DDS vendor, as ``--vendor`` takes it."""
+    domain: int
+    """The ROS domain."""
+    allowed: bool
+    """Whether the exit status is 0: nothing would be denied, and nothing was left out that
+    ``--partial`` does not accept."""
+    denied: Sequence[DeniedRight]
+    """The rights that would be denied."""
+    refused: Sequence[RefusedEnclave]
+    """Enclaves in which no process would start."""
+    unseen: Sequence[EnclaveNode]
+    """The nodes of the policy or keystore that were not seen, and so not judged."""
+    unjudged: Sequence[str]
+    """What was seen and not judged, each kind in words; ``notes`` has the names."""
+    observation: Observation
+    settled: bool
+    """Whether the ROS graph stopped changing before the result."""
+    partial: bool
+    """Whether ``--partial`` accepted what was not seen or not judged."""
+    patch: Path | None
+    """The policy with the rights to add that was written (``--patch``), or null."""
+    dry_run: DryRun
+    changes: FileChanges
+    notes: Notes
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from sros_tool.values import Words, shows
 
 PUBLISH, SUBSCRIBE = "publish", "subscribe"
 
@@ -18,9 +20,12 @@ class Endpoint:
     """A DDS topic (its raw name), and whether it is written (publish) or read (subscribe)."""
 
     topic: str
-    direction: str
+    """Its DDS topic."""
+    direction: Annotated[str, Words((PUBLISH, SUBSCRIBE))]
+    """What it does."""
 
 
+@shows("enclaves", "namespace", "name", "participant", "publish", "subscribe")
 @dataclass(frozen=True, slots=True, order=True)
 class ObservedNode:
     """A node of one process.
@@ -31,10 +36,28 @@ class ObservedNode:
     """
 
     enclaves: tuple[str, ...]
+    """Its enclave; several if the graph does not show which."""
     ns: str
     name: str
+    """Its name."""
     participant: str
+    """The participant of its process, in hexadecimal."""
     endpoints: frozenset[Endpoint]
+
+    @property
+    def namespace(self) -> str:
+        """Its namespace."""
+        return self.ns
+
+    @property
+    def publish(self) -> list[str]:
+        """DDS topics that it writes."""
+        return _topics(self, PUBLISH)
+
+    @property
+    def subscribe(self) -> list[str]:
+        """DDS topics that it reads."""
+        return _topics(self, SUBSCRIBE)
 
     @property
     def fqn(self) -> str:
@@ -42,6 +65,7 @@ class ObservedNode:
         return f"{self.ns.rstrip('/')}/{self.name}"
 
 
+@shows("nodes")
 @dataclass(frozen=True, slots=True)
 class Observation:
     """The nodes of a graph, sorted, and the endpoints that belong to none of them.
@@ -52,6 +76,7 @@ class Observation:
     """
 
     nodes: tuple[ObservedNode, ...] = ()
+    """The nodes that were observed; empty if none were asked for."""
     silent: frozenset[tuple[str, str, str]] = frozenset()
     strays: frozenset[tuple[str, Endpoint]] = frozenset()
 
@@ -96,25 +121,8 @@ def make_observation(
     return Observation(tuple(sorted(nodes)), frozenset(silent), frozenset(strays))
 
 
-def to_json(observation: Observation) -> dict[str, Any]:
-    """Return the nodes of an observation as JSON, for `from_json`."""
-    return {
-        "nodes": [
-            {
-                "enclaves": list(node.enclaves),
-                "namespace": node.ns,
-                "name": node.name,
-                "participant": node.participant,
-                PUBLISH: _topics(node, PUBLISH),
-                SUBSCRIBE: _topics(node, SUBSCRIBE),
-            }
-            for node in observation.nodes
-        ]
-    }
-
-
 def from_json(value: Mapping[str, Any]) -> Observation:
-    """Return the observation in JSON that `to_json` has made.
+    """Return the observation in JSON that `as_plain` has made of one.
 
     Raises:
         ValueError, TypeError, KeyError: ``value`` is of another form.

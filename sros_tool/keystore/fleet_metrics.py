@@ -10,7 +10,7 @@ from sros_tool.prometheus import Metric, Sample
 
 def fleet_metrics(status: FleetStatus, *, now: datetime) -> tuple[Metric, ...]:
     """Return the metrics of a fleet; ``now`` is the moment of the comparison."""
-    place = {"keystore": str(status.root.absolute())}
+    place = {"keystore": str(status.keystore.absolute())}
     robots = [({**place, "robot": each.robot}, each) for each in status.robots]
     return (
         Metric(

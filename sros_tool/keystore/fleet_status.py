@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from sros_tool.errors import SrosError
 from sros_tool.fleet.enclaves import Unrecorded, enclaves_of, robot_of, unrecorded_enclaves
@@ -47,6 +47,8 @@ from sros_tool.keystore.reader import authority_files, certificates_of
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import digest
 from sros_tool.pki.crl import SUPERSEDED
+from sros_tool.values import Words, shows
+from sros_tool.written import NamedKeystore
 
 
 class State(StrEnum):
@@ -85,6 +87,7 @@ _KINDS = {
     PERMISSIONS_CA_FILE: "permissions_ca",
 }
 _ZENOH = "zenoh"
+FileKind = Annotated[str, Words((*_KINDS.values(), _ZENOH))]
 _AUTHORITIES = ("identity_ca", "permissions_ca")
 
 
@@ -93,71 +96,115 @@ def _kind_of(path: str) -> str:
     return _KINDS.get(path.rpartition("/")[2], _ZENOH)
 
 
+@shows(
+    *("path", "kind", "state", "since", "enclave", "robot", "action"),
+    null_if_empty=("since", "enclave", "robot"),
+)
 @dataclass(frozen=True, slots=True)
 class ConfirmedFile:
     """A file that is not the one that an export would give now.
 
-    ``since`` is when the keystore issued what the robot has, or "".  ``enclave`` and ``robot`` say
-    whose it is, if it is another's.  With ``surplus``, the robot should have no such file.
+    With ``surplus``, the robot should have no such file.
     """
 
     path: str
-    kind: str
+    """The path of the file in the keystore."""
+    kind: FileKind
+    """What the file is."""
     state: State
+    """What the robot has instead: an ``earlier`` file of the same enclave; a ``different`` one of
+    Zenoh, whose earlier files the ledger does not have; none (``missing``); one that the keystore
+    did not issue (``unknown``); a ``revoked`` one; one of ``another`` robot, or of no robot.
+    ``broken``: the file at home is missing or cannot be read."""
     since: str = ""
+    """When the keystore issued what the robot has, in UTC; null if it is not known."""
     enclave: str = ""
+    """The enclave that what the robot has belongs to, if it is another's, or null."""
     robot: str = ""
+    """The robot of that enclave, or null."""
     surplus: bool = False
 
+    @property
+    def action(self) -> Annotated[str, Words(("deliver", "remove"))]:
+        """What has to be done on the robot."""
+        return "remove" if self.surplus else "deliver"
 
+
+@shows(
+    *("robot", "state", "enclaves", "revoked", "unrecorded", "sharing_name", "received", "clock"),
+    *("stage", "files", "pending", "notes"),
+    null_if_empty=("stage",),
+)
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """What a robot last confirmed.
-
-    ``received`` is when, by the clock at home; ``clock`` is the time of the robot's clock in it.
-    ``revoked`` are its enclaves that were revoked and are not in the keystore, whatever the robot
-    confirmed; ``unrecorded`` are those of the keystore that the fleet does not record.  ``stage``
-    is the stage of a CA rotation that its CA files are of: the one of the CA that is behind.
-    ``files`` counts the files of its enclaves by kind and state; ``pending`` are those that are not
-    current.
-    """
+    """What a robot last confirmed; ``others`` are enclaves that the fleet does not record."""
 
     robot: str
+    """Its name."""
     state: State
+    """The worst state of its files; ``never``: it has confirmed nothing; ``none``: it has no
+    enclave in the keystore."""
     enclaves: int
+    """The number of its enclaves in the keystore."""
     revoked: tuple[str, ...]
-    unrecorded: Unrecorded
+    """Its enclaves that were revoked and are not in the keystore, whatever it confirmed."""
+    others: Unrecorded
     received: datetime | None
+    """When its last confirmation was received, by the clock at home, in UTC, or null."""
     clock: datetime | None
-    stage: str
+    """The time of its own clock in that confirmation, in UTC, or null."""
+    stage: Annotated[str, Words(("unknown", "before", "distribute", "reissue", "complete"))]
+    """The stage of a CA rotation that its CA files are of, or null: it has confirmed none.
+    ``before``: it does not trust the CA that issues next, or now; ``complete``: it trusts no other
+    one."""
     files: Mapping[str, Mapping[State, int]]
+    """The number of its files, by kind and state."""
     pending: tuple[ConfirmedFile, ...]
+    """The files that are not as at home; empty if it has confirmed nothing."""
     notes: tuple[str, ...]
+    """Remarks, as clauses, such as on its clock."""
+
+    @property
+    def unrecorded(self) -> tuple[str, ...]:
+        """Enclaves in the folder of the robot that the fleet does not record, such as
+        ``/r3/spare``; ``sros revoke --robot`` revokes them, too.
+        """
+        return self.others.below
+
+    @property
+    def sharing_name(self) -> tuple[str, ...]:
+        """Enclaves elsewhere that the fleet does not record, with the name of the robot as a part
+        of the path, such as ``/desk/r3``; ``sros revoke --robot`` leaves them valid and names them.
+        """
+        return self.others.naming
 
 
+@shows("keystore", "complete", "stage", "counts", "unassigned", "overdue", "robots")
 @dataclass(frozen=True, slots=True)
 class FleetStatus:
-    """The robots of a fleet, and the stage of the keystore's CA rotation.
+    """The robots of a fleet, and the stage of the keystore's CA rotation."""
 
-    ``unassigned`` is the number of enclaves that belong to no robot, of which nothing is known.
-    ``overdue`` are the robots that confirmed too long ago: see `with_overdue`.
-    """
-
-    root: Path
-    stage: str
+    keystore: NamedKeystore
+    stage: Annotated[str, Words(("complete", "distribute", "reissue"))]
+    """The stage of the CA rotation of the keystore; ``complete`` if none is under way."""
     robots: tuple[RobotStatus, ...]
+    """The robots, sorted by name."""
     unassigned: int
+    """The number of enclaves that belong to no robot, of which nothing is known; 0 with --robot."""
     overdue: frozenset[str] = frozenset()
+    """The robots whose last confirmation is older than --max-age, sorted by name."""
 
     @property
     def counts(self) -> Mapping[State, int]:
-        """The number of robots in each state, from good to bad."""
+        """The number of robots by state."""
         counts = Counter(each.state for each in self.robots)
         return {state: counts[state] for state in State if counts[state]}
 
     @property
     def complete(self) -> bool:
-        """Whether each robot with enclaves confirmed in time that it has the present files."""
+        """Whether every robot that has enclaves confirmed the present files in time: the exit
+        status is 0.
+        """
         return not self.overdue and all(
             each.state in (State.CURRENT, State.NONE) for each in self.robots
         )
@@ -170,6 +217,15 @@ class FleetStatus:
             if each.enclaves and each.received and now - each.received > max_age
         )
         return replace(self, overdue=frozenset(late))
+
+
+@shows(spread=("status",))
+class ComparedFleet(NamedTuple):
+    """What each robot of the fleet has, by what it last confirmed."""
+
+    at: datetime
+    """When it was compared, in UTC."""
+    status: FleetStatus
 
 
 def fleet_status(root: Path, names: Sequence[str] = ()) -> FleetStatus:

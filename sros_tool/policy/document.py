@@ -21,10 +21,11 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 from urllib.parse import unquote
 
 from lxml import etree
@@ -52,6 +53,8 @@ from sros_tool.policy.placeholders import (
 )
 from sros_tool.policy.protection import PROTECT, Level
 from sros_tool.resources import policies_dir
+from sros_tool.values import shows
+from sros_tool.written import DryRun, FileChanges, Notes
 from sros_tool.xml import parse, read_bytes, serialize, tag_of
 
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
@@ -761,6 +764,51 @@ class ConvertedPolicy:
     policy: Policy
     notes: tuple[Note, ...]
     left_out: tuple[Note, ...]
+
+
+@shows(optional=("document",))
+class PrintedConversion(NamedTuple):
+    """The converted policy."""
+
+    policy: Path
+    """The earlier policy."""
+    enclaves: Sequence[str]
+    """The enclaves of the converted policy."""
+    left_out: Sequence[str]
+    """What cannot be converted: the exit status is 1."""
+    output: Path | None
+    """The file that was written, or null."""
+    dry_run: DryRun
+    changes: FileChanges
+    notes: Notes
+    document: str | None
+    """The converted policy, if no file was to be written."""
+
+
+class PolicyFile(NamedTuple):
+    """A policy."""
+
+    file: Path
+    """Its file."""
+    enclaves: Sequence[str]
+    """Its enclaves."""
+
+
+class ShippedPolicies(NamedTuple):
+    """The policies."""
+
+    policies: Sequence[PolicyFile]
+    """The policies."""
+
+
+class CopiedPolicies(NamedTuple):
+    """The copy."""
+
+    folder: Path
+    """The new folder."""
+    dry_run: DryRun
+    changes: FileChanges
+    notes: Notes
 
 
 def convert_policy(path: Path) -> ConvertedPolicy:

@@ -10,12 +10,13 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Annotated
 
 from sros_tool.errors import counted
 from sros_tool.names import READING_SERVICES
 from sros_tool.policy.model import ALLOW, RIGHTS, Qualifier
 from sros_tool.policy.rights import RIGHT_ORDER
-from sros_tool.values import shows
+from sros_tool.values import Words, shows
 
 SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
     ("subscribe", "reply", "execute"), False
@@ -54,11 +55,17 @@ class Protection:
     """
 
     level: WireLevel
+    """The least protection on the wire."""
     data: str = ""
+    """Protection of the payload, or an empty string."""
     metadata: str = ""
+    """Protection of submessages."""
     rtps: str = ""
+    """Protection of RTPS messages."""
     read_control: bool = True
+    """Whether permissions decide who may read."""
     write_control: bool = True
+    """Whether permissions decide who may write."""
 
 
 UNKNOWN = Protection(WireLevel.UNKNOWN)
@@ -80,15 +87,25 @@ class Edge:
     """
 
     enclave: str
+    """The enclave."""
     kind: str
+    """The kind of the name."""
     name: str
+    """The name."""
     right: str
+    """The right."""
     qualifier: Qualifier
+    """Whether it is a right or a denial."""
     by: tuple[str, ...] = ()
+    """The wildcards that give it."""
     parts: tuple[str, ...] = ()
+    """The parts of an action, if it is not for the whole."""
     mark: OverlaySide = OverlaySide.BOTH
+    """The side that has it, in a comparison."""
     common: bool = False
+    """Whether every node needs it."""
     violates: bool = False
+    """Whether a requirement does not hold because of it."""
     differs: bool = False
 
     @property
@@ -97,8 +114,8 @@ class Edge:
         return SENDS[self.right]
 
     @property
-    def direction(self) -> str:
-        """The direction of the arrow in words."""
+    def direction(self) -> Annotated[str, Words(("to the name", "from the name"))]:
+        """Where the arrow points."""
         return "to the name" if self.sends else "from the name"
 
 
@@ -118,11 +135,18 @@ class Name:
     """
 
     kind: str
+    """Its kind."""
     name: str
+    """The name."""
     namespace: str
+    """Its namespace."""
     protection: Protection
+    """Protection by the governance."""
     wildcard: bool = False
+    """Whether it is a wildcard that matches no known name."""
     lacks: Lack = Lack.NOTHING
+    """The side that no enclave may take, though one may take the other, or an empty string; who
+    serves a service is its receiver."""
 
 
 _LACKING = {
@@ -149,11 +173,17 @@ class Statement:
     """A right as written in the source, and the number of known names that it matches."""
 
     qualifier: Qualifier
+    """Whether it is a right or a denial."""
     right: str
+    """The right."""
     kind: str
+    """The kind of the name."""
     name: str
+    """The name, perhaps with wildcards."""
     reaches: int
+    """Number of known names that it matches."""
     mark: OverlaySide = OverlaySide.BOTH
+    """The side that has it, in a comparison."""
 
 
 @shows(
@@ -170,15 +200,25 @@ class PicturedEnclave:
     """
 
     path: str
+    """The enclave."""
     group: str
+    """Its host, or its namespace."""
     nodes: tuple[str, ...] = ()
+    """Its nodes."""
     statements: tuple[Statement, ...] = ()
+    """Its rights, as written in the source."""
     subject: str = ""
+    """Subject of its certificate, or an empty string; so for the next three."""
     issuer: str = ""
+    """Its issuer."""
     serial: str = ""
+    """Its serial number, in hexadecimal."""
     key: str = ""
+    """The kind of its key."""
     problems: tuple[str, ...] = ()
+    """What keeps a process from using it."""
     observed: bool = True
+    """With ``--observed``: whether it was observed."""
     note: str = ""
 
 
@@ -190,10 +230,15 @@ class Validity:
     """
 
     not_after: str
+    """Its end, in UTC."""
     not_before: str
+    """Its begin, in UTC."""
     kind: str
+    """What is valid."""
     title: str
+    """Its name."""
     enclave: str = ""
+    """The enclave, or an empty string."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,10 +246,15 @@ class PicturedFinding:
     """A fault or weakness; ``severity`` is error, warning or note."""
 
     id: str
-    severity: str
+    """The kind of finding."""
+    severity: Annotated[str, Words(("error", "warning", "note"))]
+    """Its severity."""
     text: str
+    """What was found."""
     remedy: str = ""
+    """What to do."""
     enclave: str = ""
+    """The enclave, or another subject."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +262,9 @@ class SourceTitle:
     """The title of a source in the picture: its base name, and its kind."""
 
     title: str
+    """Its base name."""
     kind: str
+    """What it is, such as ``policy``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,9 +276,12 @@ class Overlay:
     first or second side has.
     """
 
-    kind: str
+    kind: Annotated[str, Words(("use", "change", "drift", "worlds"))]
+    """What is compared."""
     first: str
+    """What only the first side has, in words."""
     second: str
+    """What only the second side has, in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,8 +293,11 @@ class OverlayDifference:
     """
 
     mark: OverlaySide
+    """The side that has it, in a comparison."""
     text: str
+    """The right."""
     notes: tuple[str, ...] = ()
+    """Notes on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,8 +305,11 @@ class Influence:
     """An enclave that influences, or is influenced, over ``hops``, by a shortest ``path``."""
 
     enclave: str
+    """The enclave."""
     hops: int
+    """Number of hops: names on the way."""
     path: str
+    """A shortest way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,13 +321,20 @@ class Focus:
     ``influenced`` are influenced by the enclave; empty for a name.
     """
 
-    kind: str
+    kind: Annotated[str, Words((*_KINDS, "enclave"))]
+    """The kind of the name, or ``enclave``."""
     name: str
+    """The name, or the enclave."""
     sentence: str
+    """The answer in one sentence."""
     senders: tuple[str, ...]
+    """Enclaves that may publish, call or write it."""
     receivers: tuple[str, ...]
+    """Enclaves that may subscribe, serve, execute or read it."""
     influencing: tuple[Influence, ...]
+    """Enclaves that influence the senders, or the enclave; with 2 hops directly."""
     influenced: tuple[Influence, ...] = ()
+    """Enclaves that the enclave influences; with 1 hop directly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,10 +342,15 @@ class PicturedUse:
     """A use of a name that breaks a requirement; ``by`` is the wildcard that allows it, or ""."""
 
     enclave: str
+    """The enclave."""
     right: str
+    """Its right."""
     kind: str
+    """The kind of the name."""
     name: str
+    """The name."""
     by: str = ""
+    """The wildcard that allows it, or an empty string."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +358,9 @@ class PicturedViolation:
     """A requirement that does not hold, in words, and the uses that break it."""
 
     text: str
+    """What breaks it, and what it demands."""
     uses: tuple[PicturedUse, ...]
+    """The uses of names that break it."""
 
 
 _SAID = 5  # violations, and units that differ, that the headlines say; JSON has all
@@ -300,8 +375,11 @@ class Requirements:
     """
 
     hold: int
+    """Number of requirements that hold."""
     violations: tuple[PicturedViolation, ...] = ()
+    """Those that do not."""
     assumed: tuple[str, ...] = ()
+    """Those that hold by an assumption, in words."""
 
     def sentences(self) -> tuple[str, ...]:
         """Return the result in sentences without a full stop."""
@@ -324,8 +402,11 @@ class EqualUnits:
     """
 
     label: str
-    what: str
+    """What stands for each of them in the picture, such as ``{r01…r50}``."""
+    what: Annotated[str, Words(("robot", "namespace", "enclave"))]
+    """What they are."""
     members: tuple[str, ...]
+    """Their names."""
 
     @property
     def title(self) -> str:
@@ -342,9 +423,13 @@ class DifferentUnit:
     """
 
     unit: str
+    """Its name, or a label in ``equal``."""
     usual: str
+    """The label of those that it differs from."""
     more: tuple[str, ...]
+    """Enclaves and rights that only it has."""
     fewer: tuple[str, ...]
+    """Enclaves and rights that it lacks."""
 
     def sentence(self) -> str:
         """Return what differs in a sentence without a full stop."""
@@ -364,18 +449,31 @@ class Picture:
     """
 
     title: str
+    """Its title."""
     origins: tuple[SourceTitle, ...]
+    """The sources."""
     enclaves: tuple[PicturedEnclave, ...]
+    """The enclaves."""
     names: tuple[Name, ...]
+    """The topics, services and actions."""
     edges: tuple[Edge, ...]
+    """The rights, one for each enclave and name."""
     overlay: Overlay | None = None
+    """The comparison, or null."""
     differences: tuple[OverlayDifference, ...] = ()
+    """Rights that only one side has."""
     validities: tuple[Validity, ...] = ()
+    """Validity of certificates, CAs, permissions and revocation lists."""
     findings: tuple[PicturedFinding, ...] = ()
+    """Findings of ``sros check``."""
     focus: tuple[Focus, ...] = ()
+    """With ``--focus``: an answer for each name and enclave."""
     requirements: Requirements | None = None
+    """With ``--requirements``: what holds and what does not; else null."""
     equal: tuple[EqualUnits, ...] = ()
+    """Robots, namespaces or enclaves that are equal but for their names, drawn as one."""
     different: tuple[DifferentUnit, ...] = ()
+    """Those that differ a little from equal ones."""
 
     @property
     def headlines(self) -> tuple[str, ...]:

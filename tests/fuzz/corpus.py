@@ -10,11 +10,12 @@ from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from sros_tool.graph.observation import Endpoint, ObservedNode, make_observation, to_json
+from sros_tool.graph.observation import Endpoint, ObservedNode, make_observation
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.pki.keys import load_key
 from sros_tool.resources import policies_dir
+from sros_tool.values import as_plain
 from tests.policy.earlier_policies import EARLIER, policies
 from tests.support.harness import policy_text, publish, sros
 from tests.support.made_by_eloquent import EVERYTHING, make_eloquent
@@ -148,7 +149,7 @@ def make_corpus(root: Path) -> Corpus:
         "p1",
         frozenset((Endpoint("rt/chatter", "publish"), Endpoint("rq/addRequest", "subscribe"))),
     )
-    (root / "observation.json").write_text(json.dumps(to_json(make_observation([node])), indent=1))
+    (root / "observation.json").write_text(json.dumps(as_plain(make_observation([node])), indent=1))
     earlier = dict(policies(EARLIER))["private-gauge"]
     (root / "earlier.xml").write_text(earlier)
     make_eloquent(root / "flat", {"/a": EVERYTHING, "/n/b": ("rt/x",)}, now=datetime.now(UTC))

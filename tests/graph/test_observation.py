@@ -7,8 +7,8 @@ from sros_tool.graph.observation import (
     Observation,
     from_json,
     make_observation,
-    to_json,
 )
+from sros_tool.values import as_plain
 from tests.graph.graphs import graph, node
 
 
@@ -65,4 +65,4 @@ def test_a_node_that_spoke_later_is_not_silent() -> None:
 
 def test_json_gives_the_same_back() -> None:
     seen = graph(node("/a", "publish x", "call fib"), node("/n/b", "reply s", participant="p2"))
-    assert from_json(to_json(seen)) == seen
+    assert from_json(as_plain(seen)) == seen
