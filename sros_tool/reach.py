@@ -25,6 +25,7 @@ from sros_tool.policy.model import DENY
 from sros_tool.policy.patterns import common_name, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import Right
 from sros_tool.topics import SERVICE_ENDS, dds_names
+from sros_tool.values import shows
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,7 @@ _WRITER_RIGHTS = {
 """By the prefix of a DDS topic: the kind of ROS name, the right to write it, and its suffix."""
 
 
+@shows("source", "right", "name", "target")
 @dataclass(frozen=True, slots=True)
 class Hop:
     """A flow of information from enclave ``source`` to enclave ``target`` by one ROS name.
@@ -81,10 +83,14 @@ class Hop:
     """
 
     source: str
+    """The enclave that sends."""
     target: str
+    """The enclave that receives."""
     kind: str
     right: str
+    """Its right."""
     name: str
+    """The name."""
     said: str
     heard: str
 

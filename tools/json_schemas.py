@@ -86,6 +86,13 @@ VERBS: Mapping[str, str | Shapes] = {
             "--convert": "sros_tool.policy.document:PrintedConversion",
         },
     ),
+    "diff_policy": Shapes(
+        "The rights that differ between A and B, or what B adds to A.",
+        {
+            "the difference": "sros_tool.keystore.rights:PolicyDifference",
+            "--no-new-access": "sros_tool.proof.growth:NewAccess",
+        },
+    ),
     "list_enclaves": "sros_tool.keystore.selection:EnclaveList",
     "env": "sros_tool.runtime.environment:PrintedEnvironment",
     "zenoh": Shapes(

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sros_tool.cli.common import print_json, print_notes
 from sros_tool.cli.progress import progress
 from sros_tool.terminal import echo, echo_document
-from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
     from sros_tool.fleet.model import Fleet
-    from sros_tool.keystore.comparison import SettingChange
-    from sros_tool.policy.model import Source
     from sros_tool.proof.growth import Gain, Growth, NewReach
     from sros_tool.proof.sources import AccessSource
 
@@ -32,7 +29,7 @@ def show_new_access(
     Raises:
         SrosError: it cannot be decided.
     """
-    from sros_tool.proof.growth import compare_access
+    from sros_tool.proof.growth import ComparedSide, NewAccess, compare_access
     from sros_tool.proof.sources import load_side
 
     with progress("reading"):
@@ -40,7 +37,7 @@ def show_new_access(
     with progress("comparing"):
         growth = compare_access(before, after)
     if form == "json":
-        print_json(_growth_json(before, after, growth))
+        print_json(NewAccess(ComparedSide.of(before), ComparedSide.of(after), growth))
     elif form == "markdown":
         echo_document(access_markdown(before, after, growth))
     else:
@@ -163,74 +160,3 @@ def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> s
             parts.append(f"**{len(lines)} {title}**")
             parts.append(bounded((code(each[2:]) for each in lines), _MOST_CHARACTERS, rest))
     return "\n\n".join(parts) + "\n"
-
-
-def _growth_json(base: AccessSource, head: AccessSource, growth: Growth) -> dict[str, Any]:
-    return {
-        "new_access": bool(growth),
-        **{
-            side: {
-                "path": source.shown,
-                "kind": source.kind,
-                "enclaves": None if source.scope is None else sorted(source.scope),
-                "notes": as_plain(source.notes),
-            }
-            for side, source in (("base", base), ("head", head))
-        },
-        "worlds": list(growth.worlds),
-        "domains": list(growth.domains),
-        "assumed": list(growth.assumed),
-        "left_out": list(growth.left_out),
-        "not_compared": list(growth.not_compared),
-        "added": [_gain_json(each) for each in growth.added],
-        "reach": [
-            {
-                "source": each.source,
-                "target": each.target,
-                "path": [
-                    {
-                        "source": hop.source,
-                        "right": hop.right,
-                        "name": hop.name,
-                        "target": hop.target,
-                    }
-                    for hop in each.path
-                ],
-            }
-            for each in growth.reach
-        ],
-        "reach_known": not growth.reach_unknown,
-        "less_protection": [_change_json(each) for each in growth.lost],
-        "removed": [_gain_json(each) for each in growth.removed],
-        "more_protection": [
-            {"key": each.key, "before": each.after, "after": each.before} for each in growth.gained
-        ],
-    }
-
-
-def _gain_json(gain: Gain) -> dict[str, Any]:
-    return {
-        "enclaves": list(gain.enclaves),
-        "action": gain.action,
-        "right": as_plain(gain.right) if gain.right else None,
-        "name": gain.name,
-        "topic": gain.topic,
-        "place": _place_json(gain.source),
-        "denied_by": as_plain(gain.denied) if gain.denied else None,
-        "denied_at": _place_json(gain.denied_at),
-        "worlds": list(gain.worlds),
-        "domains": list(gain.domains),
-    }
-
-
-def _place_json(source: Source | None) -> dict[str, Any] | None:
-    return {"file": source.file, "line": source.line} if source else None
-
-
-def _change_json(change: SettingChange) -> dict[str, Any]:
-    return {
-        "key": change.key,
-        "before": change.before,
-        "after": change.after,
-        "meaning": change.meaning,
-    }

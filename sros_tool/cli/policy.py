@@ -214,7 +214,7 @@ def diff_policy(
     A, a keystore that protects less gives more; as B, it lowers no protection. The last line says
     what is assumed and what is left out, such as dates.
     """
-    from sros_tool.keystore.rights import load_rights
+    from sros_tool.keystore.rights import load_rights, policy_difference
 
     check_one_format()
     form = "json" if as_json else form
@@ -227,7 +227,7 @@ def diff_policy(
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])
     scope, difference, protections = _compared(first, second)
     if form == "json":
-        print_json(_difference_json(first, second, difference, protections))
+        print_json(policy_difference(first, second, difference, protections))
     elif form == "markdown":
         echo_lines(rights_markdown(first, second))
     else:
@@ -363,38 +363,6 @@ def _difference_lines(
         for side, fleet in sides
         for text in folded(fleet, [(name, text) for sign, name, text in lines if sign == side])
     ]
-
-
-def _difference_json(
-    first: RightsSource,
-    second: RightsSource,
-    difference: RightsDifference,
-    protections: Sequence[tuple[str, StatedProtection]],
-) -> dict[str, Any]:
-    return {
-        "equal": not difference and not protections,
-        **{
-            side: {
-                "path": str(source.path),
-                "kind": source.kind,
-                "enclaves": None if source.scope is None else sorted(source.scope),
-                "sound": source.sound,
-                "notes": as_plain(source.notes),
-            }
-            for side, source in (("a", first), ("b", second))
-        },
-        "differences": [
-            {
-                "only": "a" if sign == "-" else "b",
-                **as_plain(right),
-                "covered_by": as_plain(difference.covered.get(right, ())),
-            }
-            for sign, right in difference.lines()
-        ],
-        "protections": [
-            {"only": "a" if sign == "-" else "b", **as_plain(each)} for sign, each in protections
-        ],
-    }
 
 
 # ── minimize_policy ─────────────────────────────────────────────────────────────────────

@@ -8,10 +8,11 @@ gives what its access control lets other enclaves do.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
+from typing import Annotated, NamedTuple
 
 from cryptography import x509
 
@@ -35,11 +36,12 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, RIGHTS, Policy, Source
-from sros_tool.policy.rights import Right, parts, policy_rights
+from sros_tool.policy.rights import Right, RightsDifference, parts, policy_rights
 from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh import StatedRight
 from sros_tool.translate_zenoh_back import rights_in_rules
+from sros_tool.values import Words, shows
 from sros_tool.xml import parse, read_bytes
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
@@ -48,6 +50,10 @@ from sros_tool.zenoh.enforcement import Enforcement
 _COMMON_NAME = re.compile(r"(?:^|[,/])\s*CN\s*=\s*(/[^,]*?)\s*(?:,|$)")
 
 
+SourceKind = Annotated[str, Words(("policy", "permissions", "enclave", "keystore", "zenoh"))]
+
+
+@shows("path", "kind", "enclaves", "sound", "notes")
 @dataclass(frozen=True, slots=True)
 class RightsSource:
     """The rights that a file or folder gives.
@@ -64,11 +70,15 @@ class RightsSource:
     """
 
     path: Path
-    kind: str
+    """It, as it was named."""
+    kind: SourceKind
+    """What it is."""
     rights: frozenset[Right]
     scope: frozenset[str] | None
     sound: bool
+    """Whether DDS would accept all of it."""
     notes: tuple[Note, ...]
+    """Notes on it."""
     fleet: Fleet | None = None
     protections: tuple[StatedProtection, ...] | None = None
     documents: Mapping[str, Permissions] = field(default_factory=dict)
@@ -76,6 +86,11 @@ class RightsSource:
     router: str = ""
     configurations: Mapping[Path, ConfigurationDocument] = field(default_factory=dict)
     policy: Policy | None = None
+
+    @property
+    def enclaves(self) -> list[str] | None:
+        """The enclaves that it can give rights to; null for all."""
+        return None if self.scope is None else sorted(self.scope)
 
 
 def load_rights(path: Path, fleet: Fleet | None = None, *, hidden: bool = False) -> RightsSource:
@@ -377,3 +392,65 @@ def recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRigh
         }
     parted = (part for each in rights - raw for part in parts(each))
     return tuple([StatedRight(each, source) for each in sorted(set(parted))])
+
+
+# ── what is printed of a comparison ─────────────────────────────────────────────────────────
+
+OnlySide = Annotated[str, Words(("a", "b"))]
+
+
+@shows(spread=("right",))
+class DifferentRight(NamedTuple):
+    """A right that only one side has."""
+
+    only: OnlySide
+    """The side that has it."""
+    right: Right
+    covered_by: Sequence[Right]
+    """Rights of the other side that include it, such as wildcards."""
+
+
+@shows(spread=("protection",))
+class DifferentProtection(NamedTuple):
+    """What only one side says about a name."""
+
+    only: OnlySide
+    """The side that says it."""
+    protection: StatedProtection
+
+
+class PolicyDifference(NamedTuple):
+    """The rights that differ between A and B."""
+
+    equal: bool
+    """Whether A and B give the same rights, and demand the same protection."""
+    a: RightsSource
+    """The source A."""
+    b: RightsSource
+    """The source B."""
+    differences: Sequence[DifferentRight]
+    """Rights that only one side has."""
+    protections: Sequence[DifferentProtection]
+    """Protection that only one of two policies demands."""
+
+
+_SIDES = {"-": "a", "+": "b"}
+
+
+def policy_difference(
+    first: RightsSource,
+    second: RightsSource,
+    difference: RightsDifference,
+    protections: Sequence[tuple[str, StatedProtection]],
+) -> PolicyDifference:
+    """Return what is printed of a comparison; ``protections`` have "-" or "+" for their side."""
+    return PolicyDifference(
+        not difference and not protections,
+        first,
+        second,
+        [
+            DifferentRight(_SIDES[sign], right, difference.covered.get(right, ()))
+            for sign, right in difference.lines()
+        ],
+        [DifferentProtection(_SIDES[sign], stated) for sign, stated in protections],
+    )

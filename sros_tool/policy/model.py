@@ -38,7 +38,9 @@ class Source:
     """The file and line (from 1) that something was read from; without a line it is 0."""
 
     file: str
+    """The file."""
     line: int
+    """The line, from 1."""
 
     def __str__(self) -> str:
         return f"{self.file}:{self.line}" if self.line else self.file

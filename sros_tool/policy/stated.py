@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from sros_tool.names import expand
-from sros_tool.policy.model import Enclave, Source
+from sros_tool.policy.model import RIGHTS, Enclave, Source
 from sros_tool.policy.protection import Level
-from sros_tool.values import shows
+from sros_tool.values import Words, shows
 
 
 @shows("enclave", "kind", "name", "level")
@@ -20,9 +21,13 @@ class StatedProtection:
     """
 
     enclave: str
-    kind: str
+    """The enclave that says it."""
+    kind: Annotated[str, Words(RIGHTS)]
+    """The kind of the name."""
     name: str
+    """The absolute ROS name, perhaps with wildcards."""
     level: Level
+    """The least protection of its messages."""
     source: Source = field(compare=False)
 
     def __str__(self) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice, product
+from typing import Annotated, NamedTuple
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.dds.decision.access import Access, GovernedDomain
@@ -28,11 +29,12 @@ from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant, Permissions
-from sros_tool.errors import DocumentError
+from sros_tool.errors import DocumentError, Note
 from sros_tool.keystore.comparison import Effect, SettingChange
+from sros_tool.keystore.rights import SourceKind
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Source
-from sros_tool.policy.rights import Right
+from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.access import domains_of, enforced_access, is_enforced
 from sros_tool.proof.assumptions import assumptions, completed, domains_of_robots, left_out
 from sros_tool.proof.protection import contradiction, less_protection
@@ -42,34 +44,53 @@ from sros_tool.proof.zenoh_settings import unknown_settings
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
 from sros_tool.topics import dds_names
 from sros_tool.translate import grant_rights
+from sros_tool.values import Words, shows
 
 _VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 _ZENOH = "Zenoh"
 _JOIN = "join"
 
 
+@shows(
+    *("enclaves", "action", "right", "name", "topic", "place", "denied_by", "denied_at"),
+    *("worlds", "domains"),
+)
 @dataclass(frozen=True, slots=True)
 class Gain:
     """Something that enclaves may do on one side only.
 
-    ``action`` is publish, subscribe, request, reply, call or execute; write or read for a DDS
-    ``topic`` that no stated right gives; or join.  ``right`` is the right that gives it, at
-    ``source``, if one is stated; it is of another enclave if a vendor takes that one's permissions
-    for those of ``enclaves``, too.  ``name`` is an example: a name for which it is so.  ``denied``
-    is where the other side denies it.  ``worlds`` are the vendors that decide so, ``domains``
-    examples of domains.
+    ``name`` is an example, and so are ``domains``.
     """
 
     enclaves: tuple[str, ...]
-    action: str
+    """The enclaves."""
+    action: Annotated[str, Words((*KIND_OF, "write", "read", "join"))]
+    """What they may do; ``write`` and ``read`` are for a DDS topic that no right states."""
     right: Right | None
+    """The right that gives it; of another enclave if a vendor takes that one's permissions for
+    those of ``enclaves``, too; null if none is stated."""
     name: str
+    """A name for which it is so; empty for ``join``."""
     topic: str
+    """The DDS topic of that name; empty for ``join``."""
     source: Source | None
     denied: Right | None
     denied_at: Source | None
+    """Where that is stated."""
     worlds: tuple[str, ...]
+    """The vendors, or Zenoh, that decide so."""
     domains: tuple[int, ...]
+    """Domains in which it is so: one of each kind."""
+
+    @property
+    def place(self) -> Source | None:
+        """Where the right is stated; null if it is not in a policy."""
+        return self.source
+
+    @property
+    def denied_by(self) -> Right | None:
+        """The right by which the other side denies the name; null without one."""
+        return self.denied
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,38 +98,124 @@ class NewReach:
     """An enclave that another one can influence on one side only, by a shortest path."""
 
     source: str
+    """The enclave that influences."""
     target: str
+    """The enclave that is influenced."""
     path: HopPath
+    """A shortest path."""
 
 
+class LostProtection(NamedTuple):
+    """A protection that is less."""
+
+    key: str
+    """What is protected."""
+    before: str
+    """The protection in BASE."""
+    after: str
+    """The protection in HEAD."""
+    meaning: str
+    """What that means."""
+
+
+class GainedProtection(NamedTuple):
+    """A protection that is more."""
+
+    key: str
+    """What is protected."""
+    before: str
+    """The protection in BASE."""
+    after: str
+    """The protection in HEAD."""
+
+
+@shows(
+    *("new_access", "worlds", "domains", "assumed", "left_out", "not_compared", "added", "reach"),
+    *("reach_known", "less_protection", "removed", "more_protection"),
+)
 @dataclass(frozen=True, slots=True)
 class Growth:
     """What HEAD adds to BASE, and what it removes; true if it adds anything or protects less.
 
-    ``reach`` has at most 10,000 pairs; ``reach_unknown`` says why it was not followed, if so.
-    ``worlds`` are what was decided.
+    ``reach_unknown`` says why ``reach`` was not followed, if so.
     """
 
     added: tuple[Gain, ...]
+    """What HEAD lets enclaves do, and BASE does not."""
     removed: tuple[Gain, ...]
+    """What BASE lets enclaves do, and HEAD does not."""
     reach: tuple[NewReach, ...]
+    """Enclaves that others can influence in HEAD, and not in BASE; at most 10,000 pairs."""
     reach_unknown: str
     lost: tuple[SettingChange, ...]
     """The protection that is less; `SettingChange` says what it was and what it is."""
     gained: tuple[SettingChange, ...]
     """The protection that is more, as the change that would undo it."""
     worlds: tuple[str, ...]
+    """The vendors, and Zenoh if a side has rules of it, for which it was decided."""
     domains: tuple[int, ...]
-    """The ROS domains that were decided: of those that have the same rules on both sides one."""
+    """The ROS domains for which it was decided: of those with the same rules on both sides one."""
     assumed: tuple[str, ...]
-    """What is taken for granted of sides that do not say everything, as clauses."""
+    """What is taken for granted of a side that does not say everything, such as a policy."""
     left_out: tuple[str, ...]
     """What is not compared on purpose."""
     not_compared: tuple[str, ...]
-    """What could not be compared; without any gain or loss, that is an error."""
+    """What could not be compared; if nothing is new, that is an error, with exit status 2."""
+
+    @property
+    def new_access(self) -> bool:
+        """Whether HEAD adds access, or protects anything less."""
+        return bool(self)
+
+    @property
+    def reach_known(self) -> bool:
+        """Whether ``reach`` was looked for: not if a side is only for some enclaves, or there are
+        too many ways between them.
+        """
+        return not self.reach_unknown
+
+    @property
+    def less_protection(self) -> list[LostProtection]:
+        """What is protected less in HEAD."""
+        return [LostProtection(it.key, it.before, it.after, it.meaning) for it in self.lost]
+
+    @property
+    def more_protection(self) -> list[GainedProtection]:
+        """What is protected more in HEAD."""
+        return [GainedProtection(it.key, it.after, it.before) for it in self.gained]
 
     def __bool__(self) -> bool:
         return bool(self.added or self.lost)
+
+
+class ComparedSide(NamedTuple):
+    """A side."""
+
+    path: str
+    """It, as it was named."""
+    kind: SourceKind
+    """What it is."""
+    enclaves: Sequence[str] | None
+    """The enclaves that it is for; null for all."""
+    notes: Sequence[Note]
+    """Notes on it."""
+
+    @staticmethod
+    def of(source: AccessSource) -> ComparedSide:
+        """Return what is printed of a source."""
+        enclaves = None if source.scope is None else sorted(source.scope)
+        return ComparedSide(source.shown, source.kind, enclaves, source.notes)
+
+
+@shows(spread=("growth",))
+class NewAccess(NamedTuple):
+    """What B (HEAD) adds to A (BASE)."""
+
+    base: ComparedSide
+    """The side BASE."""
+    head: ComparedSide
+    """The side HEAD."""
+    growth: Growth
 
 
 def compare_access(base: AccessSource, head: AccessSource) -> Growth:
