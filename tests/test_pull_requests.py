@@ -30,6 +30,7 @@ from tests.support.code_host import (
     policy,
 )
 from tests.support.harness import sros
+from tests.support.long_form import sometimes
 
 ALL = {"policy": POLICY, "requirements": REQUIRED}
 MARKS_OF_JOBS: list[str] = []
@@ -294,6 +295,7 @@ def test_the_files_fit_their_schemas(tmp_path: Path) -> None:
     subprocess.run([sys.executable, *words], check=True)
 
 
+@sometimes("the hooks of pre-commit")
 def test_the_hooks(origin: Origin, tmp_path: Path) -> None:
     """Run each hook for a commit that touches no file named like a policy."""
     hooks = yaml.safe_load((PROJECT / ".pre-commit-hooks.yaml").read_text())

@@ -13,6 +13,7 @@ import pytest
 from tests.report.pictures import WEB, hostile_permissions, new_page
 from tests.support.children import run
 from tests.support.harness import sros
+from tests.support.long_form import sometimes
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -41,6 +42,7 @@ def test_every_library_in_the_script_has_its_licence_beside_it() -> None:
     assert "Permission" in licences
 
 
+@sometimes("building the script of the pages")
 @pytest.mark.browser
 def test_building_gives_the_very_files_that_ship(built: Path, tmp_path: Path) -> None:
     node = shutil.which("node")
