@@ -25,7 +25,7 @@ settings.register_profile(
     "sros",
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
-    max_examples=1000 if LONG else 20,
+    max_examples=1000 if LONG else 10,
 )
 settings.load_profile("sros")
 
