@@ -33,6 +33,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedEnclave, Problem
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
+    Settings,
     is_for_pss,
     load_certificate,
     load_certificates,
@@ -241,9 +242,14 @@ def _content(traits: VendorTraits, data: bytes) -> bytes:
 def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
     """Return the certificates that the vendor reads from a file; raise `PkiError` if it cannot."""
     data = _content(traits, data)
-    if traits.reads_first_authority or file == CERTIFICATE_FILE:
-        return (load_certificate(data, file, trusted=traits.reads_trusted_certificates),)
-    return load_certificates(data, file)
+    if not traits.reads_trusted_certificates and (
+        traits.reads_first_authority or file == CERTIFICATE_FILE
+    ):
+        return (load_certificate(data, file, trusted=False),)
+    if file == CERTIFICATE_FILE:
+        return (load_certificate(data, file, settings=Settings.READ),)
+    of_file = Settings.OF_DOCUMENTS if file == PERMISSIONS_CA_FILE else Settings.OF_ANY_USE
+    return load_certificates(data, file, settings=of_file)
 
 
 def _signature_problems(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import secrets
 from collections.abc import Iterator
+from enum import Enum
 from functools import cache, lru_cache
 from hashlib import sha256
 from typing import TypeVar
@@ -14,7 +15,12 @@ from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed448, ed25519, padding, rsa
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
-from cryptography.x509.oid import NameOID, PublicKeyAlgorithmOID, SignatureAlgorithmOID
+from cryptography.x509.oid import (
+    ExtendedKeyUsageOID,
+    NameOID,
+    PublicKeyAlgorithmOID,
+    SignatureAlgorithmOID,
+)
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
@@ -175,49 +181,66 @@ def pem(certificate: x509.Certificate) -> bytes:
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
-def load_certificate(data: bytes, name: str, *, trusted: bool = True) -> x509.Certificate:
+class Settings(Enum):
+    """What a program reads behind a certificate: what it is trusted for (OpenSSL, X509_AUX)."""
+
+    IGNORED = "nothing"
+    READ = "settings, which have no effect"
+    OF_ANY_USE = "settings that must not restrict the certificate"
+    OF_DOCUMENTS = "settings that must let it be trusted for S/MIME"
+
+
+def load_certificate(
+    data: bytes, name: str, *, trusted: bool = True, settings: Settings = Settings.IGNORED
+) -> x509.Certificate:
     """Return the first certificate of a PEM file; ``name`` names the file in errors.
 
     Without ``trusted``, pass over blocks ``TRUSTED CERTIFICATE``, as Cyclone DDS does.
 
     Raises:
-        PkiError: the certificate cannot be read, here or by OpenSSL.
+        PkiError: the certificate cannot be read, here or by OpenSSL, or its ``settings`` forbid it.
     """
-    return _first_certificate(data, name, trusted)
+    return _first_certificate(data, name, trusted, settings)
 
 
 @lru_cache(maxsize=16)  # several readers load the certificate of an enclave, and the same few CAs
-def _first_certificate(data: bytes, name: str, trusted: bool) -> x509.Certificate:
+def _first_certificate(
+    data: bytes, name: str, trusted: bool, settings: Settings
+) -> x509.Certificate:
     what = f"the certificate {name} cannot be read"
     labels = pem_file.CERTIFICATES if trusted else pem_file.CERTIFICATES[:-1]
     for block in _blocks(data, what):
         if block.label in labels:
-            return _certificate_in(block, what, alone=trusted)
+            return _certificate_in(block, what, settings)
     why = f"It is not a PEM certificate: {pem_file.missing(data, 'CERTIFICATE')}."
     raise PkiError(what, why, _RESTORE)
 
 
 @lru_cache(maxsize=16)
-def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
+def load_certificates(
+    data: bytes, name: str, *, settings: Settings = Settings.IGNORED
+) -> tuple[x509.Certificate, ...]:
     """Return all certificates of a PEM file, at least one; ``name`` names the file in errors.
 
     Raises:
-        PkiError: the file has no certificate, or a part of it cannot be read, here or by OpenSSL.
+        PkiError: the file has no certificate, or a part of it cannot be read, here or by OpenSSL,
+            or the ``settings`` of a ``TRUSTED CERTIFICATE`` forbid it.
     """
-    first = load_certificate(data, name)
+    load_certificate(data, name)
     what = f"the certificates {name} cannot be read"
-    others: list[x509.Certificate] = []
+    certificates: list[x509.Certificate] = []
     for block in list(_blocks(data, what)):
         if block.label in pem_file.CERTIFICATES:
-            why = "A certificate after the first one is damaged."
-            others.append(_certificate_in(block, what, why))
+            why = "A certificate after the first one is damaged." if certificates else _UNREADABLE
+            of_block = settings if block.label == pem_file.CERTIFICATES[-1] else Settings.IGNORED
+            certificates.append(_certificate_in(block, what, of_block, why))
         elif block.label == "X509 CRL":
             with reading(what, "A revocation list in it is damaged.", _RESTORE):
                 tolerant.check_list(block.content)
         elif block.label in KEY_LABELS and not block.headers:
             with reading(what, "A private key in it is damaged.", _RESTORE):
                 check_key(block.content)
-    return (first, *others[1:])
+    return tuple(certificates)
 
 
 _RESTORE = "Restore it from a backup, or issue it again."
@@ -243,29 +266,44 @@ def _known_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
 
 
 def _certificate_in(
-    block: pem_file.Block, what: str, why: str = _UNREADABLE, *, alone: bool = False
+    block: pem_file.Block, what: str, settings: Settings, why: str = _UNREADABLE
 ) -> x509.Certificate:
     if block.headers:
         why = f"It has PEM headers ('{block.headers.splitlines()[0].decode('ascii', 'replace')}')."
         raise PkiError(what, why, "Remove the lines between '-----BEGIN' and the certificate.")
     with reading(what, why, _RESTORE):
         certificate, rest = der.split(block.content)
-        if rest and (alone or block.label == pem_file.CERTIFICATES[-1]):
-            _check_trust(rest)
+        if rest and settings is not Settings.IGNORED and not _permits(rest, settings):
+            why = "It says what it is trusted for, and this is not part of that."
+            raise PkiError(what, why, "Write it with the label CERTIFICATE.")
         return _load_der(certificate)
 
 
-def _check_trust(rest: bytes) -> None:
-    """Refuse what stands behind a certificate, unless it only names the certificate (X509_AUX).
+def _permits(rest: bytes, settings: Settings) -> bool:
+    """Return whether the settings behind a certificate do not forbid a use of it (obj_trust).
 
-    What the certificate is trusted for would restrict it, which sros does not decide.  Some readers
-    of OpenSSL ignore what is no such value.
+    Raises:
+        PkiError, ValueError: they are no settings (X509_AUX).
     """
-    (settings,) = der.children(rest)
-    if settings.tag != der.SEQUENCE or any(
-        each.tag in (der.SEQUENCE, der.CONTEXT_0) for each in der.children(settings.content)
-    ):
-        raise ValueError("it says what it is trusted for")
+    (value,) = der.children(der.normalized(rest))
+    if value.tag != der.SEQUENCE:
+        raise ValueError("not settings of a certificate")
+    parts = {part.tag: _purposes(part) for part in der.children(value.content)}
+    if settings is Settings.READ:
+        return True
+    uses = {_ANY_USE, _S_MIME} if settings is Settings.OF_DOCUMENTS else {_ANY_USE}
+    trusted, rejected = parts.get(der.SEQUENCE), parts.get(der.CONTEXT_0)
+    return not (rejected and rejected & uses) and (trusted is None or bool(trusted & uses))
+
+
+_ANY_USE = ExtendedKeyUsageOID.ANY_EXTENDED_KEY_USAGE.dotted_string
+_S_MIME = ExtendedKeyUsageOID.EMAIL_PROTECTION.dotted_string
+
+
+def _purposes(part: der.Value) -> set[str]:
+    if part.tag not in (der.SEQUENCE, der.CONTEXT_0):
+        return set()
+    return {der.decode_oid(purpose.content) for purpose in der.children(part.content)}
 
 
 def _sentence(clause: str) -> str:

@@ -56,6 +56,17 @@ _RESTRICTING = {
     ObjectIdentifier("1.3.6.1.5.5.7.1.14"): "proxyCertInfo",
 }
 """Extensions by which OpenSSL may refuse a chain, and which sros does not decide."""
+_INHERITED = {
+    ObjectIdentifier("1.3.6.1.5.5.7.1.7"): (
+        bytes.fromhex("30083006040200010500"),
+        bytes.fromhex("30083006040200020500"),
+    ),
+    ObjectIdentifier("1.3.6.1.5.5.7.1.8"): (
+        bytes.fromhex("3004a0020500"),
+        bytes.fromhex("3004a1020500"),
+    ),
+}
+"""Extensions of addresses and numbers of networks, by which a certificate has those of its CA."""
 _SSL_CLIENT, _SMIME, _SMIME_CA, _ANY_NETSCAPE_CA = 0x80, 0x20, 0x02, 0x07
 _ANY_POLICY = ObjectIdentifier("2.5.29.32.0")
 _OF_POLICIES = {
@@ -222,7 +233,10 @@ def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
     if _netscape_type(certificate) == -1:
         faults.append(f"the nsCertType of {name} cannot be read")
     for found in certificate.extensions:
-        if found.oid in _RESTRICTING:
+        inherited = _INHERITED.get(found.oid, ())
+        if found.oid in _RESTRICTING and not (
+            found.value.public_bytes() in inherited and not is_self_issued(certificate)
+        ):
             faults.append(f"{name} has {_RESTRICTING[found.oid]}, not known to sros")
         elif found.critical and found.oid not in _CRITICAL:
             oid = found.oid.dotted_string
@@ -262,14 +276,14 @@ def _authority(certificate: x509.Certificate) -> _Authority:
 
 def _netscape_type(certificate: x509.Certificate) -> int | None:
     """Return the bits of the extension nsCertType, or None without it; -1 for unreadable ones."""
-    for each in certificate.extensions:
-        if each.oid == _NETSCAPE_TYPE:
-            with suppress(PkiError):
-                value = der.first(each.value.public_bytes())
-                if value.tag == der.BIT_STRING and len(value.content) in (1, 2):
-                    return (value.content + b"\0")[1]
-            return -1
-    return None
+    kinds = [each.value for each in certificate.extensions if each.oid == _NETSCAPE_TYPE]
+    if not kinds:
+        return None
+    with suppress(PkiError):
+        value = der.first(kinds[0].public_bytes())
+        if value.tag == der.BIT_STRING and len(value.content) in (1, 2) and len(kinds) == 1:
+            return (value.content + b"\0")[1]
+    return -1
 
 
 def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iterator[str]:
@@ -310,7 +324,7 @@ def purpose_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     for each in chain:
         name = subject_text(each.subject)
         purposes = extension(each, x509.ExtendedKeyUsage)
-        if purposes and ExtendedKeyUsageOID.EMAIL_PROTECTION not in purposes:
+        if purposes is not None and ExtendedKeyUsageOID.EMAIL_PROTECTION not in purposes:
             yield (
                 f"the extendedKeyUsage of {name} lacks emailProtection, which signed documents need"
             )
@@ -389,11 +403,8 @@ def _signature_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
             yield f"the signature of {subject_text(below.subject)} is not by the key of {name}"
 
 
-_POLICIES = (
-    ExtensionOID.CERTIFICATE_POLICIES,
-    ExtensionOID.POLICY_CONSTRAINTS,
-    ExtensionOID.INHIBIT_ANY_POLICY,
-)
+_ALWAYS_ASKED = {ExtensionOID.CERTIFICATE_POLICIES, ExtensionOID.POLICY_CONSTRAINTS}
+"""What OpenSSL decodes of policies; the rest only where a certificate names policies."""
 
 
 def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
@@ -411,9 +422,11 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         named = [policy.policy_identifier for policy in found or ()]
         if len(named) != len(set(named)):
             yield f"{name} has a certificate policy twice"
-        if any(other.oid == ExtensionOID.POLICY_MAPPINGS for other in each.extensions):
+        maps = any(other.oid == ExtensionOID.POLICY_MAPPINGS for other in each.extensions)
+        if maps and found is not None:
             yield f"{name} has policyMappings, not known to sros"
-        if any(found.oid in _POLICIES and is_unread(found) for found in each.extensions):
+        asked = _ALWAYS_ASKED if found is None else _OF_POLICIES
+        if any(other.oid in asked and is_unread(other) for other in each.extensions):
             yield f"the policies of {name} cannot be read"
         constraints = extension(each, x509.PolicyConstraints)
         after = constraints.require_explicit_policy if constraints else None

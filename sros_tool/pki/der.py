@@ -72,6 +72,15 @@ def split(data: bytes) -> tuple[bytes, bytes]:
     return data[:end], data[end:]
 
 
+def split_all(data: bytes) -> list[bytes]:
+    """Return the values in ``data``, which are in BER, as they are written; raise as `split`."""
+    values = []
+    while data:
+        value, data = split(data)
+        values.append(value)
+    return values
+
+
 def normalized(data: bytes) -> bytes:
     """Return the first value in ``data``, which is in BER (X.690, 8), with the lengths of DER.
 

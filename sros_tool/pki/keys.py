@@ -168,14 +168,17 @@ def _key_block(data: bytes, name: str) -> bytes:
     encrypted = block.headers.startswith(_TRADITIONAL)
     if block.headers and not encrypted:
         raise _unreadable(name, "it has other PEM headers than those of an encrypted key")
-    begin = [f"-----BEGIN {block.label}-----".encode(), *block.headers.splitlines()]
-    der_key = block.content
-    if not encrypted:  # OpenSSL ignores what follows the key
+    label, der_key = block.label, block.content
+    if not encrypted:  # OpenSSL ignores what follows the key, and which form the label promises
         with suppress(PkiError):
             der_key, _ = der.split(block.content)
+            kinds = [part.tag for part in der.children(der.first(der_key).content)]
+            if kinds[:2] == [der.INTEGER, der.SEQUENCE]:
+                label = KEY_LABELS[0]
+    begin = [f"-----BEGIN {label}-----".encode(), *block.headers.splitlines()]
     content = base64.b64encode(der_key)
     lines = [content[start : start + 64] for start in range(0, len(content), 64)]
-    end = f"-----END {block.label}-----\n".encode()
+    end = f"-----END {label}-----\n".encode()
     return b"\n".join([*begin, *([b""] if encrypted else []), *lines, end])
 
 

@@ -9,6 +9,7 @@ from cryptography import x509
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
+from sros_tool.pki.names import canonical_der
 
 _BMP_STRING = 0x1E
 _IN_NAMES = (0x03, 0x0C, 0x12, 0x13, 0x14, 0x16, 0x1C, _BMP_STRING)
@@ -48,6 +49,7 @@ def read_name(name: x509.Name) -> None:
 
 def read_name_der(name: bytes) -> None:
     """Parse every part of a distinguished name in DER, as `read_name` does."""
+    canonical_der(name)
     for part in der.children(der.first(name).content):
         for attribute in der.children(part.content):
             oid, value = der.children(attribute.content)

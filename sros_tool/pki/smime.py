@@ -396,9 +396,9 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
         raise ValueError("several contents, or none")
     if content is None:
         (content,) = inside
-    for each in (value for bag in lists for value in der.children(bag.content)):
-        tolerant.check_list(each.whole)  # OpenSSL reads it, and does not use it
-    embedded = [value for bag in bags for value in der.children(bag.content)]
+    for unused in (value for bag in lists for value in der.split_all(bag.content)):
+        tolerant.check_list(unused)  # OpenSSL reads it, and does not use it
+    embedded = [value for bag in bags for value in der.split_all(bag.content)]
     listed = [_digest_of(each) for each in der.children(digests.content)]
     if None in listed:
         raise ValueError("unknown digest")
@@ -408,7 +408,7 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     return SignedDocument(
         content=content,
         document=_document(content),
-        certificates=tuple(_certificate(each.whole) for each in embedded),
+        certificates=tuple(map(_certificate, embedded)),
         signatures=signatures,
     )
 

@@ -255,8 +255,20 @@ _USAGES = (
 """The bits of a keyUsage, in order (RFC 5280, 4.2.1.3)."""
 
 
+def _extended_key_usage(content: bytes) -> x509.ExtendedKeyUsage:
+    parts = _inside(content)
+    if any(part.tag != der.OID for part in parts):
+        raise ValueError("not a purpose")
+    return x509.ExtendedKeyUsage(ObjectIdentifier(der.decode_oid(p.content)) for p in parts)
+
+
 def _name_constraints(content: bytes) -> None:
     if any(each.content for each in _inside(content)):
+        raise ValueError("not empty")
+
+
+def _policies(content: bytes) -> None:
+    if _inside(content):
         raise ValueError("not empty")
 
 
@@ -322,7 +334,9 @@ def _inside(content: bytes) -> list[der.Value]:
 _LOOSE_OF_CERTIFICATES: dict[ObjectIdentifier, _Loose] = {
     ExtensionOID.BASIC_CONSTRAINTS: _basic_constraints,
     ExtensionOID.KEY_USAGE: _key_usage,
+    ExtensionOID.EXTENDED_KEY_USAGE: _extended_key_usage,
     ExtensionOID.NAME_CONSTRAINTS: _name_constraints,
+    ExtensionOID.CERTIFICATE_POLICIES: _policies,
     ExtensionOID.SUBJECT_ALTERNATIVE_NAME: _alternative_names,
     ExtensionOID.AUTHORITY_KEY_IDENTIFIER: _authority_key_identifier,
 }
