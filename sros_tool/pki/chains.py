@@ -238,7 +238,7 @@ def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
             found.value.public_bytes() in inherited and not is_self_issued(certificate)
         ):
             faults.append(f"{name} has {_RESTRICTING[found.oid]}, not known to sros")
-        elif found.critical and found.oid not in _CRITICAL:
+        elif found.critical and found.oid not in _CRITICAL and not inherited:
             oid = found.oid.dotted_string
             faults.append(f"{name} has the unknown critical extension {oid}")
     return tuple(faults)

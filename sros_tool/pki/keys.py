@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 
 from cryptography.hazmat.primitives import serialization
-from cryptography.hazmat.primitives.asymmetric import ec, rsa
+from cryptography.hazmat.primitives.asymmetric import dsa, ec, rsa
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
@@ -129,12 +129,14 @@ def load_any_key(
     return _validated(key, name) if isinstance(key, rsa.RSAPrivateKey) else key
 
 
-def check_key(content: bytes) -> None:
-    """Raise an error of any class unless ``content`` is a private key in DER."""
+def check_key(content: bytes, label: str = "") -> None:
+    """Raise an error of any class unless ``content`` is a private key in DER, as a label says."""
     if len(content) > _MAX_BYTES:
         raise ValueError("too large")
-    key, _ = der.split(content)
-    serialization.load_der_private_key(key, None, unsafe_skip_rsa_key_validation=True)
+    data, _ = der.split(content)
+    key = serialization.load_der_private_key(data, None, unsafe_skip_rsa_key_validation=True)
+    if not isinstance(key, _KINDS.get(label, object)):
+        raise ValueError("a key of another algorithm than its label says")
 
 
 def _unreadable(name: str, reason: str = "") -> PkiError:
@@ -156,7 +158,7 @@ def _key_block(data: bytes, name: str) -> bytes:
             if block.label in KEY_LABELS and not block.headers:
                 # OpenSSL passes over a damaged key.
                 with suppress(Exception):
-                    check_key(block.content)
+                    check_key(block.content, block.label)
                     break
                 damaged = True
             elif block.label in _ALL_LABELS:
@@ -184,6 +186,11 @@ def _key_block(data: bytes, name: str) -> bytes:
 
 KEY_LABELS = ("PRIVATE KEY", "RSA PRIVATE KEY", "EC PRIVATE KEY", "DSA PRIVATE KEY")
 """The PEM labels of private keys that are not encrypted, unless a header says so."""
+_KINDS: dict[str, type] = {
+    "RSA PRIVATE KEY": rsa.RSAPrivateKey,
+    "EC PRIVATE KEY": ec.EllipticCurvePrivateKey,
+    "DSA PRIVATE KEY": dsa.DSAPrivateKey,
+}
 _ALL_LABELS = (*KEY_LABELS, "ENCRYPTED PRIVATE KEY")
 _TRADITIONAL = b"Proc-Type: 4,ENCRYPTED"
 _MAX_BYTES = 16 * 1024
