@@ -24,6 +24,8 @@ from sros_tool.checks.keystores import (
     enclaves,
     files,
     issued,
+    starting,
+    topic_names,
     vendors,
     zenoh_files,
 )
@@ -40,8 +42,18 @@ from sros_tool.checks.kind import (
 from sros_tool.errors import UsageError
 
 _MODULES = (
-    *(policies, requirements, files, authorities, enclaves, vendors, documents, issued),
-    *(zenoh_files, zenoh, zenoh_environment, environment, runtime, processes, process_files),
+    *(policies, requirements, files, authorities, enclaves, starting, vendors, documents),
+    *(
+        topic_names,
+        issued,
+        zenoh_files,
+        zenoh,
+        zenoh_environment,
+        environment,
+        runtime,
+        processes,
+        process_files,
+    ),
 )
 
 

@@ -67,6 +67,8 @@ class Grant:
     default_allow: bool = False
     default_empty: bool = False
     """Whether ``<default>`` is empty; Cyclone DDS crashes on that."""
+    default_first: bool = False
+    """Whether ``<default>`` stands before a rule; Fast DDS ignores what follows it."""
 
     @property
     def validity(self) -> Window:
@@ -195,6 +197,7 @@ def _read_grant(element: etree._Element) -> Grant:
         raise DocumentError(f"<permissions> holds an unknown element <{tag_of(element)}>")
     subject = not_before = not_after = default = None
     rules = []
+    default_first = False
     for child in element:
         match child.tag:
             case "subject_name":
@@ -203,6 +206,7 @@ def _read_grant(element: etree._Element) -> Grant:
                 not_before, not_after = child.findtext("not_before"), child.findtext("not_after")
             case "allow_rule" | "deny_rule":
                 rules.append(_read_rule(child))
+                default_first = default is not None
             case "default":
                 default = (child.text or "").strip()
             case _:
@@ -217,7 +221,13 @@ def _read_grant(element: etree._Element) -> Grant:
         except ValueError as error:
             raise DocumentError(f"{moment!r} is not an XML date and time") from error
     return Grant(
-        element.get("name", ""), subject, not_before, not_after, tuple(rules), default == "ALLOW"
+        element.get("name", ""),
+        subject,
+        not_before,
+        not_after,
+        tuple(rules),
+        default == "ALLOW",
+        default_first=default_first,
     )
 
 

@@ -271,6 +271,10 @@ CASES |= {
     "keystore.allow-everything": lambda b: b.permissions(
         ("<topic>ros_discovery_info</topic>", "<topic>*</topic>")
     ),
+    "keystore.only-denials": lambda b: b.permissions(
+        (ALLOW, DENY_ALL.replace("rt/*", "rt/stop") + ALLOW),
+        ("<topic>ros_discovery_info</topic>", "<topic>*</topic>"),
+    ),
     "enclave.node-cannot-start": lambda b: b.permissions(("rt/parameter_events", "rt/events")),
     "enclave.xml-differs": lambda b: b.permissions(("rosout", "rosoot"), xml=False),
     "enclave.crl-missing": lambda b: b.revoke(linked=False),
@@ -316,6 +320,7 @@ DENY_ALL = """      <deny_rule>
         <publish><topics><topic>rt/*</topic></topics></publish>
       </deny_rule>
 """
+LEFT = "<partitions><partition>left</partition></partitions>"
 SECOND = """      <allow_rule>
         <domains><id>0</id></domains>
         <publish><topics><topic>rt/extra</topic></topics></publish>
@@ -333,6 +338,11 @@ def _many_topics(text: str) -> str:
     return text.replace("<topics>", f"<topics>{topics}", 1)
 
 
+def names_of_dds(text: str) -> str:
+    """Permissions with a name that is not of ROS in place of every name."""
+    return re.sub(r"<topic>[^<]*<", "<topic>Square<", text)
+
+
 def _fewer_domains(bench: Bench) -> None:
     bench.options["on_robot"] = True
     bench.governance(("<id>0</id>", "<id>0</id><id>1</id>"))
@@ -343,7 +353,11 @@ CASES |= {
     "portable.default-allow": lambda b: b.permissions(("<default>DENY", "<default>ALLOW")),
     "portable.several-allow-rules": lambda b: b.permissions(("      <default>", SECOND)),
     "portable.partitions": lambda b: b.permissions(
-        ("</topics>", "</topics><partitions><partition>left</partition></partitions>")
+        ("      <default>", SECOND.replace("</topics>", f"</topics>{LEFT}"))
+    ),
+    "portable.default-first": lambda b: b.permissions(
+        ("      <default>DENY</default>\n", ""),
+        (ALLOW, f"      <default>DENY</default>\n{ALLOW}"),
     ),
     "portable.domain-range": lambda b: b.permissions(
         ("<id>0</id>", "<id_range><min>0</min></id_range>")
@@ -353,6 +367,7 @@ CASES |= {
     "portable.time-format": lambda b: b.permissions(("Z</not_after>", "+00:00</not_after>")),
     "portable.validity-window": lambda b: at(b, -1 + 0.4),
     "portable.character-class": lambda b: b.permissions(("rt/rosout<", "rt/[^a]osout<")),
+    "portable.blanks": lambda b: b.permissions(("rt/rosout<", " rt/rosout<")),
     "portable.empty-topic": lambda b: b.permissions(("rt/rosout<", "<")),
     "portable.character-set": lambda b: b.permissions(("rt/rosout<", "rt/[rs]osout<")),
     "portable.long-name": lambda b: b.permissions(("rt/rosout<", f"rt/{'n' * 249}<")),
@@ -363,7 +378,17 @@ CASES |= {
     "permissions.deny-without-effect": lambda b: b.permissions(
         ("      <default>", DENY_ALL + "      <default>")
     ),
-    "permissions.unreachable-rule": lambda b: b.permissions((ALLOW, DENY_ALL + ALLOW)),
+    "permissions.unreachable-rule": lambda b: b.permissions(
+        (ALLOW, DENY_ALL.replace("rt/*", "rt/s*") + ALLOW)
+    ),
+    "permissions.no-ros-name": lambda b: b.permissions(("rt/status<", "status<")),
+    "permissions.not-for-ros": lambda b: b.sign(
+        "enclaves/base/permissions.p7s",
+        lambda text: re.sub(r"<topic>[^<]*<", "<topic>Square<", text),
+    ),
+    "permissions.relay-only": lambda b: b.permissions(
+        ("      <default>", SECOND.replace("publish>", "relay>"))
+    ),
     "enclave.permissions-domains": lambda b: b.permissions(("<id>0</id>", "<id>0</id><id>1</id>")),
     "enclave.fewer-domains": _fewer_domains,
     "enclave.refused": lambda b: b.governance(
@@ -385,10 +410,26 @@ def _narrow_rule_last(text: str) -> str:
     return text[:end] + rule + text[end:]
 
 
+def _topic_rules_of_ros(text: str) -> str:
+    begin = text.index("        <topic_rule>")
+    end = text.index("</topic_rule>") + len("</topic_rule>\n")
+    rules = [
+        text[begin:end].replace("<topic_expression>*<", f"<topic_expression>{each}<")
+        for each in ("ros_discovery_info", "rt/*", "rq/*", "rr/*")
+    ]
+    return text[:begin] + "".join(rules) + text[end:]
+
+
+def unauthenticated_on_fast_dds_2_9(bench: Bench) -> None:
+    bench.options["vendor"] = "fastdds-2.9"
+    bench.governance(("participants>false", "participants>true"))
+
+
 CASES |= {
     "governance.unauthenticated": lambda b: b.governance(
         ("participants>false", "participants>true")
     ),
+    "governance.unauthenticated-kept-out": unauthenticated_on_fast_dds_2_9,
     "governance.no-join-control": lambda b: b.governance(
         ("join_access_control>true", "join_access_control>false")
     ),
@@ -409,6 +450,7 @@ CASES |= {
     "governance.no-topic-rule": lambda b: b.governance(
         (TOPIC_RULE, TOPIC_RULE.replace(">*<", ">rt/*<"))
     ),
+    "governance.only-ros-topics": lambda b: b.sign("enclaves/governance.p7s", _topic_rules_of_ros),
     "governance.unreachable-rule": lambda b: b.sign("enclaves/governance.p7s", _narrow_rule_last),
     "governance.domain-range": lambda b: b.governance(
         ("<id>0</id>", "<id_range><max>3</max></id_range>")

@@ -161,7 +161,7 @@ def test_a_new_keystore_that_others_can_replace_is_noted(
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ((), "Fast DDS 2.14 refuses the document"),
+        ((), "on Fast DDS 2.14 the document is refused"),
         ((("rtps_protection_kind>ENCRYPT", "rtps_protection_kind>NONE"),), "they reach no topic"),
         (
             (

@@ -42,6 +42,7 @@ ELSEWHERE = {
     "enclave.permissions-not-yet-valid": _UNKNOWN,
     "enclave.subject-not-unique": _UNKNOWN,
     "governance.unauthenticated": _EDITED,
+    "governance.unauthenticated-kept-out": _EDITED,
     "governance.no-join-control": _EDITED,
     "governance.no-access-control": _EDITED,
     "governance.no-encryption": _EDITED,

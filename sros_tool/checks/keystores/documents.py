@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -16,10 +16,11 @@ from math import isfinite
 
 from sros_tool.checks.keystores.enclaves import grant_of, plain
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
+from sros_tool.checks.keystores.topic_names import check_topic_names
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.checks.policies import outside_findings
 from sros_tool.dds.decision.moments import read_moment
-from sros_tool.dds.decision.vendors import FAST_DDS, Moments
+from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, Moments, Vendor
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Rule
@@ -28,6 +29,7 @@ from sros_tool.keystore.fleet import EnclaveDomains
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_XML
 from sros_tool.keystore.settings import edit_remedy
 from sros_tool.keystore.template import Template
+from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki import smime
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers
 from sros_tool.translate import governance_for
@@ -69,6 +71,16 @@ PARTITIONS = FindingKind(
     "partition.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Leave partitions out.",
+)
+DEFAULT_FIRST = FindingKind(
+    "portable.default-first",
+    ERROR,
+    "rules after the <default> of a grant",
+    "Fast DDS ends a grant at its <default>, and ignores the rules that follow; Cyclone DDS reads "
+    "them.",
+    "omg_shared_ca_permissions.xsd; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Put <default> behind the rules.",
+    vendors=FAST_DDS,
 )
 DOMAIN_RANGE = FindingKind(
     "portable.domain-range",
@@ -132,9 +144,19 @@ CHARACTER_CLASS = FindingKind(
     WARNING,
     "a [class] of characters that vendors read differently",
     "Cyclone DDS reads [^...] and [[:class:]] as plain characters; Fast DDS supports negation and "
-    "classes. Cyclone DDS strips spaces around a name, and Fast DDS does not.",
+    "classes.",
     "Fast DDS 2.14.5 (fnmatch), Cyclone DDS 0.10.2; measured.",
     "Use * or ?, or write the names out.",
+)
+BLANKS = FindingKind(
+    "portable.blanks",
+    WARNING,
+    "spaces or line ends around the name of a topic",
+    "Fast DDS takes them for a part of the name, so the rule matches no topic of a node; Cyclone "
+    "DDS strips them.",
+    "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Write the name alone between the tags: <topic>rt/chatter</topic>.",
+    vendors=FAST_DDS,
 )
 EMPTY_TOPIC = FindingKind(
     "portable.empty-topic",
@@ -155,8 +177,8 @@ NO_EFFECT = FindingKind(
 UNREACHABLE = FindingKind(
     "permissions.unreachable-rule",
     WARNING,
-    "a topic in a rule that an earlier rule already decides",
-    "The first rule that matches decides, so this rule never decides on the topic.",
+    "a rule that an earlier rule keeps from deciding",
+    "The first rule that matches decides, so this rule never decides on these topics.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Remove the topic, or put the narrower rule first.",
 )
@@ -203,6 +225,7 @@ def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
     if own := grant_of(enclave):
         yield from _times(enclave, own, file)
         yield from _order(own, name, file)
+        yield from check_topic_names(enclave, own, file)
         yield from _domains(enclave, own, file)
 
 
@@ -222,6 +245,8 @@ def _form(grant: Grant, name: str, file: str) -> Iterator[Finding]:
         yield SUBJECT.found(name, f"the subject is {grant.subject!r}", file)
     if grant.default_allow:
         yield DEFAULT_ALLOW.found(name, "<default> is ALLOW", file)
+    if grant.default_first:
+        yield DEFAULT_FIRST.found(name, "<default> stands before a rule", file)
     for moment in (grant.not_before, grant.not_after):
         match = _MOMENT.match(moment)
         if not match or int(match[1]) > _LAST_YEAR:
@@ -234,16 +259,33 @@ def _form(grant: Grant, name: str, file: str) -> Iterator[Finding]:
         yield DOMAIN_RANGE.found(name, f"the range {problem}", file)
     criteria = [each for rule in grant.rules for each in (*rule.publish, *rule.subscribe)]
     if any(each.partitions for each in criteria):
-        yield PARTITIONS.found(name, "a rule names partitions", file)
+        yield PARTITIONS.found(name, _partitions_text(grant), file)
     if any(not topic.strip() for each in criteria for topic in each.topics):
         yield EMPTY_TOPIC.found(name, "a <topic> in a rule is empty", file)
-    odd = sorted({t for each in criteria for t in each.topics if _is_odd(t)})
-    if odd:
-        yield CHARACTER_CLASS.found(name, f"a rule names {', '.join(map(repr, odd[:3]))}", file)
+    topics = sorted({topic for each in criteria for topic in each.topics})
+    if odd := [each for each in topics if "[^" in each or "[:" in each]:
+        yield CHARACTER_CLASS.found(name, f"a rule names {some_names([*map(repr, odd)])}", file)
+    if blank := [each.strip() for each in topics if each != each.strip() != ""]:
+        yield BLANKS.found(name, f"there are spaces or line ends around {some_names(blank)}", file)
 
 
-def _is_odd(topic: str) -> bool:
-    return "[^" in topic or "[:" in topic or topic != topic.strip()
+def _partitions_text(grant: Grant) -> str:
+    """Return what the partitions of the rules mean for ROS 2, as a clause."""
+    for rule in grant.rules:
+        for each in (*rule.publish, *rule.subscribe) if rule.allow else ():
+            if each.topics and each.partitions and not any(map(_is_default, each.partitions)):
+                word = "partition" if len(each.partitions) == 1 else "partitions"
+                topics = some_names(each.topics)
+                return (
+                    f"{topics} {'is' if len(each.topics) == 1 else 'are'} allowed only in {word} "
+                    f"{some_names(each.partitions)}, which ROS 2 does not use"
+                )
+    return "a rule names partitions"
+
+
+def _is_default(partition: str) -> bool:
+    """Return whether an expression matches the default partition, whose name is empty."""
+    return not partition.strip("* \t\r\n")
 
 
 def _times(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
@@ -279,15 +321,42 @@ def _order(grant: Grant, name: str, file: str) -> Iterator[Finding]:
         for allow in (True, False)
     }
     for index, rule in enumerate(grant.rules):
+        if rule.allow:
+            yield from _hidden(stated, rule, index, name, file)
+            continue
         for direction in _DIRECTIONS:
-            others = stated[direction, not rule.allow]
+            allowed = stated[direction, True]
+            late: dict[str, list[str]] = {}
             for topic in _topics(getattr(rule, direction)):
-                if rule.allow and (by := others.covering(topic, index)):
-                    text = f"a rule allows to {direction} {topic} after one that denies {by}"
-                    yield UNREACHABLE.found(name, text, file)
-                elif not rule.allow and (met := others.meeting(topic, index)):
-                    text = f"a rule denies to {direction} {topic} after one that allows {met}"
-                    yield NO_EFFECT.found(name, text, file)
+                if met := allowed.meeting(topic, index):
+                    late.setdefault(met, []).append(topic)
+            for met, topics in late.items():
+                text = (
+                    f"rule {index + 1} denies to {direction} {some_names(topics)} after one that "
+                )
+                yield NO_EFFECT.found(name, f"{text}allows {met}", file)
+
+
+def _hidden(
+    stated: Mapping[tuple[str, bool], _Topics], rule: Rule, index: int, name: str, file: str
+) -> Iterator[Finding]:
+    """Yield a finding if earlier rules deny topics that a rule allows."""
+    hidden: dict[str, dict[str, list[str]]] = {}
+    left = 0
+    for direction in _DIRECTIONS:
+        for topic in _topics(getattr(rule, direction)):
+            if by := stated[direction, False].covering(topic, index):
+                hidden.setdefault(by, {}).setdefault(direction, []).append(topic)
+            else:
+                left += 1
+    if hidden and not left:
+        text = f"rule {index + 1} allows nothing, as an earlier one denies {some_names([*hidden])}"
+        yield UNREACHABLE.found(name, text, file)
+        return
+    for by, topics in hidden.items():
+        what = " and ".join(f"{direction} {some_names(some)}" for direction, some in topics.items())
+        text = f"rule {index + 1} allows to {what} after one that denies {by}"
+        yield UNREACHABLE.found(name, text, file)
 
 
 class _Topics:
@@ -333,6 +402,8 @@ def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Findi
     if governed is None:
         return
     allowed, wanted = grant.domains(), governed
+    if grant.default_allow and not allowed.ranges:
+        return  # the default is for every domain
     with suppress(SrosError):
         wanted = EnclaveDomains(governed, enclave.keystore.fleet).of(enclave.name)
     if allowed == wanted:
@@ -358,10 +429,21 @@ UNAUTHENTICATED = FindingKind(
     "governance.unauthenticated",
     ERROR,
     "participants without an identity may join",
-    "On Fast DDS 2.14 they can read and write every topic without access control and protection; "
-    "with RTPS protection too, it refuses the document. Fast DDS 2.9 ignores the attribute.",
-    f"{_GOVERNANCE} (allow_unauthenticated_participants); measured.",
+    "On Fast DDS 2.14 they can read and write every topic without access control and protection, "
+    "on Cyclone DDS every topic without protection, whatever its access control. With RTPS "
+    "protection too, Fast DDS 2.14 refuses the document. Fast DDS 2.9 ignores the attribute.",
+    f"{_GOVERNANCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS "
+    "0.10.2; measured.",
     "Run `sros update_keystore ROOT --set protection.allow_unauthenticated_participants=false`.",
+)
+UNAUTHENTICATED_KEPT_OUT = FindingKind(
+    "governance.unauthenticated-kept-out",
+    NOTE,
+    "participants without an identity may join, and the vendor keeps them out",
+    "Fast DDS 2.9 ignores the attribute, and on Cyclone DDS messages that are protected as a whole "
+    "keep them out. Another vendor may open topics to them, or refuse the document.",
+    UNAUTHENTICATED.source,
+    UNAUTHENTICATED.remedy,
 )
 NO_JOIN_CONTROL = FindingKind(
     "governance.no-join-control",
@@ -431,6 +513,14 @@ NO_TOPIC_RULE = FindingKind(
     f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Add a rule for * at the end.",
 )
+NO_OTHER_TOPIC_RULE = FindingKind(
+    "governance.only-ros-topics",
+    NOTE,
+    "topic rules for the names of ROS alone",
+    "A program that uses DDS without ROS can create no endpoint.",
+    f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Nothing, if all programs are nodes of ROS 2. Otherwise add a rule for * at the end.",
+)
 UNREACHABLE_TOPIC_RULE = FindingKind(
     "governance.unreachable-rule",
     WARNING,
@@ -482,14 +572,19 @@ _OPEN = {
     "enable_liveliness_protection": LIVELINESS_OPEN,
 }
 """The kind of finding for each attribute whose open value is a weakness of its own."""
+_OF_ROS = ("rt/*", "rq/*Request", "rr/*Reply")
+"""The DDS topics of all topics, services and actions of ROS."""
 _SIGNING = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
 _NONE = (ProtectionKind.NONE,)
 
 
-def check_governance(enclave: CheckedEnclave, common: bytes) -> Iterator[Finding]:
+def check_governance(
+    enclave: CheckedEnclave, common: bytes, asked: Sequence[Vendor]
+) -> Iterator[Finding]:
     """Yield findings if an enclave loads another governance than the signed document ``common``.
 
-    That is the governance of the keystore, or of the first enclave of an export.
+    That is the governance of the keystore, or of the first enclave of an export.  ``asked`` are the
+    vendors that its nodes may use.
     """
     governance = enclave.state.governance
     if governance is None:
@@ -499,7 +594,7 @@ def check_governance(enclave: CheckedEnclave, common: bytes) -> Iterator[Finding
         file = enclave.file(GOVERNANCE_FILE)
         of = "the keystore" if enclave.keystore.governance else "other enclaves"
         yield DIFFERS.found(enclave.name, f"'{file}' differs from the governance of {of}", file)
-        yield from governance_findings(enclave.keystore, governance, file)
+        yield from governance_findings(enclave.keystore, governance, file, asked)
 
 
 @dataclass(frozen=True, slots=True)
@@ -509,31 +604,37 @@ class _Chosen:
     kind: FindingKind
     text: str
     domains: DomainSet
+    asked: Sequence[Vendor]
 
     def __call__(self, settings: Template) -> bool:
         governance = governance_for(settings.protection, self.domains)
-        found = (each for rule in governance.domain_access_rules for each in _rule_findings(rule))
-        return (self.kind, self.text) in found
+        return any(
+            (self.kind, self.text) in _rule_findings(rule, self.asked)
+            for rule in governance.domain_access_rules
+        )
 
 
-def _rule_findings(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
-    yield from _domain_rule(rule)
+def _rule_findings(rule: DomainRule, asked: Sequence[Vendor]) -> Iterator[tuple[FindingKind, str]]:
+    yield from _domain_rule(rule, asked)
     yield from _topic_rules(rule)
 
 
 def governance_findings(
-    keystore: CheckedKeystore, governance: Governance, file: str
+    keystore: CheckedKeystore, governance: Governance, file: str, asked: Sequence[Vendor]
 ) -> Iterator[Finding]:
-    """Yield findings about what a governance document leaves unprotected; ``file`` is its path."""
+    """Yield findings about what a governance document leaves unprotected.
+
+    ``file`` is its path, ``asked`` are the vendors that nodes may use.
+    """
     domains = governance.domains().closed()
 
     for rule in governance.domain_access_rules:
         subject = f"domain {rule.domains}"
-        for kind, text in _rule_findings(rule):
+        for kind, text in _rule_findings(rule, asked):
             # A template may choose open topics; no template chooses to lose messages, or a rule
             # that does nothing.
             own = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
-            by = "" if own else keystore.accepts(kind, _Chosen(kind, text, domains))
+            by = "" if own else keystore.accepts(kind, _Chosen(kind, text, domains, asked))
             yield kind.found(subject, text, file, accepted=by)
         for part in rule.domains.ranges:
             kind = GOVERNANCE_DOMAIN_RANGE if part.last is not None else GOVERNANCE_OPEN_RANGE
@@ -541,28 +642,54 @@ def governance_findings(
                 yield kind.found(subject, f"the range {problem}", file)
 
 
-def _reach_of_unauthenticated(rule: DomainRule) -> str:
-    """Describe what unauthenticated participants can do on Fast DDS 2.14, which admits them."""
-    if rule.rtps_protection_kind is not ProtectionKind.NONE:
-        return "Fast DDS 2.14 refuses the document, because it also protects RTPS messages"
-    hidden = rule.discovery_protection_kind is not ProtectionKind.NONE
+def _unauthenticated(rule: DomainRule, asked: Sequence[Vendor]) -> tuple[FindingKind, str]:
+    """Return what participants without an identity can do on the vendors, which may be none."""
+    kind = UNAUTHENTICATED_KEPT_OUT
+    clauses: dict[str, list[str]] = {}
+    for vendor in asked or MEASURED:
+        if vendor is Vendor.FAST_2_9:
+            clause = "they are refused all the same"
+        elif rule.rtps_protection_kind is ProtectionKind.NONE:
+            kind, clause = UNAUTHENTICATED, _reach_of_strangers(rule, vendor)
+        elif vendor.traits.refuses_open_rtps:
+            kind, clause = (
+                UNAUTHENTICATED,
+                "the document is refused, as RTPS messages are protected",
+            )
+        else:
+            clause = "they are kept out, as RTPS messages are protected"
+        clauses.setdefault(clause, []).append(vendor.title)
+    return kind, "; ".join(f"on {' and '.join(some)} {clause}" for clause, some in clauses.items())
+
+
+def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
+    """Return which topics participants without an identity reach on a vendor that admits them.
+
+    Cyclone DDS 0.10.2 asks them for no rights, and hides from them each topic whose discovery is
+    to be protected, whatever the protection of discovery is.
+    """
+    on_cyclone = vendor is Vendor.CYCLONE
+    hides = on_cyclone or rule.discovery_protection_kind is not ProtectionKind.NONE
     opened = [
         each.topic_expression
         for each in rule.topic_access_rules
-        if not (each.enable_read_access_control or each.enable_write_access_control)
-        and not (each.enable_discovery_protection and hidden)
+        if (on_cyclone or not (each.enable_read_access_control or each.enable_write_access_control))
+        and not (each.enable_discovery_protection and hides)
         and each.metadata_protection_kind is ProtectionKind.NONE
         and each.data_protection_kind is ProtectionKind.NONE
     ]
     if not opened:
-        return "on Fast DDS 2.14 they reach no topic, because all are controlled or protected"
-    return f"on Fast DDS 2.14 anybody can read and write {', '.join(opened[:3])}"
+        return "they reach no topic, because all are controlled or protected"
+    return f"anybody can read and write {some_names(opened)}"
 
 
-def _domain_rule(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
+def _domain_rule(rule: DomainRule, asked: Sequence[Vendor]) -> Iterator[tuple[FindingKind, str]]:
     for each, text in _open_attributes(rule):
-        reason = f": {_reach_of_unauthenticated(rule)}" if _OPEN[each] is UNAUTHENTICATED else ""
-        yield _OPEN[each], f"{text}{reason}"
+        kind = _OPEN[each]
+        if kind is UNAUTHENTICATED:
+            kind, reach = _unauthenticated(rule, asked)
+            text = f"{text}: {reach}"
+        yield kind, text
 
 
 def _open_attributes(rule: DomainRule | TopicRule) -> Iterator[tuple[str, str]]:
@@ -577,10 +704,11 @@ def _open_attributes(rule: DomainRule | TopicRule) -> Iterator[tuple[str, str]]:
 
 def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
     expressions = [each.topic_expression for each in rule.topic_access_rules]
-    if not any(covers(each, "ros_discovery_info") for each in expressions):
-        yield NO_TOPIC_RULE, "no topic rule matches ros_discovery_info"
+    if not any(covers(each, ROS_DISCOVERY_TOPIC) for each in expressions):
+        yield NO_TOPIC_RULE, f"no topic rule matches {ROS_DISCOVERY_TOPIC}"
     elif "*" not in expressions:
-        yield NO_TOPIC_RULE, "there is no rule for *"
+        of_ros = all(any(covers(each, one) for each in expressions) for one in _OF_ROS)
+        yield NO_OTHER_TOPIC_RULE if of_ros else NO_TOPIC_RULE, "there is no rule for *"
     names = Names(expressions)
     first = {each: index for index, each in reversed([*enumerate(expressions)])}
     for index, topic in enumerate(rule.topic_access_rules):

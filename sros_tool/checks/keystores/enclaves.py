@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -18,7 +17,6 @@ from sros_tool.checks.kind import (
     ERROR,
     NOTE,
     WARNING,
-    Cause,
     Finding,
     FindingKind,
     by_id,
@@ -26,7 +24,7 @@ from sros_tool.checks.kind import (
 )
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import Grant
-from sros_tool.errors import SrosError, counted
+from sros_tool.errors import SrosError
 from sros_tool.faults import VENDOR_FAULTS, Fault
 from sros_tool.keystore.issuing.tokens import pin_file_problem, pin_line_break
 from sros_tool.keystore.layout import (
@@ -35,17 +33,14 @@ from sros_tool.keystore.layout import (
     KEY_URI_FILE,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
-    PERMISSIONS_FILE,
     REQUEST,
     ZENOH_FILES,
     ca_certificate,
     waits_for_answer,
 )
 from sros_tool.keystore.reader import weaknesses
-from sros_tool.names import NODE_SERVICES, ROS_DISCOVERY_TOPIC, has_type_descriptions
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.pki.token_uri import TokenUri
-from sros_tool.policy.patterns import covers, overlap
 from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 from sros_tool.xml import read_bytes
@@ -178,6 +173,16 @@ EVERYTHING = FindingKind(
     "ros2/sros2 0.13 grants this to every enclave without a policy.",
     "Give it a policy, with `sros create_permission ROOT NAME POLICY_FILE`.",
 )
+ONLY_DENIALS = FindingKind(
+    "keystore.only-denials",
+    NOTE,
+    "an enclave that may do everything but what it is denied",
+    "Its messages are authenticated and encrypted, but it can command every node whose topics and "
+    "services nobody thought of.",
+    EVERYTHING.source,
+    EVERYTHING.remedy,
+    prominent=True,
+)
 XML_DIFFERS = FindingKind(
     "enclave.xml-differs",
     WARNING,
@@ -227,17 +232,6 @@ PIN_FILE = FindingKind(
     "start.",
     "RFC 7512, 2.4 and 4; libp11 0.4.12 (eng_parse.c), measured.",
     "Write the PIN alone into the file, with mode 0600, for the user that runs the node.",
-)
-
-NO_NODE = FindingKind(
-    "enclave.node-cannot-start",
-    ERROR,
-    "permissions with which no ordinary node of ROS 2 can start",
-    "A node of rclpy or rclcpp creates these endpoints when it starts, and exits if one of them is "
-    "denied. The permissions say nothing of nodes that were created without them.",
-    "ROS 2 Jazzy, rcl 9, rclcpp 28 and rclpy 7; ~/get_type_description since Iron (REP-2016).",
-    "Include common/node.xml in the profiles of its nodes (`sros check POLICY_FILE` says how), and "
-    "sign the policy with `sros generate_artifacts -k ROOT -p POLICY_FILE`.",
 )
 
 _SOON = timedelta(days=30)
@@ -351,10 +345,13 @@ def _expires_soon(window: Window, now: datetime) -> bool:
 def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
     file, keystore = enclave.file("permissions.p7s"), enclave.keystore
     if allows_everything(grant):
-        # No template accepts it: whoever checks a keystore asks whether its robot is closed.
-        accepted = keystore.accepts(EVERYTHING, lambda _: False)
         text = "the permissions allow publishing and subscribing every topic"
-        yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
+        if denied := _denied_before_everything(grant):
+            yield ONLY_DENIALS.found(enclave.name, f"{text} but {some_names(denied)}", file)
+        else:
+            # No template accepts it: whoever checks a keystore asks whether its robot is closed.
+            accepted = keystore.accepts(EVERYTHING, lambda _: False)
+            yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
     unique = "," in grant.subject or "+" in grant.subject
     window = grant.validity
     length = window.not_after - window.not_before
@@ -366,66 +363,15 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
         yield LONG_PERMISSIONS.found(enclave.name, text, file, accepted=accepted)
 
 
-def check_starting(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Yield a finding if the signed permissions let no ordinary node start.
-
-    An enclave with a part of what every node needs, and nothing else, is for a tool such as the
-    observer of `sros generate_policy`, which has no log and no services.
-    """
-    grant = grant_of(enclave)
-    if grant is None or grant.default_allow or not grant.rules:
-        return
-    written = frozenset(
-        topic
-        for rule in grant.rules
-        if rule.allow
-        for criteria in rule.publish
-        for topic in criteria.topics
-    )
-    wanted = [name for name in _STARTING if not any(covers(each, f"rt{name}") for each in written)]
-    described = has_type_descriptions(enclave.keystore.distribution)
-    if described and not any(overlap(each, _TYPES) for each in written):
-        wanted.append("~/get_type_description")
-    if wanted and (_STARTING[0] in wanted or any(map(_is_own, written))):
-        text = f"no node may {' or '.join(map(_starting, wanted))}"
-        yield NO_NODE.found(enclave.name, text, enclave.file(PERMISSIONS_FILE))
-
-
-def _starting(name: str) -> str:
-    return f"{'offer' if name.startswith('~') else 'publish'} {name}"
-
-
-def _is_own(topic: str) -> bool:
-    """Return whether a topic is one of the robot, not one that every node has."""
-    name = topic.rpartition("/")[2].removesuffix("Reply")
-    common = topic in (ROS_DISCOVERY_TOPIC, *(f"rt{each}" for each in _STARTING))
-    return not common and name not in NODE_SERVICES
-
-
-_STARTING = ("/parameter_events", "/rosout")
-_TYPES = "rr/*/get_type_descriptionReply"
-
-
-def with_causes(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings; those of several enclaves in which no node can start have one cause."""
-    same: dict[str, list[Finding]] = defaultdict(list)
-    for each in findings:
-        if each.kind is NO_NODE:
-            same[each.text].append(each)
-    causes = {
-        text: Cause(
-            f"{counted(len(group), 'enclave')} in which no ordinary node of ROS 2 can start",
-            f"In {some_names([each.subject for each in group])}, {text}. {NO_NODE.why}",
-            group[0].remedy,
-            len(group),
-        )
-        for text, group in same.items()
-        if len(group) > 1
-    }
-    return [
-        replace(each, cause=causes.get(each.text)) if each.kind is NO_NODE else each
-        for each in findings
-    ]
+def _denied_before_everything(grant: Grant) -> list[str]:
+    """Return the topics that are denied before the rules of a grant allow all of them."""
+    denied: dict[str, None] = {}
+    for index, rule in enumerate(grant.rules):
+        if allows_everything(replace(grant, rules=grant.rules[: index + 1], default_allow=False)):
+            return [*denied]
+        for criteria in () if rule.allow else (*rule.publish, *rule.subscribe):
+            denied.update(dict.fromkeys(criteria.topics))
+    return []
 
 
 def _is_as_long(chosen: Span, length: timedelta) -> bool:

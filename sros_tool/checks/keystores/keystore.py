@@ -23,8 +23,6 @@ from sros_tool.checks.keystores.enclaves import (
     EVERYTHING,
     LONG_PERMISSIONS,
     check_enclave,
-    check_starting,
-    with_causes,
 )
 from sros_tool.checks.keystores.files import check_files
 from sros_tool.checks.keystores.issued import (
@@ -36,6 +34,7 @@ from sros_tool.checks.keystores.issued import (
 )
 from sros_tool.checks.keystores.of_ros2 import with_cause_of_ros2
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
+from sros_tool.checks.keystores.starting import check_starting, with_causes
 from sros_tool.checks.keystores.vendors import (
     REFUSED,
     SOME_REFUSE,
@@ -121,12 +120,12 @@ def keystore_findings(
             state = open_enclave(enclave_path(root, name), now=now, domain=domain)
             evaluation = evaluate(CheckedEnclave(keystore, name, state), vendors, domain)
             enclave = evaluation.enclave
-            own = list(_enclave_findings(enclave, wanted, common))
+            own = list(_enclave_findings(enclave, wanted, common, vendors))
             if not waits_for_answer(enclave.folder):
                 shared = [] if any(each.kind is DIFFERS for each in own) else about_governance
                 own += check_vendors(evaluation, [*about_authorities, *shared, *own])
             if not on_robot and name not in wanted:  # a policy knows more exactly of its nodes
-                own += check_starting(enclave)
+                own = check_starting(evaluation, own)
             found += own
             if each := summary_of(enclave):
                 issued.append(each)
@@ -152,15 +151,18 @@ def keystore_findings(
 
 
 def _enclave_findings(
-    enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]], governance: bytes
+    enclave: CheckedEnclave,
+    wanted: dict[str, frozenset[Right]],
+    governance: bytes,
+    vendors: Sequence[Vendor],
 ) -> Iterator[Finding]:
-    """Yield all findings in one enclave, except for what vendors refuse.
+    """Yield all findings in one enclave, except for what the ``vendors`` of its nodes refuse.
 
     ``governance`` is the signed document of which the findings are known.
     """
     yield from check_enclave(enclave)
     yield from check_documents(enclave)
-    yield from check_governance(enclave, governance)
+    yield from check_governance(enclave, governance, vendors)
     yield from check_policy(enclave, wanted)
     yield from check_own_zenoh(enclave)
 
@@ -201,12 +203,13 @@ def _governance(
         enclave = evaluate(CheckedEnclave(keystore, name, state), vendors, None).enclave
         if enclave.state.governance:
             file = enclave.file(GOVERNANCE_FILE)
-            yield from governance_findings(keystore, enclave.state.governance, file)
+            yield from governance_findings(keystore, enclave.state.governance, file, vendors)
         return
     with suppress(SrosError):  # `sros create_enclave` reports it
         document = smime.parse(keystore.governance).document
         governance = parse_governance(document, GOVERNANCE_P7S)
-        yield from governance_findings(keystore, governance, keystore.shown(GOVERNANCE_P7S))
+        file = keystore.shown(GOVERNANCE_P7S)
+        yield from governance_findings(keystore, governance, file, vendors)
 
 
 def _at_real_file(finding: Finding, root: Path, real_root: str) -> Finding:

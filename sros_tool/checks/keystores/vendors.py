@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from sros_tool.checks.keystores.enclaves import fault_remedy, grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave
+from sros_tool.checks.keystores.topic_names import NO_ROS_NAME, has_foreign_letters
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb, Outcome
@@ -84,7 +85,10 @@ _NAMED_BY: Mapping[str, frozenset[str]] = {
         ),
         "malformed": ("portable.time-format", "enclave.permissions-malformed"),
         "no-grant": ("enclave.permissions-subject", "portable.subject"),
-        "no-rule": ("enclave.permissions-domain", "enclave.permissions-domains"),
+        "no-rule": (
+            *("enclave.permissions-domain", "enclave.permissions-domains"),
+            "portable.default-first",
+        ),
         "no-topic-rule": ("governance.no-topic-rule",),
         "not-yet-valid": (
             *("enclave.permissions-not-yet-valid", "enclave.permissions-local-time"),
@@ -164,7 +168,8 @@ def check_vendors(evaluation: EnclaveEvaluation, known: Collection[Finding]) -> 
         # Vendors decide alike on a document as sros writes it, and every topic takes long.
         if evaluation.portable and all(_file(each) != PERMISSIONS_FILE for each in known):
             continue
-        if found := list(_different_rights(enclave, made, domain)):
+        ids = {each.id for each in known}
+        if found := list(_different_rights(enclave, made, domain, ids)):
             yield from found
             return
 
@@ -256,15 +261,24 @@ def _listed(names: Sequence[str]) -> str:
 # ── what they decide differently ───────────────────────────────────────────────────────────
 
 _UNNAMED_TOPIC = "rt/sros_nobody_has_this"
+_BLANKS = "portable.blanks"
 _SHOWN = 3
 
 
 def _different_rights(
-    enclave: CheckedEnclave, made: Mapping[Vendor, VendorParticipant], domain: int
+    enclave: CheckedEnclave,
+    made: Mapping[Vendor, VendorParticipant],
+    domain: int,
+    known: Collection[str],
 ) -> Iterator[Finding]:
-    """Yield a finding if vendors decide differently on a topic that the permissions name."""
-    answers = {vendor: each.access for vendor, each in made.items() if each.access is not None}
-    differing = list(_differences(answers, _topics_to_ask(enclave)))
+    """Yield a finding if vendors decide differently on a topic that the permissions name.
+
+    ``known`` are the ids of the findings that are known of the enclave.
+    """
+    answers = {
+        vendor: each.access for vendor, each in made.items() if each.access and not each.causes()
+    }
+    differing = list(_differences(answers, _topics_to_ask(enclave, known)))
     if differing:
         more = f"; and {len(differing) - _SHOWN} more" if len(differing) > _SHOWN else ""
         text = f"on domain {domain}, {'; '.join(differing[:_SHOWN])}{more}"
@@ -272,8 +286,7 @@ def _different_rights(
 
 
 def _differences(answers: Mapping[Vendor, Access], topics: list[str]) -> Iterator[str]:
-    questions = [(AccessVerb.JOIN, "")]
-    questions += [
+    questions = [
         (verb, topic) for topic in topics for verb in (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
     ]
     for verb, topic in questions:
@@ -282,19 +295,23 @@ def _differences(answers: Mapping[Vendor, Access], topics: list[str]) -> Iterato
             answers_text = ", ".join(
                 f"{title}: {each.outcome.value}" for title, each in said.items()
             )
-            yield f"{f'{verb.value} {topic}'.strip()} ({answers_text})"
-            if verb is AccessVerb.JOIN:
-                return  # then every other access differs too
+            yield f"{verb.value} {topic} ({answers_text})"
 
 
-def _topics_to_ask(enclave: CheckedEnclave) -> list[str]:
-    """Return the named topics, an example for each wildcard, and a topic that no rule names."""
+def _topics_to_ask(enclave: CheckedEnclave, known: Collection[str]) -> list[str]:
+    """Return the named topics, an example for each wildcard, and a topic that no rule names.
+
+    Names that are ``known`` not to be those of ROS are left out.
+    """
     grant = grant_of(enclave)
     named: dict[str, None] = {ROS_DISCOVERY_TOPIC: None}
     for rule in grant.rules if grant else ():
         for criteria in (*rule.publish, *rule.subscribe):
             for topic in criteria.topics:
-                named[_example(topic)] = None
+                if not (_BLANKS in known and topic != topic.strip()) and not (
+                    NO_ROS_NAME.id in known and has_foreign_letters(topic)
+                ):
+                    named[_example(topic)] = None
     return [*named, _UNNAMED_TOPIC]
 
 

@@ -1,0 +1,156 @@
+"""Checks of the topics that permissions name: names that no ROS topic, service or action has."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+
+from sros_tool.checks.keystores.opened import CheckedEnclave
+from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, some_names
+from sros_tool.dds.permissions import Criteria, Grant
+from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
+from sros_tool.policy.patterns import overlap
+
+_MAPPING = 'ROS 2 design "Topic and Service name mapping to DDS"; rmw_dds_common; measured.'
+
+NO_ROS_NAME = FindingKind(
+    "permissions.no-ros-name",
+    WARNING,
+    "names that no ROS topic, service or action has",
+    "The DDS name of a ROS topic begins with rt/, those of a service with rq/ and rr/. A rule for "
+    "another name decides on nothing that a node does, so what it should allow is denied, and what "
+    "it should deny may be allowed.",
+    _MAPPING,
+    "Write the name as DDS has it, such as rt/chatter, rq/addRequest and rr/addReply, or let sros "
+    "write it: `sros create_permission ROOT NAME POLICY_FILE`. It is right only for a program that "
+    "uses DDS without ROS.",
+)
+NOT_FOR_ROS = FindingKind(
+    "permissions.not-for-ros",
+    NOTE,
+    "permissions without any name of ROS 2",
+    "No node of ROS 2 can run in this enclave: it needs ros_discovery_info, and the DDS name of a "
+    "ROS topic begins with rt/, those of a service with rq/ and rr/.",
+    _MAPPING,
+    "Nothing, if a program uses DDS without ROS. Otherwise give the enclave a policy: `sros "
+    "create_permission ROOT NAME POLICY_FILE`.",
+    prominent=True,
+)
+RELAY_ONLY = FindingKind(
+    "permissions.relay-only",
+    WARNING,
+    "topics that only <relay> allows",
+    "No RMW relays data: a node publishes and subscribes, and both are denied.",
+    "DDS-Security 1.1, 9.4.1.3.2.3; measured.",
+    "Write the topics into <publish> or <subscribe>.",
+)
+
+_PREFIXES = ("ra", "rp", "rq", "rr", "rs", "rt")
+_OF_ROS = (ROS_DISCOVERY_TOPIC, "rq/*Request", "rr/*Reply", "ra/*", "rp/*", "rs/*", "rt/*")
+_ENDS = {"rq/": "Request", "rr/": "Reply"}
+_TOKENS = r"(?:/[A-Za-z_][A-Za-z0-9_]*)+"
+_ROS_NAME = re.compile(
+    rf"(?:r[apst]{_TOKENS}|rq{_TOKENS}(?<=Request)|rr{_TOKENS}(?<=Reply)|{ROS_DISCOVERY_TOPIC})\Z"
+)
+_OF_DDS = re.compile(r"DCPS[A-Z]\w*\Z")
+"""The topics of the DDS itself, which need no right, and which some documents name."""
+_TYPE = re.compile(r"[a-z][a-z0-9_]*/(?:msg|srv|action)/[A-Z][A-Za-z0-9]*\Z")
+_WILDCARD = re.compile(r"\[[^\]]*\]|[*?]")
+_FOREIGN = re.compile(r"[^A-Za-z0-9_/]")
+_SHOWN = 3
+
+
+def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
+    """Yield findings about the names in the rules of a grant."""
+    if not is_for_ros(grant):
+        names = [repr(each) for each in dict.fromkeys(_stated(grant, allow=True))]
+        yield NOT_FOR_ROS.found(enclave.name, f"they name only {some_names(names)}", file)
+        return
+    named = dict.fromkeys((*_stated(grant, allow=True), *_stated(grant, allow=False)))
+    problems = [text for each in named if (text := ros_name_problem(each))]
+    if problems:
+        more = f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+        yield NO_ROS_NAME.found(enclave.name, "; ".join(problems[:_SHOWN]) + more, file)
+    relayed = {topic for rule in grant.rules for topic in _topics(rule.relay) if rule.allow}
+    if relayed and (only := sorted(relayed.difference(_stated(grant, allow=True)))):
+        text = f"{some_names(only)} {'is' if len(only) == 1 else 'are'} allowed only in <relay>"
+        yield RELAY_ONLY.found(enclave.name, text, file)
+
+
+def is_for_ros(grant: Grant) -> bool:
+    """Return whether the grant allows something by its name in ROS, or allows no name at all."""
+    named = tuple(_stated(grant, allow=True))
+    return not named or any(
+        overlap(wanted, each.strip())
+        for each in named
+        for wanted in (ROS_DISCOVERY_TOPIC, *(f"{prefix}/*" for prefix in _PREFIXES))
+    )
+
+
+@lru_cache(maxsize=8192)
+def ros_name_problem(text: str) -> str:
+    """Return why no ROS topic, service or action has a name that ``text`` matches, as a clause.
+
+    "" if there can be one.  Blanks around the text do not count.
+    """
+    name = text.strip()
+    if not name or _ROS_NAME.match(name) or _OF_DDS.match(name):
+        return ""
+    if has_foreign_letters(name):
+        return _foreign_problem(name)
+    if is_expression(name):
+        possible = "//" not in name and any(overlap(name, each) for each in _OF_ROS)
+        return "" if possible else f"{name!r} matches no name of ROS{_meant(name)}"
+    if _TYPE.match(name):
+        return f"{name!r} is the name of a type: write the name of the topic"
+    return f"{name!r} is no name of ROS{_meant(name)}"
+
+
+def has_foreign_letters(name: str) -> bool:
+    """Return whether an expression has characters, outside of sets, that no ROS name has."""
+    return bool(_FOREIGN.search(_WILDCARD.sub("", name.strip())))
+
+
+def _foreign_problem(name: str) -> str:
+    letters = dict.fromkeys(_FOREIGN.findall(_WILDCARD.sub("", name)))
+    shown = " ".join("a blank" if each.isspace() else each for each in letters)
+    advice = ""
+    if "{" in name or "$(" in name:
+        advice = ": fill in the template"
+    elif "," in letters or ";" in letters or any(map(str.isspace, letters)):
+        advice = ": write a <topic> for every name"
+    elif "~" in letters:
+        advice = ": write the name of the node in place of ~"
+    elif "\\" in letters:
+        advice = f": write {name.replace(chr(92), '/')}"
+    elif ".*" in name:
+        advice = f": write {name.replace('.*', '*')}"
+    elif "%" in letters:
+        advice = f": write {name.replace('%', '*')}"
+    return f"{name!r} has characters that no ROS name has ({shown}){advice}"
+
+
+def _meant(name: str) -> str:
+    """Return what was probably meant, as a clause with a colon before it, or ""."""
+    begin, slash, rest = name.partition("/")
+    parts = [each for each in (rest if begin in _PREFIXES else name).split("/") if each]
+    prefix = begin if slash and begin in _PREFIXES else "rt"
+    meant = "/".join((prefix, *parts))
+    end = _ENDS.get(f"{prefix}/", "")
+    if end and not meant.endswith(end):
+        meant += end
+    plain = _WILDCARD.sub("x", meant)
+    return f": write {meant}" if parts and _ROS_NAME.match(plain) else ""
+
+
+def _stated(grant: Grant, *, allow: bool) -> Iterator[str]:
+    """Yield the topics to publish and to subscribe of the rules that allow, or that deny."""
+    for rule in grant.rules:
+        if rule.allow is allow:
+            yield from _topics((*rule.publish, *rule.subscribe))
+
+
+def _topics(criteria: Sequence[Criteria]) -> Iterator[str]:
+    for each in criteria:
+        yield from each.topics
