@@ -343,6 +343,12 @@ def names_of_dds(text: str) -> str:
     return re.sub(r"<topic>[^<]*<", "<topic>Square<", text)
 
 
+def names_in_capitals(bench: Bench) -> None:
+    """Another enclave of the same robot has the same name with a capital."""
+    bench.permissions(("rt/status<", "rt/Status<"))
+    bench.export()
+
+
 def _fewer_domains(bench: Bench) -> None:
     bench.options["on_robot"] = True
     bench.governance(("<id>0</id>", "<id>0</id><id>1</id>"))
@@ -386,6 +392,7 @@ CASES |= {
         "enclaves/base/permissions.p7s",
         lambda text: re.sub(r"<topic>[^<]*<", "<topic>Square<", text),
     ),
+    "permissions.only-capitals-differ": names_in_capitals,
     "permissions.relay-only": lambda b: b.permissions(
         ("      <default>", SECOND.replace("publish>", "relay>"))
     ),

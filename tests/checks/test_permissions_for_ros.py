@@ -11,7 +11,14 @@ from sros_tool.checks.keystores.topic_names import ros_name_problem
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from tests.checks.bench import Bench, name_of
-from tests.checks.keystore_cases import ALLOW, DENY_ALL, LEFT, SECOND, names_of_dds
+from tests.checks.keystore_cases import (
+    ALLOW,
+    DENY_ALL,
+    LEFT,
+    SECOND,
+    names_in_capitals,
+    names_of_dds,
+)
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
@@ -167,6 +174,12 @@ def test_a_denial_that_hides_several_topics_is_one_finding(bench: Bench) -> None
     (text,) = (each.text for each in found_in(bench) if each.id == "permissions.unreachable-rule")
     assert text.startswith("rule 2 allows to publish rr/base/") and text.count("rr/base/") > 1
     assert text.endswith("after one that denies rr/*")
+
+
+def test_names_that_differ_only_in_capitals(bench: Bench) -> None:
+    names_in_capitals(bench)
+    texts = [each.text for each in found_in(bench) if each.id == "permissions.only-capitals-differ"]
+    assert texts == ["rt/status (in /arm) and rt/Status (in /base) differ only in capitals"]
 
 
 def test_blanks_are_named_where_they_count(bench: Bench) -> None:

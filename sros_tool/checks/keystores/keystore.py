@@ -35,6 +35,7 @@ from sros_tool.checks.keystores.issued import (
 from sros_tool.checks.keystores.of_ros2 import with_cause_of_ros2
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
 from sros_tool.checks.keystores.starting import check_starting, with_causes
+from sros_tool.checks.keystores.topic_names import check_capitals, names_without_wildcards
 from sros_tool.checks.keystores.vendors import (
     REFUSED,
     SOME_REFUSE,
@@ -113,9 +114,12 @@ def keystore_findings(
     first, common = _governing(keystore, names)
     about_governance = list(_governance(keystore, first, vendors))
 
-    def work(share: Sequence[str]) -> tuple[list[Finding], list[EnclaveSummary]]:
+    def work(
+        share: Sequence[str],
+    ) -> tuple[list[Finding], list[EnclaveSummary], dict[str, frozenset[str]]]:
         found: list[Finding] = []
         issued: list[EnclaveSummary] = []
+        topics: dict[str, frozenset[str]] = {}
         for name in share:
             state = open_enclave(enclave_path(root, name), now=now, domain=domain)
             evaluation = evaluate(CheckedEnclave(keystore, name, state), vendors, domain)
@@ -129,17 +133,22 @@ def keystore_findings(
             found += own
             if each := summary_of(enclave):
                 issued.append(each)
+            grant = enclave.state.grant
+            if grant and not keystore.is_home:  # a keystore of many robots has too many names
+                topics[name] = names_without_wildcards(grant)
             tick()
-        return found, issued
+        return found, issued, topics
 
     outcomes = [outcome for _, outcome in map_slices(names, work)]
-    found = [*about_governance, *(finding for findings, _ in outcomes for finding in findings)]
+    found = [*about_governance, *(finding for findings, *_ in outcomes for finding in findings)]
     if only is None:
-        issued = [each for _, share in outcomes for each in share]
+        issued = [each for _, share, _ in outcomes for each in share]
         of_keystore = [*check_files(keystore), *about_authorities]
         found = [*of_keystore, *check_issued(keystore, issued), *found]
     else:
         found = [*check_files(keystore, names), *found]
+    topics = {name: names for *_, share in outcomes for name, names in share.items()}
+    found += check_capitals(topics)
     found += check_network(keystore, only)
     for policy in policies:
         chosen = tuple(each for each in policy.enclaves if only is None or each.path in only)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 
 from sros_tool.checks.keystores.opened import CheckedEnclave
@@ -45,6 +45,14 @@ RELAY_ONLY = FindingKind(
     "DDS-Security 1.1, 9.4.1.3.2.3; measured.",
     "Write the topics into <publish> or <subscribe>.",
 )
+CAPITALS = FindingKind(
+    "permissions.only-capitals-differ",
+    WARNING,
+    "two names that differ only in capitals",
+    "They are two topics: a node with the one neither hears nor reaches a node with the other.",
+    _MAPPING,
+    "If one topic is meant, write its name alike in the permissions of all enclaves.",
+)
 
 _PREFIXES = ("ra", "rp", "rq", "rr", "rs", "rt")
 _OF_ROS = (ROS_DISCOVERY_TOPIC, "rq/*Request", "rr/*Reply", "ra/*", "rp/*", "rs/*", "rt/*")
@@ -76,6 +84,26 @@ def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Itera
     if relayed and (only := sorted(relayed.difference(_stated(grant, allow=True)))):
         text = f"{some_names(only)} {'is' if len(only) == 1 else 'are'} allowed only in <relay>"
         yield RELAY_ONLY.found(enclave.name, text, file)
+
+
+def check_capitals(enclaves: Mapping[str, frozenset[str]]) -> Iterator[Finding]:
+    """Yield a finding for names of enclaves on one robot that differ only in capitals.
+
+    ``enclaves`` are the `names_without_wildcards` of each enclave.
+    """
+    spelled: dict[str, dict[str, str]] = {}
+    for enclave, names in sorted(enclaves.items()):
+        for name in sorted(names):
+            spelled.setdefault(name.lower(), {}).setdefault(name, enclave)
+    for some in spelled.values():
+        if len(some) > 1:
+            text = " and ".join(f"{name} (in {enclave})" for name, enclave in some.items())
+            yield CAPITALS.found(next(iter(some.values())), f"{text} differ only in capitals")
+
+
+def names_without_wildcards(grant: Grant) -> frozenset[str]:
+    """Return the topics that the rules of a grant allow by their whole name."""
+    return frozenset(each for each in _stated(grant, allow=True) if not is_expression(each))
 
 
 def is_for_ros(grant: Grant) -> bool:
