@@ -35,6 +35,13 @@ class SrosError(Exception):
         text = ". ".join(each for each in sentences if each)
         return " ".join(text.split()) + ("." if self.why or self.remedy else "")
 
+    @property
+    def clause(self) -> str:
+        """Its cause as a clause: ``why``, or else ``what``."""
+        why = self.why.rstrip(".")
+        begin = why[:1] if why[1:2].isupper() else why[:1].lower()
+        return f"{begin}{why[1:]}" or self.what
+
 
 class UsageError(SrosError):
     """A wrong argument or option."""

@@ -148,6 +148,27 @@ def parse(
     return root
 
 
+def require_child(root: etree._Element, tag: str, name: str, what: str) -> etree._Element:
+    """Return the child ``tag`` of the root ``<dds>`` of a document; ``name`` names it in errors.
+
+    Raises:
+        DocumentError: the root has another name, or no such child.  DDS vendors compare names as
+            they are written, so that names with a prefix, or in a namespace, are other ones.
+    """
+    child = root.find(tag)
+    if root.tag == "dds" and child is not None:
+        return child
+    space = etree.QName(root).namespace
+    why = f"<dds><{tag}> is missing."
+    if space and root.prefix:
+        why = f"Its elements have the prefix {root.prefix}: (as <{root.prefix}:dds>); DDS has none."
+    elif space:
+        why = f"Its elements are in the namespace {space} (xmlns), and those of DDS are in none."
+    elif root.tag != "dds":
+        why = f"It begins with <{tag_of(root)}>, and not with <dds><{tag}>."
+    raise DocumentError(f"{name} is not a {what} document", why)
+
+
 def serialize(root: etree._Element, *, indent: bool = True) -> bytes:
     """Return the XML document of ``root`` in UTF-8, with an XML declaration.
 

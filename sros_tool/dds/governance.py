@@ -18,7 +18,7 @@ from sros_tool.dds.domain_elements import domain_lines, read_domains
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import XSI
 from sros_tool.errors import DocumentError
-from sros_tool.xml import escape, parse, tag_of
+from sros_tool.xml import escape, parse, require_child, tag_of
 
 _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd"
 
@@ -195,11 +195,7 @@ def parse_governance(data: bytes, name: str = "the governance document") -> Gove
         DocumentError: ``data`` is not a governance document.
     """
     root = parse(data, name, as_bytes=True)
-    parent = root.find("domain_access_rules")
-    if root.tag != "dds" or parent is None:
-        raise DocumentError(
-            f"{name} is not a governance document", "<dds><domain_access_rules> is missing."
-        )
+    parent = require_child(root, "domain_access_rules", name, "governance")
     try:
         return Governance(tuple(_read_domain_rule(child) for child in parent))
     except DocumentError as error:

@@ -14,7 +14,7 @@ from sros_tool.dds.domain_elements import domain_lines, read_domains
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError
 from sros_tool.validity import Window, iso, parse_iso
-from sros_tool.xml import escape, parse, quoted, tag_of
+from sros_tool.xml import escape, parse, quoted, require_child, tag_of
 
 _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
@@ -181,11 +181,7 @@ def parse_permissions(data: bytes, name: str = "the permissions document") -> Pe
         DocumentError: ``data`` is not a permissions document.
     """
     root = parse(data, name, as_bytes=True)
-    parent = root.find("permissions")
-    if root.tag != "dds" or parent is None:
-        raise DocumentError(
-            f"{name} is not a permissions document", "<dds><permissions> is missing."
-        )
+    parent = require_child(root, "permissions", name, "permissions")
     try:
         return Permissions(tuple(_read_grant(child) for child in parent))
     except DocumentError as error:

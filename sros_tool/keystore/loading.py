@@ -207,7 +207,7 @@ def _trust(
 
 def _unreadable(traits: VendorTraits, data: bytes, file: str, error: PkiError) -> Problem:
     cut = ", because it has a zero byte" if _content(traits, data) != data else ""
-    return Problem(file, f"{error.why.rstrip('.')}{cut}", Fault.CERTIFICATE_FILE)
+    return Problem(file, f"{error.clause}{cut}", Fault.CERTIFICATE_FILE)
 
 
 def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterator[Problem]:
@@ -433,8 +433,8 @@ def _list_faults(
         file = CRL_FILE
         if file in state.files:
             lists.append((_list(_content(traits, state.files[file]), file), file))
-    except PkiError:
-        text = "it is not a revocation list, so DDS refuses every participant"
+    except PkiError as error:
+        text = error.clause
         if file == IDENTITY_CA_FILE:
             text = "it has a revocation list that cannot be read, so DDS refuses every participant"
         yield Problem(file, text, Fault.CRL_MALFORMED)

@@ -73,6 +73,7 @@ from sros_tool.pki.crl import (
     signed_by,
 )
 from sros_tool.pki.keys import load_any_key
+from sros_tool.pki.kinds import XML, kind_of
 from sros_tool.pki.token_uri import TokenUri, read_token_file
 from sros_tool.validity import Window, iso
 from sros_tool.values import shows
@@ -539,8 +540,7 @@ class _EnclaveFiles:
         try:
             data = read_bytes(path, "file")
         except SrosError as error:
-            why = error.why.rstrip(".") or error.what
-            self._add(name, f"it cannot be read: {why}", Fault.FILE_UNREADABLE)
+            self._add(name, f"it cannot be read: {error.clause}", Fault.FILE_UNREADABLE)
             return None
         if not data:
             self._add(name, "it is empty", Fault.FILE_EMPTY)
@@ -561,7 +561,7 @@ class _EnclaveFiles:
         try:
             return read_token_file(data)
         except PkiError as error:
-            self._add(KEY_URI_FILE, error.why.rstrip("."), Fault.TOKEN_URI)
+            self._add(KEY_URI_FILE, error.clause, Fault.TOKEN_URI)
             return None
 
     def _certificate(self, name: str, files: dict[str, bytes | None]) -> x509.Certificate | None:
@@ -571,7 +571,7 @@ class _EnclaveFiles:
         try:
             certificate = load_certificate(data, name)
         except SrosError as error:
-            self._add(name, error.why.rstrip("."), Fault.CERTIFICATE_MALFORMED)
+            self._add(name, error.clause, Fault.CERTIFICATE_MALFORMED)
             return None
         faults = _EXPIRY_OF_CERTIFICATE if name == CERTIFICATE_FILE else _EXPIRY_OF_CA
         self._check_validity(name, validity_of(certificate), faults)
@@ -594,12 +594,13 @@ class _EnclaveFiles:
         """Check certificate and key; return the public key of ``key.pem``, or None."""
         key, authorities = files[KEY_FILE], files[IDENTITY_CA_FILE]
         if certificate and ca and not issued_by(certificate, ca):
-            self._add(
-                CERTIFICATE_FILE,
+            text = (
                 f"it was not issued by the identity CA of the enclave ({subject_text(ca.subject)}) "
-                f"but by {other_issuer(certificate, ca)}",
-                Fault.CERTIFICATE_ISSUER,
+                f"but by {other_issuer(certificate, ca)}"
             )
+            if refusal := self._fault_with_all(certificate, authorities or b""):
+                text += f"; with all CAs of the file, {refusal}"
+            self._add(CERTIFICATE_FILE, text, Fault.CERTIFICATE_ISSUER)
         elif certificate and ca and authorities and not self._problems:
             self._check_chain(certificate, authorities)
         if key is None:
@@ -608,17 +609,25 @@ class _EnclaveFiles:
             public_key = load_any_key(key, KEY_FILE).public_key()
         except SrosError as error:
             fault = Fault.KEY_ENCRYPTED if _ENCRYPTED.search(key) else Fault.KEY_MALFORMED
-            self._add(KEY_FILE, error.why.rstrip("."), fault)
+            self._add(KEY_FILE, error.clause, fault)
             return None
         if certificate and certificate.public_key() != public_key:
             self._add(KEY_FILE, "it is not the key of cert.pem", Fault.KEY_MISMATCH)
         return public_key
 
+    def _fault_with_all(self, certificate: x509.Certificate, authorities: bytes) -> str:
+        """Return why no chain of all CAs of a file is valid if its issuer is among them, or ""."""
+        with suppress(SrosError):
+            chain = load_certificates(authorities, "")
+            if any(issued_by(certificate, each) for each in chain):
+                return chain_fault(certificate, chain, at=self._now)
+        return ""
+
     def _check_chain(self, certificate: x509.Certificate, authorities: bytes) -> None:
         try:
             chain = load_certificates(authorities, "")
         except SrosError as error:  # in a certificate after the first one
-            self._add(IDENTITY_CA_FILE, error.why.rstrip("."), Fault.CERTIFICATE_MALFORMED)
+            self._add(IDENTITY_CA_FILE, error.clause, Fault.CERTIFICATE_MALFORMED)
             return
         if refusal := chain_fault(certificate, chain, at=self._now):
             self._add(CERTIFICATE_FILE, f"it is refused: {refusal}", Fault.CERTIFICATE_ISSUER)
@@ -636,14 +645,12 @@ class _EnclaveFiles:
         try:
             data = read_bytes(path, "revocation list")
         except SrosError as error:
-            text = f"it cannot be read: {error.why.rstrip('.') or error.what}"
-            self._add(CRL_FILE, text, Fault.FILE_UNREADABLE)
+            self._add(CRL_FILE, f"it cannot be read: {error.clause}", Fault.FILE_UNREADABLE)
             return None
         try:
             crl, signer = _load_crl(data, ca, authorities or b"")
-        except SrosError:
-            text = "it is not a revocation list, so DDS refuses every participant"
-            self._add(CRL_FILE, text, Fault.CRL_MALFORMED)
+        except SrosError as error:
+            self._add(CRL_FILE, error.clause, Fault.CRL_MALFORMED)
             return data
         if ca and not signer:
             text = "it is not of the identity CA, so DDS refuses every participant"
@@ -692,7 +699,10 @@ class _EnclaveFiles:
         try:
             return read(document, name)
         except SrosError as error:
-            self._add(name, error.why.rstrip(".") or error.what, malformed)
+            kind = kind_of(document)
+            what = f"what is signed in it is {kind}, and not XML in UTF-8"
+            text = error.clause if kind in ("", XML) else what
+            self._add(name, text, malformed)
             return None
 
     def _check_grant(

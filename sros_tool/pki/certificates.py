@@ -273,10 +273,10 @@ def _certificate_in(
         raise PkiError(what, why, "Remove the lines between '-----BEGIN' and the certificate.")
     with reading(what, why, _RESTORE):
         certificate, rest = der.split(block.content)
-        if rest and settings is not Settings.IGNORED and not _permits(rest, settings):
-            why = "It says what it is trusted for, and this is not part of that."
-            raise PkiError(what, why, "Write it with the label CERTIFICATE.")
-        return _load_der(certificate)
+        if not rest or settings is Settings.IGNORED or _permits(rest, settings):
+            return _load_der(certificate)
+    why = "It is a TRUSTED CERTIFICATE, and this use is not among those that it is trusted for."
+    raise PkiError(what, why, "Write it with the label CERTIFICATE.")
 
 
 def _permits(rest: bytes, settings: Settings) -> bool:

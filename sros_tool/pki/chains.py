@@ -300,14 +300,21 @@ def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
             kind = _authority(each)
             root = place == len(chain) - 1
             if not kind or (_Authority.OLD in kind and (strict or not root)):
-                why = "" if constraints else ": it has no basicConstraints"
-                yield f"{subject_text(each.subject)} is not a CA{why}"
+                yield f"{subject_text(each.subject)} is not a CA: {_not_a_ca(each)}"
         longest = constraints.path_length if constraints else None
         if place > 1 and longest is not None and below > longest:
             name = subject_text(each.subject)
             yield f"the chain is longer than the pathlen of {name} allows"
         if not place or not is_self_issued(each):
             below += 1
+
+
+def _not_a_ca(certificate: x509.Certificate) -> str:
+    """Return why a certificate is not that of a CA, as a clause."""
+    if extension(certificate, x509.BasicConstraints) is None:
+        return "it has no basicConstraints"
+    may_sign = _may_sign_certificates(certificate)
+    return "its basicConstraints say CA:FALSE" if may_sign else "its keyUsage lacks keyCertSign"
 
 
 def purpose_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:

@@ -20,6 +20,7 @@ from sros_tool.pki.certificates import (
     subject_text,
 )
 from sros_tool.pki.keys import PrivateKey
+from sros_tool.pki.kinds import kind_of
 from sros_tool.pki.names import same_name
 from sros_tool.pki.reading import is_of_reading, read_name, reading
 
@@ -126,7 +127,7 @@ def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
     Raises:
         PkiError: the list cannot be read; ``name`` names the file.
     """
-    with _reading(name):
+    with _reading(name, data):
         blocks = pem.blocks(data)
         return _read_block(next(each for each in blocks if each.label == _LABEL))
 
@@ -137,15 +138,17 @@ def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, 
     Raises:
         PkiError: a list, or what stands before it, cannot be read; ``name`` names the file.
     """
-    with _reading(name):
+    with _reading(name, data):
         blocks = pem.blocks(data)
         return tuple(_read_block(each) for each in blocks if each.label == _LABEL)
 
 
-def _reading(name: str) -> AbstractContextManager[None]:
+def _reading(name: str, data: bytes) -> AbstractContextManager[None]:
+    kind = "" if CRL_MARK in data else kind_of(data)
+    why = f"It is not a PEM revocation list, but {kind}" if kind else "It is not a revocation list"
     return reading(
         f"the revocation list {name} cannot be read",
-        "It is not a PEM revocation list, or it is damaged; DDS refuses every participant.",
+        f"{why}, so DDS refuses every participant.",
         _RESTORE,
     )
 

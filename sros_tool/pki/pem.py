@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from sros_tool.errors import PkiError
+from sros_tool.pki.kinds import kind_of
 
 CERTIFICATES = ("CERTIFICATE", "X509 CERTIFICATE", "TRUSTED CERTIFICATE")
 """Labels of certificates; the last one may carry what the certificate is trusted for."""
@@ -89,7 +90,8 @@ def missing(data: bytes, label: str) -> str:
             "'-----BEGIN' is not at the start of its line, where OpenSSL looks for it: "
             "the text is indented, or other text stands before it"
         )
-    return f"it has no line '-----BEGIN {label}-----'"
+    kind = kind_of(data)
+    return f"it is {kind}" if kind else f"it has no line '-----BEGIN {label}-----'"
 
 
 def _block(label: bytes, pieces: Iterator[bytes]) -> Block:

@@ -28,8 +28,10 @@ from cryptography.x509.oid import PublicKeyAlgorithmOID
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
+from sros_tool.pki.certificates import digest as fingerprint
 from sros_tool.pki.certificates import load_der_certificate
 from sros_tool.pki.keys import PrivateKey
+from sros_tool.pki.kinds import ENCRYPTED_MESSAGE, SIGNED_MESSAGE, kind_of
 from sros_tool.pki.names import canonical_der, canonical_issuer
 from sros_tool.pki.reading import read_name_der
 
@@ -203,15 +205,7 @@ class SignedDocument:
         for signature in self.signatures:
             signer = signature.signer_among(self.certificates)
             if signer is None or signer != authority:
-                who = (
-                    f"by {signer.subject.rfc4514_string()}"
-                    if signer
-                    else "by a certificate that is not embedded"
-                )
-                raise PkiError(
-                    f"it is signed {who}, not by the permissions CA "
-                    f"{authority.subject.rfc4514_string()}"
-                )
+                raise PkiError(f"it is signed {_other_signer(signer, authority)}")
             if not signature.is_intact(self.content, signer):
                 raise PkiError(
                     "its signature does not match its content",
@@ -228,6 +222,21 @@ class SignedDocument:
     def digest_matches(self) -> bool:
         """Return whether every messageDigest attribute is the digest of the content."""
         return all(each.digest_matches(self.content) for each in self.signatures)
+
+
+def _other_signer(signer: x509.Certificate | None, authority: x509.Certificate) -> str:
+    """Return by whom a document is signed in place of ``authority``; None is not embedded."""
+    name = authority.subject.rfc4514_string()
+    if signer is None:
+        return f"by a certificate that is not embedded, not by the permissions CA {name}"
+    if signer.subject != authority.subject:
+        return f"by {signer.subject.rfc4514_string()}, not by the permissions CA {name}"
+    same_key = _public_key(signer) == _public_key(authority)
+    how = "an earlier or later certificate of the permissions CA" if same_key else "another CA"
+    return (
+        f"by {how} named {name} (SHA-256 {fingerprint(signer)[:8]}), not by the permissions CA "
+        f"of the enclave (SHA-256 {fingerprint(authority)[:8]})"
+    )
 
 
 def _padding(signer: x509.Certificate, digest: hashes.HashAlgorithm) -> padding.AsymmetricPadding:
@@ -261,7 +270,11 @@ def parse(message: bytes) -> SignedDocument:
     content, signature = _split(message)
     try:
         return _parse_cms(signature, content)
-    except (IndexError, ValueError) as error:
+    except (IndexError, ValueError, PkiError) as error:
+        if kind_of(signature) == ENCRYPTED_MESSAGE:
+            raise PkiError(f"it is {ENCRYPTED_MESSAGE}") from error
+        if isinstance(error, PkiError):
+            raise
         raise PkiError("its signature is not a readable CMS signature") from error
 
 
@@ -301,6 +314,8 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
     """
     text = message.replace(b"\r\n", b"\n")
     if b"\r" in text or b"\0" in text:
+        if (form := kind_of(message)) not in ("", SIGNED_MESSAGE):
+            raise PkiError("it is not an S/MIME signed message", f"It is {form}.")
         raise PkiError(
             "it has a line end, or a zero byte, that programs read in different ways",
             "The lines of a signed document end with CR and LF, or with LF.",
@@ -316,7 +331,7 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
         raise PkiError(
             "it is not an S/MIME signed message",
             "A signed document begins with MIME headers of the type multipart/signed; "
-            "this may be the unsigned XML.",
+            f"this is {kind_of(message) or 'something else'}.",
         )
     # Also inside of lines: OpenSSL reads a long line in pieces, each of which may begin a part.
     parts = (b"\n" + body + b"\n").split(b"--" + boundary)

@@ -29,7 +29,8 @@ BEGIN = b"-----BEGIN CERTIFICATE-----\n"
     [
         (b"  " + FIRST, "'-----BEGIN' is not at the start of its line"),
         (b"certificate: " + FIRST, "'-----BEGIN' is not at the start of its line"),
-        (KEY, "it has no line '-----BEGIN CERTIFICATE-----'"),
+        (KEY, "It is not a PEM certificate: it is a private key"),
+        (b"x", "it has no line '-----BEGIN CERTIFICATE-----'"),
         (FIRST.replace(BEGIN, BEGIN + b"Subject: x\n\n"), "It has PEM headers ('Subject: x')"),
         (FIRST[:-30], "The block CERTIFICATE in it is cut short"),
         (FIRST.replace(b"END C", b"END X"), "does not end with '-----END CERTIFICATE-----'"),

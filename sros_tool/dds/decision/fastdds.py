@@ -244,7 +244,8 @@ class _Sequence:
     def next(self, name: str) -> XmlElement:
         """Take the next child; raise `UnreadableError` if it has another name."""
         if not self.is_next(name):
-            raise UnreadableError(f"<{self._name}> lacks <{name}> at its position")
+            there = f", where it has <{self.rest()[0].name}>" if self.rest() else ""
+            raise UnreadableError(f"<{self._name}> lacks <{name}> at its position{there}")
         self._index += 1
         return self._children[self._index - 1]
 

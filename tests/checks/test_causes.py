@@ -1,0 +1,136 @@
+"""A finding about a file names the cause: what the file is, or who signed it."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from datetime import timedelta
+
+import pytest
+from cryptography import x509
+
+from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import pem
+from sros_tool.pki.keys import key_pem
+from sros_tool.pki.requests import make_request
+from tests.checks.bench import Bench, new_key
+from tests.checks.keystore_cases import IS_CA
+
+pytest_plugins = ["tests.checks.sound_keystore"]
+PERMISSIONS = "enclaves/base/permissions.p7s"
+NO_SIGNING = x509.KeyUsage(True, False, False, False, False, False, False, False, False)
+ONLY_LEAVES = (x509.BasicConstraints(True, 0), True)
+Break = Callable[[Bench], object]
+CAUSES: dict[str, tuple[str, Break]] = {}
+
+
+def cause(finding: str, *texts: str) -> Callable[[Break], Break]:
+    def add(work: Break) -> Break:
+        for text in texts:
+            CAUSES[text] = (finding, work)
+        return work
+
+    return add
+
+
+@cause("enclave.certificate-malformed", "it is a signing request")
+def _(bench: Bench) -> None:
+    bench.path("enclaves/base/cert.pem").write_bytes(make_request(new_key(), "/base"))
+
+
+@cause("enclave.signature", "an empty line before its headers")
+def _(bench: Bench) -> None:
+    path = bench.path(PERMISSIONS)
+    path.write_bytes(b"\n" + path.read_bytes())
+
+
+@cause("enclave.permissions-malformed", "what is signed in it is an S/MIME signed message")
+def _(bench: Bench) -> None:
+    path = bench.path(PERMISSIONS)
+    signer = bench.authority("permissions"), bench.key("permissions")
+    path.write_bytes(smime.sign(path.read_bytes(), *signer))
+
+
+@cause("enclave.permissions-malformed", "what is signed in it is a text in UTF-16")
+def _(bench: Bench) -> None:
+    """Opaque, as OpenSSL signs it: the signed part of other messages has no zero byte."""
+    folder = bench.root.parent
+    (folder / "permissions.xml").write_bytes(bench.document(PERMISSIONS).encode("utf-16"))
+    (folder / "key.pem").write_bytes(key_pem(bench.key("permissions")))
+    words = [
+        "smime",
+        "-sign",
+        "-nodetach",
+        "-binary",
+        "-in",
+        "permissions.xml",
+        "-inkey",
+        "key.pem",
+        "-signer",
+    ]
+    signer = bench.path("public/permissions_ca.cert.pem")
+    out = ("-out", bench.path(PERMISSIONS))
+    subprocess.run(["openssl", *words.split(), signer, *out], cwd=folder, check=True)
+
+
+@cause("enclave.governance-malformed", "its elements have the prefix dds:")
+def _(bench: Bench) -> None:
+    space = 'xmlns:dds="http://www.omg.org/spec/DDS-Security"'
+    bench.governance(("</", "@"), ("<", "<dds:"), ("@", "</dds:"), ("<dds:?", "<?"))
+    bench.governance(("<dds:dds ", f"<dds:dds {space} "))
+
+
+@cause("enclave.permissions-malformed", "it begins with <policy>")
+def _(bench: Bench) -> None:
+    bench.permissions(("<dds ", "<policy "), ("</dds>", "</policy>"))
+
+
+@cause("enclave.refused", "where it has <enable_key_revision>")
+def _(bench: Bench) -> None:
+    new = "<enable_key_revision>true</enable_key_revision>"
+    bench.governance(("<topic_access_rules>", f"{new}<topic_access_rules>"))
+
+
+@cause("enclave.certificate-issuer", "is not a CA: its keyUsage lacks keyCertSign")
+def _(bench: Bench) -> None:
+    bench.adopt("identity", bench.new_authority(IS_CA, (NO_SIGNING, True)))
+
+
+@cause("enclave.certificate-issuer", "with all CAs of the file, the chain is longer than the")
+def _(bench: Bench) -> None:
+    root, key = bench.new_authority(ONLY_LEAVES, common_name="root")
+    middle, below = bench.new_authority(IS_CA, issuer=(root.subject, key), common_name="middle")
+    last = bench.new_authority(IS_CA, issuer=(middle.subject, below), common_name="last")
+    bench.adopt("identity", last)
+    chain = b"".join(map(pem, (root, middle, last[0])))
+    bench.path("public/identity_ca.cert.pem").write_bytes(chain)
+
+
+@cause("enclave.signature", "it is signed by another CA named CN=")
+def _(bench: Bench) -> None:
+    name = bench.authority("permissions").subject.rfc4514_string()
+    other, _ = bench.new_authority(IS_CA, common_name=name.removeprefix("CN="))
+    bench.trust("permissions", other)
+
+
+@cause("enclave.signature", "an earlier or later certificate of the permissions CA named CN=")
+def _(bench: Bench) -> None:
+    ca, key = bench.authority("permissions"), bench.key("permissions")
+    later = (
+        x509.CertificateBuilder(
+            ca.subject, ca.subject, ca.public_key(), 7, bench.now, bench.now + timedelta(900)
+        )
+        .add_extension(*IS_CA)
+        .sign(key, ca.signature_hash_algorithm)  # type: ignore[arg-type]
+    )
+    bench.trust("permissions", later)
+
+
+@pytest.mark.parametrize("text", CAUSES)
+def test_the_cause_is_said(text: str, bench: Bench) -> None:
+    finding, work = CAUSES[text]
+    assert not any(text in each.text for each in keystore_findings(bench.root, now=bench.now))
+    work(bench)
+    found = keystore_findings(bench.root, now=bench.now)
+    assert [each for each in found if each.id == finding and text in each.text], found
