@@ -12,6 +12,7 @@ _RCL = "rcl 9 (security.c) and the RMWs of ROS 2 Jazzy."
 _MEASURED = "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured."
 _CLOCK_BEHIND = "Often the clock of the robot is behind."
 
+_RESTORE = "Restore {path} from a backup."
 _RENEW = "Renew it: `sros renew {root} {enclave}`."
 _NEW_KEY = "Give the enclave another key: `sros renew {root} {enclave} --new-key`."
 _CLOCK = "Set the clock of this host; if it is right, sign again: `sros renew {root} {enclave}`."
@@ -35,7 +36,6 @@ _IN_EXPORT = {
     "{enclave}`.",
 }
 """What to do on a robot, of which not all is to be done in the keystore that has the CA keys."""
-_RESTORE = "Restore {path} from a backup."
 _GOVERNANCE = (
     "Every enclave depends on it: restore {root}/enclaves/governance.p7s from a backup, or read "
     "{root}/enclaves/governance.xml and sign it again: `openssl smime -sign -text -in "
@@ -83,6 +83,14 @@ class Fault(Enum):
         "DDS cannot read it either.",
         _RCL,
         "Give the user that runs the node permission to read the file.",
+    )
+    FILE_NO_FILE = (
+        "file-no-file",
+        "a folder or a pipe in place of a file of an enclave",
+        "DDS cannot read it. Where a file that is to be mounted into a container is not there, "
+        "some programs make a folder with its name.",
+        _RCL,
+        f"Remove it, and put the file in its place. {_RESTORE}",
     )
     FILE_EMPTY = (
         "file-empty",
@@ -253,6 +261,18 @@ class Fault(Enum):
         "DDS-Security 1.1, 9.4.1.1; Fast DDS 2.14.5; CVE-2023-24011 for Cyclone DDS 0.10.2.",
         _SIGN,
         {"governance.p7s": _GOVERNANCE},
+    )
+    SIGNER_NO_CA = (
+        "signer-no-ca",
+        "a document that no CA signed, and that vendors accept",
+        "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 accept every signer whose certificate the "
+        "permissions CA issued. If that CA also issues identities, each enclave can sign rights "
+        "for itself: whoever has its key gave it these.",
+        "CVE-2023-24011; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+        "Unless you signed it so on purpose, take the key of the signer for stolen: `sros revoke "
+        "{root} {enclave}`. If one CA is for both, give identities and documents a CA each, as "
+        "keystore.one-authority says.",
+        {"governance.p7s": f"Find out who signed it. {_GOVERNANCE}"},
     )
     GOVERNANCE_MALFORMED = (
         "governance-malformed",

@@ -721,7 +721,7 @@ ENCLAVES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a damaged certificate after that of the CA": (
         lambda folder: _add_damaged(folder / "identity_ca.cert.pem"),
-        "A certificate after the first one is damaged",
+        "a certificate after the first one is damaged",
     ),
 }
 

@@ -562,5 +562,7 @@ def locate_enclave(folder: Path) -> tuple[Path, str]:
     raise DocumentError(
         f"'{folder}' is not below a folder named {ENCLAVES}",
         "rcl finds an enclave by its path below that folder.",
-        "Name the keystore, or the enclave's folder in it.",
+        "Name the keystore, or the enclave's folder in it. If this folder is all that there is, "
+        f"put it where rcl looks for it, and check that: `mkdir -p robot/{ENCLAVES} && cp -a "
+        f"{quote(str(whole))} robot/{ENCLAVES}/ && sros check robot`.",
     )

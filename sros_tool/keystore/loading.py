@@ -41,7 +41,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.chains import Checks, build_chain, chain_fault
 from sros_tool.pki.crl import read_list, read_lists, refusal_of
-from sros_tool.pki.keys import algorithm
+from sros_tool.pki.keys import algorithm, is_key_for_pss
 from sros_tool.pki.pem import read_as_text
 from sros_tool.pki.revocation import Obstacle, list_refusal
 
@@ -80,6 +80,7 @@ BEFORE_DDS = (Fault.FILE_MISSING, Fault.LINK_DANGLING)
 _READ_FIRST = (IDENTITY_CA_FILE, CRL_FILE, CERTIFICATE_FILE)
 _ON_READING = (
     Fault.FILE_UNREADABLE,
+    Fault.FILE_NO_FILE,
     Fault.FILE_EMPTY,
     Fault.CERTIFICATE_MALFORMED,
     Fault.CERTIFICATE_FILE,
@@ -223,7 +224,7 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
             yield _unreadable(traits, files[CERTIFICATE_FILE], CERTIFICATE_FILE, error)
     yield from trust.refused
     if trust.authorities and identity:
-        yield from _identity_faults(traits, identity[0], state.public_key, trust.authorities, at)
+        yield from _identity_faults(traits, identity[0], state, trust.authorities, at)
         yield from _list_faults(traits, state, identity[0], trust.authorities, at)
     yield from trust.governance
     permissions = files.get(PERMISSIONS_FILE)
@@ -390,31 +391,34 @@ def _checks(traits: VendorTraits) -> Checks:
 def _identity_faults(
     traits: VendorTraits,
     certificate: x509.Certificate,
-    key: object,
+    state: OpenedEnclave,
     authorities: Certificates,
     at: datetime,
 ) -> Iterator[Problem]:
-    """Yield the faults of an identity; ``key`` is the public key of ``key.pem``, or None."""
+    """Yield why the vendor refuses an identity: the certificate, its key, or its issuer."""
     if not _hash_fits(traits, certificate):
         pss = certificate.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
         text = "it is signed with RSA-PSS" if pss else "it is not signed with SHA-256"
         yield Problem(CERTIFICATE_FILE, text, Fault.SIGNATURE_HASH)
     for file, each in ((CERTIFICATE_FILE, certificate), (IDENTITY_CA_FILE, authorities[0])):
-        if not _key_fits(traits, each.public_key(), pss=is_for_pss(each)):
-            text = f"it has a key of {algorithm(each.public_key())}"
+        pss = is_for_pss(each)
+        if not _key_fits(traits, each.public_key(), pss=pss):
+            text = f"it has a key of {algorithm(each.public_key())}{_ALONE * pss}"
             yield Problem(file, text, Fault.KEY_ALGORITHM)
-    if key is not None and traits.keys is Keys.SMALL and not _key_fits(traits, key):
-        text = f"it is a key of {algorithm(key)}"
-        yield Problem(KEY_FILE, text, Fault.KEY_ALGORITHM)
-    if traits.verifies_policies and is_for_pss(certificate):
-        text = "its key is for RSA-PSS alone, and key.pem does not say so"
-        yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_FILE)
+    if (key := state.public_key) is not None and traits.keys is Keys.SMALL:
+        pss = isinstance(key, rsa.RSAPublicKey) and is_key_for_pss(state.files[KEY_FILE])
+        if not _key_fits(traits, key, pss=pss):
+            text = f"it is a key of {algorithm(key)}{_ALONE * pss}"
+            yield Problem(KEY_FILE, text, Fault.KEY_ALGORITHM)
     if traits.crashes_on_empty_subject and not certificate.subject.rdns:
         text = "its subject is empty, which crashes the process"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_CRASH)
     trusted = _trusted(traits, authorities)
     if fault := chain_fault(certificate, trusted, at=at, checks=_checks(traits)):
         yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)
+
+
+_ALONE = " for RSA-PSS alone"
 
 
 def _list_faults(

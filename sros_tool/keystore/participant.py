@@ -422,7 +422,8 @@ def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> O
         or (problem.fault is Fault.SIGNATURE and not _signed_by_ca(state, problem.file))
     )
     if any(each.fault is Fault.SIGNATURE for each in problems):
-        return replace(state, problems=problems)
+        named = tuple(_with_acceptance(state, each, made) for each in problems)
+        return replace(state, problems=named)
     return replace(
         state,
         problems=problems,
@@ -432,15 +433,38 @@ def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> O
     )
 
 
-def _signed_by_ca(state: OpenedEnclave, file: str) -> bool:
-    """Return whether all signers of a document have the certificate of a CA."""
+def _with_acceptance(
+    state: OpenedEnclave, problem: Problem, made: Sequence[VendorParticipant]
+) -> Problem:
+    """Return a problem of a signature with who accepts it nevertheless, if a vendor does."""
+    titles: dict[bool, list[str]] = {True: [], False: []}
+    for each in made:
+        titles[problem not in each.problems].append(each.vendor.title)
+    accepting, refusing = (", ".join(titles[each]) for each in (True, False))
+    if problem.fault is not Fault.SIGNATURE or not accepting:
+        return problem
+    text = f"{problem.text}; accepted by {accepting}"
+    if refusing:
+        text += f", refused by {refusing}"
+    if state.certificate and _signers(state, problem.file) == {state.certificate}:
+        text = f"the enclave gave itself these rights: {text}"
+    return replace(problem, text=text, fault=Fault.SIGNER_NO_CA)
+
+
+def _signers(state: OpenedEnclave, file: str) -> set[x509.Certificate | None]:
+    """Return the certificates of all who signed a document, None for one that is not there."""
     with suppress(SrosError):
         signed = smime.parse(state.files[file])
         data = state.files.get(PERMISSIONS_CA_FILE, b"")
         known = (*signed.certificates, *load_certificates(data, PERMISSIONS_CA_FILE))
-        signers = [each.signer_among(known) for each in signed.signatures]
-        return bool(signers) and all(each is not None and _is_ca(each) for each in signers)
-    return False
+        return {each.signer_among(known) for each in signed.signatures}
+    return set()
+
+
+def _signed_by_ca(state: OpenedEnclave, file: str) -> bool:
+    """Return whether all signers of a document have the certificate of a CA."""
+    signers = _signers(state, file)
+    return bool(signers) and all(each is not None and _is_ca(each) for each in signers)
 
 
 def _is_ca(certificate: x509.Certificate) -> bool:

@@ -20,6 +20,7 @@ from shlex import quote
 from typing import TYPE_CHECKING, TypeVar
 
 from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
@@ -53,6 +54,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
+    is_for_pss,
     issued_by,
     load_certificate,
     load_certificates,
@@ -72,7 +74,7 @@ from sros_tool.pki.crl import (
     refusal_of,
     signed_by,
 )
-from sros_tool.pki.keys import load_any_key
+from sros_tool.pki.keys import is_key_for_pss, load_any_key
 from sros_tool.pki.kinds import XML, kind_of
 from sros_tool.pki.token_uri import TokenUri, read_token_file
 from sros_tool.validity import Window, iso
@@ -537,15 +539,25 @@ class _EnclaveFiles:
             else:
                 self._add(name, "missing", Fault.FILE_MISSING)
             return None
-        try:
-            data = read_bytes(path, "file")
-        except SrosError as error:
-            self._add(name, f"it cannot be read: {error.clause}", Fault.FILE_UNREADABLE)
+        data = self._content(path, "file")
+        if data is None:
             return None
         if not data:
             self._add(name, "it is empty", Fault.FILE_EMPTY)
             return None
         return data
+
+    def _content(self, path: Path, what: str) -> bytes | None:
+        try:
+            return read_bytes(path, what)
+        except SrosError as error:
+            if path.is_file():
+                text = f"it cannot be read: {error.clause}"
+                self._add(path.name, text, Fault.FILE_UNREADABLE)
+            else:
+                text = f"it is {'a folder' if path.is_dir() else 'not a regular file'}"
+                self._add(path.name, text, Fault.FILE_NO_FILE)
+            return None
 
     def _read_token_file(self) -> bytes | None:
         path = self._folder / KEY_URI_FILE
@@ -613,6 +625,12 @@ class _EnclaveFiles:
             return None
         if certificate and certificate.public_key() != public_key:
             self._add(KEY_FILE, "it is not the key of cert.pem", Fault.KEY_MISMATCH)
+        elif certificate and isinstance(public_key, rsa.RSAPublicKey):
+            names = ("an RSA key", "an RSA key for RSA-PSS alone")
+            said, wanted = is_key_for_pss(key), is_for_pss(certificate)
+            if said != wanted:
+                text = f"it is {names[said]}, and cert.pem is for {names[wanted]}"
+                self._add(KEY_FILE, text, Fault.KEY_MISMATCH)
         return public_key
 
     def _fault_with_all(self, certificate: x509.Certificate, authorities: bytes) -> str:
@@ -642,10 +660,8 @@ class _EnclaveFiles:
         path = self._folder / CRL_FILE
         if not path.exists():
             return None
-        try:
-            data = read_bytes(path, "revocation list")
-        except SrosError as error:
-            self._add(CRL_FILE, f"it cannot be read: {error.clause}", Fault.FILE_UNREADABLE)
+        data = self._content(path, "revocation list")
+        if data is None:
             return None
         try:
             crl, signer = _load_crl(data, ca, authorities or b"")

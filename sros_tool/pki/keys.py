@@ -129,6 +129,19 @@ def load_any_key(
     return _validated(key, name) if isinstance(key, rsa.RSAPrivateKey) else key
 
 
+def is_key_for_pss(pem: bytes) -> bool:
+    """Return whether the key of a PEM file is an RSA key for RSA-PSS alone (RFC 4055, 1.2)."""
+    with suppress(PkiError, ValueError):
+        for block in pem_file.blocks(pem):
+            if block.label == KEY_LABELS[0]:
+                _, identifier, *_ = der.children(der.first(block.content).content)
+                return der.first(identifier.content).content == _PSS
+    return False
+
+
+_PSS = der.encode_oid("1.2.840.113549.1.1.10")
+
+
 def check_key(content: bytes, label: str = "") -> None:
     """Raise an error of any class unless ``content`` is a private key in DER, as a label says."""
     if len(content) > _MAX_BYTES:

@@ -16,8 +16,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
+from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
-from sros_tool.pki.keys import key_pem
+from sros_tool.pki.keys import key_pem, load_key
 from sros_tool.policy.document import read_policy
 from tests.checks.bench import DAY, SECRET, Bench, name_of, new_key
 from tests.support.harness import sros
@@ -102,6 +103,7 @@ CASES |= {
     "keystore.stray-key": lambda b: shutil.copy(
         b.path("enclaves/base/key.pem"), b.path("enclaves/base/key.pem.bak")
     ),
+    "keystore.archive": lambda b: b.path("public/backup.tar.gz").write_bytes(b"\x1f\x8b"),
     "keystore.ca-key-on-robot": lambda b: (b.export() / "ca.key.pem").write_bytes(
         key_pem(new_key())
     ),
@@ -177,7 +179,8 @@ CASES |= {
 CASES |= {
     "enclave.file-missing": lambda b: b.unlink("enclaves/base/permissions.p7s"),
     "enclave.link-dangling": lambda b: b.unlink("public/identity_ca.cert.pem"),
-    "enclave.file-unreadable": lambda b: b.unlink("enclaves/base/key.pem").mkdir(),
+    "enclave.file-unreadable": lambda b: os.truncate(b.path("enclaves/base/key.pem"), 1 << 25),
+    "enclave.file-no-file": lambda b: b.unlink("enclaves/base/key.pem").mkdir(),
     "enclave.file-empty": lambda b: b.path("enclaves/base/key.pem").write_bytes(b""),
     "enclave.certificate-malformed": lambda b: b.path("enclaves/base/cert.pem").write_text("x"),
     "enclave.certificate-expired": lambda b: at(b, 366),
@@ -219,6 +222,24 @@ CASES |= {
         b.path("enclaves/arm/permissions.p7s"), b.path("enclaves/base/permissions.p7s")
     ),
 }
+
+
+@case("enclave.signer-no-ca")
+def _(bench: Bench) -> None:
+    """Everything of one CA, and permissions that an enclave signed with its own certificate."""
+    usage = x509.KeyUsage(True, False, False, False, False, True, True, False, False)
+    both = bench.new_authority(IS_CA, (usage, True))
+    for role in ("identity", "permissions"):
+        bench.adopt(role, both)
+    own_signature(bench)
+
+
+def own_signature(bench: Bench) -> None:
+    """Have an enclave sign its own permissions, with what it says in them now."""
+    path = bench.path("enclaves/base/permissions.p7s")
+    key = load_key(bench.path("enclaves/base/key.pem").read_bytes(), "key.pem")
+    document = bench.document("enclaves/base/permissions.p7s").encode()
+    path.write_bytes(smime.sign(document, bench.certificate(), key))
 
 
 @case("enclave.key-twice")

@@ -1,10 +1,13 @@
-"""A finding about a file names the cause: what the file is, or who signed it."""
+"""A finding about a file names the cause: what the file is, or who signed it, and nothing else."""
 
 from __future__ import annotations
 
+import re
+import shutil
 import subprocess
 from collections.abc import Callable
 from datetime import timedelta
+from pathlib import Path
 
 import pytest
 from cryptography import x509
@@ -14,8 +17,9 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
 from sros_tool.pki.requests import make_request
-from tests.checks.bench import Bench, new_key
+from tests.checks.bench import Bench, name_of, new_key
 from tests.checks.keystore_cases import IS_CA
+from tests.support.harness import sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 PERMISSIONS = "enclaves/base/permissions.p7s"
@@ -56,19 +60,10 @@ def _(bench: Bench) -> None:
 def _(bench: Bench) -> None:
     """Opaque, as OpenSSL signs it: the signed part of other messages has no zero byte."""
     folder = bench.root.parent
-    (folder / "permissions.xml").write_bytes(bench.document(PERMISSIONS).encode("utf-16"))
+    text = bench.document(PERMISSIONS).encode("utf-16")
+    (folder / "permissions.xml").write_bytes(b"Content-Type: text/plain\r\n\r\n" + text)
     (folder / "key.pem").write_bytes(key_pem(bench.key("permissions")))
-    words = [
-        "smime",
-        "-sign",
-        "-nodetach",
-        "-binary",
-        "-in",
-        "permissions.xml",
-        "-inkey",
-        "key.pem",
-        "-signer",
-    ]
+    words = "smime -sign -nodetach -binary -in permissions.xml -inkey key.pem -signer"
     signer = bench.path("public/permissions_ca.cert.pem")
     out = ("-out", bench.path(PERMISSIONS))
     subprocess.run(["openssl", *words.split(), signer, *out], cwd=folder, check=True)
@@ -134,3 +129,54 @@ def test_the_cause_is_said(text: str, bench: Bench) -> None:
     work(bench)
     found = keystore_findings(bench.root, now=bench.now)
     assert [each for each in found if each.id == finding and text in each.text], found
+
+
+@pytest.mark.parametrize(
+    ("said", "wrong"), [("/arm", True), ("arm", True), ("/gone", True), ("robot 7", False)]
+)
+def test_only_the_name_of_another_enclave_is_a_wrong_name(
+    said: str, wrong: bool, bench: Bench
+) -> None:
+    """Other PKIs name enclaves in their own way, which no vendor compares with anything."""
+    bench.issue(subject=name_of(("CN", said), ("OU", "1f")))
+    found = {each.id for each in keystore_findings(bench.root, now=bench.now)}
+    assert ("enclave.name-mismatch" in found) == wrong
+
+
+@pytest.mark.parametrize(
+    "file", ["backup.tar.gz", "ca.p12", "CA.PFX", "ca.key.pem.bak", "ks.zip", "ca.cert.pem~"]
+)
+def test_an_archive_where_others_read_is_named(file: str, bench: Bench) -> None:
+    """Twin: in the folder of the keys of CAs, a copy of them is where it belongs."""
+    for folder, named in (("public", True), ("private", False)):
+        bench.path(f"{folder}/{file}").write_bytes(b"\x1f\x8b")
+        found = keystore_findings(bench.root, now=bench.now)
+        assert any(each.id == "keystore.archive" and folder in each.file for each in found) == named
+    (bench.export() / file).write_bytes(b"\x1f\x8b")
+    found = keystore_findings(bench.checked, now=bench.now)
+    assert "keystore.archive" in {each.id for each in found}
+
+
+def test_one_authority_is_named_where_no_file_of_a_ca_is(bench: Bench) -> None:
+    """Someone else's export, in whose folder something of a CA lies, too."""
+    bench.trust("permissions", bench.authority("identity"))
+    (bench.export() / "private").mkdir(mode=0o700)
+    found = [
+        each
+        for each in keystore_findings(bench.checked, now=bench.now)
+        if each.id == "keystore.one-authority" and not each.accepted
+    ]
+    assert found and all("In the keystore that has the CA keys" in each.remedy for each in found)
+
+
+def test_a_folder_of_an_enclave_alone_can_be_checked_as_the_message_says(
+    bench: Bench, tmp_path: Path
+) -> None:
+    alone = tmp_path / "robot7"
+    shutil.copytree(bench.path("enclaves/base"), alone)
+    ended = sros("check", alone)
+    assert ended.status == 2
+    steps = re.search(r"`mkdir -p robot/enclaves && cp -a (\S+) robot/enclaves/ && ", ended.err)
+    assert steps and steps[1] == str(alone)
+    shutil.copytree(alone, tmp_path / "robot/enclaves/robot7")
+    assert sros("check", tmp_path / "robot").status in (0, 1)

@@ -142,7 +142,10 @@ def test_permissions_that_were_replaced_and_put_back(tmp_path: Path) -> None:
 
 
 def test_permissions_that_an_enclave_signed_for_itself(tmp_path: Path) -> None:
-    """With one CA for both jobs DDS takes them; what sros says is that no CA has signed them."""
+    """With one CA for both jobs some vendors take them; sros names these, and who gave the rights.
+
+    Twin: of permissions that were changed after a CA signed them, no vendor takes any.
+    """
     root = tmp_path / "ks"
     sros("create_keystore", root, "--template", "sros2").ok()
     sros("create_enclave", root, "/a").ok()
@@ -155,7 +158,16 @@ def test_permissions_that_an_enclave_signed_for_itself(tmp_path: Path) -> None:
     assert ended.status == 1
     assert "it is signed by CN=/a, not by the permissions CA" in ended.out
     assert "keystore.one-authority" in ended.out
-    assert "enclave.signature" in ended.out
+    assert "enclave.signer-no-ca" in ended.out
+    assert "the enclave gave itself these rights" in ended.out
+    taken = "accepted by Fast DDS 2.9.1, Cyclone DDS 0.10.2, refused by Fast DDS 2.14"
+    assert taken in ended.out
+    ended = sros("check", root, "--vendor", "cyclonedds")
+    assert "accepted by Cyclone DDS 0.10.2" in ended.out and "Fast" not in ended.out
+    damaged = smime.sign(document, certificate, key).replace(b"<validity>", b"<validity >", 1)
+    (folder / "permissions.p7s").write_bytes(damaged)
+    ended = sros("check", root)
+    assert "enclave.signature" in ended.out and "accepted by Fast" not in ended.out
 
 
 @pytest.mark.parametrize(("hours", "found"), [(6.5, True), (7.5, True), (8.5, False)])

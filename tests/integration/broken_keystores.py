@@ -25,6 +25,9 @@ from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem
 from sros_tool.pki.keys import key_pem, load_key
 from sros_tool.validity import Window, iso
 from tests.checks.bench import DAY, Bench, new_key
+from tests.support.raw_pki import key as raw_key
+from tests.support.raw_pki import pem as as_pem
+from tests.support.raw_pki import private_der
 
 MATCHED, UNMATCHED, DENIED, REFUSED = "matched", "unmatched", "denied", "refused"
 CRASHED = "crashed"
@@ -181,6 +184,11 @@ def elliptic_key(curve: ec.EllipticCurve) -> Callable[[Bench], object]:
 def rsa_key(bench: Bench) -> None:
     key = rsa.generate_private_key(65537, 3072)
     leaf_key(bench, key_pem(key), key.public_key())
+
+
+def pss_key_alone(bench: Bench) -> None:
+    """A key for RSA-PSS alone in key.pem, where cert.pem is for an RSA key of any use."""
+    leaf_key(bench, as_pem(*private_der("rsa2048 5", "pss")), raw_key("rsa2048 5").public_key())
 
 
 def sha384(bench: Bench) -> None:
@@ -395,6 +403,10 @@ MORE = (
     Breakage(
         "RSA 3072 key", rsa_key, MATCHED, REFUSED, "portable.key-algorithm",
         "", "algorithm unknown",
+    ),
+    Breakage(
+        "RSA-PSS key for an RSA certificate", pss_key_alone, REFUSED, REFUSED,
+        "enclave.key-mismatch", "Error verifying private key", "private key has not supported type",
     ),
     Breakage("leaf signed with SHA-384", sha384, REFUSED, MATCHED, "portable.signature-hash"),
     Breakage(

@@ -494,7 +494,8 @@ def shared_ca_findings(
         accepted = keystore.accepts(
             ONE_AUTHORITY, lambda settings: not settings.separate_authorities
         )
-        remedy = _separation(keystore) if keystore.is_home else ""
+        there = f"In the keystore that has the CA keys: {ONE_AUTHORITY.remedy}"
+        remedy = _separation(keystore) if keystore.can_issue else there.replace("ROOT", "KEYSTORE")
         yield ONE_AUTHORITY.found("the CAs", text, file, remedy=remedy, accepted=accepted)
 
 

@@ -86,7 +86,7 @@ def fault_remedy(enclave: CheckedEnclave, fault: Fault, name: str) -> str:
     ``ROOT`` and ``NAME`` in it stand for the keystore and the enclave.
     """
     file = enclave.file(name)
-    if enclave.keystore.is_home:
+    if enclave.keystore.can_issue:
         remedy, root, path = fault.remedy_in(name), "ROOT", quote(file)
         missing = _SHARED.get(name, "")
         if missing and not (enclave.keystore.root / missing).exists():
@@ -254,7 +254,8 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
     if grant:
         yield from _rights(enclave, grant)
     state = enclave.state
-    if not enclave.keystore.is_home and state.identity_ca and state.permissions_ca:
+    known = len(enclave.keystore.authorities) > 1  # then `check_authorities` compares them
+    if not known and state.identity_ca and state.permissions_ca:
         file = enclave.file("identity_ca.cert.pem")
         cas = (state.identity_ca, state.permissions_ca)
         yield from shared_ca_findings(enclave.keystore, *cas, file)
@@ -294,7 +295,10 @@ def grant_of(enclave: CheckedEnclave) -> Grant | None:
 
 def _certificate(enclave: CheckedEnclave, certificate: x509.Certificate) -> Iterator[Finding]:
     name, file = enclave.name, enclave.file("cert.pem")
-    if common_name_of(certificate.subject) != name:
+    # Other PKIs have names of their own, which no vendor compares with the folder.
+    said = common_name_of(certificate.subject)
+    of_another = said.startswith("/") or f"/{said}" in enclave.keystore.names
+    if of_another and said.removeprefix("/") != name.removeprefix("/"):
         text = f"its subject is {subject_text(certificate.subject)}"
         yield NAME_MISMATCH.found(name, text, file)
     yield from key_findings(certificate, name, file)

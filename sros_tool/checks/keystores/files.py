@@ -150,6 +150,15 @@ STRAY_KEY = FindingKind(
     "ROS 2 keystore layout: private/*.pem and enclaves/*/key.pem only.",
     "Move it to a safe place, or delete it.",
 )
+ARCHIVE = FindingKind(
+    "keystore.archive",
+    WARNING,
+    "an archive or a container of keys where none belongs",
+    "It may hold private keys: as a backup of the keystore, those of its CAs. It is not opened.",
+    "ROS 2 keystore layout: private/ alone is for keys of CAs.",
+    "Look at what is in it, and move it to a safe place. If others had access to a CA key in it, "
+    "replace the CA (`sros rotate_ca`).",
+)
 CA_KEY_ON_ROBOT = FindingKind(
     "keystore.ca-key-on-robot",
     ERROR,
@@ -213,6 +222,11 @@ _TOP = (SETTINGS, FLEET, LEDGER, LEDGER_HEAD, ROTATION)
 _KNOWN_ANYWHERE = re.compile(
     r".*\.(?:cert|key|crl)\.pem\Z|.*\.p11\Z|.*\.srl\Z|index\.txt.*|serial.*"
 )
+
+_ARCHIVES = re.compile(
+    r"(?i)\.(?:tar|tgz|tbz2?|txz|gz|bz2|xz|zst|zip|7z|rar|p12|pfx|jks|keystore|bak|old|orig)\Z|~\Z"
+)
+"""The ends of names of archives, of containers of keys, and of copies that programs keep."""
 
 
 def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -> Iterator[Finding]:
@@ -448,6 +462,9 @@ def _other(path: str, root: str, info: os.stat_result, home: bool) -> Iterator[F
             yield STRAY_KEY.found(path, "it contains a private key", path)
         return
     name = Path(path).name
+    if _ARCHIVES.search(name) and place not in (PRIVATE, REVOKED, RETIRED):
+        yield ARCHIVE.found(path, "an archive or a container of keys is not part of it", path)
+        return
     known = (
         (inside == "." and name in _TOP)
         or (place in (PUBLIC, PRIVATE) and _KNOWN_ANYWHERE.match(name))

@@ -23,6 +23,7 @@ from sros_tool.keystore.layout import (
     FLEET,
     GOVERNANCE_P7S,
     LEDGER,
+    PUBLIC,
     ROLES,
     SETTINGS,
     ca_certificate,
@@ -87,6 +88,11 @@ class CheckedKeystore:
     fleet: Fleet | None = None
     fleet_edited: str = ""
     distribution: str = ""
+
+    @property
+    def can_issue(self) -> bool:
+        """Whether it is a keystore with CAs, in which verbs can issue and sign."""
+        return self.is_home and any((self.root / each).exists() for each in (PUBLIC, SETTINGS))
 
     def accepts(self, kind: FindingKind, chosen: Callable[[Template], bool]) -> str:
         """Return text naming the template or keystore that accepts a weakness; "" if none does.

@@ -70,7 +70,9 @@ _NAMED_BY: Mapping[str, frozenset[str]] = {
         Fault.DOCUMENT_SIZE.id: ("portable.document-size",),
         Fault.CA_CHAIN.id: ("portable.intermediate", "keystore.not-a-ca"),
         Fault.CERTIFICATE_ISSUER.id: ("portable.intermediate", "keystore.not-a-ca"),
-        Fault.SIGNATURE.id: ("portable.ca-purpose", "portable.intermediate"),
+        Fault.SIGNATURE.id: (
+            *("portable.ca-purpose", "portable.intermediate", "enclave.signer-no-ca"),
+        ),
         Fault.GOVERNANCE_MALFORMED.id: ("governance.domain-range",),
         Fault.PERMISSIONS_MALFORMED.id: (
             *("portable.domain-range", "portable.empty-topic", "portable.grant-name"),
@@ -94,7 +96,7 @@ _NAMED_BY: Mapping[str, frozenset[str]] = {
             *("enclave.permissions-not-yet-valid", "enclave.permissions-local-time"),
             *("enclave.permissions-malformed", "portable.time-format", "portable.several-grants"),
         ),
-        "open-range": ("portable.domain-range",),
+        "open-range": ("portable.domain-range", "enclave.permissions-malformed"),
         "unauthenticated-with-rtps-protection": ("governance.unauthenticated",),
     }.items()
 }
