@@ -18,7 +18,12 @@ from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, counted
 from sros_tool.keystore.layout import PERMISSIONS_FILE
 from sros_tool.keystore.participant import VendorParticipant
-from sros_tool.names import NODE_SERVICES, ROS_DISCOVERY_TOPIC, has_type_descriptions
+from sros_tool.names import (
+    NODE_SERVICES,
+    ROS_DISCOVERY_TOPIC,
+    has_type_descriptions,
+    is_expression,
+)
 from sros_tool.policy.patterns import common_name, overlap
 from sros_tool.topics import dds_names, service_of
 
@@ -85,6 +90,8 @@ def check_starting(evaluation: EnclaveEvaluation, known: Sequence[Finding]) -> l
     if grant is None or not is_for_ros(grant):
         return [*known]
     described = has_type_descriptions(enclave.keystore.distribution)
+    if evaluation.portable and _states_all(grant):
+        return [*known]
     has_denials = any(not rule.allow for rule in grant.rules)
     for domain, made in evaluation.by_domain.items():
         running = [each for each in made.values() if not each.causes()]
@@ -100,6 +107,26 @@ def check_starting(evaluation: EnclaveEvaluation, known: Sequence[Finding]) -> l
         found = NO_NODE.found(enclave.name, f"{where}{worst}", enclave.file(PERMISSIONS_FILE))
         return [*(each for each in known if not worst.explains(each)), found]
     return [*known]
+
+
+def _states_all(grant: Grant) -> bool:
+    """Return whether the only rule of a grant names all that a node needs: no vendor denies it."""
+    if len(grant.rules) != 1 or not grant.rules[0].allow:
+        return False
+    published, subscribed = (
+        {topic for criteria in some for topic in criteria.topics}
+        for some in (grant.rules[0].publish, grant.rules[0].subscribe)
+    )
+    return (
+        published.issuperset(topic for verb, topic in _ENDPOINTS if verb is AccessVerb.PUBLISH)
+        and ROS_DISCOVERY_TOPIC in subscribed
+        and any(
+            names.subscribe[0] in subscribed
+            for each in published
+            if each.endswith(f"/{_TYPES}Reply") and not is_expression(each)
+            for names in (dds_names("reply", service_of(each)[0]),)
+        )
+    )
 
 
 def _denial(participant: VendorParticipant, grant: Grant, *, described: bool) -> _Denial | None:
