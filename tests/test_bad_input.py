@@ -637,7 +637,7 @@ KEYSTORES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda ks: (ks / "public/identity_ca.cert.pem").write_bytes(b"garbage"),
         "cannot be read",
     ),
-    "CA certificate on no curve": (_mutated_certificate, "cannot be read"),
+    "CA certificate on no curve": (_mutated_certificate, "do not belong together"),
     "expired identity CA": (lambda ks: _expire(ks, "identity"), "not valid now"),
     "expired permissions CA": (lambda ks: _expire(ks, "permissions"), "not valid now"),
     "tampered governance": (
@@ -721,7 +721,7 @@ ENCLAVES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a damaged certificate after that of the CA": (
         lambda folder: _add_damaged(folder / "identity_ca.cert.pem"),
-        "a certificate after the first one is damaged",
+        "certificate after the first one is damaged",
     ),
 }
 
