@@ -400,10 +400,12 @@ def _identity_faults(
         pss = certificate.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
         text = "it is signed with RSA-PSS" if pss else "it is not signed with SHA-256"
         yield Problem(CERTIFICATE_FILE, text, Fault.SIGNATURE_HASH)
-    for file, each in ((CERTIFICATE_FILE, certificate), (IDENTITY_CA_FILE, authorities[0])):
-        pss = is_for_pss(each)
-        if not _key_fits(traits, each.public_key(), pss=pss):
-            text = f"it has a key of {algorithm(each.public_key())}{_ALONE * pss}"
+    trusted = _trusted(traits, authorities)
+    with_keys = [(CERTIFICATE_FILE, certificate), *((IDENTITY_CA_FILE, ca) for ca in trusted[:1])]
+    for file, holder in with_keys:
+        pss = is_for_pss(holder)
+        if not _key_fits(traits, holder.public_key(), pss=pss):
+            text = f"it has a key of {algorithm(holder.public_key())}{_ALONE * pss}"
             yield Problem(file, text, Fault.KEY_ALGORITHM)
     if (key := state.public_key) is not None and traits.keys is Keys.SMALL:
         pss = isinstance(key, rsa.RSAPublicKey) and is_key_for_pss(state.files[KEY_FILE])
@@ -413,7 +415,6 @@ def _identity_faults(
     if traits.crashes_on_empty_subject and not certificate.subject.rdns:
         text = "its subject is empty, which crashes the process"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_CRASH)
-    trusted = _trusted(traits, authorities)
     if fault := chain_fault(certificate, trusted, at=at, checks=_checks(traits)):
         yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)
 

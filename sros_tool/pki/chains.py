@@ -50,23 +50,19 @@ _CRITICAL = frozenset(
 )
 """The critical extensions that are accepted (X509_supported_extension); any other is refused."""
 _NO_USAGE = x509.KeyUsage(*[False] * 9)
-_RESTRICTING = {
+_PROXY = ObjectIdentifier("1.3.6.1.5.5.7.1.14")
+_NETWORKS = {
     ObjectIdentifier("1.3.6.1.5.5.7.1.7"): "sbgp-ipAddrBlock",
     ObjectIdentifier("1.3.6.1.5.5.7.1.8"): "sbgp-autonomousSysNum",
-    ObjectIdentifier("1.3.6.1.5.5.7.1.14"): "proxyCertInfo",
 }
-"""Extensions by which OpenSSL may refuse a chain, and which sros does not decide."""
-_INHERITED = {
-    ObjectIdentifier("1.3.6.1.5.5.7.1.7"): (
-        bytes.fromhex("30083006040200010500"),
-        bytes.fromhex("30083006040200020500"),
-    ),
-    ObjectIdentifier("1.3.6.1.5.5.7.1.8"): (
-        bytes.fromhex("3004a0020500"),
-        bytes.fromhex("3004a1020500"),
-    ),
-}
-"""Extensions of addresses and numbers of networks, by which a certificate has those of its CA."""
+"""Extensions of addresses and numbers of networks (RFC 3779)."""
+_INHERITED = tuple(
+    map(
+        bytes.fromhex,
+        ("30083006040200010500", "30083006040200020500", "3004a0020500", "3004a1020500"),
+    )
+)
+"""Values of them by which a certificate has the networks of its CA."""
 _SSL_CLIENT, _SMIME, _SMIME_CA, _ANY_NETSCAPE_CA = 0x80, 0x20, 0x02, 0x07
 _ANY_POLICY = ObjectIdentifier("2.5.29.32.0")
 _OF_POLICIES = {
@@ -132,6 +128,7 @@ class _Chain:
         if new:
             for each in chain:
                 yield from _extension_faults(each)
+            yield from _network_faults(chain)
         if new or Checks.STRICT in checks:
             yield from _authority_faults(chain, checks)
         if Checks.DOCUMENTS in checks:
@@ -233,12 +230,9 @@ def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
     if _netscape_type(certificate) == -1:
         faults.append(f"the nsCertType of {name} cannot be read")
     for found in certificate.extensions:
-        inherited = _INHERITED.get(found.oid, ())
-        if found.oid in _RESTRICTING and not (
-            found.value.public_bytes() in inherited and not is_self_issued(certificate)
-        ):
-            faults.append(f"{name} has {_RESTRICTING[found.oid]}, not known to sros")
-        elif found.critical and found.oid not in _CRITICAL and not inherited:
+        if found.oid == _PROXY:
+            faults.append(f"{name} has proxyCertInfo, so it is no certificate of its own")
+        elif found.critical and found.oid not in _CRITICAL and found.oid not in _NETWORKS:
             oid = found.oid.dotted_string
             faults.append(f"{name} has the unknown critical extension {oid}")
     return tuple(faults)
@@ -247,6 +241,24 @@ def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
 def _unread_faults(certificate: x509.Certificate) -> list[str]:
     unread = tolerant.unread_extension(certificate)
     return [f"the {unread} of {subject_text(certificate.subject)} cannot be read"] if unread else []
+
+
+def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
+    """Yield why OpenSSL, or sros, refuses a chain for networks (v3_addr.c, v3_asid.c).
+
+    Those of its CA restrict nothing, but where the first certificate has some, a trusted CA cannot
+    have those of another one.
+    """
+    for oid, title in _NETWORKS.items():
+        values = [
+            [part.value.public_bytes() for part in each.extensions if part.oid == oid]
+            for each in chain
+        ]
+        for each, networks in zip(chain, values, strict=True):
+            if len(networks) > 1 or not set(networks) <= set(_INHERITED):
+                yield f"{subject_text(each.subject)} has {title}, not known to sros"
+        if values[0] and values[-1]:
+            yield f"{subject_text(chain[-1].subject)} has {title} of another CA, and is trusted"
 
 
 class _Authority(Flag):
