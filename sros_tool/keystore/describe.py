@@ -209,7 +209,8 @@ def _zenoh(folder: Path, now: datetime) -> Description:
 def _enclave(folder: Path, name: str, state: OpenedEnclave, now: datetime) -> Description:
     """Describe an enclave of a keystore; a key that stays on its robot is not a problem there."""
     evaluation = evaluated(name, folder, state, at=now)
-    described = {**_describe_enclave(evaluation), "problems": list(evaluation.problems)}
+    problems = [*evaluation.problems, *evaluation.for_some(state.problems)]
+    described = {**_describe_enclave(evaluation), "problems": problems}
     return {"name": name, "key_on_robot": state.key_on_robot, **described}
 
 

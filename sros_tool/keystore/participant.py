@@ -375,6 +375,19 @@ class EvaluatedEnclave:
             sentences.append(f"{each.vendor.title} refuses it: {'; '.join(causes)}.")
         return " ".join(sentences)
 
+    def for_some(self, problems: Sequence[Problem]) -> list[str]:
+        """Return those of some problems for which not all of the vendors refuse it, as clauses."""
+        clauses = []
+        for problem in problems:
+            titles = [
+                each.vendor.title
+                for each in self.participants
+                if any(cause.file == problem.file for cause in each.causes())
+            ]
+            if titles and problem not in self.state.problems:
+                clauses.append(f"{problem} (refused by {' and '.join(titles)})")
+        return clauses
+
     @property
     def problems(self) -> tuple[str, ...]:
         """What keeps a process from running in it, apart from a key that is on its robot."""
