@@ -220,6 +220,16 @@ def _may_sign_certificates(certificate: x509.Certificate) -> bool:
     return usage is None or usage.key_cert_sign
 
 
+def denies_issuing(certificate: x509.Certificate) -> bool:
+    """Return whether a certificate says that it may not issue others.
+
+    One without basicConstraints and keyUsage says nothing: vendors differ about it.
+    """
+    constraints = extension(certificate, x509.BasicConstraints)
+    denied = constraints is not None and not constraints.ca
+    return denied or not _may_sign_certificates(certificate)
+
+
 @lru_cache(maxsize=64)
 def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
     """Return the extensions for which OpenSSL, or sros, refuses a certificate in any chain."""

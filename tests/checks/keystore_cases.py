@@ -71,6 +71,7 @@ def on_token(bench: Bench, *attributes: str) -> None:
 
 
 IS_CA = (x509.BasicConstraints(True, None), True)
+IS_NO_CA = (x509.BasicConstraints(False, None), True)
 
 
 def root_enclave(bench: Bench) -> None:
@@ -149,7 +150,7 @@ CASES |= {
         key_pem(b.key("identity"))
     ),
     "keystore.ca-key-few-rounds": lambda b: weakly_encrypted(b),
-    "keystore.not-a-ca": lambda b: b.trust("identity", b.new_authority()[0]),
+    "keystore.not-a-ca": lambda b: b.trust("identity", b.new_authority(IS_NO_CA)[0]),
     "keystore.ca-extensions": lambda b: b.trust("identity", b.new_authority(IS_CA)[0]),
     "portable.intermediate": lambda b: b.trust(
         "identity",

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 
 import pytest
 from cryptography import x509
+from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, WARNING, Finding
+from sros_tool.faults import Fault
+from sros_tool.pki.certificates import pem
 from tests.checks.bench import Bench
 from tests.checks.keystore_cases import IS_CA, TOPIC_RULE
 from tests.support.harness import sros
@@ -45,11 +48,35 @@ def large_key(bench: Bench) -> None:
     bench.adopt("identity", bench.new_authority(IS_CA, curve=ec.SECP384R1()))
 
 
+def without_constraints(role: str) -> Callable[[Bench], object]:
+    """Take a CA whose certificate does not say that it is one, but may sign certificates."""
+    usage = x509.KeyUsage(
+        digital_signature=True, content_commitment=False, key_encipherment=False,
+        data_encipherment=False, key_agreement=False, key_cert_sign=True, crl_sign=True,
+        encipher_only=False, decipher_only=False,
+    )  # fmt: skip
+    return lambda bench: bench.adopt(role, bench.new_authority((usage, True)))
+
+
+def crashing_first(bench: Bench) -> None:
+    """Put a CA that is not signed with SHA-256 before the one that issued."""
+    other, _ = bench.new_authority(IS_CA, digest=hashes.SHA384())
+    file = bench.path("public/identity_ca.cert.pem")
+    file.write_bytes(pem(other) + file.read_bytes())
+
+
+def damaged_second(bench: Bench) -> None:
+    """Put half a certificate behind that of the permissions CA."""
+    file = bench.path("public/permissions_ca.cert.pem")
+    lines = file.read_bytes().splitlines(keepends=True)
+    file.write_bytes(b"".join([*lines, *lines[:3], *lines[-1:]]))
+
+
 @dataclass(frozen=True)
 class Row:
     """A way to break a keystore, and the worst finding: in it, and in an export of it.
 
-    ``says`` is in the text of the finding in the export.
+    ``says`` is in the text of the finding in the export, ``remedy`` in its remedy.
     """
 
     name: str
@@ -57,6 +84,7 @@ class Row:
     home: str
     export: str
     says: str = ""
+    remedy: str = ""
 
 
 ROWS = (
@@ -101,6 +129,45 @@ ROWS = (
         "portable.refused",
         "Cyclone DDS 0.10.2 refuses it (identity_ca.cert.pem: it has a key of ",
     ),
+    Row(
+        "an identity CA without basicConstraints",
+        without_constraints("identity"),
+        "portable.refused",
+        "portable.refused",
+        "Fast DDS 2.14 refuses it (identity_ca.cert.pem: it is refused: CN=new CA has no ",
+        Fault.CA_CHAIN.remedy,
+    ),
+    Row(
+        "a permissions CA without basicConstraints",
+        without_constraints("permissions"),
+        "portable.refused",
+        "portable.refused",
+        "Fast DDS 2.9.1 and Cyclone DDS 0.10.2 accept it",
+        Fault.CA_CHAIN.remedy,
+    ),
+    Row(
+        "an identity CA without basicConstraints and keyUsage",
+        lambda b: b.adopt("identity", b.new_authority()),
+        "enclave.certificate-issuer",
+        "enclave.certificate-issuer",
+        "CN=new CA is not a CA",
+    ),
+    Row(
+        "a CA first that crashes",
+        crashing_first,
+        "portable.refused",
+        "portable.refused",
+        "Fast DDS 2.14 crashes on it (identity_ca.cert.pem: CN=new CA is not signed with SHA-256, ",
+        Fault.CA_CRASH.remedy,
+    ),
+    Row(
+        "a damaged certificate behind that of a CA",
+        damaged_second,
+        "portable.refused",
+        "portable.refused",
+        "Fast DDS 2.14 and Fast DDS 2.9.1 refuse it (permissions_ca.cert.pem: ",
+        Fault.CERTIFICATE_FILE.remedy,
+    ),
 )
 
 FREE = (
@@ -138,7 +205,8 @@ def test_the_cause_is_found_once_wherever_the_files_lie(row: Row, bench: Bench) 
         about_vendors = [each for each in found if each.id in ABOUT_VENDORS]
         assert [each.id for each in about_vendors] == [wanted] * (wanted in ABOUT_VENDORS)
         if place == "export":
-            assert any(row.says in each.text for each in found if each.id == wanted)
+            named = [each for each in found if each.id == wanted]
+            assert any(row.says in each.text and row.remedy in each.remedy for each in named), named
             assert not any("ROOT" in each.remedy for each in found)
 
 

@@ -529,6 +529,12 @@ def certificate_rows() -> Iterator[Row]:
     yield Row("another CA of the same name before it", both, REFUSED, REFUSED, REFUSED)
     old = authority("identity CA", is_ca=None)
     yield Row("a CA without basicConstraints", Made(issuer=old), YES, REFUSED, YES)
+    silent = authority("identity CA", None, is_ca=None)
+    yield Row("a CA that says nothing of it", Made(issuer=silent), REFUSED, REFUSED, REFUSED)
+    for usage, later in ((f"{SIGNS} {CERTIFIES}", REFUSED), (None, YES)):
+        signer = authority("permissions CA", usage, is_ca=None)
+        name = f"a permissions CA without basicConstraints, {usage or 'without keyUsage'}"
+        yield Row(name, Made(permissions=(signer,)), YES, later, YES)
     policy = x509.PolicyInformation(x509.ObjectIdentifier("1.2.3.4"), None)
     policies = authority("identity CA", also=x509.CertificatePolicies([policy]))
     yield Row("a CA with critical policies", Made(issuer=policies), YES, YES, YES)

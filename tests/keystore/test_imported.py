@@ -186,6 +186,42 @@ def test_vendors_that_refuse_a_permissions_ca_are_named(
         assert checked.status == (0 if vendor in takes else 1), checked
 
 
+ALL = {Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE}
+
+
+@pytest.mark.parametrize(
+    ("role", "usage", "takes", "words"),
+    [
+        ("identity", f"{SIGNS} {CERTIFIES}", ALL - {Vendor.FAST}, "Fast DDS 2.14 refuses the encl"),
+        ("identity", None, set(), "no DDS vendor would accept an enclave"),
+        ("identity", SIGNS, set(), "does not allow it to issue certificates"),
+        ("permissions", f"{SIGNS} {CERTIFIES}", ALL - {Vendor.FAST}, "Fast DDS 2.14 refuses the e"),
+        ("permissions", None, ALL, ""),
+        ("permissions", SIGNS, set(), "does not allow it to issue certificates"),
+    ],
+)
+def test_a_ca_without_basic_constraints_is_taken_where_vendors_take_it(
+    role: str, usage: str | None, takes: set[Vendor], words: str, tmp_path: Path
+) -> None:
+    """The vendors' own answers are in `tests.integration.test_signers_on_dds`."""
+    certificate, key = authority("corp CA", usage, is_ca=None)
+    (tmp_path / "ca.pem").write_bytes(pem(certificate))
+    (tmp_path / "ca.key").write_bytes(key_pem(key))
+    place = (f"--{role}-ca", tmp_path / "ca.pem", f"--{role}-key", tmp_path / "ca.key")
+    root = tmp_path / "ks"
+    ended = sros("create_keystore", root, *place)
+    assert ended.status == (0 if takes else 2), ended
+    assert words in ended.err
+    assert root.exists() == bool(takes)
+    if not takes:
+        return
+    assert ("portable.imported-ca" in ended.err) == (takes != ALL)
+    sros("create_enclave", root, "/a").ok()
+    for vendor in ALL:
+        asked = sros("explain", root, "/a", "join", "--vendor", vendor)
+        assert asked.status == (0 if vendor in takes else 1), asked
+
+
 @pytest.mark.parametrize(
     ("text", "span", "begin", "end"),
     [

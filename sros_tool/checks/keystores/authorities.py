@@ -43,7 +43,7 @@ from sros_tool.pki.certificates import (
     validity_of,
     weakness,
 )
-from sros_tool.pki.chains import purpose_faults
+from sros_tool.pki.chains import denies_issuing, purpose_faults
 from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, few_rounds, load_key
 from sros_tool.pki.token_uri import is_token_uri
@@ -156,15 +156,10 @@ def key_findings(
 def _extensions(
     certificate: x509.Certificate, subject: str, name: str, file: str
 ) -> Iterator[Finding]:
-    extensions = certificate.extensions
-    present = {type(each.value): each.value for each in extensions}
-    constraints = present.get(x509.BasicConstraints)
-    usage = present.get(x509.KeyUsage)
-    is_ca = isinstance(constraints, x509.BasicConstraints) and constraints.ca
-    may_sign = not isinstance(usage, x509.KeyUsage) or usage.key_cert_sign
-    if not (is_ca and may_sign):
+    if denies_issuing(certificate):
         yield NOT_A_CA.found(subject, f"{name} may not issue certificates", file)
     wanted = (x509.KeyUsage, x509.SubjectKeyIdentifier, x509.AuthorityKeyIdentifier)
+    present = {type(each.value) for each in certificate.extensions}
     missing = [kind.__name__ for kind in wanted if kind not in present]
     if missing:
         yield CA_EXTENSIONS.found(subject, f"{name} lacks {', '.join(missing)}", file)

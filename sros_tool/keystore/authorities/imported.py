@@ -23,7 +23,7 @@ from sros_tool.pki.certificates import (
     validity_of,
     weakness,
 )
-from sros_tool.pki.chains import purpose_faults
+from sros_tool.pki.chains import denies_issuing, purpose_faults
 from sros_tool.pki.keys import PrivateKey, algorithm
 from sros_tool.validity import iso
 
@@ -80,8 +80,8 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
         raise PkiError(
             f"{subject_text(own[0].subject)} cannot be the {role} CA: no DDS vendor accepts it",
             f"{refusals_text(refusals)}.",
-            "Issue the CA's certificate again, self-signed with SHA-256 and keyUsage keyCertSign "
-            "and digitalSignature.",
+            "Issue the CA's certificate again, self-signed with SHA-256, basicConstraints CA:TRUE "
+            "and keyUsage keyCertSign and digitalSignature.",
         )
     return ImportedAuthority(
         own[0], b"".join(map(pem, chain)), tuple(_notes(role, chain, refusals))
@@ -108,22 +108,16 @@ def _chain(
 
 
 def _check_ca(certificate: x509.Certificate, role: str, now: datetime) -> None:
-    """Raise `PkiError` if a certificate may not issue others, or is not valid ``now``."""
+    """Raise `PkiError` if a certificate says that it is no CA's, or is not valid ``now``.
+
+    Whether a certificate that says neither is one of a CA is left to the vendors.
+    """
     name = subject_text(certificate.subject)
-    extensions = certificate.extensions
-    try:
-        is_ca = extensions.get_extension_for_class(x509.BasicConstraints).value.ca
-    except x509.ExtensionNotFound:
-        is_ca = False
-    try:
-        may_sign = extensions.get_extension_for_class(x509.KeyUsage).value.key_cert_sign
-    except x509.ExtensionNotFound:
-        may_sign = True
-    if not is_ca or not may_sign:
+    if denies_issuing(certificate):
         raise PkiError(
             f"{name} cannot be the {role} CA",
             "Its certificate does not allow it to issue certificates.",
-            "It needs basicConstraints CA:TRUE, and keyCertSign in keyUsage if it has that.",
+            "It needs basicConstraints CA:TRUE, and keyCertSign in its keyUsage.",
         )
     validity = validity_of(certificate)
     if not validity.contains(now):
