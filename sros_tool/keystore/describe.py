@@ -218,7 +218,7 @@ def _describe_enclave(evaluation: EvaluatedEnclave) -> Description:
     """Describe an enclave; ``loadable`` says whether a process can run in it now."""
     state = evaluation.state
     domains = state.domains()
-    problems = [str(each) for each in state.problems] or list(evaluation.problems)
+    problems = list(evaluation.problems_here)
     return {
         "loadable": not problems,
         "problems": problems,

@@ -394,6 +394,11 @@ class EvaluatedEnclave:
         named = tuple(map(str, self.state.problems_at_home))
         return named or tuple(filter(None, (self.stopped().removesuffix("."),)))
 
+    @property
+    def problems_here(self) -> tuple[str, ...]:
+        """What keeps a process from running in it where it is, also a missing key."""
+        return tuple(map(str, self.state.problems)) or self.problems
+
 
 def evaluated(
     name: str,

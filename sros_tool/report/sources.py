@@ -22,12 +22,12 @@ from sros_tool.errors import DocumentError, SrosError
 from sros_tool.fleet.model import Fleet
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
-from sros_tool.keystore.layout import PUBLIC
+from sros_tool.keystore.layout import PUBLIC, enclave_path
+from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.reader import (
     OpenedEnclave,
     OpenedKeystore,
-    Problem,
     open_enclave,
     read_lists,
 )
@@ -169,9 +169,10 @@ def _with_keystore(source: PictureSource, root: Path, now: datetime) -> PictureS
         findings.append(PicturedFinding("view.no-governance", "error", str(error)))
     enclaves, validities = [], set()
     for name in keystore.names:
-        state = keystore.enclave(name, now=now)
-        enclaves.append(_described(name, state, state.problems_at_home))
-        validities |= set(_validities_of(name, state))
+        opened = keystore.enclave(name, now=now)
+        evaluation = evaluated(name, enclave_path(root, name), opened, at=now)
+        enclaves.append(_described(name, evaluation.state, evaluation.problems))
+        validities |= set(_validities_of(name, evaluation.state))
     try:
         validities |= set(_authorities(root))
     except SrosError as error:
@@ -186,18 +187,18 @@ def _with_keystore(source: PictureSource, root: Path, now: datetime) -> PictureS
 
 
 def _with_enclave(source: PictureSource, folder: Path, now: datetime) -> PictureSource:
-    state = open_enclave(folder, now=now)
     name = next(iter(sorted(source.scope or ())), _base_name(folder))
+    evaluation = evaluated(name, folder, open_enclave(folder, now=now), at=now)
+    state = evaluation.state
     return replace(
         source,
-        enclaves=(_described(name, state, state.problems),),
+        enclaves=(_described(name, state, evaluation.problems_here),),
         governance=state.governance,
         validities=tuple(sorted(_validities_of(name, state))),
     )
 
 
-def _described(name: str, state: OpenedEnclave, found: tuple[Problem, ...]) -> PicturedEnclave:
-    problems = tuple(map(str, found))
+def _described(name: str, state: OpenedEnclave, problems: tuple[str, ...]) -> PicturedEnclave:
     certificate = state.certificate
     if certificate is None:
         return PicturedEnclave(name, "", problems=problems)

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 from cryptography import x509
@@ -15,8 +16,12 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, WARNING, Finding
+from sros_tool.errors import PkiError
 from sros_tool.faults import Fault
+from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
+from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
+from sros_tool.pki.keys import load_key
 from tests.checks.bench import Bench
 from tests.checks.keystore_cases import IS_CA, TOPIC_RULE
 from tests.support.harness import sros
@@ -290,8 +295,43 @@ def test_every_verb_starts_what_the_vendor_starts(
     for folder in (robot, bench.root):
         shown = json.loads(sros("inspect", folder / "enclaves/base", "--json").out)
         assert (shown["loadable"], not shown["problems"]) == (loadable, loadable)
+    for source in (robot, robot / "enclaves/base", bench.root):
+        drawn = json.loads(sros("view", source, "--json").out)["enclaves"]
+        assert {not each["problems"] for each in drawn} == {loadable}
     sent = sros("distribute_key", bench.root, "/base", robot.with_name("another robot"))
     assert sent.status == (0 if loadable else 2), sent
+
+
+@pytest.mark.parametrize(
+    ("work", "why"),
+    [
+        (lambda _: None, ""),
+        (lambda b: b.permissions(("<default>DENY</default>", "")), ""),
+        (_bad_kind, "Cyclone DDS 0.10.2 refuses it: governance.p7s: "),
+        (lambda b: b.governance(("</dds>", "")), "governance.p7s: "),
+    ],
+    ids=("sound", "taken by Cyclone DDS alone", "refused by all", "malformed"),
+)
+def test_an_answer_is_taken_where_a_vendor_takes_it(
+    work: Callable[[Bench], object], why: str, bench: Bench
+) -> None:
+    work(bench)
+    folder = bench.export() / "enclaves/base"
+    key = load_key((bench.root / "enclaves/base/key.pem").read_bytes(), "key").public_key()
+    files = {
+        f"enclaves/base/{path.name}": path.read_bytes()
+        for path in folder.iterdir()
+        if path.name != "key.pem"
+    }
+    certificate, signing = bench.authority("permissions"), bench.key("permissions")
+    signer = SimpleNamespace(sign=lambda data, _: smime.sign(data, certificate, signing))
+    answer = RequestAnswer("/base", files, seal(files, 9, signer))  # type: ignore[arg-type]
+    if not why:
+        check_answer(answer, key, now=bench.now)
+        return
+    with pytest.raises(PkiError) as refusal:
+        check_answer(answer, key, now=bench.now)
+    assert why in refusal.value.why
 
 
 @pytest.mark.parametrize(

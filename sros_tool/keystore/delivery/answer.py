@@ -6,7 +6,7 @@ import hashlib
 import re
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     has_key,
 )
+from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import (
     OpenedEnclave,
     open_enclave,
@@ -165,9 +166,11 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
     with tempfile.TemporaryDirectory(prefix="sros-") as folder:
         for path, data in answer.files.items():
             write_new_file(Path(folder, path.rpartition("/")[2]), data)
-        state = open_enclave(Path(folder), now=now)
+        opened = replace(open_enclave(Path(folder), now=now), key_on_robot=True)
+        evaluation = evaluated(answer.name, Path(folder), opened, at=now)
+        state = evaluation.state
         zenoh = open_zenoh(Path(folder), answer.name, state)
-    problems = [str(each) for each in state.problems if each.file != KEY_FILE]
+    problems = list(evaluation.problems)
     if zenoh.files:
         problems += [str(each) for each in zenoh.problems if each.file != CERTIFICATE_FILE]
     certificate = state.certificate
