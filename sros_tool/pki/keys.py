@@ -130,12 +130,11 @@ def load_any_key(
 
 
 def is_key_for_pss(pem: bytes) -> bool:
-    """Return whether the key of a PEM file is an RSA key for RSA-PSS alone (RFC 4055, 1.2)."""
+    """Return whether the first key of a PEM file is for RSA-PSS alone (RFC 4055, 1.2)."""
     with suppress(PkiError, ValueError):
-        for block in pem_file.blocks(pem):
-            if block.label == KEY_LABELS[0]:
-                _, identifier, *_ = der.children(der.first(block.content).content)
-                return der.first(identifier.content).content == _PSS
+        block = next(pem_file.blocks(_key_block(pem, "")))
+        _, identifier, *_ = der.children(der.first(block.content).content)
+        return identifier.tag == der.SEQUENCE and der.first(identifier.content).content == _PSS
     return False
 
 
