@@ -299,7 +299,7 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
         state = keystore.enclave(name, now=now, domain=domain)
         faults = [each for each in state.problems if each.fault is not Fault.REVOKED]
         own = len(faults) < len(state.problems)
-        if any(each.fault is Fault.FILE_UNREADABLE for each in faults):
+        if any(each.fault in (Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE) for each in faults):
             unreadable.append(name)
         elif KEY_FILE not in state.files and (state.key_on_robot or state.token):
             elsewhere.append(name)

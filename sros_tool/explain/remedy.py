@@ -61,7 +61,7 @@ _SHARED = {
     PERMISSIONS_CA_FILE: ca_certificate(PERMISSIONS),
 }
 """Files of an enclave that are normally links to files of the keystore."""
-_NOT_IN_THE_FILE = (Fault.CA_NOT_YET_VALID, Fault.FILE_UNREADABLE)
+_NOT_IN_THE_FILE = (Fault.CA_NOT_YET_VALID, Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE)
 _OF_VALIDITY = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
 _OF_GOVERNANCE = (Fault.GOVERNANCE_MALFORMED, Fault.GOVERNANCE_DOMAIN)
 

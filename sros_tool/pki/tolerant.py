@@ -7,6 +7,7 @@ classes, which cannot be derived from, the members that sros uses.
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -103,6 +104,8 @@ class TolerantName:
 class _Signed:
     """What a CA signed: a value in DER of the signed part, an algorithm and the signature."""
 
+    _LABEL = b""
+
     def __init__(self, data: bytes) -> None:
         self._data = data
         parts = _sequence(der.first(der.normalized(data)))
@@ -130,10 +133,13 @@ class _Signed:
         return None
 
     def public_bytes(self, encoding: serialization.Encoding) -> bytes:
-        """Return it as it was read; in DER only."""
-        if encoding is not serialization.Encoding.DER:
-            raise ValueError("it is written in DER only")
-        return self._data
+        """Return it as it was read, in DER, or that as PEM."""
+        if encoding is serialization.Encoding.DER:
+            return self._data
+        text = base64.encodebytes(self._data).replace(b"\n", b"")
+        lines = [text[start : start + 64] for start in range(0, len(text), 64)]
+        label = self._LABEL
+        return b"\n".join([b"-----BEGIN %b-----" % label, *lines, b"-----END %b-----\n" % label])
 
     def fingerprint(self, algorithm: hashes.HashAlgorithm) -> bytes:
         """Return the hash of it."""
@@ -157,6 +163,8 @@ class _Signed:
 
 class _TolerantCertificate(_Signed):
     """A certificate; see `cryptography.x509.Certificate` for the members."""
+
+    _LABEL = b"CERTIFICATE"
 
     def __init__(self, data: bytes) -> None:
         super().__init__(data)
@@ -206,6 +214,8 @@ class _TolerantEntry(NamedTuple):
 
 class _TolerantList(_Signed):
     """A revocation list; see `cryptography.x509.CertificateRevocationList` for the members."""
+
+    _LABEL = b"X509 CRL"
 
     def __init__(self, data: bytes) -> None:
         super().__init__(data)

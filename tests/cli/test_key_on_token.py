@@ -121,7 +121,7 @@ def test_a_place_that_is_no_text_or_no_file(root: Path) -> None:
     path = root / "enclaves/arm/key.p11"
     path.unlink()
     os.mkfifo(path)
-    assert "it cannot be read" in sros("inspect", root).out
+    assert "it is not a regular file" in sros("inspect", root).out
     path.unlink()
     path.symlink_to("gone")
     assert sros("inspect", root).out.count("key.p") == 1

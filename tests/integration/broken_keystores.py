@@ -449,7 +449,7 @@ MORE = (
         "", "File could not be found",
     ),
     Breakage(
-        "a folder in place of the key", as_folder, REFUSED, REFUSED, "enclave.file-unreadable",
+        "a folder in place of the key", as_folder, REFUSED, REFUSED, "enclave.file-no-file",
         "Error obtaining private key",
         ("read from failed", "seek to end failed"),  # the latter where the folder is in memory
     ),

@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 
 from sros_tool.errors import PkiError, UsageError
-from sros_tool.pki.certificates import load_certificate, load_certificates
+from sros_tool.pki.certificates import load_certificate, load_certificates, pem
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import generate_key, key_pem, load_key
 from sros_tool.pki.requests import load_request, make_request
@@ -120,7 +120,9 @@ def test_a_broken_enclave_does_not_stop_what_is_said_of_others(case: str, keysto
     path = keystore / "enclaves/a/cert.pem"
     hostile = changed(path.read_bytes(), CERTIFICATES[case])
     if case in READ_BY_OPENSSL:
-        assert is_tolerated(load_certificate(hostile, "drawn"))
+        certificate = load_certificate(hostile, "drawn")
+        assert is_tolerated(certificate)
+        assert load_certificate(pem(certificate), "drawn") == certificate
     else:
         with pytest.raises(PkiError, match=r"Restore it from a backup, or issue it again"):
             load_certificate(hostile, "drawn")
