@@ -218,9 +218,9 @@ def test_odd_keys() -> None:
         serialization.NoEncryption(),
     )
     plain = key_pem(ec.generate_private_key(ec.SECP256R1()))
-    for pem in (other, b"", plain[:-60], changed(plain, every((0x06,), content=b"\x2a\x03"))):
+    for damaged in (other, b"", plain[:-60], changed(plain, every((0x06,), content=b"\x2a\x03"))):
         with pytest.raises(PkiError):
-            load_key(pem, "drawn")
+            load_key(damaged, "drawn")
 
 
 PASSPHRASES = {
