@@ -110,13 +110,7 @@ VERBS: Mapping[str, str | Shapes] = {
     "distribute_key": "sros_tool.keystore.delivery.shown:ExportedEnclaves",
     "sign_request": "sros_tool.keystore.delivery.shown:SignedRequest",
     "import": "sros_tool.keystore.delivery.shown:ImportedAnswer",
-    "create_keystore": Shapes(
-        "The new keystore and its CAs.",
-        {
-            "a new keystore": f"{_LIFECYCLE}:NewKeystore",
-            "--from": f"{_LIFECYCLE}:AdoptedKeystore",
-        },
-    ),
+    "create_keystore": f"{_LIFECYCLE}:NewKeystore",
     "create_enclave": f"{_LIFECYCLE}:CreatedEnclaves",
     "create_permission": f"{_LIFECYCLE}:ChangedEnclave",
     "generate_artifacts": f"{_LIFECYCLE}:MadeEnclaves",

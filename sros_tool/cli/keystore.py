@@ -434,17 +434,9 @@ Example:
     identity CA and permissions CA: separate, valid for 3650d; ...
     identity CA SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e1003ee5b8c...
     permissions CA SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91...
-  $ sros create_keystore fleet --template production --domain 10-19
-  $ sros create_keystore keystore --from eloquent_keys""",
+  $ sros create_keystore fleet --template production --domain 10-19""",
 )
 @click.argument("root", type=PATH)
-@click.option(
-    "--from",
-    "earlier",
-    type=PATH,
-    metavar="OLD",
-    help="Take over the CA, keys and rights of OLD, a keystore of ROS 2 Eloquent or earlier.",
-)
 @click.option(
     "--template",
     "template_name",
@@ -490,7 +482,6 @@ Example:
 @json_option
 def create_keystore(
     root: Path | None,
-    earlier: Path | None,
     template_name: str,
     domain: str | None,
     ca_layout: str | None,
@@ -515,9 +506,6 @@ def create_keystore(
     from sros_tool.keystore.lifecycle.create import create_keystore as create
 
     root = root or keystore_from_environment()
-    if earlier is not None:
-        _adopt(root, earlier, dry_run, as_json)
-        return
     own = ros_domain() if domain is None else None
     domains = DomainSet.parse(domain, "--domain") if domain is not None else None
     if own is not None:
@@ -545,62 +533,6 @@ def create_keystore(
         _print_new_keystore(root, template, result.domains, frozenset(imported))
     if not dry_run:
         _print_open_rights(root, template)
-
-
-_WITH_FROM = ("root", "earlier", "dry_run", "as_json", "verbose")
-"""The parameters of create_keystore that go with --from."""
-
-
-def _adopt(root: Path, earlier: Path, dry_run: bool, as_json: bool) -> None:
-    from click.core import ParameterSource
-
-    from sros_tool.keystore.layout import earlier_nodes, is_earlier_keystore
-    from sros_tool.keystore.lifecycle.adopt import adopt_keystore
-
-    context = click.get_current_context()
-    for option in context.command.params:
-        given = context.get_parameter_source(option.name or "") is ParameterSource.COMMANDLINE
-        if given and option.name not in _WITH_FROM:
-            raise UsageError(
-                f"{option.opts[0]} and --from exclude each other",
-                f"The new keystore gets what '{earlier}' has.",
-                "Leave one of them out.",
-            )
-    total = sum(1 for _ in earlier_nodes(earlier)) if is_earlier_keystore(earlier) else 0
-    with progress("signing", total) as step:
-        result = adopt_keystore(
-            root, earlier, now=now(), keyring=keyring(), dry_run=dry_run, progress=step
-        )
-    print_notes(result.notes)
-    if as_json:
-        from sros_tool.keystore.lifecycle.shown import (
-            AdoptedKeystore,
-            shown_creation,
-            shown_keystore,
-        )
-
-        notes = _open_rights(root, result.template)
-        new = shown_keystore(result, result.template, {}, notes, dry_run=dry_run)
-        print_json(AdoptedKeystore(shown_creation(result, dry_run=dry_run), new, earlier))
-    elif dry_run:
-        print_plan(root, result.changes)
-    else:
-        count = len(result.created)
-        nodes = f"{count} node{'s' * (count != 1)}"
-        echo(f"created keystore '{root}' for domain {result.domains}")
-        echo(f"  with the CA, the governance and {nodes} of '{earlier}'")
-        for name in result.created:
-            echo(f"  enclave {name}")
-    if dry_run:
-        return
-    echo(
-        "Keys and certificates are those of the nodes; their permissions are signed again. "
-        f"'{earlier}' is as it was: its permissions work until they expire, with ROS 2 Eloquent or "
-        "earlier. Start a node with ROS_SECURITY_KEYSTORE in place of ROS_SECURITY_ROOT_DIRECTORY "
-        "and --ros-args --enclave NAME, or by `sros run`.",
-        err=True,
-    )
-    _print_open_rights(root, result.template)
 
 
 def _choices(

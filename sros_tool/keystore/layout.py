@@ -129,16 +129,11 @@ def folder_mode(path: str) -> int:
     return 0o755 if path in ("", PUBLIC) else 0o700
 
 
-EARLIER_CA, EARLIER_CA_KEY = "ca.cert.pem", "ca.key.pem"
-"""The CA in a keystore of ros2/sros2 0.6 to 0.8 (ROS 2 Crystal, Dashing, Eloquent), at its top.
-
-Such a keystore is flat: the folder of a node has the name of the node, below the keystore itself.
-"""
-_MOST_FOLDERS = 1000
+_EARLIER_CA = ("ca.cert.pem", "ca.key.pem")
+"""The CA at the top of a flat keystore, of ros2/sros2 0.6 to 0.8 (ROS 2 Crystal to Eloquent)."""
 
 _TOP_FILES = frozenset((SETTINGS, FLEET, LEDGER, LEDGER_HEAD, ROTATION))
 _OF_IDENTITY = (CERTIFICATE_FILE, KEY_FILE)
-_OF_NODE = (CERTIFICATE_FILE, KEY_FILE, PERMISSIONS_FILE)
 _OF_ENCLAVE = (CERTIFICATE_FILE, *KEY_FILES)
 _FILE_TYPES = (".pem", ".p7s", ".p11", ".xml", ".json5")
 _TOP_FOLDERS = frozenset((ENCLAVES, PUBLIC, PRIVATE, REVOKED, RETIRED))
@@ -449,81 +444,20 @@ def list_enclaves(root: Path) -> tuple[str, ...]:
     return enclave_names(root)
 
 
-def earlier_nodes(root: Path) -> Iterator[str]:
-    """Yield the names of the nodes in a flat keystore of ROS 2 Eloquent or earlier.
-
-    A node is a folder, or a link to one, that has a certificate, its key, or its permissions.
-
-    Raises:
-        KeystoreError: a node may be missing, because a folder cannot be read.
-    """
-    top = os.fspath(root)
-
-    def fail(error: OSError) -> None:
-        effect = "Its nodes would be missing."
-        raise _unreadable(root, [UnreadPath.of(error)], effect) from error
-
-    for folder, folders, _ in os.walk(top, onerror=fail):
-        folders[:] = sorted(each for each in folders if not each.startswith("."))
-        if folder == top:
-            folders[:] = [each for each in folders if each not in _TOP_FOLDERS]
-        for each in folders:
-            path = os.path.join(folder, each)
-            if any(os.path.lexists(f"{path}/{file}") for file in _OF_NODE):
-                yield path[len(top) :].replace(os.sep, "/")
-
-
-def is_earlier_keystore(root: Path) -> bool:
-    """Return whether ``root`` has the CA of a flat keystore of ROS 2 Eloquent or earlier."""
-    return any((root / file).is_file() for file in (EARLIER_CA, EARLIER_CA_KEY))
-
-
 def refuse_earlier(root: Path) -> None:
-    """Raise `KeystoreError` if ``root`` is a flat keystore of ROS 2 Eloquent or earlier, or a part.
+    """Raise `KeystoreError` if ``root`` is a flat keystore of ROS 2 Eloquent or earlier.
 
-    A keystore of today, or its folder of enclaves, is not refused, even if parts of an earlier one
-    are in it.
+    A keystore of today is not refused, even if the files of an earlier one lie in it.
     """
     if not root.is_dir() or is_keystore(root):
         return
-    if root.name == ENCLAVES and is_keystore(root.parent):
-        return
-    if is_earlier_keystore(root):
+    if any((root / file).is_file() for file in _EARLIER_CA):
         raise KeystoreError(
             f"'{root}' is not a valid keystore",
-            "It is one of ROS 2 Eloquent or earlier, with its CA and the folders of its nodes at "
-            f"the top; ROS 2 since Foxy reads {ENCLAVES}, {PUBLIC} and {PRIVATE}.",
-            f"Run `sros create_keystore NEW --from {quote(str(root))}`: the keystore NEW gets its "
-            "CA, its keys and the rights of its nodes, and this one stays as it is.",
+            "It is one of ROS 2 Eloquent or earlier, which ended in 2020.",
+            "Create a keystore, and generate artifacts from the policy: `sros create_keystore NEW` "
+            "and `sros generate_artifacts -k NEW -p POLICY`.",
         )
-    if _holds_earlier_node(root):
-        raise KeystoreError(
-            f"'{root}' is not a valid keystore",
-            f"It has folders of nodes outside of a folder named {ENCLAVES}, as keystores of ROS 2 "
-            "Eloquent or earlier have, and no CA.",
-            f"If they are of ROS 2 Foxy or later, move them into a folder {ENCLAVES}. Otherwise "
-            "run `sros create_keystore NEW --from OLD` where the CA of that keystore OLD is, and "
-            "export the enclaves with `sros distribute_key NEW`.",
-        )
-
-
-def _holds_earlier_node(root: Path) -> bool:
-    """Return whether one of the first folders below ``root`` is that of a node.
-
-    Its permissions are for its path: those of a copy elsewhere are not.
-    """
-    from sros_tool.xml import read_bytes  # completion uses this module without it
-
-    walk, top = os.walk(root), os.fspath(root)
-    for _, (folder, folders, files) in zip(range(_MOST_FOLDERS), walk, strict=False):
-        folders[:] = [each for each in folders if each not in _TOP_FOLDERS and each[0] != "."]
-        if folder != top and {PERMISSIONS_CA_FILE, *_OF_NODE} <= set(files):
-            subject = f"CN={folder[len(top) :].replace(os.sep, '/')}<"
-            with suppress(DocumentError):
-                signed = read_bytes(Path(folder, PERMISSIONS_FILE), "permissions document")
-                if subject.encode(errors="surrogateescape") in signed:
-                    return True
-    return False
 
 
 def check_keystore(root: Path) -> None:
@@ -557,8 +491,7 @@ def locate_enclave(folder: Path) -> tuple[Path, str]:
         if above.name == ENCLAVES:
             return above.parent, f"/{'/'.join(whole.relative_to(above).parts)}"
     for above in whole.parents:
-        if is_earlier_keystore(above):
-            refuse_earlier(above)
+        refuse_earlier(above)
     raise DocumentError(
         f"'{folder}' is not below a folder named {ENCLAVES}",
         "rcl finds an enclave by its path below that folder.",

@@ -5,11 +5,9 @@ from __future__ import annotations
 import shutil
 import subprocess
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 from tests.support.harness import policy_text, publish, sros
-from tests.support.made_by_eloquent import EVERYTHING, make_eloquent
 from tests.support.zenoh_configurations import denying, self_limiting
 
 WITHOUT_JSON = {
@@ -79,7 +77,6 @@ def make_folder(folder: Path) -> None:
         "create_keystore elsewhere --identity-key file:identity.pem",
     ):
         sros(*line.split(), cwd=folder).ok()
-    make_eloquent(folder / "eloquent", {"/talker": EVERYTHING}, now=datetime.now(UTC))
     for copy in ("turned", "broken", "lost", "wrecked", "partial", "fleet"):
         shutil.copytree(folder / "ks", folder / copy, symlinks=True)
     sros("rotate_ca", "turned", "--next", cwd=folder).ok()
@@ -121,8 +118,6 @@ CASES: dict[str, tuple[Case, ...]] = {
     "create_keystore": (
         Case("new"),
         Case("new --dry-run --ca-layout single --domain 3"),
-        Case("new --from eloquent"),
-        Case("new --from eloquent --dry-run"),
         Case(
             "new --identity-ca ks/public/identity_ca.cert.pem --identity-key file:ks/private/"
             "identity_ca.key.pem"

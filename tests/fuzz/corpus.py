@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -18,7 +17,6 @@ from sros_tool.resources import policies_dir
 from sros_tool.values import as_plain
 from tests.policy.earlier_policies import EARLIER, policies
 from tests.support.harness import policy_text, publish, sros
-from tests.support.made_by_eloquent import EVERYTHING, make_eloquent
 
 PASSPHRASE = "the passphrase"
 _SIGNED = 'chatter<?sros protect="sign"?>'
@@ -152,7 +150,6 @@ def make_corpus(root: Path) -> Corpus:
     (root / "observation.json").write_text(json.dumps(as_plain(make_observation([node])), indent=1))
     earlier = dict(policies(EARLIER))["private-gauge"]
     (root / "earlier.xml").write_text(earlier)
-    make_eloquent(root / "flat", {"/a": EVERYTHING, "/n/b": ("rt/x",)}, now=datetime.now(UTC))
     (root / "shipped.xml").write_bytes((policies_dir() / "mobile_robot.xml").read_bytes())
     key = load_key((keystore / "private/identity_ca.key.pem").read_bytes(), "of the corpus")
     assert isinstance(key, ec.EllipticCurvePrivateKey)

@@ -29,7 +29,6 @@ from sros_tool.keystore.fleet_metrics import fleet_metrics
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.history import history
 from sros_tool.keystore.ledger import certificate_entry, read_ledger
-from sros_tool.keystore.lifecycle.adopt import adopt_keystore
 from sros_tool.keystore.lifecycle.rotation.state import read_rotation, rotation_status
 from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.rights import load_rights
@@ -252,18 +251,6 @@ def _answer(data: bytes, place: Place) -> None:
     import_answer(place.corpus.robot, data, now=NOW, dry_run=True)
 
 
-def _of_node(data: bytes, place: Place) -> None:
-    old = place.folder / "flat"
-    if not old.exists():
-        shutil.copytree(place.corpus.root / "flat", old)
-    for file in ("cert.pem", "permissions.p7s"):
-        if (b"CERTIFICATE" in data) is (file == "cert.pem"):
-            (old / "a" / file).write_bytes(data)
-        else:
-            shutil.copyfile(place.corpus.root / "flat/a" / file, old / "a" / file)
-    adopt_keystore(place.folder / "new", old, now=NOW, dry_run=True)
-
-
 def _confirmation(data: bytes, place: Place) -> None:
     """Receive what a robot says that it has, keep it, and compare it with the keystore."""
     received = receive(data, "r7", "drawn", now=NOW)
@@ -303,7 +290,6 @@ READERS: dict[str, Reader] = {
     "governance": Reader(_governance, ("ks/enclaves/governance.xml",), 2),
     "policy": Reader(_policy, ("policy.xml", "shipped.xml"), 3),
     "earlier policy": Reader(_earlier_policy, ("earlier.xml",)),
-    "earlier keystore": Reader(_of_node, ("flat/a/permissions.p7s", "flat/a/cert.pem")),
     "template": Reader(_template, ("ks/sros.toml",), 2),
     "scenario": Reader(_scenario, ("scenario.toml",), 2),
     "ledger": Reader(_ledger, ("ks/ledger.jsonl",)),

@@ -168,7 +168,7 @@ def create_keystore(
     """
     if not dry_run:
         tidy(root)
-    check_free(root)
+    _check_free(root)
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         domains = domains or DomainSet.of((0, 0))
         keystore = _write_keystore(transaction, template, domains, keyring, now, imported)
@@ -183,7 +183,7 @@ def create_keystore(
         domains,
         True,
         changes=transaction.changes,
-        notes=(*notes, *place_notes(root)),
+        notes=(*notes, *_place_notes(root)),
     )
 
 
@@ -319,7 +319,7 @@ def generate_artifacts(
             )
         return replace(creation, notes=(*again, *creation.notes))
     _check_typo(root)
-    check_free(root)
+    _check_free(root)
     domains = domains or _domains_of(fleet, domain)
     check_domain(domains, domain, root)
     create = replace(create, protection=with_stated(create.protection, protections))
@@ -331,7 +331,7 @@ def generate_artifacts(
         creation = write_enclaves(
             transaction, keystore, wanted, now, progress, keyring=keyring, places=places
         )
-    return replace(creation, notes=(*creation.notes, *place_notes(root)))
+    return replace(creation, notes=(*creation.notes, *_place_notes(root)))
 
 
 def _protecting(policies: Sequence[Policy | FleetPolicy]) -> Iterator[Enclave]:
@@ -529,7 +529,7 @@ def _write_keystore(
     imported: Mapping[str, bytes],
 ) -> _Keystore:
     """Stage a new keystore: its CAs, its governance and its settings."""
-    check_free(transaction.root)  # another process may have created it meanwhile
+    _check_free(transaction.root)  # another process may have created it meanwhile
     for span in (template.certificate_validity, template.permissions_validity):
         window(now, span)  # raises if the CAs could not issue anything
     authorities = create_authorities(transaction, template, keyring, now, imported)
@@ -543,7 +543,7 @@ def _write_keystore(
     return _Keystore(authorities, template, domains, known, entries=tuple(entries), is_new=True)
 
 
-def check_free(root: Path) -> None:
+def _check_free(root: Path) -> None:
     """Raise `KeystoreError` if a new keystore cannot be created at ``root``."""
     if is_keystore(root):
         raise _already_exists(root)
@@ -568,7 +568,7 @@ def check_free(root: Path) -> None:
         )
 
 
-def place_notes(root: Path) -> Iterator[Note]:
+def _place_notes(root: Path) -> Iterator[Note]:
     """Note that users other than this one and root can replace a new keystore."""
     trusted = frozenset({0, os.geteuid()})
     found = list(replaceable_on_the_way(root, trusted))

@@ -143,16 +143,6 @@ class NewKeystore(NamedTuple):
     notes: Notes
 
 
-@shows(spread=("creation", "settings"))
-class AdoptedKeystore(NamedTuple):
-    """The keystore with what an earlier one had."""
-
-    creation: EnclaveCreation[Annotated[str, Words(("created",)), "It was taken over."]]
-    settings: NewKeystore
-    from_: Path
-    """The earlier keystore, as it was named."""
-
-
 def shown_keystore(
     result: Creation,
     template: Template,
