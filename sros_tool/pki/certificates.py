@@ -126,10 +126,22 @@ def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certifi
     )
 
 
+def check_signer(certificate: x509.Certificate) -> None:
+    """Raise `PkiError` if sros cannot sign with a certificate that DDS reads."""
+    if tolerant.is_tolerated(certificate):
+        raise PkiError(
+            f"sros cannot sign with the CA {subject_text(certificate.subject)}",
+            "Its certificate breaks rules of X.509 (RFC 5280); DDS reads it all the same, but "
+            "programs that issue certificates do not.",
+            "Issue the certificate of the CA again, without the damage or with other extensions.",
+        )
+
+
 class Issuer:
     """An identity CA that issues certificates to enclaves."""
 
     def __init__(self, certificate: x509.Certificate, key: PrivateKey) -> None:
+        check_signer(certificate)
         self._certificate = certificate
         self._key = key
         self._name = certificate.subject
@@ -161,6 +173,12 @@ def authority_identifier(certificate: x509.Certificate) -> x509.AuthorityKeyIden
 def _builder(
     subject: x509.Name, issuer: x509.Name, public: PublicKey, validity: Window
 ) -> x509.CertificateBuilder:
+    if isinstance(subject, TolerantName):
+        raise PkiError(
+            f"no certificate can have the subject {subject_text(subject)}",
+            "It has characters that its types of text do not allow.",
+            "Create the enclave anew, with another subject.",
+        )
     return x509.CertificateBuilder(
         issuer_name=issuer,
         subject_name=subject,

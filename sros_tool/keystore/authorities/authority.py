@@ -14,7 +14,7 @@ from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.errors import KeystoreError, Note, PkiError, check_meaning
+from sros_tool.errors import KeystoreError, Note, check_meaning
 from sros_tool.keystore.authorities.imported import check_imported
 from sros_tool.keystore.authorities.keyring import Keyring, check_imported_keys, check_places
 from sros_tool.keystore.layout import (
@@ -34,16 +34,15 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     Issuer,
     authority_text,
+    check_signer,
     common_name,
     issue_ca,
     pem,
     same_key,
-    subject_text,
     validity_of,
 )
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.pki.token import TokenKey
-from sros_tool.pki.tolerant import is_tolerated
 from sros_tool.validity import iso, window
 
 
@@ -60,14 +59,7 @@ class Authority:
         return isinstance(self.key, TokenKey)
 
     def __post_init__(self) -> None:
-        if is_tolerated(self.certificate):
-            raise PkiError(
-                f"sros cannot sign with the CA {subject_text(self.certificate.subject)}",
-                "Its certificate breaks rules of X.509 (RFC 5280); DDS reads it all the same, but "
-                "programs that issue certificates do not.",
-                "Issue the certificate of the CA again, without the damage or with other "
-                "extensions.",
-            )
+        check_signer(self.certificate)
 
     def issuer(self) -> Issuer:
         """Return an `Issuer` that signs certificates with this CA."""
