@@ -6,7 +6,7 @@ could not be asked or done, and is never the answer "no".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 NOT_DONE = 2
 """Exit status for what could not be asked or done; 1 is the answer "no", or findings."""
@@ -71,8 +71,7 @@ class UnavailableError(SrosError):
     """A missing DDS stack, RMW, Python package or privilege."""
 
 
-@dataclass(frozen=True, slots=True)
-class Note:
+class Note(NamedTuple):
     """A remark on the result."""
 
     id: str

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 _CONTROLS = [
     *(code for code in range(0x20) if chr(code) not in "\n\t"),
@@ -21,7 +22,6 @@ _SHOWN = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code 
 _SHOWN |= {code: f"\\u{code:04x}" for code in (*range(0xD800, 0xE000), 0xFFFE, 0xFFFF)}
 _SHOWN |= {code: f"\\x{code - 0xDC00:02x}" for code in _BYTES}
 _SHOWN_ON_A_LINE = {**_SHOWN, 0x0A: "\\x0a"}
-_IN_JSON = {code: f"\\u{code:04x}" for code in (*_CONTROLS, *range(0xD800, 0xE000))}
 _COLOURS = {
     "error": "red",
     "warning": "yellow",
@@ -32,8 +32,7 @@ _COLOURS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Coloured:
+class Coloured(NamedTuple):
     """A word of sros in its colour, on a terminal and without $NO_COLOR (https://no-color.org)."""
 
     word: str
@@ -52,9 +51,14 @@ def visible_line(text: str) -> str:
     return text.translate(_SHOWN_ON_A_LINE)
 
 
+@cache
+def _in_json() -> dict[int, str]:
+    return {code: f"\\u{code:04x}" for code in (*_CONTROLS, *range(0xD800, 0xE000))}
+
+
 def visible_json(document: str) -> str:
     """Replace the control characters in a JSON document with JSON escapes of the same value."""
-    return document.translate(_IN_JSON)
+    return document.translate(_in_json())
 
 
 def echo(*parts: str | Coloured, err: bool = False) -> None:

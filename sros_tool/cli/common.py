@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import re
 import select
@@ -23,7 +22,6 @@ from click.core import ParameterSource
 from sros_tool.cli.progress import paused
 from sros_tool.errors import DocumentError, PkiError, SrosError, UsageError
 from sros_tool.terminal import ask_secret, echo, echo_lines, visible_json, visible_line
-from sros_tool.values import versioned
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -83,15 +81,36 @@ def dry_run_option(function: Decorated) -> Decorated:
     )(function)
 
 
+class _MeasuredVendors(click.Choice):  # type: ignore[type-arg]  # generic from click 8.2 on
+    """The vendors whose DDS was measured; they are imported when the option is used."""
+
+    def __init__(self) -> None:
+        self.case_sensitive = True
+
+    def __getattr__(self, name: str) -> tuple[str, ...]:
+        if name != "choices":
+            raise AttributeError(name)
+        from sros_tool.dds.decision.vendors import MEASURED
+
+        self.choices = tuple(vendor.value for vendor in MEASURED)
+        return self.choices
+
+
+def _as_vendors(_ctx: click.Context, _option: click.Parameter, words: tuple[str, ...]) -> object:
+    if not words:
+        return ()
+    from sros_tool.dds.decision.vendors import Vendor
+
+    return tuple(map(Vendor, words))
+
+
 def allow_refusal_option(function: Decorated) -> Decorated:
     """Add ``--allow-refusal VENDOR`` to a verb that changes what enclaves load."""
-    from sros_tool.dds.decision.vendors import MEASURED, Vendor
-
     return click.option(
         "--allow-refusal",
         multiple=True,
-        type=click.Choice([vendor.value for vendor in MEASURED]),
-        callback=lambda _context, _option, words: tuple(map(Vendor, words)),
+        type=_MeasuredVendors(),
+        callback=_as_vendors,
         help="Go on although this DDS then refuses enclaves that it accepts today.  Can be "
         "repeated.",
     )(function)
@@ -332,11 +351,15 @@ def complete_template(
 
 def json_text(value: object) -> str:
     """Return a value as the text of a JSON document."""
+    import json
+
     return visible_json(json.dumps(value, indent=2, ensure_ascii=False))
 
 
 def print_json(value: object) -> None:
     """Print what ``--json`` shows of a verb on stdout; the type of ``value`` says the keys."""
+    from sros_tool.values import versioned
+
     echo_lines(json_text(versioned(value)))
 
 

@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from shlex import quote
-from textwrap import wrap
 from typing import TYPE_CHECKING
 
 from sros_tool.terminal import Coloured, echo, visible_line
@@ -44,6 +43,8 @@ def _finding_lines(finding: Finding) -> list[str]:
 
 def _wrapped(text: str, indent: str) -> list[str]:
     """Return lines of at most 80 characters; what is to be copied stays on one, however long."""
+    from textwrap import wrap
+
     whole = re.sub(r"`[^`]+`|<\w[^>]*/>", lambda m: m[0].replace(" ", "\0"), visible_line(text))
     lines = wrap(
         whole,

@@ -6,12 +6,10 @@ import importlib
 import os
 import re
 import sys
-import traceback
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -23,8 +21,7 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
 
-@dataclass(frozen=True, slots=True)
-class VerbEntry:
+class VerbEntry(NamedTuple):
     """A verb: its module, one line of help, aliases, and its name in the module if different."""
 
     module: str
@@ -353,6 +350,8 @@ def _defect(error: BaseException, arguments: Sequence[str]) -> int:
     if isinstance(error, (ImportError, AttributeError)) and (problem := _outdated_dependency()):
         return _print_error(_prefixed(problem, arguments))
     if os.environ.get("SROS_DEBUG"):
+        import traceback
+
         echo_lines("".join(traceback.format_exception(error)).rstrip("\n"), err=True)
     return _print_error(
         _prefixed(

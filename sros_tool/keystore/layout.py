@@ -9,11 +9,10 @@ import errno
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from sros_tool.errors import DocumentError, KeystoreError
 
@@ -196,8 +195,7 @@ def waits_for_answer(folder: Path) -> bool:
 _FOLDER_ELSEWHERE = "It is a symbolic link to a folder elsewhere, which sros does not follow"
 
 
-@dataclass(frozen=True, slots=True)
-class UnreadPath:
+class UnreadPath(NamedTuple):
     """A file or folder of a keystore that sros does not read, and ``why``, as a clause."""
 
     path: str
