@@ -12,11 +12,6 @@ NOT_DONE = 2
 """Exit status for what could not be asked or done; 1 is the answer "no", or findings."""
 
 
-def counted(number: int, thing: str) -> str:
-    """Return a number with its noun, like ``1 topic`` or ``2 topics``."""
-    return f"{number} {thing}{'' if number == 1 else 's'}"
-
-
 class SrosError(Exception):
     """Base of every error that sros raises on purpose.
 

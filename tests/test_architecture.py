@@ -28,11 +28,12 @@ LAYERS = {
         "topics",
         "validity",
         "values",
+        "wording",
         "written",
     }
     | {"xml", "files", "folders", "parallel", "resources", "prometheus", "markdown", "terminal"},
     2: {"pki", "policy", "dds", "zenoh"},
-    3: {"fleet", "translate", "translate_zenoh", "translate_zenoh_back"},
+    3: {"fleet", "translate", "translate_zenoh"},
     4: {"translate_from_zenoh", "reach", "keystore", "graph", "runtime"},
     5: {"checks", "explain", "demo", "report"},
     6: {"proof"},

@@ -32,8 +32,9 @@ from sros_tool.cli.observing import (
     why_empty,
 )
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.errors import UnavailableError, UsageError, counted
+from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.terminal import echo
+from sros_tool.wording import counted
 from sros_tool.written import file_change
 
 if TYPE_CHECKING:

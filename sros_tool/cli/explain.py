@@ -40,11 +40,12 @@ from sros_tool.cli.explain_zenoh import (
 )
 from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import NEWEST, Vendor
-from sros_tool.errors import KeystoreError, Note, SrosError, UsageError, counted
+from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.names import check_enclave_name, is_expression
 from sros_tool.terminal import Coloured, echo
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
+from sros_tool.wording import counted
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from sros_tool.errors import counted
 from sros_tool.validity import iso
+from sros_tool.wording import counted
 
 if TYPE_CHECKING:
     from sros_tool.explain.question import Question

@@ -25,9 +25,10 @@ from sros_tool.cli.observing import (
     observing_options,
     why_empty,
 )
-from sros_tool.errors import SrosError, UsageError, counted
+from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo, echo_document
 from sros_tool.values import as_plain
+from sros_tool.wording import counted
 from sros_tool.written import FileChange, file_change
 
 if TYPE_CHECKING:

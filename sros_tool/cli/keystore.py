@@ -380,13 +380,14 @@ def list_enclaves(
     root: Path | None, patterns: tuple[str, ...], robots: tuple[str, ...], as_json: bool
 ) -> None:
     """List the enclaves of the keystore ROOT, sorted."""
-    from sros_tool.errors import KeystoreError, counted
+    from sros_tool.errors import KeystoreError
     from sros_tool.keystore.layout import (
         enclave_names,
         hidden_enclaves,
         is_keystore,
         refuse_earlier,
     )
+    from sros_tool.wording import counted
 
     root = root or keystore_from_environment()
     if not is_keystore(root):

@@ -23,7 +23,7 @@ from typing import Annotated, NamedTuple
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import Governance
-from sros_tool.errors import Note, PolicyError, counted
+from sros_tool.errors import Note, PolicyError
 from sros_tool.explain.denials import nodes_served
 from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import Part, Question
@@ -54,6 +54,7 @@ from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, order
 from sros_tool.topics import dds_names
 from sros_tool.values import Words, shows
+from sros_tool.wording import counted
 from sros_tool.written import DryRun, FileChanges, Notes
 
 _DENY_RULE = "deny-rule"

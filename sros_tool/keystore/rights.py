@@ -39,8 +39,7 @@ from sros_tool.policy.model import ALLOW, RIGHTS, Policy, Source
 from sros_tool.policy.rights import Right, RightsDifference, parts, policy_rights
 from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.translate import grant_rights
-from sros_tool.translate_zenoh import StatedRight
-from sros_tool.translate_zenoh_back import rights_in_rules
+from sros_tool.translate_zenoh import StatedRight, rights_in_rules
 from sros_tool.values import Words, shows
 from sros_tool.xml import parse, read_bytes
 from sros_tool.zenoh.configuration import Mode

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import accumulate
 
-from sros_tool.errors import counted
 from sros_tool.policy.model import ALLOW, Qualifier
 from sros_tool.report.focus import ENCLAVE, FocusFlow
 from sros_tool.report.layout import (
@@ -43,6 +42,7 @@ from sros_tool.report.picture import (
     coarsened,
     fold,
 )
+from sros_tool.wording import counted
 
 HOPS = 2
 """The hops that are drawn unless a number is chosen."""

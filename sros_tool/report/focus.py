@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from sros_tool.dds.governance import Governance
-from sros_tool.errors import UsageError, counted
+from sros_tool.errors import UsageError
 from sros_tool.keystore.missing import likely_names
 from sros_tool.names import ACTION_SEPARATOR, is_expression
 from sros_tool.policy.model import ALLOW, DENY
@@ -22,6 +22,7 @@ from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_tex
 from sros_tool.report.compose import PictureSource, edge_order, namespace_of, protection_of
 from sros_tool.report.picture import Edge, Focus, Influence, Name, Picture, asks
 from sros_tool.topics import dds_names
+from sros_tool.wording import counted
 
 ENCLAVE = "enclave"
 _VERBS = {

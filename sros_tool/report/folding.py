@@ -26,7 +26,6 @@ from collections.abc import (
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
-from sros_tool.errors import counted
 from sros_tool.fleet.model import Robot
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.compose import edge_order, namespace_of
@@ -42,6 +41,7 @@ from sros_tool.report.picture import (
     Picture,
     PicturedEnclave,
 )
+from sros_tool.wording import counted
 
 _MARKS = "{}…"
 """The letters of labels, which no ROS name has; a picture with them is drawn as it is."""

@@ -14,7 +14,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
-from sros_tool.errors import counted
 from sros_tool.policy.model import ALLOW, Qualifier
 from sros_tool.report.picture import (
     SENDS,
@@ -30,6 +29,7 @@ from sros_tool.report.picture import (
     is_plain,
     lack_text,
 )
+from sros_tool.wording import counted
 
 _SIDE_WIDTH, _NAMES_WIDTH, _GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from textwrap import wrap
 
-from sros_tool.errors import counted
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.layout import (
     KIND_NAMES,
@@ -28,6 +27,7 @@ from sros_tool.report.picture import (
     WireLevel,
     lack_text,
 )
+from sros_tool.wording import counted
 
 _HEAD, _SAID = 40, 19
 _STYLE = """\

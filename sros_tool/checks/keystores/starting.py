@@ -15,7 +15,7 @@ from sros_tool.checks.kind import ERROR, Cause, Finding, FindingKind, some_names
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.permissions import Grant
-from sros_tool.errors import DocumentError, counted
+from sros_tool.errors import DocumentError
 from sros_tool.keystore.layout import PERMISSIONS_FILE
 from sros_tool.keystore.participant import VendorParticipant
 from sros_tool.names import (
@@ -26,6 +26,7 @@ from sros_tool.names import (
 )
 from sros_tool.policy.patterns import common_name, overlap
 from sros_tool.topics import dds_names, service_of
+from sros_tool.wording import counted
 
 NO_NODE = FindingKind(
     "enclave.node-cannot-start",

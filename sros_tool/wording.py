@@ -1,0 +1,25 @@
+"""Numbers and lists in words: "2 topics", "a, b and 3 more", "a, b and c"."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def counted(number: int, thing: str, things: str = "") -> str:
+    """Return a number with its noun, like ``1 topic`` or ``2 topics``.
+
+    ``things`` is the plural where it is more than the noun with an *s*.
+    """
+    return f"{number} {thing if number == 1 else things or f'{thing}s'}"
+
+
+def first_few(texts: Sequence[str], most: int, separator: str = ", ", joint: str = " and ") -> str:
+    """Return at most ``most`` texts and the number of the others: "a, b and 3 more"."""
+    others = len(texts) - most
+    return separator.join(texts[:most]) + (f"{joint}{others} more" if others > 0 else "")
+
+
+def enumerated(texts: Sequence[str], joint: str = " and ") -> str:
+    """Return all texts as in a sentence: "a, b and c"."""
+    *first, last = texts
+    return f"{', '.join(first)}{joint}{last}" if first else last

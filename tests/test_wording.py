@@ -1,0 +1,37 @@
+"""Numbers and lists in words."""
+
+from __future__ import annotations
+
+import pytest
+
+from sros_tool.wording import counted, enumerated, first_few
+
+
+@pytest.mark.parametrize(
+    ("number", "words"), [(0, "0 topics"), (1, "1 topic"), (2, "2 topics"), (1000, "1000 topics")]
+)
+def test_a_number_has_its_noun(number: int, words: str) -> None:
+    assert counted(number, "topic") == words
+
+
+def test_a_noun_has_its_own_plural() -> None:
+    assert counted(1, "policy", "policies") == "1 policy"
+    assert counted(2, "policy", "policies") == "2 policies"
+
+
+@pytest.mark.parametrize(
+    ("most", "words"), [(1, "a and 2 more"), (2, "a, b and 1 more"), (3, "a, b, c"), (9, "a, b, c")]
+)
+def test_what_is_left_out_is_counted(most: int, words: str) -> None:
+    assert first_few(["a", "b", "c"], most) == words
+
+
+def test_clauses_have_their_own_separators() -> None:
+    assert first_few(["a", "b", "c"], 2, "; ", "; and ") == "a; b; and 1 more"
+
+
+@pytest.mark.parametrize(
+    ("texts", "words"), [(["a"], "a"), (["a", "b"], "a and b"), (["a", "b", "c"], "a, b and c")]
+)
+def test_a_list_ends_in_and(texts: list[str], words: str) -> None:
+    assert enumerated(texts) == words
