@@ -8,6 +8,7 @@ from enum import StrEnum
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.values import shows
+from sros_tool.wording import first_few
 
 
 class Severity(StrEnum):
@@ -208,8 +209,7 @@ def by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
 
 def some_names(names: Sequence[str]) -> str:
     """Return the first names, and the number of the others."""
-    more = len(names) - _NAMES_SHOWN
-    return ", ".join(names[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
+    return first_few(names, _NAMES_SHOWN)
 
 
 _NAMES_SHOWN = 6

@@ -55,6 +55,7 @@ from sros_tool.resources import policies_dir
 from sros_tool.topics import GOAL
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
+from sros_tool.wording import first_few
 from sros_tool.xml import parse, read_bytes
 
 
@@ -626,9 +627,7 @@ def within_root(rights: Collection[Right]) -> str:
         for name, found in own.items()
         if all(root.allow("/", each.right, each.name) for each in found)
     )
-    more = len(names) - _NAMES_SHOWN
-    some = ", ".join(names[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
-    return f"/ has all rights of {some}" if names else ""
+    return f"/ has all rights of {first_few(names, _NAMES_SHOWN)}" if names else ""
 
 
 def only_basic(rights: Collection[Right]) -> bool:

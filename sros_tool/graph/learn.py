@@ -30,6 +30,7 @@ from sros_tool.names import (
 from sros_tool.policy.document import IncludedFile, Includer
 from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.translate import ros_rights
+from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes, tag_of
 
 
@@ -476,8 +477,7 @@ class _Notes:
 
 def listed(subjects: Sequence[str], separator: str = ", ") -> str:
     """Return the first subjects in words: "a, b, c, d, e and 2 more"."""
-    more = len(subjects) - _SHOWN
-    return separator.join(subjects[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+    return first_few(subjects, _SHOWN, separator)
 
 
 _EVERY_NODE = "common/node.xml"

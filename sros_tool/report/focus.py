@@ -22,7 +22,7 @@ from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_tex
 from sros_tool.report.compose import PictureSource, edge_order, namespace_of, protection_of
 from sros_tool.report.picture import Edge, Focus, Influence, Name, Picture, asks
 from sros_tool.topics import dds_names
-from sros_tool.wording import counted
+from sros_tool.wording import counted, enumerated
 
 ENCLAVE = "enclave"
 _VERBS = {
@@ -361,5 +361,4 @@ def _who(enclaves: Collection[str]) -> str:
         return "no enclave"
     if len(enclaves) > _NAMED:
         return counted(len(enclaves), "enclave")
-    *first, last = sorted(enclaves)
-    return f"{', '.join(first)} and {last}" if first else f"{last} alone"
+    return enumerated(sorted(enclaves)) + (" alone" if len(enclaves) == 1 else "")

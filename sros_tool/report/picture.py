@@ -16,7 +16,7 @@ from sros_tool.names import READING_SERVICES
 from sros_tool.policy.model import ALLOW, RIGHTS, Qualifier
 from sros_tool.policy.rights import RIGHT_ORDER
 from sros_tool.values import Words, shows
-from sros_tool.wording import counted
+from sros_tool.wording import counted, first_few
 
 SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
     ("subscribe", "reply", "execute"), False
@@ -435,8 +435,7 @@ class DifferentUnit:
         """Return what differs in a sentence without a full stop."""
         parts = []
         for has, found in (("it has", self.more), ("it lacks", self.fewer)):
-            more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
-            parts += [f"{has} {'; '.join(found[:_SHOWN])}{more}"] if found else []
+            parts += [f"{has} {first_few(found, _SHOWN, '; ')}"] if found else []
         usual = self.usual.strip("{}").replace("…", " … ")
         return f"{self.unit.strip('{}')} differs from {usual}: {', and '.join(parts)}"
 

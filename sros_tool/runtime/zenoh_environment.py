@@ -16,6 +16,7 @@ from pathlib import Path
 
 from sros_tool.errors import KeystoreError, Note
 from sros_tool.runtime.rmw import RMW
+from sros_tool.wording import first_few
 
 RMW_ZENOH = "rmw_zenoh_cpp"
 SESSION_URI, ROUTER_URI = "ZENOH_SESSION_CONFIG_URI", "ZENOH_ROUTER_CONFIG_URI"
@@ -95,8 +96,7 @@ def replaced_notes(environment: Mapping[str, str], variables: Mapping[str, str])
             yield Note("zenoh.replaced", f"{name} was {_shortened(before)}, and is replaced.")
             continue
         keys = [key.strip().strip("/") for key, _ in override_pairs(before)]
-        shown = ", ".join(map(_shortened, keys[:_MOST_KEYS])) or "nothing"
-        shown += f" and {len(keys) - _MOST_KEYS} more" if len(keys) > _MOST_KEYS else ""
+        shown = first_few([_shortened(key) for key in keys], _MOST_KEYS) or "nothing"
         yield Note("zenoh.replaced", f"{OVERRIDE} was set for {shown}, and is replaced.")
         if any(key.partition("/")[0] == "access_control" for key in keys):
             yield Note(

@@ -28,6 +28,7 @@ from sros_tool.keystore.participant import (
 )
 from sros_tool.keystore.reader import OpenedEnclave
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
+from sros_tool.wording import enumerated, first_few
 
 _ENGINE = (
     "sros: its decision engine, compared with Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2."
@@ -225,7 +226,9 @@ def _refusals(
     clauses = [_clause(cause, some) for cause, some in by_cause.items()]
     accepting = [vendor.title for vendor, some in causes.items() if not some]
     if accepting:
-        clauses.append(f"{_listed(accepting)} {'accepts' if len(accepting) == 1 else 'accept'} it")
+        clauses.append(
+            f"{enumerated(accepting)} {'accepts' if len(accepting) == 1 else 'accept'} it"
+        )
     first = next(iter(by_cause))
     fault = FAULTS.get(first.reason)
     yield (REFUSED if all_refuse else SOME_REFUSE).found(
@@ -253,11 +256,7 @@ def _file(finding: Finding) -> str:
 def _clause(cause: RefusalCause, vendors: Sequence[Vendor]) -> str:
     several, one = _HIT_PEERS if cause.hits_peers else _SAYS.get(cause.outcome, _REFUSES)
     says = one if len(vendors) == 1 else several
-    return f"{_listed([each.title for each in vendors])} {says} ({cause.text})"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+    return f"{enumerated([each.title for each in vendors])} {says} ({cause.text})"
 
 
 # ── what they decide differently ───────────────────────────────────────────────────────────
@@ -282,8 +281,7 @@ def _different_rights(
     }
     differing = list(_differences(answers, _topics_to_ask(enclave, known)))
     if differing:
-        more = f"; and {len(differing) - _SHOWN} more" if len(differing) > _SHOWN else ""
-        text = f"on domain {domain}, {'; '.join(differing[:_SHOWN])}{more}"
+        text = f"on domain {domain}, {first_few(differing, _SHOWN, '; ', '; and ')}"
         yield DIFFER.found(enclave.name, text, enclave.file(PERMISSIONS_FILE))
 
 

@@ -58,11 +58,12 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import may_sign_lists, read_list, sign_crl
+from sros_tool.pki.crl import may_sign_lists, sign_crl
 from sros_tool.pki.forms import holds_at, read_form
 from sros_tool.pki.keys import generate_key
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
+from sros_tool.wording import enumerated, first_few
 from sros_tool.xml import read_bytes
 
 _LOADED = (
@@ -124,7 +125,7 @@ def refuse_stopping(
     found = _stopped_enclaves(transaction, now)
     if refused := {vendor: each for vendor, each in found.items() if vendor not in allowed}:
         raise _would_stop(transaction.root, refused, remedy)
-    old = _authority_without_list(transaction)
+    old = _authority_withoutenumerated(transaction)
     if old and (cut_off := [each for each in _READ_SEVERAL if each not in allowed]):
         raise _would_be_shut_out(transaction.root, old, cut_off, remedy)
     notes = [
@@ -201,14 +202,14 @@ def _would_stop(root: Path, found: Mapping[Vendor, _Refusals], remedy: str) -> K
         f"no node could start in {_some(names)} of '{root}'",
         f"{_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
         f"{remedy or 'Replace the file that is named.'} If no node runs on "
-        f"{_list([each.title for each in found])}, add {options}.",
+        f"{enumerated([each.title for each in found])}, add {options}.",
     )
 
 
 _READ_SEVERAL = tuple(each for each in MEASURED if not each.traits.reads_first_authority)
 
 
-def _authority_without_list(transaction: Transaction) -> x509.Certificate | None:
+def _authority_withoutenumerated(transaction: Transaction) -> x509.Certificate | None:
     """Return a CA before the present one that may not sign lists, where a first list is added.
 
     Where there is a list, OpenSSL asks for one of the CA of a certificate.
@@ -230,7 +231,7 @@ def _authority_without_list(transaction: Transaction) -> x509.Certificate | None
 def _would_be_shut_out(
     root: Path, old: x509.Certificate, vendors: Sequence[Vendor], remedy: str
 ) -> KeystoreError:
-    name, titles = subject_text(old.subject), _list([each.title for each in vendors])
+    name, titles = subject_text(old.subject), enumerated([each.title for each in vendors])
     options = " ".join(f"--allow-refusal {vendor.value}" for vendor in vendors)
     return KeystoreError(
         f"processes that still run with certificates of {name} would be shut out of '{root}'",
@@ -246,18 +247,13 @@ def _clauses(refused: Mapping[Vendor, str], what: str) -> str:
     for vendor, reason in refused.items():
         by_reason.setdefault(reason, []).append(vendor.title)
     return "; ".join(
-        f"{_list(titles)} {'refuses' if len(titles) == 1 else 'refuse'} {what} ({reason})"
+        f"{enumerated(titles)} {'refuses' if len(titles) == 1 else 'refuse'} {what} ({reason})"
         for reason, titles in by_reason.items()
     )
 
 
 def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return f"{', '.join(names[:_SHOWN])}{more}"
-
-
-def _list(words: Sequence[str]) -> str:
-    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
+    return first_few(names, _SHOWN)
 
 
 # ── CAs that are imported ──────────────────────────────────────────────────────────────────
@@ -291,7 +287,9 @@ def imported_notes(
     if new := {vendor: why for vendor, why in refused.items() if vendor.title not in known}:
         others = [vendor.title for vendor in MEASURED if vendor not in refused]
         verb = "accepts" if len(others) == 1 else "accept"
-        text = f"{_clauses(new, 'the enclaves of this keystore')}; {_list(others)} {verb} them."
+        text = (
+            f"{_clauses(new, 'the enclaves of this keystore')}; {enumerated(others)} {verb} them."
+        )
         notes.append(Note("portable.imported-ca", text))
     identity = authorities.identity
     validity = validity_of(identity.certificate).within(window(now, template.revocation_validity))
