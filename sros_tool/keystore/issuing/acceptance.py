@@ -58,7 +58,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import may_sign_lists, sign_crl
+from sros_tool.pki.crl import may_sign_lists, read_list, sign_crl
 from sros_tool.pki.forms import holds_at, read_form
 from sros_tool.pki.keys import generate_key
 from sros_tool.translate import permissions_for
@@ -125,7 +125,7 @@ def refuse_stopping(
     found = _stopped_enclaves(transaction, now)
     if refused := {vendor: each for vendor, each in found.items() if vendor not in allowed}:
         raise _would_stop(transaction.root, refused, remedy)
-    old = _authority_withoutenumerated(transaction)
+    old = _authority_without_list(transaction)
     if old and (cut_off := [each for each in _READ_SEVERAL if each not in allowed]):
         raise _would_be_shut_out(transaction.root, old, cut_off, remedy)
     notes = [
@@ -209,7 +209,7 @@ def _would_stop(root: Path, found: Mapping[Vendor, _Refusals], remedy: str) -> K
 _READ_SEVERAL = tuple(each for each in MEASURED if not each.traits.reads_first_authority)
 
 
-def _authority_withoutenumerated(transaction: Transaction) -> x509.Certificate | None:
+def _authority_without_list(transaction: Transaction) -> x509.Certificate | None:
     """Return a CA before the present one that may not sign lists, where a first list is added.
 
     Where there is a list, OpenSSL asks for one of the CA of a certificate.
