@@ -17,7 +17,7 @@ from sros_tool.errors import DocumentError
 
 _LOG = logging.getLogger(__name__)
 
-_MAX_BYTES = 16 * 1024 * 1024
+MAX_BYTES = 16 * 1024 * 1024
 """Largest document that is read, in bytes."""
 _MAX_MARKUP = 400_000
 """Most tags and attributes that are read: even a short one takes libxml2 over 100 bytes."""
@@ -36,7 +36,7 @@ def _parser(instructions: bool) -> etree.XMLParser:
     )
 
 
-def read_bytes(path: Path, what: str, *, owner: int | None = None, most: int = _MAX_BYTES) -> bytes:
+def read_bytes(path: Path, what: str, *, owner: int | None = None, most: int = MAX_BYTES) -> bytes:
     """Return the content of a regular file of at most ``most`` bytes (16 MiB).
 
     ``what`` describes the file in errors, such as "policy".  A file without a size is empty, also
@@ -46,6 +46,13 @@ def read_bytes(path: Path, what: str, *, owner: int | None = None, most: int = _
     Raises:
         DocumentError: the file does not exist, cannot be read, is too large or not a regular file.
     """
+    return read_file(path, what, owner=owner, most=most)[1]
+
+
+def read_file(
+    path: Path, what: str, *, owner: int | None = None, most: int = MAX_BYTES
+) -> tuple[os.stat_result, bytes]:
+    """Return the state of a regular file, and its content as `read_bytes` does."""
     try:
         # Looked at first, because opening a pipe would wait for its writer.
         there, data = path.stat(), b""
@@ -71,7 +78,7 @@ def read_bytes(path: Path, what: str, *, owner: int | None = None, most: int = _
             f"It has more than {most // 1024**2} MiB.",
         ) from OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
     _LOG.debug("read the %s '%s', %d bytes", what, path, len(data))
-    return data
+    return there, data
 
 
 def _read_open(path: Path, most: int) -> tuple[os.stat_result, bytes]:

@@ -65,8 +65,8 @@ from sros_tool.keystore.layout import (
     enclave_path,
 )
 from sros_tool.keystore.reader import (
+    Keystore,
     OpenedEnclave,
-    OpenedKeystore,
     governance_of,
     load_settings,
     open_keystore,
@@ -284,7 +284,7 @@ def _listed(names: frozenset[str] | tuple[str, ...]) -> str:
     return f"{first} and {len(others)} more" if others else first
 
 
-def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enclaves:
+def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
     """Read the files of all enclaves; ``domain`` is the domain in which they meet."""
     rights: dict[str, Grant] = {}
     faulty: dict[str, str] = {}
@@ -326,7 +326,7 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
     )
 
 
-def _revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
+def _revoked_serials(keystore: Keystore) -> frozenset[int]:
     """Return the serial numbers that the ledger or the revocation list names as revoked."""
     entries = (each for each in keystore.ledger.entries if each.what == "revocation")
     listed = keystore.revocation_list.revoked if keystore.revocation_list else ()
@@ -341,7 +341,7 @@ def _content(path: Path) -> bytes:
         return b""
 
 
-def _strange_authority(keystore: OpenedKeystore, state: OpenedEnclave) -> str:
+def _strange_authority(keystore: Keystore, state: OpenedEnclave) -> str:
     """Return which CA file of an enclave has no CA of the keystore, or ""."""
     for file, role in ((IDENTITY_CA_FILE, IDENTITY), (PERMISSIONS_CA_FILE, PERMISSIONS)):
         known = {digest(each) for each in keystore.authority(role)}

@@ -31,7 +31,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
-from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave
+from sros_tool.keystore.reader import Keystore, OpenedEnclave, open_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     digest,
@@ -128,7 +128,7 @@ def _configuration(path: Path, data: bytes, now: datetime, authority: Path | Non
 
 
 def _keystore(root: Path, now: datetime) -> Description:
-    keystore = OpenedKeystore(root)
+    keystore = Keystore(root)
     settings = keystore.settings
     authorities: Description = {}
     for role in ROLES:

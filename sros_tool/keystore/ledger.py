@@ -21,7 +21,7 @@ import re
 import stat
 from array import array
 from bisect import bisect_right
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from datetime import datetime
@@ -121,7 +121,7 @@ _SERIAL = re.compile(r"[0-9a-f]{1,40}")
 _MOST_BITS = 159
 """The length of a serial number (RFC 5280, 4.1.2.2)."""
 _MOST_NUMBER = 10**12
-_MOST_REMEMBERED = 16 * 1024 * 1024
+_MOST_KEPT = 16 * 1024 * 1024
 _HEAD = re.compile(rb"sros ledger 1\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n")
 _VALUES = {
     "serial": r'"(?P<serial>[0-7][0-9a-f]{39}|[0-9a-f]{1,39})"',
@@ -195,16 +195,13 @@ def document_entry(
 
 
 def read_ledger(root: Path, *, having: tuple[str, str] | None = None) -> Ledger:
-    """Return the ledger of a keystore; empty for one that has none (of ros2/sros2).
-
-    With ``having``, a field and its value, others than those entries may be left out: the chain is
-    proven as always, and that is all that the lines of the others cost.
+    """Return the ledger of a keystore as `LedgerFile` reads it, with the CAs of the keystore.
 
     Raises:
         KeystoreError: the file cannot be read at all.
     """
-    text = f'"{having[0]}":{_quoted(having[1])}'.encode() if having else _EVERY
-    return _read(root, having=text).ledger
+    file = LedgerFile(root, lambda: _authorities(root))
+    return file.with_field(*having) if having else file.ledger()
 
 
 class _Reading(NamedTuple):
@@ -222,61 +219,146 @@ class _Reading(NamedTuple):
 
 _EVERY = b""
 _NONE = b"\n"
-"""A text that is in every line, and one that is in none, as ``having`` of `_read`."""
+"""A text that is in every line, and one that is in none, as ``having`` of a reading."""
 _GAP, _CA = b'"what":"gap"', b'"what":"ca"'
 
 
-def _read(root: Path, *, follow_link: bool = True, having: bytes = _EVERY) -> _Reading:
-    """Return the ledger; with ``having``, lines without that text are only proven, if chained."""
-    while True:
-        head = _read_head(root)
-        with _open(root, follow_link) or io.BytesIO() as file:
-            reading = _compare(root, file, head, having)
+class _Files(NamedTuple):
+    """The ledger and its head at one moment.
+
+    ``state`` is None without a ledger; ``lines`` is its content, None if it is too long to keep.
+    """
+
+    head: _Head | None
+    state: os.stat_result | None
+    lines: bytes | None
+
+
+class LedgerFile:
+    """The lines of a ledger and their signed head, which are read once.
+
+    ``authorities`` returns the certificates of the CAs that the keystore trusts.  Only a ledger of
+    more than 16 MiB is read again for each question.  Who has the lock of the keystore does not
+    follow a link (``follow_link``).
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        authorities: Callable[[], Sequence[x509.Certificate]],
+        *,
+        follow_link: bool = True,
+    ) -> None:
+        self.root = root
+        self._authorities = authorities
+        self._follow_link = follow_link
+        self._files: _Files | None = None
+        self._readings: dict[bytes, _Reading] = {}
+
+    def ledger(self) -> Ledger:
+        """Return the ledger; empty for a keystore that has none (of ros2/sros2).
+
+        Raises:
+            KeystoreError: the file cannot be read at all.
+        """
+        return self._reading(_EVERY).ledger
+
+    def with_field(self, name: str, value: str) -> Ledger:
+        """Return the ledger, in which entries without this value of a field may be missing.
+
+        The chain is proven as always, and that is all that the lines of the others cost.
+
+        Raises:
+            KeystoreError: the file cannot be read at all.
+        """
+        if _EVERY in self._readings:
+            return self._readings[_EVERY].ledger
+        return self._reading(f'"{name}":{_quoted(value)}'.encode()).ledger
+
+    def end(self) -> _Reading:
+        """Return what is needed to add lines; entries may be missing from the ledger in it."""
+        return self._readings.get(_EVERY) or self._reading(_NONE)
+
+    def content(self) -> Iterator[bytes]:
+        """Yield the bytes of all lines, in blocks."""
+        if self._files and self._files.lines is not None:
+            yield self._files.lines
+            return
+        with _open(self.root, self._follow_link) or io.BytesIO() as file:
+            yield from iter(lambda: file.read(_BLOCK), b"")
+
+    def _reading(self, having: bytes) -> _Reading:
+        """Return the ledger; lines without the text ``having`` are only proven, if chained."""
+        if having not in self._readings:
+            self._readings[having] = self._compared(having)
+        return self._readings[having]
+
+    def _compared(self, having: bytes) -> _Reading:
+        while True:
+            known = self._files
+            files = known or self._read()
+            reading = self._compared_with_head(files, having)
             # A transaction of another process may have ended between the reading of the two files.
-            if not reading.unrecorded or (
-                _is_still(root / LEDGER, file) and _read_head(root) == head
-            ):
+            kept = known is not None and known.lines is not None
+            if kept or not reading.unrecorded or self._is_still(files):
+                self._files = files
                 return reading
+            self._files = None
 
+    def _read(self) -> _Files:
+        head = _read_head(self.root, self._authorities)
+        file = _open(self.root, self._follow_link)
+        if file is None:
+            return _Files(head, None, b"")
+        with file:
+            state = os.fstat(file.fileno())
+            return _Files(head, state, file.read() if state.st_size <= _MOST_KEPT else None)
 
-def _is_still(path: Path, file: BinaryIO) -> bool:
-    """Return whether the open ``file`` is the one at ``path``; an `io.BytesIO` stands for none."""
-    with suppress(OSError):
-        there = path.stat()
-        return not isinstance(file, io.BytesIO) and os.path.samestat(there, os.fstat(file.fileno()))
-    return isinstance(file, io.BytesIO)
+    def _is_still(self, files: _Files) -> bool:
+        """Return whether what was read is what is there now."""
+        state = None
+        with suppress(OSError):
+            state = (self.root / LEDGER).stat()
+        if state is None or files.state is None:
+            same = state is files.state
+        else:
+            same = os.path.samestat(state, files.state)
+        return same and _read_head(self.root, self._authorities) == files.head
 
+    def _lines(self, files: _Files, having: bytes) -> _Lines:
+        stated = files.head.lines if files.head else 0
+        if files.lines is not None:
+            read = _remembered(files.lines, having, stated, _MOST_LINES, _MOST_BYTES)
+        else:
+            with _open(self.root, self._follow_link) or io.BytesIO() as file:
+                read = _read_lines(file, having, stated, _MOST_LINES, _MOST_BYTES)
+        if read is None:
+            raise _too_large(self.root / LEDGER)
+        return read
 
-def _compare(root: Path, file: BinaryIO, head: _Head | None, having: bytes) -> _Reading:
-    """Return the ledger in ``file``, compared with its head; an `io.BytesIO` stands for none."""
-    stated = head.lines if head else 0
-    is_there = not isinstance(file, io.BytesIO)
-    if is_there and os.fstat(file.fileno()).st_size <= _MOST_REMEMBERED:
-        read = _remembered(file.read(), having, stated, _MOST_LINES, _MOST_BYTES)
-    else:
-        read = _read_lines(file, having, stated, _MOST_LINES, _MOST_BYTES)
-    if read is None:
-        raise _too_large(root / LEDGER)
-    if not read.lines:
-        return _without_lines(root, is_there=is_there)
-    entries, numbers, faults = read.entries, read.numbers, [*read.faults]
-    if fault := _head_fault(head, read.lines, read.signed, chained=read.chained):
-        faults.append(fault)
-    recorded = [_Fault(each.number, each.reason) for each in entries if each.what == GAP]
-    gaps = (at for at, each in zip(numbers, entries, strict=True) if each.what == GAP)
-    last_recorded = max(gaps, default=0)
-    start = _first_of(_authorities(root), zip(numbers, entries, strict=True))
-    every = [*recorded, *faults]
-    last_fault = max((each.line for each in every), default=0)
-    ledger = Ledger(
-        entries,
-        tuple(dict.fromkeys(each.text for each in every if each.line >= start)),
-        entries[bisect_right(numbers, last_fault) :],
-        0 if start > read.unchained else read.unchained,
-        read.lines,
-    )
-    unrecorded = [each for each in faults if each.line >= last_recorded]
-    return _Reading(ledger, unrecorded, read.previous, read.ended)
+    def _compared_with_head(self, files: _Files, having: bytes) -> _Reading:
+        read = self._lines(files, having)
+
+        if not read.lines:
+            return _without_lines(self.root, is_there=files.state is not None)
+        entries, numbers, faults = read.entries, read.numbers, [*read.faults]
+        if fault := _head_fault(files.head, read.lines, read.signed, chained=read.chained):
+            faults.append(fault)
+        recorded = [_Fault(entry.number, entry.reason) for entry in entries if entry.what == GAP]
+        gaps = (at for at, entry in zip(numbers, entries, strict=True) if entry.what == GAP)
+        last_recorded = max(gaps, default=0)
+        start = _first_of(self._authorities(), zip(numbers, entries, strict=True))
+        every = [*recorded, *faults]
+        last_fault = max((fault.line for fault in every), default=0)
+        ledger = Ledger(
+            entries,
+            tuple(dict.fromkeys(fault.text for fault in every if fault.line >= start)),
+            entries[bisect_right(numbers, last_fault) :],
+            0 if start > read.unchained else read.unchained,
+            read.lines,
+        )
+        unrecorded = [fault for fault in faults if fault.line >= last_recorded]
+        return _Reading(ledger, unrecorded, read.previous, read.ended)
 
 
 class _Lines(NamedTuple):
@@ -302,7 +384,7 @@ def _read_lines(
 ) -> _Lines | None:
     """Return the lines of a ledger, or None if there are more than ``most``, or more bytes.
 
-    ``stated`` is the number of lines that the head states; ``having`` is as in `_read`.
+    ``stated`` is the number of lines that the head states; ``having`` is as in `LedgerFile`.
     """
     entries: list[Entry] = []
     numbers = array("Q")
@@ -516,13 +598,13 @@ class _Head(NamedTuple):
     fault: str = ""
 
 
-def _read_head(root: Path) -> _Head | None:
-    """Return the head of a keystore's ledger; None without one."""
+def _read_head(root: Path, trusted: Callable[[], Sequence[x509.Certificate]]) -> _Head | None:
+    """Return the head of a keystore's ledger, signed by a ``trusted`` CA; None without a head."""
     if not (root / LEDGER_HEAD).exists():
         return None
     try:
         signed = smime.parse(read_bytes(root / LEDGER_HEAD, "signed head of the ledger"))
-        if authorities := _authorities(root):
+        if authorities := trusted():
             _verify(signed, authorities)
         stated = _HEAD.fullmatch(signed.text)
     except SrosError as error:
@@ -565,9 +647,15 @@ def _verify(signed: smime.SignedDocument, authorities: Sequence[x509.Certificate
 
 
 def append(
-    transaction: Transaction, entries: Collection[Entry], authority: Authority, now: datetime
+    transaction: Transaction,
+    entries: Collection[Entry],
+    authority: Authority,
+    now: datetime,
+    file: LedgerFile | None = None,
 ) -> None:
     """Stage the ledger with ``entries`` added at its end, and its head, signed by ``authority``.
+
+    ``file`` is the ledger as it was read under the lock; without it, it is read here.
 
     What is wrong with the present ledger is recorded first, so that the new head hides nothing.
     Before the first entry in a keystore of ros2/sros2 stands what is there already.
@@ -578,13 +666,13 @@ def append(
         return
     entries = take_over(transaction, now, entries)
     root, follow = transaction.root, transaction.dry_run
-    present = _read(root, follow_link=follow, having=_NONE)
+    file = file or LedgerFile(root, lambda: _authorities(root), follow_link=follow)
+    present = file.end()
     gaps = (Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded)
     links = _Links(chain(gaps, entries), present.previous)
 
     def content() -> Iterator[bytes]:
-        with _open(root, follow) or io.BytesIO() as file:
-            yield from iter(lambda: file.read(_BLOCK), b"")
+        yield from file.content()
         yield b"" if present.ended else b"\n"
         yield from links
 

@@ -10,14 +10,14 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property, lru_cache
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar, overload
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import rsa
@@ -52,6 +52,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     key_on_robot,
 )
+from sros_tool.keystore.ledger import Ledger, LedgerFile
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     is_for_pss,
@@ -79,124 +80,420 @@ from sros_tool.pki.kinds import XML, kind_of
 from sros_tool.pki.token_uri import TokenUri, read_token_file
 from sros_tool.validity import Window, iso
 from sros_tool.values import shows
-from sros_tool.xml import read_bytes
+from sros_tool.xml import MAX_BYTES, read_bytes, read_file
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.ledger import Ledger
     from sros_tool.keystore.template import Template
 
 _Parsed = TypeVar("_Parsed")
 
 
+# ── files that are read once ───────────────────────────────────────────────────────────────
+
+
+class FilesReadOnce:
+    """Files, each of which is read at most once, whatever links lead to it.
+
+    What is known of a path stays as it was first read; a file that could not be read fails again.
+    """
+
+    def __init__(self) -> None:
+        self._by_path: dict[str, bytes] = {}
+        self._by_file: dict[tuple[int, int, int, int], bytes] = {}
+        self._errors: dict[tuple[str, str], SrosError] = {}
+        self._signed: dict[bytes, smime.SignedDocument | SrosError] = {}
+
+    def read(self, path: Path, what: str, *, most: int = MAX_BYTES) -> bytes:
+        """Return the content of a regular file, as `sros_tool.xml.read_bytes` does.
+
+        Raises:
+            DocumentError: the file does not exist, cannot be read, is too large or not regular.
+        """
+        name = os.fspath(path)
+        data = self._by_path.get(name)
+        if data is not None and len(data) <= most:
+            return data
+        if error := self._errors.get((name, what)):
+            raise error.with_traceback(None)
+        try:
+            data = self._read(path, what, most)
+        except SrosError as error:
+            self._errors[name, what] = error
+            raise
+        self._by_path[name] = data
+        return data
+
+    def _read(self, path: Path, what: str, most: int) -> bytes:
+        with suppress(OSError, ValueError):  # what is wrong with a path is said by `read_file`
+            data = self._by_file.get(_identity(path.stat()))
+            if data is not None and len(data) <= most:
+                return data
+        state, data = read_file(path, what, most=most)
+        self._by_file[_identity(state)] = data
+        return data
+
+    def signed(self, message: bytes) -> smime.SignedDocument:
+        """Return a signed document, which is parsed once, so that it is also verified once.
+
+        Raises:
+            PkiError: it is not a signed message.
+        """
+        known = self._signed.get(message)
+        if known is None:
+            try:
+                known = smime.parse(message)
+            except SrosError as error:
+                known = error
+            self._signed[message] = known
+        if isinstance(known, SrosError):
+            raise known.with_traceback(None)
+        return known
+
+
+def _identity(state: os.stat_result) -> tuple[int, int, int, int]:
+    return state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns
+
+
 # ── a keystore ─────────────────────────────────────────────────────────────────────────────
 
 
-class OpenedKeystore:
-    """A keystore, or an export for a robot, opened for reading.
+class _Part(Generic[_Parsed]):
+    """A property of a keystore that is read when it is first asked for, and never again."""
 
-    Each property reads its file at the first access; it raises `SrosError` if the file exists and
-    cannot be read.
+    def __init__(self, read: Callable[[Keystore], _Parsed]) -> None:
+        self._read = read
+        self.__doc__ = read.__doc__
+
+    @overload
+    def __get__(self, keystore: None, owner: object) -> _Part[_Parsed]: ...
+    @overload
+    def __get__(self, keystore: Keystore, owner: object) -> _Parsed: ...
+    def __get__(self, keystore: Keystore | None, owner: object) -> _Part[_Parsed] | _Parsed:
+        if keystore is None:
+            return self
+        return keystore.once(self, lambda: self._read(keystore))
+
+
+class Keystore:
+    """A keystore, or an export for a robot, as it was when each of its parts was first asked for.
+
+    Every part is read when it is first asked for, and never again: a change needs a new
+    `Keystore`.  A part that exists and cannot be read raises `SrosError`, each time the same.
+
+    Args:
+        root: its folder.
+        locked: whether this process has the lock of the keystore, so that no link of a change that
+            is under way is followed.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, locked: bool = False) -> None:
         self.root = root
+        self.files = FilesReadOnce()
+        """The files that were read, also of what lies next to it."""
+        self._parts: dict[Hashable, object] = {}
+        self._locked = locked
+
+    def __repr__(self) -> str:
+        return f"Keystore({str(self.root)!r})"
+
+    def once(self, key: Hashable, read: Callable[[], _Parsed]) -> _Parsed:
+        """Return what ``read`` returns or raises, and call it only the first time for a ``key``."""
+        if key not in self._parts:
+            try:
+                self._parts[key] = read()
+            except (SrosError, OSError) as error:
+                self._parts[key] = _Failure(error)
+        part = self._parts[key]
+        if isinstance(part, _Failure):
+            raise part.error.with_traceback(None)
+        return part  # type: ignore[return-value]
+
+    def read(self, path: str | Path, what: str) -> bytes:
+        """Return the content of a file; ``path`` is relative to the keystore, or a whole path.
+
+        ``what`` describes the file in errors.
+
+        Raises:
+            DocumentError: the file does not exist, cannot be read, is too large or not regular.
+        """
+        return self.files.read(self.root / path, what)
+
+    def has(self, path: str) -> bool:
+        """Return whether there is a file or folder at ``path``, relative to the keystore."""
+        return (self.root / path).exists()
+
+    # ── what it is ──
+
+    def check(self) -> None:
+        """Raise `KeystoreError` if its folder is no keystore."""
+        self.once("check", lambda: check_keystore(self.root))
 
     @property
     def is_home(self) -> bool:
         """Whether it is a keystore with CAs or settings, not an export for a robot."""
-        return any((self.root / part).exists() for part in (PUBLIC, PRIVATE, SETTINGS))
+        return any(map(self.has, (PUBLIC, PRIVATE, SETTINGS)))
 
-    @cached_property
+    @_Part
     def names(self) -> tuple[str, ...]:
         """The sorted names of the enclaves; raises `KeystoreError` if one may be missing."""
         return enclave_names(self.root)
 
-    @cached_property
+    @_Part
     def settings(self) -> Template | None:
         """The settings; None for a keystore of ros2/sros2 and for an export."""
-        return load_settings(self.root) if (self.root / SETTINGS).exists() else None
+        return self.template if self.has(SETTINGS) else None
 
-    @cached_property
-    def governance(self) -> Governance:
-        """The governance that DDS loads, with its signature verified."""
-        return governance_of(self.root)
+    @_Part
+    def template(self) -> Template:
+        """The settings; without settings, the template for ros2/sros2."""
+        from sros_tool.keystore.template import decode_template, load_template
 
-    @cached_property
-    def domains(self) -> DomainSet:
-        """The ROS domains that the governance names."""
-        return self.governance.domains().closed()
+        if not self.has(SETTINGS):
+            return load_template("sros2")
+        remedy = "Correct the file, or write the settings of before again with `sros "
+        return decode_template(
+            self.read(SETTINGS, "settings file"),
+            self.root / SETTINGS,
+            "settings file",
+            f"{remedy}update_keystore {quote(str(self.root))} --discard-edits`.",
+        )
 
-    @cached_property
-    def revocation_list(self) -> RevocationList | None:
-        """The revocation list of the issuing identity CA, or None if the keystore has no list."""
-        return read_crl(self.root)
+    @_Part
+    def ledger_file(self) -> LedgerFile:
+        """The ledger of all issued files, to ask for some entries, and to add to it."""
+        return LedgerFile(self.root, lambda: self._trusted, follow_link=not self._locked)
 
-    @cached_property
+    @property
     def ledger(self) -> Ledger:
         """The ledger of all issued files; empty without a ledger."""
-        from sros_tool.keystore.ledger import read_ledger
+        return self.once("ledger", lambda: self.ledger_file.ledger())
 
-        return read_ledger(self.root)
+    def ledger_with(self, name: str, value: str) -> Ledger:
+        """Return the ledger, in which entries without this value of a field may be missing."""
+        return self.once(("ledger", name, value), lambda: self.ledger_file.with_field(name, value))
+
+    # ── CAs ──
 
     def authority(self, role: str) -> tuple[x509.Certificate, ...]:
         """Return the certificates in a CA's file, the issuing CA first; empty without a file."""
         path = self.root / ca_certificate(role)
+
+        def read() -> tuple[x509.Certificate, ...]:
+            if not path.exists():
+                return ()
+            return load_certificates(self.read(path, "certificate"), f"'{path}'")
+
+        return self.once(("authority", role), read)
+
+    def ca_certificate(self, role: str) -> x509.Certificate:
+        """Return the certificate of the issuing identity or permissions CA."""
+        return self.certificate(ca_certificate(role), f"{role} CA certificate")
+
+    def certificate(self, path: str | Path, what: str = "certificate") -> x509.Certificate:
+        """Return the first certificate of a PEM file; ``what`` describes the file in errors.
+
+        Raises:
+            SrosError: the file is missing, or is not a readable certificate.
+        """
+        path = self.root / path
+        return self.once(
+            ("certificate", path, what),
+            lambda: load_certificate(self.read(path, what), f"'{path}'"),
+        )
+
+    @_Part
+    def _trusted(self) -> list[x509.Certificate]:
+        """The certificates of the CAs that the keystore trusts; none where unreadable."""
+        trusted: list[x509.Certificate] = []
+        for role in ROLES:
+            with suppress(SrosError):
+                trusted += self.authority(role)
+        return trusted
+
+    @_Part
+    def authority_files(self) -> Mapping[str, tuple[str, ...]]:
+        """The stem of each CA file, with the roles of its CA.
+
+        Raises:
+            KeystoreError: a CA file is missing, or is a link to a file outside of the keystore.
+        """
+        stems: dict[str, tuple[str, ...]] = {}
+        for role in ROLES:
+            path = self.root / ca_certificate(role)
+            file = path
+            # A link into the stage, left by an interrupted change, stands for the file itself.
+            if path.is_symlink() and STAGE not in (to := str(path.readlink())):
+                file = path.parent / to
+            if not file.is_file() or file.parent != path.parent:
+                raise KeystoreError(
+                    f"keystore '{self.root}' has no {role} CA",
+                    f"'{path}' is missing, or is a link to a file outside of the keystore.",
+                    "Use the keystore that this one was exported from.",
+                )
+            stem = file.name.removesuffix(".cert.pem")
+            stems[stem] = (*stems.get(stem, ()), role)
+        return stems
+
+    @property
+    def identity_file(self) -> str | None:
+        """The stem of the identity CA's file; None for an export, which has no CA files."""
+        with suppress(KeystoreError):
+            return next(file for file, roles in self.authority_files.items() if IDENTITY in roles)
+        return None
+
+    def certificates_of(self, file: str) -> tuple[x509.Certificate, ...]:
+        """Return all certificates of the CA file with this stem, the issuing CA first."""
+        path = self.root / PUBLIC / f"{file}.cert.pem"
+        return self.once(
+            ("certificates", file),
+            lambda: load_certificates(self.read(path, "CA certificate"), f"'{path}'"),
+        )
+
+    def embedded_list(self, file: str) -> RevocationList | None:
+        """Return the revocation list in a CA file, after its certificates, or None."""
+        path = self.root / PUBLIC / f"{file}.cert.pem"
+
+        def read() -> RevocationList | None:
+            data = self.read(path, "CA certificate")
+            return load_crl(data, f"in '{path}'") if CRL_MARK in data else None
+
+        return self.once(("list", file), read)
+
+    @_Part
+    def revocation_list(self) -> RevocationList | None:
+        """The revocation list of the issuing identity CA, or None if the keystore has no list."""
+        path = self.root / CRL
         if not path.exists():
-            return ()
-        return load_certificates(read_bytes(path, "certificate"), f"'{path}'")
+            return None
+        return load_crl(self.read(path, "revocation list"), f"'{path}'")
+
+    @property
+    def revocation_lists(self) -> tuple[RevocationList, ...]:
+        """The revocation lists that DDS reads: of the issuing identity CA, and of the other one.
+
+        Only during a rotation is there another identity CA.
+        """
+        file = self.identity_file
+        lists = (self.revocation_list, self.embedded_list(file) if file else None)
+        return tuple(filter(None, lists))
+
+    # ── governance ──
+
+    @_Part
+    def governance(self) -> Governance:
+        """The governance that DDS loads, verified with the permissions CA of the keystore.
+
+        Raises:
+            KeystoreError: it is missing or malformed, or its signature does not verify.
+        """
+        return self.governance_by(self.ca_certificate(PERMISSIONS))
+
+    def governance_by(self, authority: x509.Certificate) -> Governance:
+        """Return the governance that DDS loads, after verifying that ``authority`` signed it.
+
+        Raises:
+            KeystoreError: it is missing or malformed, or its signature does not verify.
+        """
+        return self.once(("governance", authority), lambda: self._governance_by(authority))
+
+    def _governance_by(self, authority: x509.Certificate) -> Governance:
+        path = self.root / GOVERNANCE_P7S
+        try:
+            signed = self.files.signed(self.read(path, "governance document"))
+            signed.verify(authority)
+            return parse_governance(signed.document, f"'{path}'")
+        except SrosError as error:
+            raise KeystoreError(
+                f"the governance of keystore '{self.root}' cannot be used: {error.what}",
+                error.why,
+                error.remedy or f"Restore '{path}' from a backup; every enclave depends on it.",
+            ) from error
+
+    @_Part
+    def domains(self) -> DomainSet:
+        """The ROS domains that the governance names."""
+        return self.governance.domains().closed()
+
+    def check_domain(self, domain: int | None) -> None:
+        """Raise `KeystoreError` if ``domain`` is given and the governance does not name it."""
+        if domain is None or domain in self.domains:
+            return
+        domains = self.domains
+        raise KeystoreError(
+            f"ROS_DOMAIN_ID is {domain}, but keystore '{self.root}' is for domain {domains} only",
+            "In any other domain, DDS refuses a node with this keystore.",
+            f"Set ROS_DOMAIN_ID to {domains}, or add the domain with `sros update_keystore "
+            f"{quote(str(self.root))} --domain {domains},{domain} --allow-looser`.",
+        )
+
+    # ── enclaves ──
+
+    def folder(self, name: str) -> Path:
+        """Return the folder of an enclave."""
+        return enclave_path(self.root, name)
 
     def enclave(self, name: str, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
         """Return an enclave of the keystore, as `open_enclave` does."""
-        return open_enclave(enclave_path(self.root, name), now=now, domain=domain)
+        folder = self.folder(name)
+        return self.once(
+            ("enclave", name, now, domain),
+            lambda: open_enclave(folder, now=now, domain=domain, files=self.files),
+        )
+
+    def certificate_of(self, name: str) -> x509.Certificate:
+        """Return the certificate of an enclave.
+
+        Raises:
+            SrosError: the file is missing, or is not a readable certificate.
+        """
+        return self.certificate(self.folder(name) / CERTIFICATE_FILE)
+
+    def signed_grant(self, name: str, subject: str) -> SignedGrant:
+        """Return an enclave's permissions and their grant to ``subject``, not verified yet.
+
+        Raises:
+            SrosError: the file is not a signed permissions document.
+        """
+        path = self.folder(name) / PERMISSIONS_FILE
+        return self.once(
+            ("grant", name, subject), lambda: read_signed_grant(path, subject, self.files)
+        )
 
 
-def open_keystore(root: Path) -> OpenedKeystore:
+@dataclass(frozen=True, slots=True)
+class _Failure:
+    """Why a part of a keystore cannot be read."""
+
+    error: SrosError | OSError
+
+
+def open_keystore(root: Path) -> Keystore:
     """Return the keystore ``root``, opened for reading.
 
     Raises:
         KeystoreError: ``root`` is not a keystore.
     """
-    check_keystore(root)
-    return OpenedKeystore(root)
+    keystore = Keystore(root)
+    keystore.check()
+    return keystore
+
+
+# ── parts of a keystore by its path ────────────────────────────────────────────────────────
 
 
 def load_settings(root: Path) -> Template:
-    """Return the settings of a keystore; without settings, the template for ros2/sros2.
-
-    Raises:
-        DocumentError: the settings are malformed.
-    """
-    from sros_tool.keystore.template import load_template, read_template
-
-    path = root / SETTINGS
-    if not path.exists():
-        return load_template("sros2")
-    remedy = "Correct the file, or write the settings of before again with `sros update_keystore "
-    return read_template(path, "settings file", f"{remedy}{quote(str(root))} --discard-edits`.")
+    """Return `Keystore.template` of a keystore that is opened for that alone."""
+    return Keystore(root).template
 
 
 def load_governance(root: Path, authority: x509.Certificate) -> Governance:
-    """Return the governance that DDS loads, after verifying that ``authority`` signed it.
-
-    Raises:
-        KeystoreError: the governance is missing or malformed, or its signature does not verify.
-    """
-    path = root / GOVERNANCE_P7S
-    try:
-        signed = smime.parse(read_bytes(path, "governance document"))
-        signed.verify(authority)
-        return parse_governance(signed.document, f"'{path}'")
-    except SrosError as error:
-        raise KeystoreError(
-            f"the governance of keystore '{root}' cannot be used: {error.what}",
-            error.why,
-            error.remedy or f"Restore '{path}' from a backup; every enclave depends on it.",
-        ) from error
+    """Return `Keystore.governance_by` of a keystore that is opened for that alone."""
+    return Keystore(root).governance_by(authority)
 
 
 def governance_of(root: Path) -> Governance:
-    """Return the governance that DDS loads, verified with the permissions CA of the keystore."""
-    return load_governance(root, load_ca_certificate(root, PERMISSIONS))
+    """Return `Keystore.governance` of a keystore that is opened for that alone."""
+    return Keystore(root).governance
 
 
 def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
@@ -211,9 +508,6 @@ def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
     )
 
 
-# ── CAs ────────────────────────────────────────────────────────────────────────────────────
-
-
 def read_certificate(path: Path, what: str = "certificate") -> x509.Certificate:
     """Return the first certificate of a PEM file; ``what`` describes the file in errors.
 
@@ -224,70 +518,38 @@ def read_certificate(path: Path, what: str = "certificate") -> x509.Certificate:
 
 
 def load_ca_certificate(root: Path, role: str) -> x509.Certificate:
-    """Return the certificate of the issuing identity or permissions CA of a keystore."""
-    return read_certificate(root / ca_certificate(role), f"{role} CA certificate")
+    """Return `Keystore.ca_certificate` of a keystore that is opened for that alone."""
+    return Keystore(root).ca_certificate(role)
 
 
-def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
-    """Map the stem of each CA file to the roles of its CA.
-
-    Raises:
-        KeystoreError: a CA file is missing, or is a link to a file outside of the keystore.
-    """
-    found: dict[str, tuple[str, ...]] = {}
-    for role in ROLES:
-        path = root / ca_certificate(role)
-        file = path
-        # A link into the stage, left by an interrupted transaction, stands for the file itself.
-        if path.is_symlink() and STAGE not in (to := str(path.readlink())):
-            file = path.parent / to
-        if not file.is_file() or file.parent != path.parent:
-            raise KeystoreError(
-                f"keystore '{root}' has no {role} CA",
-                f"'{path}' is missing, or is a link to a file outside of the keystore.",
-                "Use the keystore that this one was exported from.",
-            )
-        stem = file.name.removesuffix(".cert.pem")
-        found[stem] = (*found.get(stem, ()), role)
-    return found
+def authority_files(root: Path) -> Mapping[str, tuple[str, ...]]:
+    """Return `Keystore.authority_files` of a keystore that is opened for that alone."""
+    return Keystore(root).authority_files
 
 
 def identity_file(root: Path) -> str | None:
-    """Return the stem of the identity CA's file; None for an export, which has no CA files."""
-    with suppress(KeystoreError):
-        return next(file for file, roles in authority_files(root).items() if IDENTITY in roles)
-    return None
+    """Return `Keystore.identity_file` of a keystore that is opened for that alone."""
+    return Keystore(root).identity_file
 
 
 def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
-    """Return all certificates of a CA file, the issuing CA first."""
-    path = root / PUBLIC / f"{file}.cert.pem"
-    return load_certificates(read_bytes(path, "CA certificate"), f"'{path}'")
+    """Return `Keystore.certificates_of` of a keystore that is opened for that alone."""
+    return Keystore(root).certificates_of(file)
 
 
 def embedded_crl(root: Path, file: str) -> RevocationList | None:
-    """Return the revocation list in a CA file, after its certificates, or None."""
-    path = root / PUBLIC / f"{file}.cert.pem"
-    data = read_bytes(path, "CA certificate")
-    return load_crl(data, f"in '{path}'") if CRL_MARK in data else None
+    """Return `Keystore.embedded_list` of a keystore that is opened for that alone."""
+    return Keystore(root).embedded_list(file)
 
 
 def read_crl(root: Path) -> RevocationList | None:
-    """Return the revocation list of the issuing identity CA; None if the keystore has no list."""
-    path = root / CRL
-    if not path.exists():
-        return None
-    return load_crl(read_bytes(path, "revocation list"), f"'{path}'")
+    """Return `Keystore.revocation_list` of a keystore that is opened for that alone."""
+    return Keystore(root).revocation_list
 
 
 def read_lists(root: Path) -> tuple[RevocationList, ...]:
-    """Return the revocation lists that DDS reads: of the issuing identity CA, and of the other one.
-
-    Only during a rotation is there another identity CA.
-    """
-    file = identity_file(root)
-    found = (read_crl(root), embedded_crl(root, file) if file else None)
-    return tuple(each for each in found if each)
+    """Return `Keystore.revocation_lists` of a keystore that is opened for that alone."""
+    return Keystore(root).revocation_lists
 
 
 # ── signed permissions ─────────────────────────────────────────────────────────────────────
@@ -306,14 +568,15 @@ class SignedGrant:
     grant: Grant | None
 
 
-def read_signed_grant(path: Path, subject: str) -> SignedGrant:
+def read_signed_grant(path: Path, subject: str, files: FilesReadOnce | None = None) -> SignedGrant:
     """Read a ``permissions.p7s`` and its grant to ``subject``, without verifying its signature.
 
     Raises:
         SrosError: the file is not a signed permissions document.
     """
-    message = read_bytes(path, "permissions document")
-    signed = smime.parse(message)
+    files = files or FilesReadOnce()
+    message = files.read(path, "permissions document")
+    signed = files.signed(message)
     permissions = parse_permissions(signed.document, f"'{path}'")
     return SignedGrant(signed, hashlib.sha256(message).hexdigest(), permissions.grant_of(subject))
 
@@ -435,12 +698,19 @@ def weaknesses(state: OpenedEnclave) -> Iterator[tuple[str, str]]:
                 yield file, text
 
 
-def open_enclave(folder: Path, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
+def open_enclave(
+    folder: Path,
+    *,
+    now: datetime,
+    domain: int | None = None,
+    files: FilesReadOnce | None = None,
+) -> OpenedEnclave:
     """Return the content of an enclave's files, and their problems at the time ``now``.
 
-    With ``domain``, also check whether the enclave may join that ROS domain.
+    With ``domain``, also check whether the enclave may join that ROS domain.  ``files`` are those
+    that were read before, such as of its keystore (`Keystore.enclave`).
     """
-    return _EnclaveFiles(folder, now).check(domain)
+    return _EnclaveFiles(folder, now, files or FilesReadOnce()).check(domain)
 
 
 _EXPIRY_OF_CERTIFICATE = (Fault.CERTIFICATE_EXPIRED, Fault.CERTIFICATE_NOT_YET_VALID)
@@ -452,14 +722,6 @@ _SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
 # The enclaves of a keystore share some files, which are parsed only once.
 _parse_governance = lru_cache(maxsize=8)(parse_governance)
-
-
-@lru_cache(maxsize=8)
-def _signed_document(message: bytes, authority: x509.Certificate | None) -> bytes:
-    signed = smime.parse(message)
-    if authority:
-        signed.verify(authority)
-    return signed.document
 
 
 @lru_cache(maxsize=8)
@@ -477,9 +739,10 @@ def _load_crl(
 class _EnclaveFiles:
     """Checker of the files of one enclave, which collects the problems."""
 
-    def __init__(self, folder: Path, now: datetime) -> None:
+    def __init__(self, folder: Path, now: datetime, files: FilesReadOnce) -> None:
         self._folder = folder
         self._now = now
+        self._files = files
         self._problems: list[Problem] = []
 
     def check(self, domain: int | None) -> OpenedEnclave:
@@ -549,7 +812,7 @@ class _EnclaveFiles:
 
     def _content(self, path: Path, what: str) -> bytes | None:
         try:
-            return read_bytes(path, what)
+            return self._files.read(path, what)
         except SrosError as error:
             if path.is_file():
                 text = f"it cannot be read: {error.clause}"
@@ -699,7 +962,10 @@ class _EnclaveFiles:
         if data is None:
             return None
         try:
-            return _signed_document(data, authority)
+            signed = self._files.signed(data)
+            if authority:
+                signed.verify(authority)
+            return signed.document
         except SrosError as error:
             fault = Fault.SIGNATURE if _SIGNED.search(data[:1000]) else Fault.NOT_SIGNED
             self._add(name, str(error), fault)

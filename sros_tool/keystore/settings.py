@@ -20,7 +20,7 @@ from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.errors import Note, SrosError
 from sros_tool.keystore.layout import GOVERNANCE_P7S, GOVERNANCE_XML, SETTINGS
 from sros_tool.keystore.ledger import Entry, Ledger, read_ledger
-from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template, parse_template, render_template, settings_values
 from sros_tool.pki import smime
 from sros_tool.translate import governance_for
@@ -100,7 +100,7 @@ def edit_notes(root: Path, governance: Governance) -> tuple[Note, ...]:
 def found_edits(root: Path, governance: Governance | None) -> HandEdits:
     """Return what was edited in a keystore; ``governance`` is the signed one, if it is readable."""
     ledger = read_ledger(root, having=("what", "settings"))
-    return hand_edits(root, ledger, OpenedKeystore(root).settings, governance)
+    return hand_edits(root, ledger, Keystore(root).settings, governance)
 
 
 def edit_remedy(root: Path | str) -> str:

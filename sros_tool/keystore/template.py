@@ -104,10 +104,13 @@ def read_template(path: Path, what: str = "template", remedy: str = "") -> Templ
 
     ``what`` names the kind of file in the error.
     """
-    data = read_bytes(path, what)
+    return decode_template(read_bytes(path, what), path, what, remedy)
+
+
+def decode_template(data: bytes, path: Path, what: str, remedy: str) -> Template:
+    """Return the template in the content of a file, as `read_template` does."""
     try:
-        text = data.decode()
-        return parse_template(text, path.stem)
+        return parse_template(data.decode(), path.stem)
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         why = str(error)
         raise DocumentError(

@@ -36,7 +36,7 @@ from sros_tool.keystore.layout import (
     permissions_ca_for,
 )
 from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.reader import OpenedKeystore, governance_of, load_settings
+from sros_tool.keystore.reader import Keystore, governance_of, load_settings
 from sros_tool.keystore.rights import RightsSource, load_rights, load_zenoh_rights
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.zenoh.opened import is_signed
@@ -241,7 +241,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         governance=_of_all(path, folders.values()),
         authorities=_authorities(folders.values()),
         trusts=_trusts(trusting, _expiries(path)),
-        later=load_settings(path) if OpenedKeystore(path).is_home else None,
+        later=load_settings(path) if Keystore(path).is_home else None,
         certified=_certified(folders),
     )
     if not has_zenoh_files(path, hidden=True):

@@ -26,8 +26,8 @@ from sros_tool.keystore.layout import PUBLIC, enclave_path
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.reader import (
+    Keystore,
     OpenedEnclave,
-    OpenedKeystore,
     open_enclave,
     read_lists,
 )
@@ -162,7 +162,7 @@ def _observation(path: Path) -> PictureSource:
 def _with_keystore(source: PictureSource, root: Path, now: datetime) -> PictureSource:
     findings = list(source.findings)
     governance = None
-    keystore = OpenedKeystore(root)
+    keystore = Keystore(root)
     try:
         governance = keystore.governance
     except SrosError as error:

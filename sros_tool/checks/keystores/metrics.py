@@ -22,7 +22,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
 )
 from sros_tool.keystore.reader import (
-    OpenedKeystore,
+    Keystore,
     load_ca_certificate,
     load_governance,
     open_keystore,
@@ -121,7 +121,7 @@ def keystore_metrics(
     )
 
 
-def _shared(keystore: OpenedKeystore) -> Iterator[Expiry]:
+def _shared(keystore: Keystore) -> Iterator[Expiry]:
     """Yield the expiry of what all enclaves share; what cannot be read is a finding."""
     for role in ROLES:
         with suppress(SrosError):
@@ -138,7 +138,7 @@ def _shared(keystore: OpenedKeystore) -> Iterator[Expiry]:
             yield Expiry("crl", "", crl.next_update)
 
 
-def _of_enclaves(keystore: OpenedKeystore, lifetimes: Iterable[Lifetime]) -> Iterator[Expiry]:
+def _of_enclaves(keystore: Keystore, lifetimes: Iterable[Lifetime]) -> Iterator[Expiry]:
     for each in lifetimes:
         yield Expiry("certificate", each.name, each.certificate.not_after)
         yield Expiry("permissions", each.name, each.permissions.not_after)
