@@ -209,14 +209,17 @@ class Keystore:
         return part  # type: ignore[return-value]
 
     def read(self, path: str | Path, what: str) -> bytes:
-        """Return the content of a file; ``path`` is relative to the keystore, or a whole path.
+        """Return the content of a file: a path, or a name relative to the keystore.
 
         ``what`` describes the file in errors.
 
         Raises:
             DocumentError: the file does not exist, cannot be read, is too large or not regular.
         """
-        return self.files.read(self.root / path, what)
+        return self.files.read(self._path(path), what)
+
+    def _path(self, path: str | Path) -> Path:
+        return path if isinstance(path, Path) else self.root / path
 
     def has(self, path: str) -> bool:
         """Return whether there is a file or folder at ``path``, relative to the keystore."""
@@ -290,12 +293,12 @@ class Keystore:
         return self.certificate(ca_certificate(role), f"{role} CA certificate")
 
     def certificate(self, path: str | Path, what: str = "certificate") -> x509.Certificate:
-        """Return the first certificate of a PEM file; ``what`` describes the file in errors.
+        """Return the first certificate of a PEM file, named as in `read`.
 
         Raises:
             SrosError: the file is missing, or is not a readable certificate.
         """
-        path = self.root / path
+        path = self._path(path)
         return self.once(
             ("certificate", path, what),
             lambda: load_certificate(self.read(path, what), f"'{path}'"),
