@@ -24,6 +24,7 @@ from benchmarks.floor import make_enclaves, sizes_of
 from benchmarks.inputs import enclaves_policy, topics_policy
 from benchmarks.observing import observing
 from benchmarks.picturing import picturing
+from benchmarks.protecting import protecting
 from benchmarks.requiring import requiring
 from benchmarks.zenoh import zenoh_files
 
@@ -55,12 +56,20 @@ def main() -> int:
     parser.add_argument(
         "--fleet", type=int, default=0, help="only measure a fleet of this number of enclaves"
     )
+    parser.add_argument(
+        "--protection",
+        choices=("auto", "rclpy", "cyclone"),
+        help="only measure what encryption and signatures cost on this back end of the demo",
+    )
     parser.add_argument("--check", action="store_true", help="exit 1 if a limit is not kept")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if options.fleet:
             return _report((Row(*each) for each in fleet(folder, options.fleet, RULES)), options)
+        if options.protection:
+            figures = protecting(folder, options.protection, options.rounds)
+            return _report((Row(*figure) for figure in figures), options)
         rows = _artifacts(folder, options.enclaves, options.rounds)
         rows += _topics(folder, options.topics, options.rounds)
         rows += _starts(folder, options.rounds)

@@ -323,7 +323,7 @@ def test_many_stars_in_a_policy(question: str, tmp_path: Path) -> None:
 # ── places to write to ─────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("option", ["--summary", "--report", "--plot"])
+@pytest.mark.parametrize("option", ["--summary", "--report"])
 def test_demo_refuses_a_place_before_it_runs(option: str, tmp_path: Path) -> None:
     words = ["demo", "--scenario", "governance", "--only", "nothing is named so"]
     check_refused(sros(*words, option, tmp_path / "none" / "page"), "Its folder does not exist.")

@@ -54,7 +54,7 @@ Example:
   ...
   11 of 11 rows as expected.
   $ sros demo --scenario attacks --keystore ~/robot --summary attacks.md
-  $ sros demo --scenario governance --plot cost.svg
+  $ sros demo --scenario governance
   $ sros demo --scenario all
   $ sros demo --backend zenoh --summary zenoh.md
   $ sros run keystore /talker_listener/talker -- sros demo talker
@@ -137,16 +137,10 @@ names the row. With --keystore it is 2 if an attack could not be tried that has 
     help="Write a summary for reviewers, in Markdown.",
 )
 @click.option(
-    "--plot",
-    type=PATH,
-    metavar="FILE.svg",
-    help="Plot the cost of security (with --scenario governance).",
-)
-@click.option(
     "--report",
     type=PATH,
     metavar="FILE.html",
-    help="Write all results as one HTML page, with plots of the cost of security.",
+    help="Write all results as one HTML page.",
 )
 @force_option
 @json_option
@@ -166,7 +160,6 @@ def demo(
     network: str,
     keep: Path | None,
     summary: Path | None,
-    plot: Path | None,
     report: Path | None,
     force: bool,
     as_json: bool,
@@ -206,23 +199,13 @@ def demo(
         network=network,
         keep=keep,
     )
-    for path in (summary, plot, report):
+    for path in (summary, report):
         if path is not None:  # fail before the demo runs, not after it
             check_output(path, force=force)
     if keep is not None and keep.exists() and not keep.is_dir():
         raise UsageError(f"--keep '{keep}' is not a folder", "It is a file.", "Name a folder.")
-    if plot is not None and not any(scenario.measured for scenario in options.scenarios):
-        raise UsageError(
-            "there is nothing to plot",
-            "None of the chosen scenarios measures the cost of security.",
-            "Add --scenario governance.",
-        )
     moment = now()
     result = run_demo(options, moment, _progress)
-    if plot is not None and result.cost is not None:
-        from sros_tool.report.cost_plot import cost_picture
-
-        replace_file(plot, cost_picture(result.cost.as_json()).encode())
     if report is not None:
         _write_report(report, result.as_json(), keep)
     if summary is not None:

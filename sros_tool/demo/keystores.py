@@ -232,11 +232,11 @@ def create_scenario_keystore(root: Path, scenario: Scenario, spec: KeystoreSpec)
 
 
 def _forgeries_of(scenario: Scenario) -> list[Forge | Undefended]:
-    """Return the distinct forgeries that the rows and the measurement of a scenario use."""
+    """Return the distinct forgeries that the rows of a scenario use."""
     used: list[KeystoreChoice | None] = [
         party.identity.keystore for row in scenario.rows for party in row.parties
     ]
-    chosen = dict.fromkeys([*used, *scenario.measured.values()])
+    chosen = dict.fromkeys(used)
     return [each for each in chosen if each is not None and not isinstance(each, SoundKeystore)]
 
 

@@ -29,7 +29,6 @@ from sros_tool.demo.backend import (
     zenoh_backend,
 )
 from sros_tool.demo.casting import UserKeystore, open_user_keystore
-from sros_tool.demo.cost import Effort, measure_cost
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.network import Progress, run_isolated
 from sros_tool.demo.result import DemoResult, KeystoreSummary, ScenarioResult
@@ -80,7 +79,6 @@ class DemoOptions:
     only: tuple[str, ...] = ()
     accept_open: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
-    effort: Effort = field(default_factory=Effort)
 
 
 def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoResult:
@@ -114,7 +112,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
     with _ended_by_signals(), _folder(options.keep) as folder:
         if zenoh is None:
             progress("looking for a DDS that enforces security")
-        backend = zenoh or _find_backend(options.backend, folder, topic, now)
+        backend = zenoh or find_backend(options.backend, folder, topic, now)
         for scenario, row_domains in zip(groups, domains, strict=True):
             scenario_folder = folder if len(groups) == 1 else folder / scenario.name
             keystore_domains = (
@@ -149,12 +147,6 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 started=started,
             )
             row_results = run_isolated(partial(run_rows, plan), isolation, progress)
-            cost = None
-            if scenario.measured:
-                measuring = partial(
-                    measure_cost, plan, scenario.measured, scenario_folder / "cost", options.effort
-                )
-                cost = run_isolated(measuring, isolation, progress)
             if zenoh:
                 results += _parted(scenarios, row_results)
                 continue
@@ -163,9 +155,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 KeystoreSummary(user.enclaves, user.elsewhere, user.not_tried) if user else None
             )
             results.append(
-                ScenarioResult(
-                    scenario.name, scenario.title, tuple(row_results), cost, cast, summary
-                )
+                ScenarioResult(scenario.name, scenario.title, tuple(row_results), cast, summary)
             )
         left_out = sum(len(each.rows) for each in options.scenarios)
         left_out -= sum(len(each.rows) for each in results)
@@ -218,7 +208,7 @@ def _check_accepted(options: DemoOptions) -> None:
             )
 
 
-def _find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend:
+def find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend:
     """Return a backend that enforces security, tried with a temporary keystore."""
     with TemporaryDirectory(dir=folder, prefix="probe-") as probed:
         domains = DomainSet.of((_DEFAULT_DOMAIN, _DEFAULT_DOMAIN))

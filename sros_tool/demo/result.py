@@ -28,7 +28,7 @@ ran in the enclave, ``why`` is why it was chosen, or "".
 the number of enclaves, how many have their key elsewhere, and what would have to be tried for a
 proof, and was not: attacks that were skipped, and peculiar enclaves that got no part.
 
-``cost`` is null, or what `sros_tool.demo.cost.CostResult.as_json` describes.
+``cost`` is null: readers of earlier versions expect the key.
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ from typing import Any
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.casting import CastMember
-from sros_tool.demo.cost import CostResult
 from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import NOT_DONE
 from sros_tool.runtime.netns import Isolation
@@ -61,7 +60,6 @@ class ScenarioResult:
     name: str
     title: str
     rows: tuple[RowResult, ...]
-    cost: CostResult | None = None
     cast: tuple[CastMember, ...] = ()
     keystore: KeystoreSummary | None = None
 
@@ -94,7 +92,7 @@ class ScenarioResult:
             "cast": as_plain(self.cast),
             "keystore": self._keystore_as_json(),
             "rows": [{**row.as_json(), "scenario": self.name} for row in self.rows],
-            "cost": self.cost.as_json() if self.cost else None,
+            "cost": None,
         }
 
     def _keystore_as_json(self) -> dict[str, Any] | None:
@@ -118,11 +116,6 @@ class DemoResult:
     def rows(self) -> tuple[RowResult, ...]:
         """The rows of all scenarios."""
         return tuple(row for scenario in self.scenarios for row in scenario.rows)
-
-    @property
-    def cost(self) -> CostResult | None:
-        """The cost of security in the first scenario that measured it, or None."""
-        return next((each.cost for each in self.scenarios if each.cost is not None), None)
 
     @property
     def as_expected(self) -> bool:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
-from typing import Any
 
 from sros_tool.demo.casting import CastMember
-from sros_tool.demo.cost import NOTE, CostResult
 from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.scenarios.model import RowStatus
 from sros_tool.demo.verdict import RowResult
@@ -66,7 +64,7 @@ def _scenario(scenario: ScenarioResult) -> list[str]:
         ]
         if row.known_open or row.open_here:
             lines.append(f"{_INDENT}{_why_open(row)}")
-    return lines if scenario.cost is None else [*lines, "", *cost_table(scenario.cost)]
+    return lines
 
 
 def _why_open(row: RowResult) -> str:
@@ -154,9 +152,6 @@ def summary_page(result: DemoResult, now: datetime) -> str:
         lines += _attacks(attacks, [row for row in result.rows if row.removed])
     if others:
         lines += ["## Other rows", "", *_table(others)]
-    for scenario in result.scenarios:
-        if scenario.cost is not None:
-            lines += ["## Cost of security", "", *_cost_markdown(scenario.cost.as_json()), ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -228,55 +223,3 @@ def _cells(row: RowResult) -> str:
     if row.observed is RowStatus.SKIPPED:
         observed = f"skipped: {row.detail}"
     return f"{row.name} | {row.expected} | {observed}"
-
-
-def payload_text(size: int) -> str:
-    """Return a payload size in bytes as text: "64 B", "16 KiB", "1 MiB"."""
-    for unit, name in ((1024 * 1024, "MiB"), (1024, "KiB")):
-        if size >= unit:
-            return f"{size / unit:g} {name}"
-    return f"{size} B"
-
-
-def cost_table(cost: CostResult) -> list[str]:
-    """Return the cost of security as lines for a terminal."""
-    shown = cost.as_json()
-    lines = ["cost of security: latency and throughput, with the ratio to unsecured", ""]
-    lines.append(f"{'protection':<12}{'first message':>15}{'ratio':>8}")
-    lines += [
-        f"{each['kind']:<12}{each['seconds']:>13.3f} s{each['ratio']:>8.2f}"
-        for each in shown["first_message"]
-    ]
-    lines += [
-        "",
-        f"{'payload':<10}{'protection':<12}{'latency':>13}{'ratio':>7}{'MB/s':>11}{'ratio':>7}",
-    ]
-    for payload in cost.payloads:
-        for each in shown["measurements"]:
-            if each["payload"] == payload:
-                lines.append(
-                    f"{payload_text(payload):<10}{each['kind']:<12}{each['latency_us']:>10.0f} us"
-                    f"{each['latency_ratio']:>7.2f}{each['megabytes_per_s']:>11.2f}"
-                    f"{each['throughput_ratio']:>7.2f}"
-                )
-    return [*lines, "", NOTE]
-
-
-def _cost_markdown(shown: Mapping[str, Any]) -> list[str]:
-    lines = ["| protection | first message | ratio |", "| --- | ---: | ---: |"]
-    lines += [
-        f"| {each['kind']} | {each['seconds']:.3f} s | {each['ratio']:.2f} |"
-        for each in shown["first_message"]
-    ]
-    lines += [
-        "",
-        "| payload | protection | latency | ratio | throughput | ratio |",
-        "| ---: | --- | ---: | ---: | ---: | ---: |",
-    ]
-    lines += [
-        f"| {payload_text(each['payload'])} | {each['kind']} | {each['latency_us']:.0f} µs"
-        f" | {each['latency_ratio']:.2f} | {each['megabytes_per_s']:.2f} MB/s"
-        f" | {each['throughput_ratio']:.2f} |"
-        for each in sorted(shown["measurements"], key=lambda each: int(each["payload"]))
-    ]
-    return [*lines, "", shown["note"] + "."]

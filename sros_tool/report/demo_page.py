@@ -1,4 +1,4 @@
-"""The result of a demo as an HTML page: its rows, and the cost of security.
+"""The result of a demo as an HTML page: its rows.
 
 The input is the JSON value of ``sros demo --json`` (`sros_tool.demo.result`).  The page has no
 script; it can be opened from disk, and printed.
@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from sros_tool.report.cost_plot import cost_section
 from sros_tool.report.markup import escape
 from sros_tool.report.page import asset, document
 
@@ -119,8 +118,6 @@ def _scenario(scenario: Json) -> str:
     if rows:
         count = f"{escape(scenario['name'])}: {good} of {len(rows)} rows as expected"
         parts += [f'<p class="soft">{count}</p>', _table(rows)]
-    if scenario.get("cost"):
-        parts.append(cost_section(scenario["cost"]))
     return "\n".join((*parts, "</section>"))
 
 

@@ -35,7 +35,7 @@ from tests.cli.json_cases import (
     make_folder,
 )
 from tests.cli.test_audit import FINE, LOUD, POLICY, SHORT
-from tests.demo.test_demo_result import CLOSED, COST, OPEN, TWIN, result
+from tests.demo.test_demo_result import CLOSED, OPEN, TWIN, result
 from tests.graph.fake_graph import Beside, graph
 from tests.support.harness import Ended, snapshot, sros
 from tests.support.verbs import COMMANDS
@@ -289,7 +289,7 @@ def test_what_demo_prints(
     seen = Seen()
     for case in CASES["demo"]:
         seen.check("demo", both_ways("demo", case, made_folder, tmp_path))
-    shown = result(CLOSED, TWIN, OPEN, cost=COST)
+    shown = result(CLOSED, TWIN, OPEN)
     cast = (CastMember("listener", "/a", ("/n",)),)
     keystore = KeystoreSummary(3, not_tried=("/b with a governance of its own",))
     scenario = replace(shown.scenarios[0], cast=cast, keystore=keystore)

@@ -199,7 +199,6 @@ def test_rows_that_nobody_has_are_refused() -> None:
     [
         (("--scenario", "nothing"), "no scenario 'nothing'"),
         (("--summary", "no/such/folder/x.md"), "Its folder does not exist"),
-        (("--plot", "x.svg"), "nothing to plot"),
         (("--keystore", "x"), "isolation cannot run in a keystore of yours"),
         (("--topic", ""), "not a topic name"),
         (("--accept-open", "x"), "--accept-open is given without --keystore"),

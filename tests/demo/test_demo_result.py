@@ -1,36 +1,22 @@
-"""What is shown of a result: JSON, the page for a reviewer, the cost as table and plot."""
+"""What is shown of a result: JSON, the table, the page for a reviewer."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
 from datetime import UTC, datetime
-from xml.etree import ElementTree
 
 import pytest
 
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.cost import CostResult, Measurement
 from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.scenarios.model import RowStatus
-from sros_tool.demo.show import cost_table, demo_table, payload_text, summary_page
+from sros_tool.demo.show import demo_table, summary_page
 from sros_tool.demo.verdict import RowResult
-from sros_tool.report import cost_plot
 from sros_tool.report.demo_page import render_demo_page
 from sros_tool.runtime.netns import Isolation
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
-COST = CostResult(
-    ("unsecured", "encrypt"),
-    (64, 1024 * 1024),
-    {"unsecured": 0.1, "encrypt": 0.25},
-    (
-        Measurement("unsecured", 64, 40e-6, 50_000.0),
-        Measurement("encrypt", 64, 100e-6, 20_000.0),
-        Measurement("unsecured", 1024 * 1024, 2e-3, 500.0),
-        Measurement("encrypt", 1024 * 1024, 6e-3, 100.0),
-    ),
-)
 CLOSED = RowResult(
     "edited", RowStatus.NOT_LET_IN, RowStatus.NOT_LET_IN, "a signature", "seen", 1, attack="forged"
 )
@@ -57,31 +43,20 @@ OPEN = RowResult(
 )
 
 
-def result(*rows: RowResult, cost: CostResult | None = None) -> DemoResult:
-    scenario = ScenarioResult("attacks", "every way in", rows, cost)
+def result(*rows: RowResult) -> DemoResult:
+    scenario = ScenarioResult("attacks", "every way in", rows)
     backend = Backend("cyclone", "Cyclone DDS 0.10.2", "a test")
     return DemoResult(backend, "/chatter", Isolation(True), "production", (scenario,))
 
 
 def test_json_says_what_the_module_describes() -> None:
-    shown = json.loads(json.dumps(result(CLOSED, TWIN, OPEN, cost=COST).as_json()))
+    shown = json.loads(json.dumps(result(CLOSED, TWIN, OPEN).as_json()))
     assert shown["as_expected"] is True
     assert shown["scenarios"][0]["rows"] == shown["rows"]
     closed, twin, open_ = shown["rows"]
     assert (closed["scenario"], closed["attack"]) == ("attacks", "forged")
     assert (twin["defence_removed"], closed["defence_removed"]) == ("the signature", "")
     assert (open_["open_because"], open_["remedy"]) == ("nothing revokes it", "renew")
-    cost = shown["scenarios"][0]["cost"]
-    assert cost["first_message"][1] == {"kind": "encrypt", "seconds": 0.25, "ratio": 2.5}
-    assert cost["measurements"][1] == {
-        "kind": "encrypt",
-        "payload": 64,
-        "latency_us": 100.0,
-        "messages_per_s": 20000.0,
-        "megabytes_per_s": 1.28,
-        "latency_ratio": 2.5,
-        "throughput_ratio": 0.4,
-    }
 
 
 def test_a_known_open_door_is_named_and_no_failure() -> None:
@@ -150,35 +125,10 @@ def test_a_door_that_was_known_to_be_open_and_is_closed_is_told() -> None:
 
 
 def test_the_page_for_a_reviewer() -> None:
-    page = summary_page(result(CLOSED, TWIN, OPEN, cost=COST), NOW)
+    page = summary_page(result(CLOSED, TWIN, OPEN), NOW)
     assert "2026-01-02T03:04:05Z" in page
     assert "template `production`" in page
     assert (
         "| edited | not let in | not let in | a signature | heard without the signature |" in page
     )
     assert "| put back | heard | heard | nothing revokes it | renew |" in page
-    assert "| 1 MiB | encrypt | 6000 µs | 3.00 | 104.86 MB/s | 0.20 |" in page
-
-
-def test_the_cost_on_a_terminal_and_as_a_plot() -> None:
-    text = "\n".join(cost_table(COST))
-    assert "encrypt             0.250 s    2.50" in text
-    assert "both ends are Python" in text
-    drawn = cost_plot.cost_picture(COST.as_json())
-    plot = ElementTree.fromstring(drawn)
-    lines = [each for each in plot.iter() if each.tag.endswith("polyline")]
-    assert len(lines) == 4
-    first = [tuple(map(float, point.split(","))) for point in lines[0].get("points", "").split()]
-    assert first[0][0] < first[1][0]
-    assert first[0][1] > first[1][1]  # more latency is higher up
-    assert "encrypt: first message after 0.25 s" in drawn
-    words = " ".join(each.text or "" for each in plot.iter() if each.tag.endswith("text"))
-    assert "both ends are Python" in words
-
-
-def test_payloads_for_people() -> None:
-    assert [payload_text(size) for size in (64, 1024, 16384, 1048576)] == [
-        *("64 B", "1 KiB", "16 KiB", "1 MiB")
-    ]
-    for size in (1, 64, 1023, 1024, 16384, 262144, 1048576):
-        assert cost_plot.payload_text(size) == payload_text(size)

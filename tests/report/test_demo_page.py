@@ -1,4 +1,4 @@
-"""The page of a demo: every row, and what it costs; names in it stay names."""
+"""The page of a demo: every row; names in it stay names."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 pytest_plugins = ["tests.report.browsing"]
-KINDS = ("unsecured", "signed", "encrypted")
 
 
 def row(name: str, **values: Any) -> dict[str, Any]:
@@ -40,8 +39,8 @@ def row(name: str, **values: Any) -> dict[str, Any]:
     return {**given, **values}
 
 
-def result(*rows: dict[str, Any], cost: dict[str, Any] | None = None) -> dict[str, Any]:
-    scenario = {"name": "attacks", "title": "every way in", "as_expected": True, "cost": cost}
+def result(*rows: dict[str, Any]) -> dict[str, Any]:
+    scenario = {"name": "attacks", "title": "every way in", "as_expected": True, "cost": None}
     return {
         "backend": "cyclone",
         "dds": "Cyclone DDS 0.10.2",
@@ -73,27 +72,6 @@ def test_what_was_not_tried_is_said_and_nothing_of_it_is_green() -> None:
     assert not page.cssselect("script")
 
 
-COST = {
-    "kinds": list(KINDS),
-    "payloads": [64, 1024, 1048576],
-    "note": "medians of several rounds",
-    "first_message": [{"kind": k, "seconds": 0.2, "ratio": 1.5} for k in KINDS],
-    "measurements": [
-        {
-            "kind": kind,
-            "payload": size,
-            "latency_us": 50.5 + size / 1000,
-            "messages_per_s": 1000.0,
-            "megabytes_per_s": size / 1000,
-            "latency_ratio": 1.25,
-            "throughput_ratio": 0.75,
-        }
-        for kind in KINDS
-        for size in (64, 1024, 1048576)
-    ],
-}
-
-
 def test_every_row_is_told_with_what_came_of_it() -> None:
     page = render_demo_page(
         result(
@@ -123,20 +101,6 @@ def test_every_row_is_told_with_what_came_of_it() -> None:
     assert [each.text_content() for each in attacks] == ["joining", "looking"]
 
 
-def test_costs_are_drawn_and_told() -> None:
-    tree = html.fromstring(render_demo_page(result(row("x"), cost=COST)))
-    plots = tree.xpath("//figure/svg")
-    assert len(plots) == 2
-    for plot in plots:
-        assert len(plot.xpath(".//polyline")) == len(KINDS)
-        assert len(plot.xpath(".//path/title")) == 9
-    latency = plots[0].xpath(".//polyline")[0].get("points").split()
-    heights = [float(point.split(",")[1]) for point in latency]
-    assert heights == sorted(heights, reverse=True)  # larger payloads take longer
-    cells = [" ".join(c.itertext()) for c in tree.xpath("//table[@class='costs']//td")]
-    assert "0.20 s (1.5)" in cells and "50.564 (1.25) 0.064 (0.75)" in cells
-
-
 def test_no_place_of_the_machine_is_told() -> None:
     value = {"a": ["in /home/me/ks/log", 3], "b": {"c": "/home/me"}, "d": None}
     assert without_folders(value, ["/home/me", "/"]) == {
@@ -162,14 +126,14 @@ def test_no_place_of_the_machine_is_written(tmp_path: Path) -> None:
 def test_it_opens_from_disk_and_runs_nothing(browser: Browser, built: Path, tmp_path: Path) -> None:
     rows = [row(text, mechanism=text, attack=text, detail=text) for text in HOSTILE]
     path = tmp_path / "demo.html"
-    path.write_text(render_demo_page(result(*rows, cost=COST)))
+    path.write_text(render_demo_page(result(*rows)))
     said: list[str] = []
     page = new_page(browser)
     page.on("console", lambda message: said.append(message.text))
     page.goto(path.as_uri())
     assert not said
     shown = page.locator("tbody th[scope=row]").all_text_contents()
-    assert shown == [*map(visible_line, HOSTILE), *KINDS]
+    assert shown == [*map(visible_line, HOSTILE)]
     assert page.evaluate("window.broken") is None
     page.evaluate((built / "node_modules/axe-core/axe.min.js").read_text())
     for scheme in ("light", "dark"):

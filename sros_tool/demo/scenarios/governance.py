@@ -1,4 +1,4 @@
-"""The governance scenario: the same messages unprotected, signed and encrypted; and the cost."""
+"""The governance scenario: the same messages unprotected, signed and encrypted."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sros_tool.demo.scenarios.model import (
     RowStatus,
     Scenario,
 )
-from sros_tool.demo.scenarios.policies import measured_policy
+from sros_tool.demo.scenarios.policies import talking_policy
 
 _KINDS = {
     "none": Undefended(template=forger.unprotected),
@@ -74,14 +74,11 @@ _CHANGES = (
 
 GOVERNANCE = Scenario(
     "governance",
-    "the same messages unprotected, signed and encrypted: on the wire, and the cost",
+    "the same messages unprotected, signed and encrypted, on the wire",
     (*(_row(kind) for kind in _KINDS), *_CHANGES),
     {
         "talker": "/talker_listener/talker",
         "listener": "/talker_listener/listener",
-        "ping": "/cost/ping",
-        "pong": "/cost/pong",
     },
-    measured_policy,
-    measured=_KINDS,
+    talking_policy,
 )

@@ -367,9 +367,8 @@ class Scenario:
 
     ``cast`` has the enclave of each part.  ``policy`` returns the policy for the topic of the demo;
     the enclaves ``unpermitted`` have no policy.  With a ``router``, the name of an enclave, its
-    keystores also have the files for Zenoh.  ``measured`` has the keystore of each protection
-    kind whose cost is measured.  A scenario with ``any_keystore`` can also run in a user's
-    keystore.
+    keystores also have the files for Zenoh.  A scenario with ``any_keystore`` can also run in a
+    user's keystore.
     """
 
     name: str
@@ -379,7 +378,6 @@ class Scenario:
     policy: Callable[[str], Policy] | None = None
     unpermitted: tuple[str, ...] = ()
     router: str = ""
-    measured: Mapping[str, Undefended] = field(default_factory=dict)
     any_keystore: bool = False
 
 

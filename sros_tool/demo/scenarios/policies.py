@@ -8,7 +8,7 @@ from typing import Final
 
 from sros_tool.errors import UsageError
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profiles
+from sros_tool.policy.model import Enclave, Group, Policy, Profile
 from sros_tool.resources import policies_dir
 
 DEFAULT_TOPIC: Final = "/chatter"
@@ -23,7 +23,6 @@ GUEST: Final = "/talker_listener/guest"
 _GUEST_TOPIC: Final = "/guest_book"
 SERVICE: Final = "/add_two_ints"
 ACTION: Final = "/fibonacci"
-_COST_TOPICS: Final = ("/cost_ping", "/cost_pong")
 
 _ROS_TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _MAX_TOPIC_LENGTH = 200
@@ -120,19 +119,6 @@ def composed_policy(topic: str) -> Policy:
     container = (_with_topic(each, topic) for each in _shipped_policy("composition.xml").enclaves)
     service = shipped_service_policy(topic).enclaves
     return replace(talking, enclaves=(*talking.enclaves, *container, *service))
-
-
-def measured_policy(topic: str) -> Policy:
-    """Return a policy for a talker, a listener, and the two ends of the cost measurement."""
-    talking = talking_policy(topic)
-    basics = read_policy(policies_dir() / "defaults/node_basics.xml").enclaves[0].all_profiles()
-    rights = (("publish", ALLOW), ("subscribe", ALLOW))
-    groups = (*basics[0].groups, Group("topics", rights, _COST_TOPICS))
-    ends = tuple(
-        Enclave(path, (Profiles((Profile("/", "cost", groups),)),))
-        for path in ("/cost/ping", "/cost/pong")
-    )
-    return replace(talking, enclaves=(*talking.enclaves, *ends))
 
 
 def _with_topic(enclave: Enclave, topic: str | None, before: str = _POLICY_TOPIC) -> Enclave:

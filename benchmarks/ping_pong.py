@@ -1,4 +1,4 @@
-"""One end of a measurement: ``python -m sros_tool.demo.nodes.ping_pong cyclone|rclpy ping|pong``.
+"""One end of a measurement: ``python -m benchmarks.ping_pong cyclone|rclpy ping|pong``.
 
 ``ping`` measures, and writes the numbers as JSON; ``pong`` answers.  The first letter of a message
 is its kind: "h" (hello) asks when the other end began to join, "e" (echo) is sent back unchanged,
@@ -23,7 +23,11 @@ from typing import Any
 
 from sros_tool.errors import SrosError, UnavailableError
 
-_PING, _PONG = "/cost_ping", "/cost_pong"
+ENDS = ("pong", "ping")
+TOPICS = ("/cost_ping", "/cost_pong")
+"""The topics that ping and pong write."""
+
+_PING, _PONG = TOPICS
 _DEPTH = 10
 _BURST = 8  # less than the history depth, so that no message is overwritten
 _BURST_BYTES = 128 * 1024  # less than the default buffer of a socket, if possible
@@ -92,9 +96,9 @@ _CHANNELS = {"cyclone": _cyclone_channel, "rclpy": _rclpy_channel}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, or answer until the parent ends; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m sros_tool.demo.nodes.ping_pong")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.ping_pong")
     parser.add_argument("library", choices=_CHANNELS)
-    parser.add_argument("role", choices=("ping", "pong"))
+    parser.add_argument("role", choices=ENDS)
     parser.add_argument("--sizes", type=int, nargs="*", default=[], help="payloads in bytes")
     parser.add_argument("--seconds", type=float, default=0.5, help="duration of each measurement")
     parser.add_argument("--answer", type=Path, help="file to which ping writes its JSON")
