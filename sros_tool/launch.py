@@ -81,11 +81,11 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
 
 def _environment(keystore: Path, enclave: str) -> Mapping[str, str]:
     """Return the variables of an enclave; raise `RuntimeError` if no process can run in it."""
-    from sros_tool.cli.enclave_environment import loadable_environment
+    from sros_tool.cli.common import enclave_environment
     from sros_tool.errors import SrosError
     from sros_tool.terminal import visible_line
 
     try:
-        return {**REFUSING, **loadable_environment(keystore, enclave).variables}
+        return {**REFUSING, **enclave_environment(keystore, enclave).variables}
     except SrosError as error:
         raise RuntimeError(visible_line(str(error))) from error

@@ -36,7 +36,7 @@ LAYERS = {
     3: {"fleet", "translate", "translate_zenoh"},
     4: {"translate_from_zenoh", "reach", "keystore", "graph", "runtime"},
     5: {"checks", "explain", "demo", "report"},
-    6: {"proof"},
+    6: {"proof", "enclave_environment"},
     7: {"api", "cli"},
     8: {"launch", "__init__", "__main__"},
 }
@@ -246,15 +246,15 @@ def circle(modules: Modules) -> list[str]:
     return []
 
 
-def test_a_package_of_many_modules_lists_them() -> None:
-    """Whoever opens such a package finds what stands where; the smaller ones are read at once."""
-    missing = {}
-    for first in PACKAGE.rglob("__init__.py"):
-        modules = {each.stem for each in first.parent.glob("*.py")} - {"__init__"}
-        if len(modules) > 25:
-            listed = ast.get_docstring(tree_of(first.read_text())) or ""
-            missing[first.parent.name] = modules - set(re.findall(r"`(\w+)`", listed))
-    assert missing == {"cli": set()}
+CROWDED = {"sros_tool", "keystore"}
+"""Folders that still have more than 25 modules."""
+
+
+def test_a_folder_has_few_modules() -> None:
+    count = {
+        each.parent.name: len([*each.parent.glob("*.py")]) for each in PACKAGE.rglob("__init__.py")
+    }
+    assert {folder for folder, number in count.items() if number > 25} <= CROWDED
 
 
 def test_no_module_imports_itself_through_others() -> None:

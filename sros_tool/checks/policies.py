@@ -47,10 +47,18 @@ from sros_tool.names import (
 )
 from sros_tool.pki.certificates import common_name, subject_text
 from sros_tool.policy.document import COMMON, IncludedFile, Includer, read_policy
-from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Policy, Profile, Source
+from sros_tool.policy.model import (
+    ALLOW,
+    DENY,
+    RIGHTS,
+    Enclave,
+    Policy,
+    Profile,
+    Source,
+    stated_protections,
+)
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
 from sros_tool.policy.rights import WHOLE, Right, Rules, parts, policy_rights
-from sros_tool.policy.stated import stated_protections
 from sros_tool.resources import policies_dir
 from sros_tool.topics import GOAL
 from sros_tool.translate import permissions_for

@@ -21,7 +21,7 @@ from sros_tool.keystore.layout import (
     locate_enclave,
     refuse_earlier,
 )
-from sros_tool.policy.folder import policy_files
+from sros_tool.policy.document import policy_files
 from sros_tool.policy.model import Policy
 from sros_tool.xml import read_bytes
 

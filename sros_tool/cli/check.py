@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
+import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,23 +25,24 @@ from sros_tool.cli.common import (
     check_output,
     complete_template,
     domain_of,
+    echo_findings,
     fleet_option,
     force_option,
     json_option,
     json_text,
     keystore_from_environment,
+    local_zone,
     moment_of,
     now,
     print_json,
     save,
     taken_secrets,
 )
-from sros_tool.cli.findings import echo_findings
 from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
-from sros_tool.terminal import echo, echo_document, echo_lines, visible
-from sros_tool.values import shows
+from sros_tool.terminal import echo, echo_document, echo_lines, visible, visible_json
+from sros_tool.values import shows, versioned
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -48,6 +51,7 @@ if TYPE_CHECKING:
     from sros_tool.demo.doctor import Diagnosis
     from sros_tool.fleet.model import Fleet
     from sros_tool.proof.system import System
+    from sros_tool.runtime.processes import RunningProcesses
     from sros_tool.runtime.ros2cli import SecurityProvider
 
 _FAMILIES = ("policy", "keystore", "runtime")
@@ -259,9 +263,8 @@ def check(
                 "",
                 "Write `sros check runtime --watch`.",
             )
-        from sros_tool.cli.watching import watch_processes
 
-        watch_processes(_environment(domain_of(domain)), selection, as_json=form == "json")
+        _watch_processes(_environment(domain_of(domain)), selection, as_json=form == "json")
         return 0
     at = _circumstances(domain, moment, policies, fleet_file)
     at = replace(at, distribution=_distribution(distribution), vendor=vendor or "")
@@ -541,7 +544,7 @@ def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Findi
 
     It is the same if it is about the same line of the policy, in the enclave of another robot.
     """
-    from sros_tool.fleet.folding import path_of_robots
+    from sros_tool.fleet.enclaves import path_of_robots
 
     found: dict[object, list[tuple[Finding, str]]] = {}
     number: Counter[object] = Counter()
@@ -736,3 +739,47 @@ def _report_sections(
             for (severity, identity, title), number in counted.items()
         ],
     }
+
+
+# ── check runtime --watch ─────────────────────────────────────────────────────────────────────
+
+
+_SECONDS = 2.0
+"""Time between two looks at the processes."""
+_AGAIN = timedelta(minutes=1)
+"""Time after which unchanged processes are judged again, because files expire."""
+_ENDING = (signal.SIGINT, signal.SIGTERM)
+
+
+def _watch_processes(
+    environment: Mapping[str, str], selection: FindingFilter, *, as_json: bool
+) -> None:
+    """Report what changes among the findings about processes, until SIGINT or SIGTERM."""
+    from sros_tool.checks.news import FindingNews
+    from sros_tool.checks.processes import process_findings
+    from sros_tool.runtime.processes import ProcessTable
+
+    table, news, zone = ProcessTable(), FindingNews(), local_zone(environment)
+    judged: tuple[RunningProcesses, datetime] | None = None
+    # Blocked, they come only where they are waited for: no line is cut off.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+    try:
+        echo("watching the processes of this machine until SIGINT (Ctrl-C) or SIGTERM", err=True)
+        while True:
+            moment = now()
+            running = table.look(moment)
+            if judged is None or judged[0] != running or moment - judged[1] >= _AGAIN:
+                judged = running, moment
+                found = process_findings(
+                    environment, running, now=moment, zone=zone, one_by_one=True
+                )
+                for change in news.changes(selection.choose(found).shown, moment):
+                    if as_json:
+                        line = json.dumps(versioned(change), ensure_ascii=False)
+                        echo_lines(visible_json(line))
+                    else:
+                        echo(str(change))
+            if signal.sigtimedwait(_ENDING, _SECONDS):
+                return
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -9,6 +9,7 @@ import select
 import stat
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
@@ -21,11 +22,14 @@ from click.core import ParameterSource
 
 from sros_tool.cli.progress import paused
 from sros_tool.errors import DocumentError, PkiError, SrosError, UsageError
-from sros_tool.terminal import ask_secret, echo, echo_lines, visible_json, visible_line
+from sros_tool.terminal import Coloured, ask_secret, echo, echo_lines, visible_json, visible_line
+from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
+    from sros_tool.checks.kind import Finding
+    from sros_tool.enclave_environment import EnclaveEnvironment
     from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.model import Fleet
@@ -389,10 +393,9 @@ def print_closed(root: Path, changes: Sequence[Change]) -> None:
         )
     closed = [str(root / each.path) for each in changes if each.action == "close"]
     if closed:
-        more = f" and {len(closed) - 3} more" if len(closed) > 3 else ""
         where = quote(str(root))
         echo(
-            f"closed to other users, who could open them until now: {', '.join(closed[:3])}{more}. "
+            f"closed to other users, who could open them until now: {first_few(closed, 3)}. "
             "Run the nodes as the owner of the keystore, or from an export of that user (`sros "
             "distribute_key`). Replace keys that somebody may have copied: `sros renew "
             f"{where} NAME --new-key --revoke-old` those of enclaves, `sros rotate_ca {where} "
@@ -420,17 +423,14 @@ def print_restart(
     """
     if not names:
         return
-    number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
-    text = f"restart the processes of {number} for it to take effect: {_some(names)}"
+    number = counted(len(names), "enclave")
+    text = (
+        f"restart the processes of {number} for it to take effect: {first_few(names, _MAX_NAMES)}"
+    )
     if zenoh and zenoh.files and set(zenoh.restart) != set(names):
-        text += f"; of those on Zenoh: {_some(zenoh.restart) or 'none'}"
+        text += f"; of those on Zenoh: {first_few(zenoh.restart, _MAX_NAMES) or 'none'}"
     again = "; where they run from an export, export them again first" if exported else ""
     echo(text + again, err=True)
-
-
-def _some(names: Sequence[str]) -> str:
-    more = len(names) - _MAX_NAMES
-    return ", ".join(names[:_MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def check_output(output: Path, *, force: bool) -> None:
@@ -535,6 +535,31 @@ def local_zone(environment: Mapping[str, str]) -> tzinfo:
         return datetime.now().astimezone().tzinfo or UTC
 
 
+def enclave_environment(
+    root: Path,
+    name: str,
+    domain: str | None = None,
+    rmw: str | None = None,
+    *,
+    accept_key: bool = False,
+    target: Path | None = None,
+) -> EnclaveEnvironment:
+    """Return the environment of an enclave for a process that this one could start now."""
+    from sros_tool.enclave_environment import loadable_environment
+
+    return loadable_environment(
+        root,
+        name,
+        domain,
+        rmw,
+        environment=os.environ,
+        now=now(),
+        zone=local_zone(os.environ),
+        accept_key=accept_key,
+        target=target,
+    )
+
+
 def ros_domain() -> int | None:
     """Return the domain ID in $ROS_DOMAIN_ID, or None if it is not set."""
     from sros_tool.runtime.variables import domain_from
@@ -614,7 +639,7 @@ def keyring(
 
 
 def _absolute(place: str) -> str:
-    from sros_tool.pki.token_uri import is_token_uri
+    from sros_tool.pki.token import is_token_uri
 
     if is_token_uri(place):
         return place
@@ -781,3 +806,69 @@ def read_log(log: str) -> str:
             "Shorten it first, for example: tail -n 100000 LOG.",
         )
     return data.decode("utf-8", "replace")
+
+
+# ── findings ──────────────────────────────────────────────────────────────────────────────────
+
+
+def echo_findings(findings: Sequence[Finding], *, err: bool = False) -> None:
+    """Print one finding, or findings of one cause; the severity is in colour on a terminal."""
+    first = findings[0]
+    if first.cause and len(findings) > 1:
+        place = first.cause.place or first.place
+        ids = ", ".join(dict.fromkeys(each.id for each in findings))
+        lines = [f"{place}: {first.severity.word}: {first.cause.title}"]
+        for text in (f"[{ids}]", first.cause.text, first.cause.remedy):
+            lines += _wrapped(text, "    ")
+    else:
+        lines = _finding_lines(first)
+    word = first.severity.word
+    place, _, title = lines[0].partition(f": {word}: ")
+    echo(f"{place}: ", Coloured(word), f": {title}", err=err)
+    for line in lines[1:]:
+        echo(line, err=err)
+
+
+def _finding_lines(finding: Finding) -> list[str]:
+    """Return a finding as lines: place and title, reason, remedy, and related places."""
+    head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
+    subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
+    by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
+    related = [f"      {each}: {each.text}" for each in finding.related]
+    return [head, f"    {subject}{finding.text}{by}", *related, f"    {finding.remedy}"]
+
+
+def _wrapped(text: str, indent: str) -> list[str]:
+    """Return lines of at most 80 characters; what is to be copied stays on one, however long."""
+    from textwrap import wrap
+
+    whole = re.sub(r"`[^`]+`|<\w[^>]*/>", lambda m: m[0].replace(" ", "\0"), visible_line(text))
+    lines = wrap(
+        whole,
+        80,
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return [each.replace("\0", " ") for each in lines]
+
+
+def print_signed(groups: Sequence[Sequence[Finding]], files: Iterable[str]) -> None:
+    """Print on stderr what is wrong with the policies, in ``files``, of signed permissions."""
+    from sros_tool.checks.kind import Severity
+
+    for group in groups[:_MOST_SHOWN]:
+        echo_findings(group, err=True)
+    hidden = Counter(each.severity for group in groups[_MOST_SHOWN:] for each in group)
+    more = [
+        counted(hidden[severity], severity.word)
+        for severity in sorted(Severity, reverse=True)
+        if hidden[severity]
+    ]
+    if more:
+        command = f"sros check {' '.join(map(quote, dict.fromkeys(files)))}"
+        echo(f"and {', '.join(more)}: see `{command}`", err=True)
+
+
+_MOST_SHOWN = 3

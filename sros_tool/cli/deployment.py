@@ -237,8 +237,7 @@ def verify(
     status is 0 if there are no findings.
     """
     from sros_tool.checks.keystores.arrival import verify_arrival
-    from sros_tool.cli.common import local_zone
-    from sros_tool.cli.findings import echo_findings
+    from sros_tool.cli.common import echo_findings, local_zone
     from sros_tool.keystore.selection import select_enclaves
     from sros_tool.validity import iso
 

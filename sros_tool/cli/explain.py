@@ -571,7 +571,7 @@ def _planned_enclave(policy: Enclave, root: Path | None, options: _ContextOption
     from sros_tool.keystore.protection import with_stated
     from sros_tool.keystore.reader import governance_of
     from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
-    from sros_tool.policy.stated import stated_protections
+    from sros_tool.policy.model import stated_protections
     from sros_tool.translate import governance_for
 
     if root is not None:
@@ -1255,7 +1255,7 @@ def _who_lines(
 
     The enclaves of a fleet are folded by robot.
     """
-    from sros_tool.fleet.folding import folded
+    from sros_tool.fleet.enclaves import folded
 
     able = [each for each in found if each.outcome.ok]
     wild = "  by the wildcard {}"
@@ -1371,7 +1371,7 @@ def _reach_lines(reach: Reach, fleet: Fleet | None) -> Iterator[str]:
 
     The enclaves of a fleet are folded by robot.
     """
-    from sros_tool.fleet.folding import folded
+    from sros_tool.fleet.enclaves import folded
     from sros_tool.reach import path_text
 
     for what, paths in (

@@ -33,14 +33,15 @@ from sros_tool.cli.common import (
     print_plan,
     print_remarks,
     print_restart,
+    print_signed,
     ros_domain,
     several_enclaves,
     split_root,
 )
-from sros_tool.cli.findings import print_signed
 from sros_tool.cli.progress import progress
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo
+from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
@@ -332,8 +333,8 @@ def _show(
                 err=True,
             )
     if result.kept:
-        number = "1 enclave" if len(result.kept) == 1 else f"{len(result.kept)} enclaves"
-        echo(f"unchanged: {number}: {_shown_names(result.kept)}", err=True)
+        number = counted(len(result.kept), "enclave")
+        echo(f"unchanged: {number}: {first_few(result.kept, _NAMES_SHOWN)}", err=True)
     if not dry_run:
         print_closed(result.root, result.changes)
     _show_rights(result.replaced, dry_run, err=True)  # stdout is that of ros2/sros2
@@ -356,13 +357,7 @@ def _show_rights(replaced: Sequence[ReplacedRights], dry_run: bool, *, err: bool
                 together.setdefault((verb, text), []).append(each.enclave)
     for (verb, text), names in together.items():
         word = f"would {verb}" if dry_run else verb if len(names) > 1 else f"{verb}s"
-        echo(f"{_shown_names(names)} {word}: {text}", err=err)
-
-
-def _shown_names(names: Sequence[str]) -> str:
-    """Return the first names, and the number of the others."""
-    more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
-    return f"{', '.join(names[:_NAMES_SHOWN])}{more}"
+        echo(f"{first_few(names, _NAMES_SHOWN)} {word}: {text}", err=err)
 
 
 @click.command(
@@ -387,7 +382,6 @@ def list_enclaves(
         is_keystore,
         refuse_earlier,
     )
-    from sros_tool.wording import counted
 
     root = root or keystore_from_environment()
     if not is_keystore(root):
@@ -410,10 +404,9 @@ def list_enclaves(
     for name in names:
         echo(name)
     if hidden:
-        shown = ", ".join(hidden[:5]) + (f" and {len(hidden) - 5} more" if hidden[5:] else "")
         echo(
             f"{counted(len(hidden), 'enclave')} in a hidden folder, which DDS loads and sros "
-            f"leaves out: {shown}. `sros check {quote(str(root))}` says what to do.",
+            f"leaves out: {first_few(hidden, 5)}. `sros check {quote(str(root))}` says what to do.",
             err=True,
         )
 
@@ -883,7 +876,7 @@ def _show_update(
     _show_rights(update.rights, dry_run)
     for names, what in ((update.renewed, "renewed"), (update.signed, "signed the permissions of")):
         if names and not dry_run:
-            echo(f"{what} {_shown_names(names)}")
+            echo(f"{what} {first_few(names, _NAMES_SHOWN)}")
     if dry_run:
         print_plan(update.root, update.changes)
     if not dry_run:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
@@ -31,6 +31,7 @@ from sros_tool.cli.progress import progress
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import as_plain
+from sros_tool.wording import first_few
 from sros_tool.written import FileChange, file_change
 
 if TYPE_CHECKING:
@@ -39,9 +40,10 @@ if TYPE_CHECKING:
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.merge import Merged
     from sros_tool.policy.minimize import EnclaveUse, MinimizedPolicy, WildcardProposal
-    from sros_tool.policy.model import Enclave, Group, Policy
+    from sros_tool.policy.model import Enclave, Group, Policy, StatedProtection
     from sros_tool.policy.rights import Right, RightsDifference
-    from sros_tool.policy.stated import StatedProtection
+    from sros_tool.proof.growth import Gain, Growth, NewReach
+    from sros_tool.proof.sources import AccessSource
 
 
 # ── merge_policy ────────────────────────────────────────────────────────────────────────
@@ -219,9 +221,7 @@ def diff_policy(
     check_one_format()
     form = "json" if as_json else form
     if no_new_access:
-        from sros_tool.cli.new_access import show_new_access
-
-        return show_new_access(a, b, fleets_of(fleet_files), form)
+        return _show_new_access(a, b, fleets_of(fleet_files), form)
     with progress("reading"):
         fleets = fleets_of(fleet_files)
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])
@@ -348,7 +348,7 @@ def _difference_lines(
     difference: RightsDifference, first: Fleet | None, second: Fleet | None
 ) -> list[str]:
     """Return the lines that are shown of a difference: those of a fleet folded by robot."""
-    from sros_tool.fleet.folding import folded
+    from sros_tool.fleet.enclaves import folded
 
     lines: list[tuple[str, str, str]] = []
     for sign, right in difference.lines():
@@ -434,7 +434,7 @@ def minimize_policy(
     With --fleet, what was observed of some robots stays for all robots of the same enclave, and
     sizes are those of the robot with the longest name.
     """
-    from sros_tool.fleet import minimize as of_fleet
+    from sros_tool.fleet import expansion as of_fleet
     from sros_tool.fleet.document import read_fleet
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.rights import load_rights
@@ -495,9 +495,8 @@ def _node_basics() -> Sequence[Group]:
 
 def _robot_notes(unobserved: dict[str, list[str]]) -> Iterator[Note]:
     for path, robots in unobserved.items():
-        more = f" and {len(robots) - _SHOWN} more" if len(robots) > _SHOWN else ""
         text = (
-            f"{path} was never observed for {', '.join(robots[:_SHOWN])}{more}: what only these "
+            f"{path} was never observed for {first_few(robots, _SHOWN)}: what only these "
             "use is removed, too."
         )
         yield Note("minimize.robot-never-observed", text)
@@ -552,8 +551,7 @@ def _measure(
 
 def _longest(policy: Policy, fleet: Fleet | None) -> Enclave:
     """Return the only enclave of a policy, or the one of the robot with the longest path."""
-    from sros_tool.fleet.expansion import FleetPolicy
-    from sros_tool.fleet.minimize import written
+    from sros_tool.fleet.expansion import FleetPolicy, written
 
     robots = FleetPolicy(written(policy), fleet) if fleet else None
     return robots[max(robots, key=len)] if robots else policy.enclaves[0]
@@ -597,15 +595,14 @@ def _use_lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
     yield f"  permissions.p7s: {sizes}, of at most {MAX_SIGNED_BYTES - 1}{too_large}"
     for proposal in measured.proposals:
         names = [right.describe() for right in proposal.adds]
-        adds = ", ".join(names[:_SHOWN]) or "no name known here"
-        adds += f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        adds = first_few(names, _SHOWN) or "no name known here"
         yield f"    {proposal.rule.describe()}  in place of {len(proposal.replaces)} names"
         yield f"      would save {proposal.saves} bytes and add {adds}"
 
 
 def _as_written(value: Any) -> Any:
     """Return a JSON value with names as a policy for a fleet has them."""
-    from sros_tool.fleet.minimize import as_written
+    from sros_tool.fleet.expansion import as_written
 
     if isinstance(value, dict):
         return {key: _as_written(each) for key, each in value.items()}
@@ -855,3 +852,148 @@ def _convert(
             )
         echo(f"look at the result with `sros check {quote(str(output))}`", err=True)
     return 1 if converted.left_out else 0
+
+
+# ── diff_policy --no-new-access ───────────────────────────────────────────────────────────────
+
+
+_MOST_NEW_LINES = 20
+"""Lines of reach that text shows, and enclaves of a line; JSON has all."""
+_MOST_CHARACTERS = 12_000
+"""Characters of each list in Markdown."""
+
+
+def _show_new_access(
+    base: Path, head: Path, fleets: tuple[Fleet | None, Fleet | None], form: str
+) -> int:
+    """Print what HEAD adds to BASE in a format; return 1 if it adds anything, else 0.
+
+    Raises:
+        SrosError: it cannot be decided.
+    """
+    from sros_tool.proof.growth import ComparedSide, NewAccess, compare_access
+    from sros_tool.proof.sources import load_side
+
+    with progress("reading"):
+        before, after = load_side(base, fleets[0]), load_side(head, fleets[-1])
+    with progress("comparing"):
+        growth = compare_access(before, after)
+    if form == "json":
+        print_json(NewAccess(ComparedSide.of(before), ComparedSide.of(after), growth))
+    elif form == "markdown":
+        echo_document(access_markdown(before, after, growth))
+    else:
+        for line in (*_added_lines(after, growth), *_removed_lines(before, growth)):
+            echo(line)
+        echo(access_summary(growth), err=True)
+    if form != "json":
+        print_notes((*before.notes, *after.notes))
+    return int(bool(growth))
+
+
+def _added_lines(head: AccessSource, growth: Growth) -> list[str]:
+    return [
+        *_folded(head, "+", growth.added, growth),
+        *(f"+ less protection: {each}" for each in growth.lost),
+        *_reach_lines(head, growth.reach),
+    ]
+
+
+def _removed_lines(base: AccessSource, growth: Growth) -> list[str]:
+    more = (
+        f"- more protection: {each.key} {each.after} -> {each.before}" for each in growth.gained
+    )
+    return [*_folded(base, "-", growth.removed, growth), *more]
+
+
+def _folded(side: AccessSource, sign: str, gains: Iterable[Gain], growth: Growth) -> list[str]:
+    from sros_tool.fleet.enclaves import folded
+
+    lines = [(gain.enclaves[0], f"{sign} {_gain_text(sign, gain, growth)}") for gain in gains]
+    return list(folded(side.fleet, lines))
+
+
+def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
+    who, other = first_few(gain.enclaves, _MOST_NEW_LINES), "BASE" if sign == "+" else "HEAD"
+    if gain.action == "join":
+        text = f"{who} join the domain"
+    elif gain.right is None:
+        text = f"{who} {gain.action} DDS topic {gain.topic}, which no right states"
+    else:
+        text = f"{who} {gain.right.describe()}"
+        if gain.source:
+            text += f"  ({gain.source})"
+        if gain.right.enclave not in gain.enclaves:
+            text += f" by the permissions of {gain.right.enclave}, which fit its certificate"
+        if gain.name != gain.right.name:
+            text += f": such as {gain.name}"
+    if gain.denied:
+        at = f" at {gain.denied_at}" if gain.denied_at else ""
+        text += f", which {other} denies by {gain.denied.name}{at}"
+    if gain.worlds != growth.worlds:
+        text += f"; with {', '.join(gain.worlds)}"
+    if gain.domains != (0,) or len(growth.domains) > 1:
+        text += f"; in domain {', '.join(map(str, gain.domains))}"
+    return text
+
+
+def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
+    from sros_tool.fleet.enclaves import folded
+    from sros_tool.reach import path_text
+
+    found = [
+        (each.source, f"+ {each.source} can influence {each.target}: {path_text(each.path)}")
+        for each in reach
+    ]
+    lines = list(folded(head.fleet, found))
+    more = len(lines) - _MOST_NEW_LINES
+    if more > 0:
+        lines[_MOST_NEW_LINES:] = [f"+ and {more} more that can influence others (--json has all)"]
+    return lines
+
+
+def access_summary(growth: Growth) -> str:
+    """Return what a change adds, in one sentence."""
+    worlds = ", ".join(growth.worlds)
+    basis = "".join(
+        f"; {title}: {', '.join(clauses)}"
+        for title, clauses in (
+            ("not compared", growth.not_compared),
+            ("assumed", growth.assumed),
+            ("left out", growth.left_out),
+        )
+        if clauses
+    )
+    gone = f"; {_count(len(growth.removed), 'right')} gone" if growth.removed else ""
+    if not growth:
+        return f"nobody gets more access, and nothing is protected less ({worlds}){gone}{basis}"
+    parts = []
+    if growth.added:
+        parts.append(f"{_count(len(growth.added), 'right')} new")
+    if growth.lost:
+        parts.append(f"{_count(len(growth.lost), 'protection')} less")
+    if growth.reach:
+        pairs = len(growth.reach)
+        text = "1 enclave can influence another one"
+        parts.append((text if pairs == 1 else f"{pairs} pairs of enclaves can influence") + " now")
+    if growth.added and growth.reach_unknown:
+        parts.append(f"whom that lets enclaves influence is not known: {growth.reach_unknown}")
+    return "; ".join(parts) + gone + basis
+
+
+def _count(number: int, what: str) -> str:
+    return f"1 {what} is" if number == 1 else f"{number} {what}s are"
+
+
+def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> str:
+    """Return what a change adds, and removes, as Markdown."""
+    from sros_tool.markdown import bounded, code, plain
+
+    rest = "which `sros diff_policy --no-new-access` shows"
+    parts = [f"### New access: {plain('yes' if growth else 'none')}", plain(access_summary(growth))]
+    lists = (("added", _added_lines(head, growth)), ("removed", _removed_lines(base, growth)))
+    for title, lines in lists:
+        if lines:
+            parts.append(f"**{len(lines)} {title}**")
+            parts.append(bounded((code(each[2:]) for each in lines), _MOST_CHARACTERS, rest))
+    return "\n\n".join(parts) + "\n"

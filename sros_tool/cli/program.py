@@ -64,7 +64,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "zenoh": VerbEntry("zenoh", "Write the files that make Zenoh enforce policies."),
     },
     "Policy": {
-        "generate_policy": VerbEntry("generate_policy", "Learn a policy from the running robot."),
+        "generate_policy": VerbEntry("observing", "Learn a policy from the running robot."),
         "merge_policy": VerbEntry("policy", "Add the rights of policies to a policy file."),
         "diff_policy": VerbEntry(
             "policy", "Compare the rights of policies, permissions, keystores."
@@ -86,7 +86,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
     "Running": {
         "env": VerbEntry("running", "Print the environment of an enclave."),
         "run": VerbEntry("running", "Run a command in an enclave."),
-        "units": VerbEntry("units", "Write systemd units for nodes in enclaves, and timers."),
+        "units": VerbEntry("running", "Write systemd units for nodes in enclaves, and timers."),
         "demo": VerbEntry("demo", "Show on a real DDS that secured nodes are isolated."),
         "completion": VerbEntry("running", "Print the completion script of a shell."),
     },

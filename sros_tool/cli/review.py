@@ -347,7 +347,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
     """Return what a step found, in one clause."""
     from sros_tool.checks.registry import ChosenFindings
     from sros_tool.cli.check import findings_summary
-    from sros_tool.cli.new_access import access_summary
+    from sros_tool.cli.policy import access_summary
     from sros_tool.proof.review import (
         AccessChange,
         DroppedRequirements,
@@ -439,8 +439,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     from sros_tool.checks.markdown import findings_markdown
     from sros_tool.checks.registry import ChosenFindings
     from sros_tool.cli.check import findings_summary, renewal_markdown
-    from sros_tool.cli.new_access import access_markdown
-    from sros_tool.cli.policy import rights_markdown
+    from sros_tool.cli.policy import access_markdown, rights_markdown
     from sros_tool.keystore.expiry import describe_lifetime
     from sros_tool.markdown import bounded, code
     from sros_tool.proof.review import (

@@ -3,35 +3,49 @@
 from __future__ import annotations
 
 import os
+import pwd
 import shlex
 import shutil
 import signal
+import stat
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from io import UnsupportedOperation
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sros_tool.cli.common import (
     PATH,
     check_one_format,
+    chosen_enclaves,
     complete_keystore_and_enclave,
+    domain_of,
+    dry_run_option,
+    enclave_environment,
     json_option,
+    now,
     print_json,
     print_notes,
+    several_enclaves,
     split_root,
 )
-from sros_tool.cli.containers import INSTALLED, container_text, target_path
-from sros_tool.cli.enclave_environment import RMWS, loadable_environment
+from sros_tool.cli.progress import progress
+from sros_tool.enclave_environment import INSTALLED, RMWS, container_text, target_path
 from sros_tool.errors import Note, UnavailableError, UsageError
-from sros_tool.runtime.containers import COMPOSE, KUBERNETES
+from sros_tool.runtime.containers import COMPOSE, KUBERNETES, SECRET
 from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
+from sros_tool.runtime.units import Job
 from sros_tool.terminal import echo, echo_document, echo_lines
+from sros_tool.written import FileChange
 
-COMMAND = "sros.command"
-"""The key of ``ctx.meta`` with the words after ``--`` of a `WithCommand`."""
+if TYPE_CHECKING:
+    from sros_tool.errors import Note
+
+_COMMAND = "sros.command"
+"""The key of ``ctx.meta`` with the words after ``--`` of a `_WithCommand`."""
 _FAST_DDS_PIN = "FASTDDS_PKCS11_PIN"
 """The variable from which Fast DDS takes the PIN of a token (Pkcs11Provider.cpp)."""
 _NO_PIN = (
@@ -45,7 +59,7 @@ _WORDS = click.argument(
     required=True,
     shell_complete=complete_keystore_and_enclave,
 )
-DOMAIN = click.option(
+_DOMAIN = click.option(
     "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"
 )
 
@@ -55,13 +69,13 @@ def _complete_rmw(_ctx: click.Context, _parameter: click.Parameter, incomplete: 
     return [each for each in RMWS if each.startswith(incomplete)]
 
 
-RMW = click.option(
+_RMW = click.option(
     "--rmw",
     metavar="NAME",
     shell_complete=_complete_rmw,
     help="The RMW of the process, such as rmw_zenoh_cpp. [default: $RMW_IMPLEMENTATION]",
 )
-ACCEPT_KEY = click.option(
+_ACCEPT_KEY = click.option(
     "--accept-readable-key",
     is_flag=True,
     help="Accept a private key, or the PIN of its token, that other users can read, and folders in "
@@ -167,9 +181,9 @@ Example:
     help="The name of the service in Compose, or the Deployment. [default: from the enclave]",
 )
 @click.option("--image", metavar="IMAGE", help="The image of the container.")
-@DOMAIN
-@RMW
-@ACCEPT_KEY
+@_DOMAIN
+@_RMW
+@_ACCEPT_KEY
 @json_option
 def env(
     words: tuple[str, ...],
@@ -206,12 +220,21 @@ def env(
     if there is None and in_container:
         there = INSTALLED
     target = None if there is None else target_path(there)
-    found = loadable_environment(
+    found = enclave_environment(
         root, rest[0], domain, rmw, accept_key=accept_readable_key, target=target
     )
     if target and in_container:
+        if form == SECRET:
+            _refuse_open_output()
         text = container_text(
-            root, rest[0], form, target, found.variables, container or "", image or ""
+            root,
+            rest[0],
+            form,
+            target=target,
+            variables=found.variables,
+            name=container or "",
+            image=image or "",
+            now=now(),
         )
     else:
         text = render_environment(found.variables, "json" if as_json else form)
@@ -225,7 +248,24 @@ def env(
         print_notes(notes)
 
 
-class WithCommand(click.Command):
+def _refuse_open_output() -> None:
+    """Raise `UsageError` if standard output is a terminal, or a file that others can read."""
+    command = "Use a pipe, `| kubectl apply --server-side -f -`, or a file after `umask 077`."
+    if sys.stdout is not None and sys.stdout.isatty():
+        raise UsageError(
+            "a private key would be written to this terminal", "A Secret is not encrypted.", command
+        )
+    with suppress(UnsupportedOperation):
+        state = os.fstat(sys.stdout.fileno())
+        if stat.S_ISREG(state.st_mode) and state.st_mode & 0o077:
+            raise UsageError(
+                "a private key would be written to a file that others can read",
+                f"The mode of the file is {stat.S_IMODE(state.st_mode):04o}.",
+                command,
+            )
+
+
+class _WithCommand(click.Command):
     """A verb with a command as argument, whose options it does not parse.
 
     The command is all words after ``--``; without it, if ``needs_no_dashes``, parsing of options
@@ -241,13 +281,13 @@ class WithCommand(click.Command):
             own, command = args[: args.index("--")], args[args.index("--") + 1 :]
         elif self.needs_no_dashes:
             ctx.allow_interspersed_args = False
-        ctx.meta[COMMAND] = command
+        ctx.meta[_COMMAND] = command
         return super().parse_args(ctx, own)
 
 
 @click.command(
     "run",
-    cls=WithCommand,
+    cls=_WithCommand,
     epilog="""\b
 Example:
   $ sros run keystore /talker_listener/talker -- \\
@@ -269,9 +309,9 @@ Example:
     type=PATH,
     help="Take the enclave in which FILE has the node that COMMAND starts, in place of NAME.",
 )
-@DOMAIN
-@RMW
-@ACCEPT_KEY
+@_DOMAIN
+@_RMW
+@_ACCEPT_KEY
 @click.option("--no-ros-args", is_flag=True, help="Add no arguments to COMMAND.")
 @click.pass_context
 def run(
@@ -296,13 +336,13 @@ def run(
     from sros_tool.runtime.environment import enclave_argument, named_enclave, with_enclave
 
     root, rest = split_root(words)
-    if policy and rest and ctx.meta[COMMAND]:
+    if policy and rest and ctx.meta[_COMMAND]:
         raise UsageError(
             f"--policy and the enclave {rest[0]} exclude each other",
             "The policy says in which enclave the node is.",
             "Leave one of both out.",
         )
-    command = [*rest[0 if policy else 1 :], *ctx.meta[COMMAND]]
+    command = [*rest[0 if policy else 1 :], *ctx.meta[_COMMAND]]
     if not command:
         raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
     name = _enclave_of_node(policy, command) if policy else rest[0] if rest else ""
@@ -313,7 +353,7 @@ def run(
             f"Leave `--enclave {shlex.quote(other)}` out, or name the same enclave: `sros run "
             f"{shlex.quote(str(root))} {shlex.quote(other)} -- COMMAND`.",
         )
-    found = loadable_environment(root, name, domain, rmw, accept_key=accept_readable_key)
+    found = enclave_environment(root, name, domain, rmw, accept_key=accept_readable_key)
     program = shutil.which(command[0])
     if program is None:
         raise UsageError(
@@ -402,3 +442,198 @@ def completion(shell: str) -> None:
             f"there is no completion for {shell}", "", "Choose bash, zsh or fish."
         )
     echo_lines(kind(program, {}, "sros", "_SROS_COMPLETE").source())
+
+
+# ── units ─────────────────────────────────────────────────────────────────────────────────────
+
+
+_NODE_USER = "ros"
+
+
+class _WithCommandAfterDashes(_WithCommand):
+    needs_no_dashes = False
+
+
+@click.command(
+    "units",
+    cls=_WithCommandAfterDashes,
+    epilog="""\b
+Examples:
+  $ sros units keystore /talker units -- /opt/robot/talker.sh
+  wrote units/sros@.service
+  wrote units/sros@talker.service.d/enclave.conf
+  $ sudo cp -r units/* /etc/systemd/system/
+  $ sudo systemctl enable --now sros@talker
+  $ sros units keystore --match '/arm/*' units  # /etc/sros/nodes/arm/...
+  $ sros units keystore --job renew --job check --job metrics units""",
+)
+@click.argument(
+    "words",
+    metavar="[ROOT] [NAME...] FOLDER [-- COMMAND...]",
+    nargs=-1,
+    required=True,
+    shell_complete=complete_keystore_and_enclave,
+)
+@several_enclaves
+@click.option(
+    "--job",
+    "jobs",
+    multiple=True,
+    type=click.Choice([each.value for each in Job]),
+    help="A timer that renews what expires within 30 days, checks the keystore each day, or "
+    "writes metrics every 15 minutes: of the keystore, or of `sros fleet status` (fleet); guard is "
+    "no timer, and watches all ROS processes of the machine, as root.  Can be repeated.",
+)
+@click.option(
+    "--target",
+    "there",
+    metavar="DIR",
+    help="The path of the keystore where the units run. "
+    f"[default: {INSTALLED} for nodes, ROOT for jobs]",
+)
+@click.option(
+    "--user",
+    metavar="NAME",
+    help=f"The user who runs the units. [default: {_NODE_USER}, for jobs the owner of ROOT]",
+)
+@click.option(
+    "--sros",
+    "program",
+    metavar="FILE",
+    help="The program sros where the units run, which then also verifies each enclave before its "
+    "node starts. [default: none for nodes, this program for jobs]",
+)
+@click.option(
+    "--passphrase-file",
+    "passphrase",
+    metavar="FILE",
+    help="With --job renew: the file there with the passphrase of the CA keys.",
+)
+@_DOMAIN
+@_RMW
+@_ACCEPT_KEY
+@click.option("--force", is_flag=True, help="Replace files in FOLDER that differ.")
+@dry_run_option
+@json_option
+@click.pass_context
+def units(
+    ctx: click.Context,
+    words: tuple[str, ...],
+    every: bool,
+    patterns: tuple[str, ...],
+    robots: tuple[str, ...],
+    jobs: tuple[str, ...],
+    there: str | None,
+    user: str | None,
+    program: str | None,
+    passphrase: str | None,
+    domain: str | None,
+    rmw: str | None,
+    accept_readable_key: bool,
+    force: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Write units of systemd to FOLDER: nodes in the enclaves NAME..., and timers (--job).
+
+    A node runs in its enclave or not at all, sees the keys of no other enclave, and gets no right
+    that a ROS node does not need. COMMAND is its program; without it, that is a file with the path
+    of the enclave in /etc/sros/nodes.
+    """
+    from sros_tool.keystore.layout import enclaves_below
+    from sros_tool.runtime.units import (
+        TEMPLATE,
+        WrittenUnits,
+        job_units,
+        node_settings,
+        node_template,
+        unit_changes,
+        unit_instance,
+        write_units,
+    )
+
+    root, rest = split_root(words)
+    command = tuple(ctx.meta[_COMMAND])
+    several = bool(every or patterns or robots)
+    if not rest or not (rest[1:] or several or jobs):
+        raise UsageError("units takes a keystore, enclaves or --job, and a folder")
+    folder = PATH.convert(rest[-1], None, None)
+    if passphrase is not None and Job.RENEW not in jobs:
+        raise UsageError("--passphrase-file is for --job renew only")
+    if user is not None and Job.GUARD in jobs:
+        raise UsageError(
+            "--user is not for --job guard",
+            "Only root can look at the processes of all users.",
+            "Write the guard by a command of its own, without --user.",
+        )
+    if jobs and (rest[1:] or several) and there is None:
+        raise UsageError(
+            f"the nodes run where the keystore is in {INSTALLED}, and the jobs are for '{root}'",
+            "One folder of units is for one machine.",
+            "Write them to two folders by two commands, or name the keystore there by --target.",
+        )
+    target = None if there is None else target_path(there)
+    files: dict[str, str] = {}
+    notes: list[Note] = []
+    names: Sequence[str] = ()
+    if rest[1:] or several:
+        names = chosen_enclaves(root, rest[:-1], patterns, robots, every=every)
+        place = target or Path(INSTALLED)
+        files[TEMPLATE] = node_template(user or _NODE_USER)
+        with progress("checking"):
+            for name in names:
+                found = enclave_environment(
+                    root, name, domain, rmw, accept_key=accept_readable_key, target=place
+                )
+                notes += [*found.notes, *found.enclave_notes]
+                files[f"sros@{unit_instance(name)}.service.d/enclave.conf"] = node_settings(
+                    name,
+                    found.variables,
+                    str(place),
+                    command=command,
+                    below=enclaves_below(root, name),
+                    sros=program or "",
+                )
+    elif command:
+        raise UsageError("COMMAND is for nodes, and no enclave is named")
+    for job in jobs:
+        files |= job_units(
+            Job(job),
+            str(target or root.absolute()),
+            user=user or _owner(root),
+            sros=program or _this_program(),
+            passphrase=passphrase or "",
+            domain=domain_of(domain) or 0,
+        )
+    changes = unit_changes(folder, files, force=force)
+    if not dry_run:
+        write_units(folder, files, changes)
+    if as_json:
+        written = [FileChange(action, str(folder / path)) for path, action in changes.items()]
+        print_json(WrittenUnits(root, dry_run, names, written, notes))
+        return
+    for path, action in changes.items():
+        word = f"would {action}" if dry_run else {"create": "wrote", "replace": "replaced"}[action]
+        echo(f"{word} {folder / path}")
+    if not changes:
+        echo(f"the units in '{folder}' are already up to date", err=True)
+    print_notes(list(dict.fromkeys(notes)))
+
+
+def _owner(root: Path) -> str:
+    """Return the name of the owner of a keystore.  Raises `UsageError`."""
+    number = root.stat().st_uid
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        raise UsageError(
+            f"the owner of keystore '{root}', user {number}, has no name", "", "Add --user NAME."
+        ) from None
+
+
+def _this_program() -> str:
+    """Return the absolute path of the program sros that runs.  Raises `UsageError`."""
+    found = shutil.which(sys.argv[0]) or shutil.which("sros")
+    if found is None or not os.access(found, os.X_OK):
+        raise UsageError("this program has no path of its own", "", "Add --sros FILE.")
+    return str(Path(found).absolute())

@@ -42,7 +42,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.chains import Checks, chain_fault
 from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
 from sros_tool.pki.keys import algorithm, holds_private_key, load_key
-from sros_tool.pki.token_uri import TokenUri, read_token_file
+from sros_tool.pki.token import TokenUri, read_token_file
 from sros_tool.translate import RosRight, ros_rights
 from sros_tool.validity import iso
 from sros_tool.xml import parse, read_bytes

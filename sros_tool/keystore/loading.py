@@ -40,10 +40,9 @@ from sros_tool.pki.certificates import (
     subject_text,
 )
 from sros_tool.pki.chains import Checks, build_chain, chain_fault
-from sros_tool.pki.crl import read_list, read_lists, refusal_of
+from sros_tool.pki.crl import Obstacle, list_refusal, read_list, read_lists, refusal_of
 from sros_tool.pki.keys import algorithm, is_key_for_pss
 from sros_tool.pki.pem import read_as_text
-from sros_tool.pki.revocation import Obstacle, list_refusal
 
 Certificates = tuple[x509.Certificate, ...]
 

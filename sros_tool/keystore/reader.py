@@ -77,7 +77,7 @@ from sros_tool.pki.crl import (
 )
 from sros_tool.pki.keys import is_key_for_pss, load_any_key
 from sros_tool.pki.kinds import XML, kind_of
-from sros_tool.pki.token_uri import TokenUri, read_token_file
+from sros_tool.pki.token import TokenUri, read_token_file
 from sros_tool.validity import Window, iso
 from sros_tool.values import shows
 from sros_tool.xml import MAX_BYTES, read_bytes, read_file

@@ -35,9 +35,15 @@ from sros_tool.keystore.layout import (
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW, RIGHTS, Policy, Source
+from sros_tool.policy.model import (
+    ALLOW,
+    RIGHTS,
+    Policy,
+    Source,
+    StatedProtection,
+    stated_protections,
+)
 from sros_tool.policy.rights import Right, RightsDifference, parts, policy_rights
-from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh import StatedRight, rights_in_rules
 from sros_tool.values import Words, shows

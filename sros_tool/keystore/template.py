@@ -17,7 +17,7 @@ from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import parse_toml
 from sros_tool.names import check_enclave_name, expand, expression_problem
-from sros_tool.pki.token_uri import refuse_pin
+from sros_tool.pki.token import refuse_pin
 from sros_tool.policy.patterns import covers, matches
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.resources import templates_dir

@@ -1,12 +1,19 @@
-"""Comparison of distinguished names as X.509 demands it (RFC 5280, 7.1; OpenSSL, x_name.c)."""
+"""Distinguished names: reading and comparing them as OpenSSL does (RFC 5280, 7.1; x_name.c).
+
+``object_names.txt`` has all names of objects of OpenSSL 3.0, which the measured vendors of DDS use.
+"""
 
 from __future__ import annotations
 
 import re
-from functools import lru_cache
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache, lru_cache
+from pathlib import Path
 
 from cryptography import x509
 
+from sros_tool.errors import PkiError
 from sros_tool.pki import der
 
 _ENCODINGS = {
@@ -56,3 +63,67 @@ def _attribute(attribute: der.Value) -> bytes:
     # Letters beyond ASCII keep their case.
     plain = _SPACES.sub(b" ", text).strip(b" ").lower()
     return der.encode(der.SEQUENCE, kind.whole, der.encode(0x0C, plain))
+
+
+# ── names of objects ──────────────────────────────────────────────────────────────────────────
+
+
+@cache
+def short_names() -> Mapping[str, str]:
+    """Return OpenSSL's short names by OID; it prints any other attribute in hexadecimal."""
+    data = Path(__file__).with_name("object_names.txt").read_text(encoding="ascii")
+    return dict(line.split(" ") for line in data.splitlines())
+
+
+# ── reading ───────────────────────────────────────────────────────────────────────────────────
+
+
+_BMP_STRING = 0x1E
+_IN_NAMES = (0x03, 0x0C, 0x12, 0x13, 0x14, 0x16, 0x1C, _BMP_STRING)
+"""The ASN.1 types that OpenSSL reads in names (B_ASN1_PRINTABLE)."""
+
+
+@contextmanager
+def reading(what: str, why: str, remedy: str = "") -> Iterator[None]:
+    """Raise `PkiError` with these texts for any error of `cryptography` in the ``with`` block.
+
+    For a damaged or hostile document it raises errors of more than ten classes, most of them at
+    the first use of a part (``subject``, ``extensions``, ``public_key()``).  So the block also uses
+    each part that is used later.
+    """
+    try:
+        yield
+    except BaseException as error:
+        if is_of_reading(error):
+            raise PkiError(what, why, remedy) from error
+        raise
+
+
+def is_of_reading(error: BaseException) -> bool:
+    """Return whether an error may be one of `cryptography` about what it reads."""
+    return isinstance(error, Exception) or type(error).__name__ == "PanicException"
+
+
+def read_name(name: x509.Name) -> None:
+    """Parse every part of a distinguished name that sros shows, compares or copies.
+
+    Raises one of the errors that `reading` handles: also for a value that OpenSSL takes for no part
+    of a name, such as a time.
+    """
+    name.rfc4514_string()
+    read_name_der(name.public_bytes())
+
+
+def read_name_der(name: bytes) -> None:
+    """Parse every part of a distinguished name in DER, as `read_name` does."""
+    canonical_der(name)
+    for part in der.children(der.first(name).content):
+        for attribute in der.children(part.content):
+            oid, value = der.children(attribute.content)
+            if (part.tag, attribute.tag, oid.tag) != (der.SET, der.SEQUENCE, der.OID):
+                raise ValueError("not the structure of a name")
+            if value.tag not in _IN_NAMES:
+                raise ValueError(f"a value of a name has the ASN.1 type {value.tag}")
+            characters = value.content.decode("utf-16-be") if value.tag == _BMP_STRING else ""
+            if max(characters, default="") > "\uffff":
+                raise ValueError("a BMPString has a character of more than 16 bits")

@@ -24,7 +24,7 @@ from lxml import etree
 from sros_tool.errors import DocumentError, Note, PolicyError
 from sros_tool.names import check_namespace, expand
 from sros_tool.policy.document import instruction_text, read_policy
-from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier, stated_protections
 from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import (
     RIGHT_ORDER,
@@ -36,8 +36,8 @@ from sros_tool.policy.rights import (
     order,
     policy_rights,
 )
-from sros_tool.policy.stated import stated_protections
 from sros_tool.values import shows
+from sros_tool.wording import first_few
 from sros_tool.written import DryRun, FileChanges, Notes
 from sros_tool.xml import parse, read_bytes, tag_of
 
@@ -181,9 +181,7 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
     notes = []
     for (denied, new), allowed in by_denial.items():
         shown = [right.describe() for right in dict.fromkeys(sorted(allowed, key=order))]
-        some = ", ".join(shown[:_SHOWN])
-        if len(shown) > _SHOWN:
-            some += f" and {len(shown) - _SHOWN} more"
+        some = first_few(shown, _SHOWN)
         if new:
             text = f"{denied} was added. It removes rights that the file allows: {some}."
             notes.append(Note("merge.newly-denied", text))

@@ -26,6 +26,7 @@ from sros_tool.policy.model import (
     Policy,
     Profile,
     Qualifier,
+    stated_protections,
     with_groups,
 )
 from sros_tool.policy.patterns import Names, compiled, covers, literal_prefix, matches
@@ -42,7 +43,6 @@ from sros_tool.policy.rights import (
     policy_rights,
     unfolded,
 )
-from sros_tool.policy.stated import stated_protections
 
 _Pair = tuple[str, str]
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sros_tool.errors import DocumentError, UsageError
-from sros_tool.policy.document import MissingFileError
-from sros_tool.policy.folder import is_policy
+from sros_tool.policy.document import MissingFileError, is_policy
 from sros_tool.policy.model import Source
 from sros_tool.proof.repository import FILES, FOLDER, Repository, walk
 
@@ -44,7 +43,7 @@ class Revision:
         """Return the policies in this folder and below it, or this file.
 
         Raises:
-            DocumentError: what is there is perhaps a policy (`sros_tool.policy.folder`), a link, or
+            DocumentError: what is there is perhaps a policy (`policy_files`), a link, or
                 a submodule: where these lead to is not followed.
         """
         entry = self.repository.find(self.commit, self.path)

@@ -52,11 +52,9 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import embedded_lists, load_crl, names_issuers, refusal_of, signed_by
 from sros_tool.pki.requests import key_digest
-from sros_tool.policy.document import PolicyFiles, read_policy, refuse_fallbacks
-from sros_tool.policy.folder import policy_files
-from sros_tool.policy.model import Enclave, Policy, Source
+from sros_tool.policy.document import PolicyFiles, policy_files, read_policy, refuse_fallbacks
+from sros_tool.policy.model import Enclave, Policy, Source, StatedProtection, stated_protections
 from sros_tool.policy.rights import Right, policy_rights
-from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.proof.revisions import PREFIX, Revision, find_revision
 from sros_tool.proof.zenoh_settings import LONE, SIGNED, SignedConfiguration
 from sros_tool.translate import permissions_for

@@ -38,10 +38,9 @@ from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.document import refuse_fallbacks
-from sros_tool.policy.model import ALLOW, Policy, Source
+from sros_tool.policy.model import ALLOW, Policy, Source, StatedProtection, stated_protections
 from sros_tool.policy.protection import PROTECT, Level
 from sros_tool.policy.rights import Right, policy_rights
-from sros_tool.policy.stated import StatedProtection, stated_protections
 from sros_tool.proof.access import (
     dds_access,
     domains_of,

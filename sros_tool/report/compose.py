@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.names import ACTION_SEPARATOR, is_expression
-from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier, StatedProtection
 from sros_tool.policy.patterns import Names, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import (
     KIND_OF,
@@ -26,7 +26,6 @@ from sros_tool.policy.rights import (
     parts,
     unfolded,
 )
-from sros_tool.policy.stated import StatedProtection
 from sros_tool.report.picture import (
     UNKNOWN,
     Edge,

@@ -41,9 +41,8 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import algorithm
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import Policy
+from sros_tool.policy.model import Policy, StatedProtection
 from sros_tool.policy.rights import Right, policy_rights
-from sros_tool.policy.stated import StatedProtection
 from sros_tool.report.compose import PictureSource
 from sros_tool.report.picture import PicturedEnclave, PicturedFinding, SourceTitle, Validity
 from sros_tool.resources import policies_dir

@@ -8,15 +8,20 @@ Sources: systemd.exec(5), systemd.service(5), systemd.unit(5) of systemd 247 and
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
+from pathlib import Path
 from typing import NamedTuple
 
 from sros_tool.errors import UsageError
+from sros_tool.files import new_files, replace_file, write_new_folder
+from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.runtime.environment import render_environment
 from sros_tool.runtime.variables import DOMAIN, ENABLE, KEYSTORE, STRATEGY
 from sros_tool.written import DryRun, FileChanges, NamedKeystore, Notes
+from sros_tool.xml import read_bytes
 
 
 class WrittenUnits(NamedTuple):
@@ -333,3 +338,54 @@ def _words(command: Sequence[str]) -> Iterable[str]:
             continue
         quoted = word.replace("\\", "\\\\").replace('"', '\\"')
         yield '"' + quoted.replace("%", "%%").replace("$", "$$") + '"'
+
+
+def unit_changes(folder: Path, files: Mapping[str, str], *, force: bool) -> dict[str, str]:
+    """Map the files that are missing or differ to `create` or `replace`.
+
+    Raises:
+        UsageError: a file differs, and not ``force``.
+    """
+    _refuse_folders_of_others(folder, files)
+    found = {}
+    for path, text in files.items():
+        if not os.path.lexists(folder / path):
+            found[path] = "create"
+        elif read_bytes(folder / path, "unit") != text.encode():
+            found[path] = "replace"
+    different = [path for path, action in found.items() if action == "replace"]
+    if different and not force:
+        raise UsageError(
+            f"'{folder}' already holds other versions of {', '.join(different[:3])}",
+            "Nothing was changed.",
+            "Add --force to replace these files, or choose another folder.",
+        )
+    return found
+
+
+def _refuse_folders_of_others(folder: Path, files: Iterable[str]) -> None:
+    """Raise `UsageError` if another user could change the units, which systemd would run."""
+    trusted = frozenset({0, os.geteuid()})
+    for place in dict.fromkeys((folder, *((folder / path).parent for path in files))):
+        others = [*replaceable_on_the_way(place, trusted)]
+        if os.path.lexists(place):
+            others.append((place, other_writers(place.lstat(), trusted)))
+        for each, why in others:
+            if why:
+                raise UsageError(
+                    f"the units would be in '{each}', which others can change: {why}",
+                    "systemd would run what they write there.",
+                    "Choose a folder that only you can change, such as /etc/systemd/system.",
+                )
+
+
+def write_units(folder: Path, files: Mapping[str, str], changes: Mapping[str, str]) -> None:
+    """Write the files that `unit_changes` returned."""
+    new = {path: files[path].encode() for path, action in changes.items() if action == "create"}
+    if not folder.exists():
+        write_new_folder(folder, new)
+        return
+    with new_files(folder, new):
+        for path, action in changes.items():
+            if action == "replace":
+                replace_file(folder / path, files[path].encode())

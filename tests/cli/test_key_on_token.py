@@ -15,7 +15,7 @@ from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.errors import PkiError, UsageError
 from sros_tool.keystore.layout import has_enclave, list_enclaves
 from sros_tool.keystore.participant import load_enclave
-from sros_tool.pki.token_uri import (
+from sros_tool.pki.token import (
     TokenUri,
     parse_enclave_uri,
     read_token_file,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.fleet.folding import folded
+from sros_tool.fleet.enclaves import folded
 from sros_tool.fleet.model import Fleet, Robot
 from tests.support.harness import policy_text, publish, sros
 

@@ -38,7 +38,7 @@ def test_every_module_of_the_graph_can_be_imported_without_rclpy() -> None:
         "sys.modules['rclpy'] = None\n"
         "for each in pkgutil.iter_modules(graph.__path__):\n"
         "    importlib.import_module(f'sros_tool.graph.{each.name}')\n"
-        "import sros_tool.cli.generate_policy\n"
+        "import sros_tool.cli.observing\n"
     )
     python("-c", code)
 

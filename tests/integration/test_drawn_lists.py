@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from sros_tool.pki.certificates import common_name
-from sros_tool.pki.revocation import Obstacle, list_refusal
+from sros_tool.pki.crl import Obstacle, list_refusal
 from tests.integration.libcrypto import CRL_CHECK, libcrypto
 from tests.support.children import LONG
 from tests.support.openssl import takes_changes_for_lists

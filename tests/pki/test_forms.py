@@ -9,8 +9,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from sros_tool.pki.certificates import common_name, pem
-from sros_tool.pki.forms import CertificateForm, holds_at, read_form
+from sros_tool.pki.certificates import CertificateForm, common_name, holds_at, pem, read_form
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 LATER = NOW + timedelta(days=30)

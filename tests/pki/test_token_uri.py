@@ -8,7 +8,7 @@ import pytest
 
 from sros_tool.errors import UsageError
 from sros_tool.keystore.authorities.keyring import Keyring
-from sros_tool.pki.token_uri import TokenUri, parse_token_uri
+from sros_tool.pki.token import TokenUri, parse_token_uri
 from sros_tool.resources import templates_dir
 from tests.support.harness import sros
 

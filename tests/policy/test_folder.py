@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import DocumentError
-from sros_tool.policy.folder import policy_files
+from sros_tool.policy.document import policy_files
 from tests.support.harness import policy_text, publish, sros
 
 POLICY = policy_text({"/a": publish("/x")})

@@ -14,9 +14,8 @@ from sros_tool.fleet.model import Fleet, Robot
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.policy.minimize import minimize
-from sros_tool.policy.model import ALLOW, Policy
+from sros_tool.policy.model import ALLOW, Policy, stated_protections
 from sros_tool.policy.rights import Right
-from sros_tool.policy.stated import stated_protections
 from tests.support.harness import sros
 
 SIGN, ENCRYPT = '<?sros protect="sign"?>', '<?sros protect="encrypt"?>'

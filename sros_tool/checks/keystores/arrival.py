@@ -33,8 +33,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import open_enclave
-from sros_tool.pki.token import Secrets, open_enclave_key
-from sros_tool.pki.token_uri import TokenUri
+from sros_tool.pki.token import Secrets, TokenUri, open_enclave_key
 from sros_tool.values import Words, shows
 
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"

@@ -46,7 +46,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.chains import denies_issuing, purpose_faults
 from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, few_rounds, load_key
-from sros_tool.pki.token_uri import is_token_uri
+from sros_tool.pki.token import is_token_uri
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 

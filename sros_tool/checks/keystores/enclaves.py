@@ -40,7 +40,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import weaknesses
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
-from sros_tool.pki.token_uri import TokenUri
+from sros_tool.pki.token import TokenUri
 from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 from sros_tool.xml import read_bytes

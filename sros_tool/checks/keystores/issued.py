@@ -33,8 +33,8 @@ from sros_tool.keystore.rights import load_rights
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import fingerprints, load_certificates
 from sros_tool.pki.crl import load_crl, signed_by
+from sros_tool.policy.model import stated_protections
 from sros_tool.policy.rights import Right, compare, policy_rights
-from sros_tool.policy.stated import stated_protections
 from sros_tool.translate import grant_rights
 from sros_tool.xml import read_bytes
 

@@ -19,8 +19,14 @@ from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
-from sros_tool.pki.token import create_token_key, holds_token_key, open_token_key
-from sros_tool.pki.token_uri import is_token_uri, parse_token_uri, refuse_pin
+from sros_tool.pki.token import (
+    create_token_key,
+    holds_token_key,
+    is_token_uri,
+    open_token_key,
+    parse_token_uri,
+    refuse_pin,
+)
 from sros_tool.xml import read_bytes
 
 _SHORTEST_PASSPHRASE = 12  # characters; OWASP ASVS 4.0.3, 2.1.1

@@ -41,7 +41,7 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh.opened import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.keys import holds_private_key
-from sros_tool.pki.token_uri import read_token_file
+from sros_tool.pki.token import read_token_file
 from sros_tool.xml import read_bytes
 
 _ARCHIVE_SUFFIXES = SUFFIXES

@@ -25,8 +25,14 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.requests import key_digest, load_request, make_request
-from sros_tool.pki.token import Secrets, TokenKey, make_enclave_key, open_enclave_key
-from sros_tool.pki.token_uri import TokenUri, token_file
+from sros_tool.pki.token import (
+    Secrets,
+    TokenKey,
+    TokenUri,
+    make_enclave_key,
+    open_enclave_key,
+    token_file,
+)
 from sros_tool.xml import read_bytes
 
 

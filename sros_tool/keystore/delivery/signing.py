@@ -86,9 +86,8 @@ from sros_tool.pki.certificates import enclave_subject, has_unique_part, pem, va
 from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import holds_private_key, load_key
 from sros_tool.pki.requests import SigningRequest, key_digest, load_request
-from sros_tool.policy.model import Enclave, Policy
+from sros_tool.policy.model import Enclave, Policy, stated_protections
 from sros_tool.policy.placeholders import has_placeholder
-from sros_tool.policy.stated import stated_protections
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 

@@ -51,15 +51,16 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     enclave_subject,
+    holds_at,
     is_self_issued,
     issued_by,
     load_certificates,
     pem,
+    read_form,
     subject_text,
     validity_of,
 )
 from sros_tool.pki.crl import may_sign_lists, read_list, sign_crl
-from sros_tool.pki.forms import holds_at, read_form
 from sros_tool.pki.keys import generate_key
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window

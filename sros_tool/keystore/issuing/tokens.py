@@ -12,11 +12,14 @@ from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, Usage
 from sros_tool.keystore.authorities.authority import Authorities
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path
-from sros_tool.pki.token import Secrets, TokenKey, make_enclave_key, planned_key
-from sros_tool.pki.token_uri import (
+from sros_tool.pki.token import (
+    Secrets,
+    TokenKey,
     TokenUri,
     is_token_uri,
+    make_enclave_key,
     parse_enclave_uri,
+    planned_key,
     read_token_file,
     token_file,
 )

@@ -108,10 +108,8 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.keys import PublicKey, generate_key, load_key
-from sros_tool.pki.token import TokenKey, open_enclave_key
-from sros_tool.pki.token_uri import TokenUri
-from sros_tool.policy.model import Enclave, Policy
-from sros_tool.policy.stated import StatedProtection, stated_protections
+from sros_tool.pki.token import TokenKey, TokenUri, open_enclave_key
+from sros_tool.policy.model import Enclave, Policy, StatedProtection, stated_protections
 from sros_tool.translate import governance_for
 from sros_tool.validity import Window, iso, parse_iso, window
 from sros_tool.xml import read_bytes

@@ -19,8 +19,8 @@ from sros_tool.keystore.protection import less_protected, with_stated
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.policy.model import StatedProtection
 from sros_tool.policy.protection import Level
-from sros_tool.policy.stated import StatedProtection
 from sros_tool.translate import governance_for
 
 _SHOWN = 5

@@ -1,26 +1,28 @@
-"""The environment of an enclave for a process here, given only if the process can run in it."""
+"""An enclave as a process gets it, only if it can run in it: as environment, or as a container."""
 
 from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from shlex import quote
 from typing import TYPE_CHECKING
 
-from sros_tool.cli.common import now
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.unchanged import of_one_state
 from sros_tool.owners import other_writers
 
 if TYPE_CHECKING:
-    from datetime import datetime
+    from datetime import datetime, tzinfo
 
+    from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.dds.domains import DomainSet
+    from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.reader import OpenedEnclave
     from sros_tool.keystore.zenoh.opened import OpenedZenoh
-    from sros_tool.pki.token_uri import TokenUri
+    from sros_tool.pki.token import TokenUri
 
 RMWS = (
     "rmw_connextdds",
@@ -53,6 +55,9 @@ def loadable_environment(
     domain_text: str | None = None,
     rmw: str | None = None,
     *,
+    environment: Mapping[str, str],
+    now: datetime,
+    zone: tzinfo,
     accept_key: bool = False,
     target: Path | None = None,
 ) -> EnclaveEnvironment:
@@ -63,6 +68,9 @@ def loadable_environment(
         name: the enclave.
         domain_text: the value of --domain; None stands for $ROS_DOMAIN_ID.
         rmw: the value of --rmw; None stands for $RMW_IMPLEMENTATION.
+        environment: the variables of the process as they are.
+        now: the current time.
+        zone: the time zone of this machine.
         accept_key: accept a private key, or the PIN of its token, that other users can read.
         target: the absolute path of the keystore where the process will run; None stands for here.
             A key that was made there need not be here.
@@ -81,32 +89,40 @@ def loadable_environment(
         list_enclaves,
     )
     from sros_tool.keystore.missing import no_such_enclave
+    from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.reader import open_enclave
     from sros_tool.names import check_enclave_name
     from sros_tool.pki.token import MODULE_VARIABLE
     from sros_tool.runtime.environment import choose_domain, secured_environment
-    from sros_tool.runtime.rmw import RMW, rmw_implementations
+    from sros_tool.runtime.rmw import (
+        RMW,
+        chosen_rmw,
+        rmw_implementations,
+        vendor_here,
+        vendor_of,
+    )
     from sros_tool.runtime.variables import DOMAIN, domain_from
     from sros_tool.runtime.zenoh_environment import REFUSING_ZENOH, RMW_ZENOH
 
     if domain_text == "":
         raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
-    wanted = domain_from(os.environ if domain_text is None else {DOMAIN: domain_text})
-    with_zenoh = _uses_zenoh(rmw)
+    wanted = domain_from(environment if domain_text is None else {DOMAIN: domain_text})
+    used = chosen_rmw(rmw, environment)
+    with_zenoh = _uses_zenoh(rmw, used)
     check_enclave_name(name)
     check_keystore(root)
     if not has_enclave(root, name):
         raise no_such_enclave(root, name, list_enclaves(root))
     folder = enclave_path(root, name)
-    state = open_enclave(folder, now=now())
+    state = open_enclave(folder, now=now)
     domains = state.domains() if wanted is not None else state.joined_domains()
-    zenoh = _opened_zenoh(root, name, state) if with_zenoh and not state.token else None
+    zenoh = _opened_zenoh(root, name, state, now) if with_zenoh and not state.token else None
     if zenoh and domains:
         wanted = _zenoh_domain(root, zenoh, wanted, domains)
     domain = choose_domain(domains, wanted, root) if domains else 0
-    state = open_enclave(folder, now=now(), domain=domain)
+    state = open_enclave(folder, now=now, domain=domain)
     if not with_zenoh:
-        state = _check_joining(name, folder, state, domain, rmw)
+        state = _check_joining(name, folder, state, used, JoinContext(domain, now, zone))
     problems = state.problems_at_home if target else state.problems
     if problems:
         raise KeystoreError(
@@ -115,7 +131,7 @@ def loadable_environment(
             f"See `sros inspect {folder}`.",
         )
     if state.token:
-        _check_token_used(state.token, name, rmw)
+        _check_token_used(state.token, name, used)
         if not (accept_key or target):
             _check_pin(state.token, name)
     elif not accept_key and not (target and state.key_on_robot):
@@ -124,20 +140,21 @@ def loadable_environment(
         if not accept_key:
             _check_folders_closed(root, folder, name)
         if not zenoh:
-            _check_dates_here(name, folder, domain, rmw)
+            vendor = vendor_of(used) or vendor_here(environment)[0]
+            _check_dates_here(name, folder, vendor, JoinContext(domain, now, zone))
     variables = secured_environment(target or root, name, domain)
     if zenoh:
         place = enclave_path(target or root, name)
-        found = _zenoh_environment(place, name, zenoh, variables)
+        found = _zenoh_environment(place, name, zenoh, variables, environment)
         return replace(found, notes=()) if target else found  # they are about this process
-    if (target and not rmw) or RMW_ZENOH in rmw_implementations(os.environ):
+    if (target and not rmw) or RMW_ZENOH in rmw_implementations(environment):
         variables |= REFUSING_ZENOH  # what chooses it later, such as a launch file, starts no node
     if rmw:
         variables[RMW] = rmw
     if not state.token:
         return EnclaveEnvironment(variables)
     # The module is only the one that the user names for this process: loading it runs its code.
-    module = os.environ.get(MODULE_VARIABLE)
+    module = environment.get(MODULE_VARIABLE)
     if module and not target:
         variables[MODULE_VARIABLE] = module
     notes = (_token_there(name, state.token),) if target else tuple(pin_notes(state.token))
@@ -173,9 +190,9 @@ def _check_folders_closed(root: Path, folder: Path, name: str) -> None:
 
 
 def _check_joining(
-    name: str, folder: Path, state: OpenedEnclave, domain: int, rmw: str | None
+    name: str, folder: Path, state: OpenedEnclave, rmw: str, context: JoinContext
 ) -> OpenedEnclave:
-    """Return an enclave as it is for the vendor of a process, or for all if that is not certain.
+    """Return an enclave as it is for the vendor of a process of ``rmw``, or for all vendors.
 
     Raises:
         KeystoreError: it has no fault that its reader names, and each of these vendors refuses it.
@@ -183,11 +200,13 @@ def _check_joining(
     from sros_tool.dds.decision.vendors import MEASURED
     from sros_tool.faults import Fault
     from sros_tool.keystore.participant import evaluated
-    from sros_tool.runtime.rmw import chosen_rmw, vendor_of
+    from sros_tool.runtime.rmw import vendor_of
 
-    vendor = vendor_of(chosen_rmw(rmw, os.environ))
+    vendor = vendor_of(rmw)
     vendors = (vendor,) if vendor else MEASURED
-    evaluation = evaluated(name, folder, state, at=now(), domain=domain, vendors=vendors)
+    evaluation = evaluated(
+        name, folder, state, at=context.at, domain=context.domain, vendors=vendors
+    )
     # `_check_token_used` says that a vendor reads no token.
     refusals = evaluation.stopped(ignored=(Fault.KEY_ON_TOKEN.id,))
     if evaluation.state.problems or not refusals:
@@ -199,23 +218,19 @@ def _check_joining(
     )
 
 
-def _check_dates_here(name: str, folder: Path, domain: int, rmw: str | None) -> None:
+def _check_dates_here(name: str, folder: Path, vendor: Vendor, context: JoinContext) -> None:
     """Raise `KeystoreError` if DDS takes permissions that are valid for expired in this time zone.
 
     Fast DDS reads their dates, which are in UTC, as local time.
     """
-    from sros_tool.cli.common import local_zone
     from sros_tool.explain.evaluator import Evaluator
     from sros_tool.explain.question import ask
-    from sros_tool.keystore.participant import JoinContext, load_enclave
-    from sros_tool.runtime.rmw import chosen_rmw, vendor_here, vendor_of
+    from sros_tool.keystore.participant import load_enclave
 
-    zone, moment = local_zone(os.environ), now()
-    if not zone.utcoffset(moment.replace(tzinfo=None)):
+    if not context.zone.utcoffset(context.at.replace(tzinfo=None)):
         return
-    vendor = vendor_of(chosen_rmw(rmw, os.environ)) or vendor_here(os.environ)[0]
-    enclave = load_enclave(name, folder, at=moment)
-    answer = Evaluator(vendor, enclave, JoinContext(domain, moment, zone)).answer(ask("join"))
+    enclave = load_enclave(name, folder, at=context.at)
+    answer = Evaluator(vendor, enclave, context).answer(ask("join"))
     if not answer.allowed and answer.decision.reason in ("expired", "not-yet-valid"):
         raise KeystoreError(
             f"a process cannot run in enclave {name} in this time zone",
@@ -238,17 +253,15 @@ def _token_there(name: str, place: TokenUri) -> Note:
     )
 
 
-def _check_token_used(place: TokenUri, name: str, rmw: str | None) -> None:
+def _check_token_used(place: TokenUri, name: str, rmw: str) -> None:
     """Raise `KeystoreError` if a process would use an RMW that reads keys from files alone."""
-    from sros_tool.runtime.rmw import chosen_rmw, vendor_of
+    from sros_tool.runtime.rmw import vendor_of
 
-    chosen = chosen_rmw(rmw, os.environ)
-    vendor = vendor_of(chosen)
-    if chosen and not (vendor and vendor.traits.reads_tokens):
+    vendor = vendor_of(rmw)
+    if rmw and not (vendor and vendor.traits.reads_tokens):
         raise KeystoreError(
-            f"a process of {chosen} cannot run in enclave {name}",
-            f"Its key is on the token {place.token!r}, and {chosen} reads a key from key.pem "
-            "alone.",
+            f"a process of {rmw} cannot run in enclave {name}",
+            f"Its key is on the token {place.token!r}, and {rmw} reads a key from key.pem alone.",
             "Use rmw_fastrtps_cpp of ROS 2 Jazzy or later, or an enclave with a key in a file.",
         )
 
@@ -268,34 +281,33 @@ def _check_pin(place: TokenUri, name: str) -> None:
 # ── Zenoh ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _uses_zenoh(rmw: str | None) -> bool:
-    """Return whether a process would use rmw_zenoh_cpp.
+def _uses_zenoh(named: str | None, rmw: str) -> bool:
+    """Return whether a process of ``rmw``, which the user may have ``named``, is on Zenoh.
 
     Raises:
         UsageError: it would use an RMW of which sros knows no security.
     """
-    from sros_tool.runtime.rmw import RMW, chosen_rmw, middleware_of
+    from sros_tool.runtime.rmw import RMW, middleware_of
     from sros_tool.runtime.zenoh_environment import RMW_ZENOH
 
-    if rmw is not None and rmw not in RMWS:
+    if named is not None and named not in RMWS:
         raise UsageError(
-            f"--rmw {rmw!r} is not an RMW that sros knows to enforce security",
+            f"--rmw {named!r} is not an RMW that sros knows to enforce security",
             "",
             f"Choose one of {', '.join(RMWS)}.",
         )
-    chosen = chosen_rmw(rmw, os.environ)
-    if chosen == RMW_ZENOH:
+    if rmw == RMW_ZENOH:
         return True
-    if (middleware := middleware_of(chosen)) and middleware.name == "Zenoh":
+    if (middleware := middleware_of(rmw)) and middleware.name == "Zenoh":
         raise UsageError(
-            f"{RMW} is {chosen!r}, which is not an RMW that sros knows to enforce security",
+            f"{RMW} is {rmw!r}, which is not an RMW that sros knows to enforce security",
             f"Of those on Zenoh, sros knows only {RMW_ZENOH}.",
             f"Set {RMW} to another one, or name one with --rmw.",
         )
     return False
 
 
-def _opened_zenoh(root: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
+def _opened_zenoh(root: Path, name: str, state: OpenedEnclave, now: datetime) -> OpenedZenoh:
     """Return the Zenoh configurations of an enclave.
 
     Raises:
@@ -307,7 +319,7 @@ def _opened_zenoh(root: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
 
     found = open_zenoh(enclave_path(root, name), name, state)
     if not found.problems:
-        _refuse_outdated(root, name)
+        _refuse_outdated(root, name, now)
         return found
     write = f"`sros zenoh {quote(str(root))}`"
     if not (root / PUBLIC).is_dir():
@@ -326,7 +338,7 @@ def _opened_zenoh(root: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
     )
 
 
-def _refuse_outdated(root: Path, name: str) -> None:
+def _refuse_outdated(root: Path, name: str, now: datetime) -> None:
     """Raise `KeystoreError` if the file of an enclave has not the rights of all others.
 
     A router, and a session that connects to others, enforces those rights: with a file of before,
@@ -350,7 +362,7 @@ def _refuse_outdated(root: Path, name: str) -> None:
         return any(each.enclave == name for each in drifts)
 
     # The router starts although the permissions of another enclave have expired since.
-    if drifted(now()) and drifted(None):
+    if drifted(now) and drifted(None):
         where = quote(str(root))
         raise KeystoreError(
             f"the Zenoh configuration of enclave {name} is not in step with the keystore",
@@ -383,7 +395,11 @@ def _zenoh_domain(
 
 
 def _zenoh_environment(
-    folder: Path, name: str, zenoh: OpenedZenoh, variables: dict[str, str]
+    folder: Path,
+    name: str,
+    zenoh: OpenedZenoh,
+    variables: dict[str, str],
+    environment: Mapping[str, str],
 ) -> EnclaveEnvironment:
     from sros_tool.keystore.layout import (
         CERTIFICATE_FILE,
@@ -415,4 +431,95 @@ def _zenoh_environment(
             "topics and services."
         )
         needed = (Note("zenoh.enclave-argument", text),)
-    return EnclaveEnvironment(variables, tuple(replaced_notes(os.environ, variables)), needed)
+    return EnclaveEnvironment(variables, tuple(replaced_notes(environment, variables)), needed)
+
+
+# ── containers ─────────────────────────────────────────────────────────────────────────────
+
+INSTALLED = "/etc/sros/keystore"
+"""Where a robot or a container has its keystore, unless another path is named."""
+
+
+def target_path(text: str) -> Path:
+    """Return the path of a keystore on another machine.
+
+    Raises:
+        UsageError: it is not absolute, or not in its shortest form.
+    """
+    path = PurePosixPath(text)
+    if not path.is_absolute() or ".." in path.parts or str(path) != text or text.startswith("//"):
+        raise UsageError(
+            f"--target {text!r} is not the path of a keystore on another machine",
+            "It must be absolute, without '..', '//' and a '/' at the end.",
+            f"Write it as {INSTALLED}.",
+        )
+    return Path(text)
+
+
+def container_text(
+    root: Path,
+    enclave: str,
+    form: str,
+    *,
+    target: Path,
+    variables: Mapping[str, str],
+    name: str,
+    image: str,
+    now: datetime,
+) -> str:
+    """Return an enclave as a service of Compose, or as objects of Kubernetes.
+
+    Args:
+        root: the keystore.
+        enclave: one of its enclaves, in which a process can run.
+        form: one of `sros_tool.runtime.containers.FORMS`.
+        target: the keystore in the container and, for Compose, on the machine that runs it.
+        variables: the environment of the enclave there.
+        name: the name of the service or object; "" stands for one that no other enclave has.
+        image: the image, or "".
+        now: the current time.
+
+    Raises:
+        UsageError: a name is not valid.
+        KeystoreError: the container would see the keys of other enclaves, or no files.
+    """
+    from sros_tool.keystore.delivery.export import exported_files
+    from sros_tool.keystore.layout import enclave_path
+    from sros_tool.runtime.containers import (
+        COMPOSE,
+        SECRET,
+        Container,
+        check_name,
+        object_name,
+        render_container,
+        render_secret,
+    )
+
+    if form == SECRET:
+        files = exported_files(root, (enclave,), now)
+        return render_secret(enclave, {PurePosixPath(path).name: files[path] for path in files})
+    if form == COMPOSE:
+        _check_mounted(root, enclave, target)
+    name = check_name(name, form) if name else object_name(enclave)
+    folder = str(enclave_path(target, enclave))
+    return render_container(Container(enclave, name, variables, folder, image), form)
+
+
+def _check_mounted(root: Path, enclave: str, target: Path) -> None:
+    """Raise `KeystoreError` if the folder of an enclave cannot be mounted alone."""
+    from sros_tool.keystore.layout import enclaves_below
+    from sros_tool.keystore.reader import open_keystore
+
+    export = f"`sros distribute_key {quote(str(root))} {quote(enclave)} DIR`"
+    if inner := enclaves_below(root, enclave):
+        raise KeystoreError(
+            f"the folder of enclave {enclave} also has {', '.join(inner[:3])}",
+            "The container would get the private keys of all of them.",
+            f"Export this enclave alone, {export}, and name DIR as the keystore.",
+        )
+    if open_keystore(root).is_home and target == root.absolute():
+        raise KeystoreError(
+            f"a container cannot use '{target}' itself",
+            "Files of an enclave are links to others of the keystore, which it would not have.",
+            f"Export the enclave, {export}, and name the path of DIR with --target.",
+        )
