@@ -39,7 +39,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import lock as locking
 from sros_tool.keystore.transaction.stage import staged_name
@@ -197,7 +197,7 @@ def test_no_verb_is_recommended_over_a_made_up_stage(
     name: str, keystore: Path, outside: Path
 ) -> None:
     MADE_UP[name](stage(keystore), outside)
-    found = keystore_findings(keystore, now=NOW)
+    found = keystore_findings(Keystore(keystore), now=NOW)
     (of_stage,) = [each for each in found if Path(each.file).name == STAGE]
     assert of_stage.kind.id == "keystore.transaction-not-ours"
     assert "create_enclave" not in of_stage.kind.remedy
@@ -722,7 +722,10 @@ def test_the_name_of_a_file_becomes_no_command_in_a_remedy(keystore: Path) -> No
     for name, damage in (("key.pem", b""), ("cert.pem", b"x"), ("governance.p7s", b"x")):
         (odd / "enclaves/a" / name).write_bytes(damage)
     (odd / "public/identity_ca.cert.pem").unlink()
-    found_there = [*keystore_findings(odd, now=NOW), *verify_arrival(odd, now=NOW).findings]
+    found_there = [
+        *keystore_findings(Keystore(odd), now=NOW),
+        *verify_arrival(odd, now=NOW).findings,
+    ]
     commands = [each for found in found_there for each in re.findall("`(.+?)`", found.remedy)]
     with_name = [shlex.split(each) for each in commands if "touch" in each]
     assert len({words[0] for words in with_name}) >= 2, commands
@@ -736,7 +739,7 @@ def test_a_file_of_the_kernel_is_not_read(keystore: Path) -> None:
     certificate = keystore / "enclaves/a/cert.pem"
     certificate.unlink()
     certificate.symlink_to("/proc/kmsg")
-    found = {each.kind.id for each in keystore_findings(keystore, now=NOW)}
+    found = {each.kind.id for each in keystore_findings(Keystore(keystore), now=NOW)}
     assert {"enclave.file-empty", "enclave.file-unreadable"} & found
 
 

@@ -23,6 +23,7 @@ from sros_tool.keystore.layout import (
     refuse_earlier,
     search_enclaves,
 )
+from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
 from sros_tool.xml import read_bytes
@@ -264,7 +265,7 @@ def _enclave(
         effect = "" if enforced else f"; nodes RUN UNSECURED, as {STRATEGY} is not 'Enforce'"
         yield ENCLAVE_NOT_FOUND.found(ENCLAVE, f"'{root}' has no enclave {name}{hint}{effect}")
         return
-    found = keystore_findings(root, now=now, zone=zone, domain=domain, only=(name,))
+    found = keystore_findings(Keystore(root), now=now, zone=zone, domain=domain, only=(name,))
     for each in found:
         if each.id == "enclave.governance-domain":
             yield DOMAIN_NOT_GOVERNED.found(DOMAIN, each.text, each.file)

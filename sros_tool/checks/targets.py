@@ -21,6 +21,7 @@ from sros_tool.keystore.layout import (
     locate_enclave,
     refuse_earlier,
 )
+from sros_tool.keystore.reader import Keystore
 from sros_tool.policy.document import policy_files
 from sros_tool.policy.model import Policy
 from sros_tool.xml import read_bytes
@@ -90,7 +91,7 @@ def policy_findings(path: Path, at: Circumstances) -> list[Finding]:
 
 def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:
     return keystore_findings(
-        root,
+        Keystore(root),
         now=at.now,
         zone=at.zone,
         domain=at.domain,

@@ -82,6 +82,7 @@ def metrics(
     """
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.keystores.metrics import keystore_metrics
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.prometheus import KeystoreMetrics, render_metrics
 
     root, moment = root or keystore_from_environment(), now()
@@ -92,8 +93,11 @@ def metrics(
         raise UsageError("--fleet is for the placeholders of a policy: add --policy FILE")
     wanted = tuple(policy_for(each, fleet_file) for each in policies)
     with progress("examining"):
-        findings = keystore_findings(root, now=moment, zone=local_zone(os.environ), policies=wanted)
-        found = keystore_metrics(root, findings, now=moment, each_enclave=not earliest)
+        keystore = Keystore(root)
+        findings = keystore_findings(
+            keystore, now=moment, zone=local_zone(os.environ), policies=wanted
+        )
+        found = keystore_metrics(keystore, findings, now=moment, each_enclave=not earliest)
         found += _of_processes(moment) if runtime else ()
     text = render_metrics(found)
     changes = file_change(output, existed=output.exists()) if output else ()

@@ -14,13 +14,7 @@ from cryptography import x509
 
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.layout import (
-    CERTIFICATE_FILE,
-    PERMISSIONS_FILE,
-    enclave_path,
-    list_enclaves,
-)
-from sros_tool.keystore.reader import read_certificate, read_signed_grant
+from sros_tool.keystore.reader import Keystore, as_keystore
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
@@ -141,7 +135,7 @@ def parse_threshold(text: str) -> Threshold:
     return Threshold(elapsed=int(match[1]) / 100)
 
 
-def _lifetimes(root: Path) -> tuple[Lifetime, ...]:
+def _lifetimes(root: Path | Keystore) -> tuple[Lifetime, ...]:
     """Return the lifetimes of a keystore's enclaves, sorted by name.
 
     Raises:
@@ -152,16 +146,18 @@ def _lifetimes(root: Path) -> tuple[Lifetime, ...]:
     return found
 
 
-def survey(root: Path) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
+def survey(root: Path | Keystore) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
     """Return the lifetimes of the readable enclaves, and the unreadable enclaves, on all cores."""
+    keystore = as_keystore(root)
+    keystore.check()
 
     def read(name: str) -> Lifetime | UnreadableEnclave:
         try:
-            return read_credentials(root, name).lifetime()
+            return read_credentials(keystore, name).lifetime()
         except SrosError as error:
             return UnreadableEnclave(name, error)
 
-    slices = map_slices(list_enclaves(root), lambda names: list(map(read, names)))
+    slices = map_slices(keystore.names, lambda names: list(map(read, names)))
     found = [each for _, part in slices for each in part]
     return (
         tuple(each for each in found if isinstance(each, Lifetime)),
@@ -170,7 +166,7 @@ def survey(root: Path) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, .
 
 
 def due_enclaves(
-    root: Path, threshold: Threshold, moment: datetime, settings: Template
+    root: Path | Keystore, threshold: Threshold, moment: datetime, settings: Template
 ) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...], int]:
     """Return the enclaves of a keystore that need to be renewed, those unreadable, and a count.
 
@@ -197,28 +193,29 @@ def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> N
         )
 
 
-def read_credentials(root: Path, name: str) -> Credentials:
+def read_credentials(root: Path | Keystore, name: str) -> Credentials:
     """Return the certificate and the grant of an enclave, without verifying them.
 
     Raises:
         KeystoreError: a file is missing or cannot be read, or no grant is for the certificate.
     """
-    folder = enclave_path(root, name)
+    keystore = as_keystore(root)
     try:
-        certificate = read_certificate(folder / CERTIFICATE_FILE)
+        certificate = keystore.certificate_of(name)
         subject = subject_text(certificate.subject)
-        granted = read_signed_grant(folder / PERMISSIONS_FILE, subject)
+        granted = keystore.signed_grant(name, subject)
     except SrosError as error:
         raise KeystoreError(
             f"enclave {name} cannot be read: {error.what}",
             error.why,
-            error.remedy or f"See `sros inspect {quote(str(folder))}`.",
+            error.remedy or f"See `sros inspect {quote(str(keystore.folder(name)))}`.",
         ) from error
     if granted.grant is None:
         raise KeystoreError(
             f"the permissions of enclave {name} have no grant for {subject}",
             "They belong to another certificate.",
-            f"Sign them again with `sros create_permission {quote(str(root))} {name} POLICY_FILE`.",
+            f"Sign them again with `sros create_permission {quote(str(keystore.root))} {name} "
+            "POLICY_FILE`.",
         )
     return Credentials(name, certificate, granted.signed, granted.digest, granted.grant)
 

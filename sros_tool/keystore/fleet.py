@@ -19,10 +19,10 @@ from sros_tool.errors import KeystoreError, Note
 from sros_tool.fleet.document import MAX_BYTES, parse_fleet, render_fleet
 from sros_tool.fleet.enclaves import enclaves_of, robot_of, size_problem
 from sros_tool.fleet.model import Fleet, Robot
-from sros_tool.keystore.layout import FLEET, check_keystore, enclave_names, has_enclave
-from sros_tool.keystore.ledger import Entry, Ledger, read_ledger
+from sros_tool.keystore.layout import FLEET, enclave_names, has_enclave
+from sros_tool.keystore.ledger import Entry, Ledger
+from sros_tool.keystore.reader import Keystore, as_keystore
 from sros_tool.validity import iso
-from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
     from sros_tool.keystore.transaction.transaction import Transaction
@@ -38,34 +38,40 @@ FLEET_REMEDY = (
 _SHOWN = 5
 
 
-def load_fleet(root: Path) -> Fleet | None:
+def load_fleet(root: Path | Keystore) -> Fleet | None:
     """Return the fleet of a keystore, or None: nobody named one.
 
     Raises:
         DocumentError: the file cannot be read, or is not a fleet.
     """
-    data = _read(root)
-    return None if data is None else _parse(root, data)
+    keystore = as_keystore(root)
+
+    def read() -> Fleet | None:
+        data = _read(keystore)
+        return None if data is None else _parse(keystore.root, data)
+
+    return keystore.once("fleet", read)
 
 
-def checked_fleet(root: Path) -> Fleet | None:
+def checked_fleet(root: Path | Keystore) -> Fleet | None:
     """Return the fleet as `load_fleet`, for what is issued or sent because of it.
 
     Raises:
         KeystoreError: the file is not the one that sros wrote last.
     """
-    if problem := edited_fleet(root, read_ledger(root, having=("what", "fleet"))):
+    keystore = as_keystore(root)
+    if problem := edited_fleet(keystore, keystore.ledger_with("what", "fleet")):
         raise KeystoreError(
-            f"'{root / FLEET}' {problem}",
+            f"'{keystore.root / FLEET}' {problem}",
             "It decides which enclaves belong to a robot, and which domains they may join.",
-            FLEET_REMEDY.replace("ROOT", quote(str(root))),
+            FLEET_REMEDY.replace("ROOT", quote(str(keystore.root))),
         )
-    return load_fleet(root)
+    return load_fleet(keystore)
 
 
-def edited_fleet(root: Path, ledger: Ledger) -> str:
+def edited_fleet(keystore: Keystore, ledger: Ledger) -> str:
     """Return how the file of the fleet is not the one that sros wrote, as a clause, or ""."""
-    return _edited(ledger, _read(root))
+    return _edited(ledger, _read(keystore))
 
 
 def _edited(ledger: Ledger, data: bytes | None) -> str:
@@ -82,30 +88,33 @@ def _edited(ledger: Ledger, data: bytes | None) -> str:
     return "" if same else f"is not the one that sros wrote at {last.time}"
 
 
-def _read(root: Path) -> bytes | None:
-    path = root / FLEET
-    return read_bytes(path, "fleet file", most=MAX_BYTES) if os.path.lexists(path) else None
+def _read(keystore: Keystore) -> bytes | None:
+    path = keystore.root / FLEET
+    if not os.path.lexists(path):
+        return None
+    return keystore.files.read(path, "fleet file", most=MAX_BYTES)
 
 
 def _parse(root: Path, data: bytes) -> Fleet:
     return parse_fleet(data, f"the fleet file '{root / FLEET}'")
 
 
-def recorded_fleet(root: Path) -> Fleet:
+def recorded_fleet(root: Path | Keystore) -> Fleet:
     """Return the fleet of a keystore.
 
     Raises:
         KeystoreError: ``root`` is no keystore, or nobody named a fleet.
         DocumentError: the file cannot be read, or is not a fleet.
     """
-    check_keystore(root)
-    fleet = load_fleet(root)
+    keystore = as_keystore(root)
+    keystore.check()
+    fleet = load_fleet(keystore)
     if fleet is None:
         raise KeystoreError(
-            f"keystore '{root}' has no fleet",
+            f"keystore '{keystore.root}' has no fleet",
             "",
-            f"Name its robots with `sros generate_artifacts -k {quote(str(root))} -p POLICY_FILE "
-            "--fleet FLEET_FILE`.",
+            f"Name its robots with `sros generate_artifacts -k {quote(str(keystore.root))} -p "
+            "POLICY_FILE --fleet FLEET_FILE`.",
         )
     return fleet
 
@@ -157,7 +166,8 @@ def write_fleet(
 
     It gets the paths of enclaves that it names itself, that the keystore had, and ``patterns``.
     """
-    before = load_fleet(transaction.root)
+    keystore = Keystore(transaction.root)
+    before = load_fleet(keystore)
     known = (before.enclaves if before else (), fleet.enclaves, patterns)
     paths = dict.fromkeys(sorted(each for paths in known for each in paths))
     fleet = fleet.with_enclaves(tuple(paths))
@@ -169,8 +179,8 @@ def write_fleet(
         )
     _refuse_shared(fleet)
     document = (_COMMENT + render_fleet(fleet)).encode()
-    ledger = read_ledger(transaction.root, having=("what", "fleet"))
-    if not _edited(ledger, document) and _read(transaction.root):
+    ledger = keystore.ledger_with("what", "fleet")
+    if not _edited(ledger, document) and _read(keystore):
         return fleet, ()
     transaction.write(FLEET, document)
     digest = hashlib.sha256(document).hexdigest()

@@ -20,30 +20,27 @@ from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     KEY_FILE,
     REQUEST,
-    enclave_names,
-    enclave_path,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import Entry, read_ledger
-from sros_tool.keystore.reader import read_certificate, read_lists
+from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.reader import Keystore, as_keystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import common_name_of, identity_of, subject_text
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
 from sros_tool.pki.requests import key_digest, load_request
-from sros_tool.xml import read_bytes
 
 
 class KnownKeys:
     """The keys of a keystore, to compare with a key that is about to be certified."""
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    def __init__(self, root: Path | Keystore) -> None:
+        self._keystore = as_keystore(root)
 
     @cached_property
     def _revocations(self) -> Sequence[Entry]:
         """The revocations in the ledger."""
-        entries = read_ledger(self._root, having=("what", "revocation")).entries
+        entries = self._keystore.ledger_with("what", "revocation").entries
         return [each for each in entries if each.what == "revocation"]
 
     @cached_property
@@ -52,9 +49,9 @@ class KnownKeys:
         recorded = [each for each in self._revocations if each.key]
         found = {each.key: f"certificate {each.serial} of {each.subject}" for each in recorded}
         serials = {each.serial for each in recorded}
-        for path in revoked_certificates(self._root):
+        for path in revoked_certificates(self._keystore.root):
             try:
-                found.update([_described(read_certificate(path))])
+                found.update([_described(self._keystore.certificate(path))])
             except SrosError:
                 if path.parent.name not in serials:
                     raise
@@ -64,7 +61,7 @@ class KnownKeys:
     def _revoked_serials(self) -> Collection[int]:
         """The serial numbers of certificates that were revoked together with their keys."""
         found = {int(each.serial, 16) for each in self._revocations if each.reason != SUPERSEDED}
-        lists = (entry for crl in read_lists(self._root) for entry in crl.revoked)
+        lists = (entry for crl in self._keystore.revocation_lists for entry in crl.revoked)
         return found | {entry.serial for entry in lists if entry.reason != SUPERSEDED}
 
     @cached_property
@@ -74,11 +71,11 @@ class KnownKeys:
         Where the ledger was lost, those whose files are in ``revoked``, with a certificate that a
         revocation list names.
         """
-        files = revoked_certificates(self._root)
+        files = revoked_certificates(self._keystore.root)
         if not files and all(each.reason == SUPERSEDED for each in self._revocations):
             return set()
         found, recorded = set(), set()
-        for each in read_ledger(self._root).entries:
+        for each in self._keystore.ledger.entries:
             recorded.add(each.serial)
             if each.what == "certificate":
                 found.discard(each.enclave)
@@ -87,7 +84,7 @@ class KnownKeys:
         for path in files:
             if path.parent.name not in recorded:
                 with suppress(SrosError):  # a file that is no certificate
-                    certificate = read_certificate(path)
+                    certificate = self._keystore.certificate(path)
                     if certificate.serial_number in self._revoked_serials:
                         found.add(common_name_of(certificate.subject))
         return found
@@ -107,10 +104,10 @@ class KnownKeys:
         """Map the digest of each key to the enclaves that have it."""
 
         def read(names: Sequence[str]) -> list[tuple[str, str]]:
-            return [(digest, name) for name in names for digest in _digests(self._root, name)]
+            return [(digest, name) for name in names for digest in _digests(self._keystore, name)]
 
         found: dict[str, list[str]] = defaultdict(list)
-        for _, part in map_slices(enclave_names(self._root), read):
+        for _, part in map_slices(self._keystore.names, read):
             for digest, name in part:
                 found[digest].append(name)
         return found
@@ -173,16 +170,18 @@ def _digest_of(certificate: x509.Certificate) -> str:
     return key_digest(certificate.public_key())  # type: ignore[arg-type]
 
 
-def _digests(root: Path, name: str) -> Iterator[str]:
+def _digests(keystore: Keystore, name: str) -> Iterator[str]:
     """Yield the digest of an enclave's key, from its certificate, or else its key or request."""
-    folder = enclave_path(root, name)
+    folder = keystore.folder(name)
     try:
         if (folder / CERTIFICATE_FILE).exists():
-            yield _digest_of(read_certificate(folder / CERTIFICATE_FILE))
+            yield _digest_of(keystore.certificate_of(name))
         elif (path := folder / KEY_FILE).exists():
-            yield key_digest(load_key(read_bytes(path, "private key"), f"'{path}'").public_key())
+            key = load_key(keystore.read(path, "private key"), f"'{path}'")
+            yield key_digest(key.public_key())
         elif (path := folder / REQUEST).exists():  # the key is on a token
-            yield key_digest(load_request(read_bytes(path, "request"), f"'{path}'").public_key)
+            request = load_request(keystore.read(path, "request"), f"'{path}'")
+            yield key_digest(request.public_key)
     except PkiError:
         return  # a damaged file, which no DDS loads; `sros check` reports it
 
@@ -190,15 +189,15 @@ def _digests(root: Path, name: str) -> Iterator[str]:
 # ── participants of DDS ─────────────────────────────────────────────────────────────────
 
 
-def enclaves_by_identity(root: Path) -> dict[str, str]:
+def enclaves_by_identity(root: Path | Keystore) -> dict[str, str]:
     """Map `identity_of` each certificate's subject in a keystore to its enclave.
 
     A secured participant shows this identity in its GUID.  An enclave whose certificate cannot be
     read is left out.
     """
-    found = {}
-    for name in enclave_names(root):
+    keystore, enclaves = as_keystore(root), {}
+    for name in keystore.names:
         with suppress(SrosError):
-            certificate = read_certificate(enclave_path(root, name) / CERTIFICATE_FILE)
-            found[identity_of(certificate.subject.public_bytes())] = name
-    return found
+            certificate = keystore.certificate_of(name)
+            enclaves[identity_of(certificate.subject.public_bytes())] = name
+    return enclaves

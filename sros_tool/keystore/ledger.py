@@ -239,7 +239,7 @@ class LedgerFile:
 
     ``authorities`` returns the certificates of the CAs that the keystore trusts.  Only a ledger of
     more than 16 MiB is read again for each question.  Who has the lock of the keystore does not
-    follow a link (``follow_link``).
+    follow a link (``follow_link``).  ``read`` reads the head the first time.
     """
 
     def __init__(
@@ -248,8 +248,10 @@ class LedgerFile:
         authorities: Callable[[], Sequence[x509.Certificate]],
         *,
         follow_link: bool = True,
+        read: Callable[[Path, str], bytes] = read_bytes,
     ) -> None:
         self.root = root
+        self._read_first = read
         self._authorities = authorities
         self._follow_link = follow_link
         self._files: _Files | None = None
@@ -306,13 +308,30 @@ class LedgerFile:
             self._files = None
 
     def _read(self) -> _Files:
-        head = _read_head(self.root, self._authorities)
+        head = self._read_head(self._read_first)
+        self._read_first = read_bytes
         file = _open(self.root, self._follow_link)
         if file is None:
             return _Files(head, None, b"")
         with file:
             state = os.fstat(file.fileno())
             return _Files(head, state, file.read() if state.st_size <= _MOST_KEPT else None)
+
+    def _read_head(self, read: Callable[[Path, str], bytes]) -> _Head | None:
+        """Return the head of the ledger; None without one."""
+        path = self.root / LEDGER_HEAD
+        if not path.exists():
+            return None
+        try:
+            signed = smime.parse(read(path, "signed head of the ledger"))
+            if authorities := self._authorities():
+                _verify(signed, authorities)
+            stated = _HEAD.fullmatch(signed.text)
+        except SrosError as error:
+            return _Head(fault=f"{LEDGER_HEAD} does not sign its end: {error.what}")
+        if not stated:
+            return _Head(fault=f"{LEDGER_HEAD} is not the signed end of a ledger")
+        return _Head(int(stated[1]), stated[2].decode())
 
     def _is_still(self, files: _Files) -> bool:
         """Return whether what was read is what is there now."""
@@ -323,7 +342,7 @@ class LedgerFile:
             same = state is files.state
         else:
             same = os.path.samestat(state, files.state)
-        return same and _read_head(self.root, self._authorities) == files.head
+        return same and self._read_head(read_bytes) == files.head
 
     def _lines(self, files: _Files, having: bytes) -> _Lines:
         stated = files.head.lines if files.head else 0
@@ -596,22 +615,6 @@ class _Head(NamedTuple):
     lines: int = 0
     last: str = ""
     fault: str = ""
-
-
-def _read_head(root: Path, trusted: Callable[[], Sequence[x509.Certificate]]) -> _Head | None:
-    """Return the head of a keystore's ledger, signed by a ``trusted`` CA; None without a head."""
-    if not (root / LEDGER_HEAD).exists():
-        return None
-    try:
-        signed = smime.parse(read_bytes(root / LEDGER_HEAD, "signed head of the ledger"))
-        if authorities := trusted():
-            _verify(signed, authorities)
-        stated = _HEAD.fullmatch(signed.text)
-    except SrosError as error:
-        return _Head(fault=f"{LEDGER_HEAD} does not sign its end: {error.what}")
-    if not stated:
-        return _Head(fault=f"{LEDGER_HEAD} is not the signed end of a ledger")
-    return _Head(int(stated[1]), stated[2].decode())
 
 
 def _head_fault(head: _Head | None, lines: int, signed: str, *, chained: bool) -> _Fault | None:

@@ -161,7 +161,7 @@ def _is_specific(problem: Problem, state: OpenedEnclave) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Trust:
-    """What a vendor makes of the CAs and the governance that the enclaves of a keystore share.
+    """What a vendor makes of the CAs that the enclaves of a keystore share.
 
     ``authorities`` and ``signers`` are the certificates of the identity CA's and the permissions
     CA's file, in order; none if it cannot be read.
@@ -171,7 +171,6 @@ class _Trust:
     signers: Certificates
     unreadable: tuple[Problem, ...]
     refused: tuple[Problem, ...]
-    governance: tuple[Problem, ...]
 
 
 @lru_cache(maxsize=16)  # of some keystores, for all vendors
@@ -179,7 +178,6 @@ def _trust(
     traits: VendorTraits,
     identity_ca: bytes | None,
     permissions_ca: bytes | None,
-    governance: bytes | None,
     at: datetime,
 ) -> _Trust:
     read: dict[str, Certificates] = {}
@@ -201,7 +199,6 @@ def _trust(
         signers,
         tuple(unreadable),
         tuple(refused),
-        tuple(_signature_problems(traits, GOVERNANCE_FILE, governance, signers, at)),
     )
 
 
@@ -213,7 +210,7 @@ def _unreadable(traits: VendorTraits, data: bytes, file: str, error: PkiError) -
 def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterator[Problem]:
     files = state.files
     shared = (files.get(IDENTITY_CA_FILE), files.get(PERMISSIONS_CA_FILE))
-    trust = _trust(traits, *shared, files.get(GOVERNANCE_FILE), at)
+    trust = _trust(traits, *shared, at)
     yield from trust.unreadable
     identity: Certificates = ()
     if CERTIFICATE_FILE in files:
@@ -225,9 +222,8 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
     if trust.authorities and identity:
         yield from _identity_faults(traits, identity[0], state, trust.authorities, at)
         yield from _list_faults(traits, state, identity[0], trust.authorities, at)
-    yield from trust.governance
-    permissions = files.get(PERMISSIONS_FILE)
-    yield from _signature_problems(traits, PERMISSIONS_FILE, permissions, trust.signers, at)
+    for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
+        yield from _signature_problems(traits, file, state, trust.signers, at)
     largest = traits.largest_document
     if largest is not None and state.permissions_bytes > largest:
         text = f"it has {state.permissions_bytes} bytes, and from {largest + 1} on the "
@@ -253,13 +249,13 @@ def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
 
 
 def _signature_problems(
-    traits: VendorTraits, file: str, message: bytes | None, signers: Certificates, at: datetime
+    traits: VendorTraits, file: str, state: OpenedEnclave, signers: Certificates, at: datetime
 ) -> Iterator[Problem]:
     """Yield why the vendor refuses the signature of a document, if the document is there."""
-    if message is None or not signers:
+    if file not in state.files or not signers:
         return
     try:
-        text = _signer_fault(traits, smime.parse(message), signers, at)
+        text = _signer_fault(traits, state.signed(file), signers, at)
     except PkiError as error:
         text = str(error)
     if text:

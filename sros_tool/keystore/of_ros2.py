@@ -26,11 +26,9 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     ROLES,
     SETTINGS,
-    enclave_path,
 )
-from sros_tool.keystore.reader import load_ca_certificate, open_enclave
+from sros_tool.keystore.reader import Keystore, as_keystore
 from sros_tool.translate import protection_for
-from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
     from sros_tool.keystore.ledger import Entry
@@ -42,17 +40,18 @@ _ADOPTED = "taken over"
 _RECORDS = (SETTINGS, LEDGER, LEDGER_HEAD)
 
 
-def is_of_ros2(root: Path) -> bool:
+def is_of_ros2(root: Path | Keystore) -> bool:
     """Return whether ros2/sros2 made a keystore, and sros has written nothing to it yet.
 
     It has neither settings nor a ledger, and its CA has no key identifier, which sros gives to
     every CA that it makes: a keystore of sros is not taken for one of ros2/sros2 because somebody
     removed the records of what was taken away.
     """
-    if any(os.path.lexists(root / name) for name in _RECORDS):
+    keystore = as_keystore(root)
+    if any(os.path.lexists(keystore.root / name) for name in _RECORDS):
         return False
     try:
-        authority = load_ca_certificate(root, IDENTITY)
+        authority = keystore.ca_certificate(IDENTITY)
         authority.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
     except x509.ExtensionNotFound:
         return True
@@ -70,24 +69,24 @@ def take_over(transaction: Transaction, now: datetime, entries: Iterable[Entry])
     added = list(entries)
     if not is_of_ros2(transaction.root):
         return added
-    before = list(_present(transaction.root, transaction.enclaves, now))
+    before = list(_present(Keystore(transaction.root), transaction.enclaves, now))
     transaction.adopt()
     if not any(each.what == "settings" for each in added):
         before += _settings(transaction, now)
     return [*before, *added]
 
 
-def _present(root: Path, names: Iterable[str], now: datetime) -> Iterator[Entry]:
+def _present(keystore: Keystore, names: Iterable[str], now: datetime) -> Iterator[Entry]:
     from sros_tool.keystore.ledger import certificate_entry, document_entry
 
-    authorities = dict.fromkeys(load_ca_certificate(root, role) for role in ROLES)
+    authorities = dict.fromkeys(keystore.ca_certificate(role) for role in ROLES)
     for authority in authorities:
         yield certificate_entry(now, "ca", authority, reason=_ADOPTED)
     with suppress(SrosError):  # a missing one is reported by the verb
-        message = read_bytes(root / GOVERNANCE_P7S, "governance document")
+        message = keystore.read(GOVERNANCE_P7S, "governance document")
         yield replace(document_entry(now, "governance", message), reason=_ADOPTED)
     for name in names:
-        state = open_enclave(enclave_path(root, name), now=now)
+        state = keystore.enclave(name, now=now)
         files = {problem.file for problem in state.problems_at_home}
         if state.certificate and "cert.pem" not in files:
             yield certificate_entry(now, "certificate", state.certificate, name, _ADOPTED)

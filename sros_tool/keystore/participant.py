@@ -31,9 +31,8 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
 )
 from sros_tool.keystore.loading import BEFORE_DDS, CRASHES, vendor_problems
-from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
+from sros_tool.keystore.reader import Keystore, OpenedEnclave, Problem, open_enclave
 from sros_tool.names import ROS_DISCOVERY_TOPIC
-from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     extension,
     load_certificates,
@@ -41,7 +40,6 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.policy.model import Enclave
-from sros_tool.xml import read_bytes
 
 # ── what DDS loads ─────────────────────────────────────────────────────────────────────────
 
@@ -116,10 +114,15 @@ def load_enclave(name: str, folder: Path, *, at: datetime) -> LoadedEnclave:
     return loaded(name, folder, open_enclave(folder, now=at), at=at)
 
 
+def load_enclave_of(keystore: Keystore, name: str, *, at: datetime) -> LoadedEnclave:
+    """Return an enclave of a keystore as DDS would load it at the time ``at``."""
+    return loaded(name, keystore.folder(name), keystore.enclave(name, now=at), at=at)
+
+
 def loaded(name: str, folder: Path, state: OpenedEnclave, *, at: datetime) -> LoadedEnclave:
     """Return the enclave that DDS would load from a folder that was opened at the time ``at``."""
     governance, permissions = (
-        _document(state.files.get(file, b"")) for file in ("governance.p7s", "permissions.p7s")
+        _document(state, file) for file in (GOVERNANCE_FILE, PERMISSIONS_FILE)
     )
     return LoadedEnclave(
         name,
@@ -127,7 +130,7 @@ def loaded(name: str, folder: Path, state: OpenedEnclave, *, at: datetime) -> Lo
         governance,
         permissions,
         state.domains() or _domains(governance),
-        state.files.get("permissions.p7s", b""),
+        state.files.get(PERMISSIONS_FILE, b""),
         folder,
         state,
         at,
@@ -188,9 +191,9 @@ def _is_plain(permissions: Permissions) -> bool:
 _MARKUP = '&<>"'
 
 
-def _document(message: bytes) -> bytes:
+def _document(state: OpenedEnclave, file: str) -> bytes:
     with suppress(SrosError):
-        return smime.parse(message).document
+        return state.signed(file).document
     return b""
 
 
@@ -214,7 +217,8 @@ def _expiries(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetim
         from sros_tool.pki.crl import load_crl
 
         with suppress(SrosError):
-            yield "crl.pem", load_crl(read_bytes(crl, "revocation list"), "").next_update
+            data = state.read_once.read(crl, "revocation list")
+            yield "crl.pem", load_crl(data, "").next_update
 
 
 # ── what a vendor makes of it ──────────────────────────────────────────────────────────────
@@ -472,7 +476,7 @@ def _with_acceptance(
 def _signers(state: OpenedEnclave, file: str) -> set[x509.Certificate | None]:
     """Return the certificates of all who signed a document, None for one that is not there."""
     with suppress(SrosError):
-        signed = smime.parse(state.files[file])
+        signed = state.signed(file)
         data = state.files.get(PERMISSIONS_CA_FILE, b"")
         known = (*signed.certificates, *load_certificates(data, PERMISSIONS_CA_FILE))
         return {each.signer_among(known) for each in signed.signatures}

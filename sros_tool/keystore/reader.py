@@ -95,9 +95,12 @@ class FilesReadOnce:
     """Files, each of which is read at most once, whatever links lead to it.
 
     What is known of a path stays as it was first read; a file that could not be read fails again.
+    Of many thousand enclaves not all content is kept: what was read once 16 MiB are `full` is read
+    again.
     """
 
     def __init__(self) -> None:
+        self._size = 0
         self._by_path: dict[str, bytes] = {}
         self._by_file: dict[tuple[int, int, int, int], bytes] = {}
         self._errors: dict[tuple[str, str], SrosError] = {}
@@ -120,8 +123,14 @@ class FilesReadOnce:
         except SrosError as error:
             self._errors[name, what] = error
             raise
-        self._by_path[name] = data
+        if not self.full:
+            self._by_path[name] = data
         return data
+
+    @property
+    def full(self) -> bool:
+        """Whether nothing more is kept."""
+        return self._size > _MOST_KEPT
 
     def _read(self, path: Path, what: str, most: int) -> bytes:
         with suppress(OSError, ValueError):  # what is wrong with a path is said by `read_file`
@@ -129,7 +138,9 @@ class FilesReadOnce:
             if data is not None and len(data) <= most:
                 return data
         state, data = read_file(path, what, most=most)
-        self._by_file[_identity(state)] = data
+        if not self.full:
+            self._by_file[_identity(state)] = data
+            self._size += len(data)
         return data
 
     def signed(self, message: bytes) -> smime.SignedDocument:
@@ -144,10 +155,14 @@ class FilesReadOnce:
                 known = smime.parse(message)
             except SrosError as error:
                 known = error
-            self._signed[message] = known
+            if not self.full:
+                self._signed[message] = known
         if isinstance(known, SrosError):
             raise known.with_traceback(None)
         return known
+
+
+_MOST_KEPT = 16 * 1024 * 1024
 
 
 def _identity(state: os.stat_result) -> tuple[int, int, int, int]:
@@ -188,17 +203,26 @@ class Keystore:
 
     def __init__(self, root: Path, *, locked: bool = False) -> None:
         self.root = root
-        self.files = FilesReadOnce()
-        """The files that were read, also of what lies next to it."""
-        self._parts: dict[Hashable, object] = {}
         self._locked = locked
+        self.forget()
 
     def __repr__(self) -> str:
         return f"Keystore({str(self.root)!r})"
 
+    def forget(self) -> None:
+        """Forget what was read: the keystore was changed meanwhile."""
+        self.files = FilesReadOnce()
+        """The files that were read, also of what lies next to it."""
+        self._parts: dict[Hashable, object] = {}
+
     def once(self, key: Hashable, read: Callable[[], _Parsed]) -> _Parsed:
-        """Return what ``read`` returns or raises, and call it only the first time for a ``key``."""
+        """Return what ``read`` returns or raises, and call it only the first time for a ``key``.
+
+        Of an enclave, which is one of many, it is not kept when the content of files is not either.
+        """
         if key not in self._parts:
+            if self.files.full and isinstance(key, tuple) and key[0] in _OF_ENCLAVES:
+                return read()
             try:
                 self._parts[key] = read()
             except (SrosError, OSError) as error:
@@ -264,7 +288,12 @@ class Keystore:
     @_Part
     def ledger_file(self) -> LedgerFile:
         """The ledger of all issued files, to ask for some entries, and to add to it."""
-        return LedgerFile(self.root, lambda: self._trusted, follow_link=not self._locked)
+        return LedgerFile(
+            self.root,
+            lambda: self._trusted,
+            follow_link=not self._locked,
+            read=self.files.read,
+        )
 
     @property
     def ledger(self) -> Ledger:
@@ -463,6 +492,9 @@ class Keystore:
         )
 
 
+_OF_ENCLAVES = ("enclave", "grant", "certificate")
+
+
 @dataclass(frozen=True, slots=True)
 class _Failure:
     """Why a part of a keystore cannot be read."""
@@ -479,6 +511,11 @@ def open_keystore(root: Path) -> Keystore:
     keystore = Keystore(root)
     keystore.check()
     return keystore
+
+
+def as_keystore(keystore: Path | Keystore) -> Keystore:
+    """Return a keystore, opened now if it is given by its path."""
+    return keystore if isinstance(keystore, Keystore) else Keystore(keystore)
 
 
 # ── parts of a keystore by its path ────────────────────────────────────────────────────────
@@ -632,6 +669,18 @@ class OpenedEnclave:
     """
     public_key: object = field(default=None, repr=False)
     """The public key of ``key.pem``; None if that cannot be read."""
+    read_once: FilesReadOnce = field(
+        default_factory=lambda: FilesReadOnce(), repr=False, compare=False
+    )
+    """What was read and parsed of its files, and of those that it shares with other enclaves."""
+
+    def signed(self, file: str) -> smime.SignedDocument:
+        """Return a signed document of the enclave, which may not be verified yet.
+
+        Raises:
+            PkiError: the file is not there, or is not a signed message.
+        """
+        return self.read_once.signed(self.files.get(file, b""))
 
     @cached_property
     def subject(self) -> str:
@@ -697,7 +746,7 @@ def weaknesses(state: OpenedEnclave) -> Iterator[tuple[str, str]]:
                     yield file, text
     for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
         with suppress(SrosError):
-            if text := smime.parse(state.files.get(file, b"")).weakness():
+            if text := state.signed(file).weakness():
                 yield file, text
 
 
@@ -791,6 +840,7 @@ class _EnclaveFiles:
             key_on_robot(self._folder),
             token,
             public_key,
+            self._files,
         )
 
     def _add(self, file: str, text: str, fault: Fault) -> None:

@@ -10,8 +10,9 @@ from shlex import quote
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.layout import SETTINGS
-from sros_tool.keystore.ledger import Entry, Ledger, read_ledger
+from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.of_ros2 import is_of_ros2
+from sros_tool.keystore.reader import Keystore, as_keystore
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +34,16 @@ class RecordedRights:
     their rights signed again, with a new date.
     """
 
-    def __init__(self, root: Path, ledger: Ledger | None = None) -> None:
-        ledger = ledger or read_ledger(root, having=("what", "permissions"))
-        self._root = root
+    def __init__(self, root: Path | Keystore, ledger: Ledger | None = None) -> None:
+        keystore = as_keystore(root)
+        ledger = ledger or keystore.ledger_with("what", "permissions")
+        self._root = keystore.root
         self._gaps = ledger.gaps
         self._unchained = ledger.unchained
         chained = ledger.entries[ledger.unchained :]
         self._chained = {each.enclave for each in chained if each.what == "permissions"}
         # A keystore of ros2/sros2 has enclaves that no ledger records.
-        self._complete = (root / SETTINGS).exists() or not (is_of_ros2(root) or ledger.lines)
+        self._complete = keystore.has(SETTINGS) or not (is_of_ros2(keystore) or ledger.lines)
         self._last = {each.enclave: each for each in ledger.entries if each.what == "permissions"}
         self._certain = {each.enclave for each in ledger.certain if each.what == "permissions"}
 

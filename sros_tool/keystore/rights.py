@@ -32,6 +32,7 @@ from sros_tool.keystore.layout import (
     permissions_ca_for,
     refuse_earlier,
 )
+from sros_tool.keystore.reader import FilesReadOnce, Keystore, as_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
@@ -98,7 +99,9 @@ class RightsSource:
         return None if self.scope is None else sorted(self.scope)
 
 
-def load_rights(path: Path, fleet: Fleet | None = None, *, hidden: bool = False) -> RightsSource:
+def load_rights(
+    path: Path | Keystore, fleet: Fleet | None = None, *, hidden: bool = False
+) -> RightsSource:
     """Return the rights that ``path`` gives; a policy's are those for ``fleet``, if there is one.
 
     ``path`` is a policy file, ``permissions.p7s`` or ``permissions.xml``, an enclave folder, a
@@ -108,9 +111,11 @@ def load_rights(path: Path, fleet: Fleet | None = None, *, hidden: bool = False)
     Raises:
         DocumentError: ``path`` is anything else, or malformed.
     """
+    if isinstance(path, Keystore):
+        return _keystore_rights(path, hidden=hidden)
     if path.is_dir():
         if is_keystore(path):
-            return _keystore_rights(path, hidden=hidden)
+            return _keystore_rights(Keystore(path), hidden=hidden)
         if (path / PERMISSIONS_FILE).exists():
             return _document_rights(path, "enclave", path / PERMISSIONS_FILE)
         refuse_earlier(path)
@@ -134,7 +139,7 @@ def load_rights(path: Path, fleet: Fleet | None = None, *, hidden: bool = False)
     return _document_rights(path, "permissions", path)
 
 
-def load_zenoh_rights(root: Path, *, hidden: bool = False) -> RightsSource:
+def load_zenoh_rights(root: Path | Keystore, *, hidden: bool = False) -> RightsSource:
     """Return the rights that the Zenoh configurations of a keystore give its enclaves together.
 
     Those are of the router, and of peers, which are connected without it.  ``hidden`` is that of
@@ -144,7 +149,9 @@ def load_zenoh_rights(root: Path, *, hidden: bool = False) -> RightsSource:
         KeystoreError: there is no configuration of a router, or there are several.
         DocumentError: Zenoh would not accept a configuration.
     """
-    files = {name: enclave_path(root, name) for name in enclave_names(root, hidden=hidden)}
+    keystore = as_keystore(root)
+    root = keystore.root
+    files = {name: keystore.folder(name) for name in enclave_names(root, hidden=hidden)}
     routers = [name for name, folder in files.items() if (folder / ROUTER_FILE).is_file()]
     if not routers:
         raise KeystoreError(
@@ -165,7 +172,7 @@ def load_zenoh_rights(root: Path, *, hidden: bool = False) -> RightsSource:
         for file in (folder / ROUTER_FILE, folder / SESSION_FILE):
             if not file.is_file():
                 continue
-            data = read_bytes(file, "Zenoh configuration")
+            data = keystore.read(file, "Zenoh configuration")
             document = parse_configuration(data, str(file), lines=False)
             configurations[file] = document
             # Clients are filtered by the router.
@@ -228,7 +235,7 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
 
 
 def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:
-    reader = _Reader()
+    reader = _Reader(FilesReadOnce())
     rights, scope = reader.permissions(file, str(path))
     return RightsSource(
         path,
@@ -241,8 +248,8 @@ def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:
     )
 
 
-def _keystore_rights(root: Path, *, hidden: bool) -> RightsSource:
-    reader = _Reader()
+def _keystore_rights(keystore: Keystore, *, hidden: bool) -> RightsSource:
+    root, reader = keystore.root, _Reader(keystore.files)
     rights: set[Right] = set()
     for name in enclave_names(root, hidden=hidden):
         file = enclave_path(root, name) / PERMISSIONS_FILE
@@ -264,7 +271,7 @@ def _keystore_rights(root: Path, *, hidden: bool) -> RightsSource:
         None,
         reader.sound,
         tuple(reader.unverified[:1] + reader.notes),
-        load_fleet(root),
+        load_fleet(keystore),
         documents=reader.documents,
     )
 
@@ -276,18 +283,18 @@ class _Reader:
     ``unverified`` are notes about documents whose signature is missing or was not verified.
     """
 
+    files: FilesReadOnce
     sound: bool = True
     unverified: list[Note] = field(default_factory=list)
     notes: list[Note] = field(default_factory=list)
     documents: dict[str, Permissions] = field(default_factory=dict)
-    _authorities: dict[bytes, x509.Certificate] = field(default_factory=dict)
 
     def permissions(self, file: Path, what: str) -> tuple[frozenset[Right], tuple[str, ...]]:
         """Return the rights in a permissions document and the enclaves that it is for."""
-        data = read_bytes(file, "permissions document")
+        data = self.files.read(file, "permissions document")
         if b"multipart/signed" in data[:1000].lower():
             try:
-                signed = smime.parse(data)
+                signed = self.files.signed(data)
             except SrosError as error:
                 raise DocumentError(f"'{file}' cannot be read: {error.what}", error.why) from error
             self._verify(signed, file, what)
@@ -322,10 +329,7 @@ class _Reader:
         path = permissions_ca_for(file)
         if path is None:
             return None
-        data = read_bytes(path, "certificate")
-        if data not in self._authorities:
-            self._authorities[data] = load_certificate(data, f"'{path}'")
-        return self._authorities[data]
+        return load_certificate(self.files.read(path, "certificate"), f"'{path}'")
 
 
 def _first_of_each(permissions: Permissions) -> dict[str, Grant]:

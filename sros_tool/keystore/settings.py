@@ -19,13 +19,11 @@ from typing import TYPE_CHECKING
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.errors import Note, SrosError
 from sros_tool.keystore.layout import GOVERNANCE_P7S, GOVERNANCE_XML, SETTINGS
-from sros_tool.keystore.ledger import Entry, Ledger, read_ledger
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.ledger import Entry, Ledger
+from sros_tool.keystore.reader import Keystore, as_keystore
 from sros_tool.keystore.template import Template, parse_template, render_template, settings_values
-from sros_tool.pki import smime
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso
-from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
     from sros_tool.keystore.transaction.transaction import Transaction
@@ -82,25 +80,27 @@ class HandEdits:
 _SHOWN = 3
 
 
-def edit_notes(root: Path, governance: Governance) -> tuple[Note, ...]:
+def edit_notes(root: Path | Keystore, governance: Governance) -> tuple[Note, ...]:
     """Return a note on files that were edited by hand, for a verb that does not carry it out.
 
     ``governance`` is the signed governance of the keystore.
     """
-    edits = found_edits(root, governance)
+    keystore = as_keystore(root)
+    edits = found_edits(keystore, governance)
     if not edits:
         return ()
     clauses = edits.clauses()
     more = f"; and {len(clauses) - _SHOWN} more" if len(clauses) > _SHOWN else ""
     text = f"{'; '.join(clauses[:_SHOWN])}{more}. Only what is issued from now on may follow it, "
-    text += f"and the signed governance does not: {edit_remedy(root)}"
+    text += f"and the signed governance does not: {edit_remedy(keystore.root)}"
     return (Note("keystore.edited", text),)
 
 
-def found_edits(root: Path, governance: Governance | None) -> HandEdits:
+def found_edits(root: Path | Keystore, governance: Governance | None) -> HandEdits:
     """Return what was edited in a keystore; ``governance`` is the signed one, if it is readable."""
-    ledger = read_ledger(root, having=("what", "settings"))
-    return hand_edits(root, ledger, Keystore(root).settings, governance)
+    keystore = as_keystore(root)
+    ledger = keystore.ledger_with("what", "settings")
+    return hand_edits(keystore, ledger, keystore.settings, governance)
 
 
 def edit_remedy(root: Path | str) -> str:
@@ -113,7 +113,10 @@ def edit_remedy(root: Path | str) -> str:
 
 
 def hand_edits(
-    root: Path, ledger: Ledger, present: Template | None, governance: Governance | None
+    root: Path | Keystore,
+    ledger: Ledger,
+    present: Template | None,
+    governance: Governance | None,
 ) -> HandEdits:
     """Return what was edited by hand; ``governance`` is the signed one, ``present`` sros.toml.
 
@@ -128,7 +131,7 @@ def hand_edits(
         meant = governance_for(present.protection, governance.domains().closed())
         if meant != governance:
             unsigned = tuple(_unsigned(present, recorded, settings))
-    return HandEdits(settings, _governance_edit(root), unsigned)
+    return HandEdits(settings, _governance_edit(as_keystore(root)), unsigned)
 
 
 def _unsigned(
@@ -148,14 +151,14 @@ def _differences(old: Template, new: Template, origin: str) -> Iterator[str]:
             yield f"{key} in {SETTINGS} is {other}, and {one} was {origin}"
 
 
-def _governance_edit(root: Path) -> str:
+def _governance_edit(keystore: Keystore) -> str:
     """Return a clause if ``governance.xml`` is another document than the signed one, else ""."""
-    xml, signed = root / GOVERNANCE_XML, root / GOVERNANCE_P7S
-    if not (xml.is_file() and signed.is_file()):
+    if not all((keystore.root / file).is_file() for file in (GOVERNANCE_XML, GOVERNANCE_P7S)):
         return ""
     try:
-        one = read_bytes(xml, "governance document")
-        other = smime.parse(read_bytes(signed, "governance document")).document
+        one = keystore.read(GOVERNANCE_XML, "governance document")
+        message = keystore.read(GOVERNANCE_P7S, "governance document")
+        other = keystore.files.signed(message).document
     except SrosError:
         return ""
     if one.replace(b"\r\n", b"\n").strip() == other.replace(b"\r\n", b"\n").strip():

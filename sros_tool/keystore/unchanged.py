@@ -14,16 +14,18 @@ from typing import Concatenate, ParamSpec, TypeVar
 
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import LEDGER, SETTINGS
+from sros_tool.keystore.reader import Keystore
 
 _MOST_READS = 5
 
 Result = TypeVar("Result")
 Arguments = ParamSpec("Arguments")
+Opened = TypeVar("Opened", Path, Keystore)
 
 
 def of_one_state(
-    read: Callable[Concatenate[Path, Arguments], Result],
-) -> Callable[Concatenate[Path, Arguments], Result]:
+    read: Callable[Concatenate[Opened, Arguments], Result],
+) -> Callable[Concatenate[Opened, Arguments], Result]:
     """Return ``read``, a function of a keystore, so that it reads again what was changed meanwhile.
 
     A keystore that is changed all the time is read five times; what the last one returns or raises
@@ -31,18 +33,21 @@ def of_one_state(
     """
 
     @wraps(read)
-    def read_again(root: Path, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+    def read_again(opened: Opened, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+        root = opened.root if isinstance(opened, Keystore) else opened
         for _ in range(_MOST_READS - 1):
             before = _state(root)
             try:
-                found = read(root, *arguments, **named)
+                result = read(opened, *arguments, **named)
             except SrosError:
                 if _state(root) == before:
                     raise
-                continue
-            if _state(root) == before:
-                return found
-        return read(root, *arguments, **named)
+            else:
+                if _state(root) == before:
+                    return result
+            if isinstance(opened, Keystore):
+                opened.forget()
+        return read(opened, *arguments, **named)
 
     return read_again  # type: ignore[return-value]  # mypy knows the name of the first argument
 

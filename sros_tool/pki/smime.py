@@ -15,7 +15,7 @@ import base64
 import re
 import secrets
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TypeVar
 
@@ -124,6 +124,7 @@ class Signature:
     _message_digest: bytes
     _value: bytes
     _issuer_and_serial: tuple[tuple[bytes, ...], int]
+    _verified: dict[tuple[bytes, x509.Certificate], bool] = field(default_factory=dict)
 
     def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
         """Return the first certificate with the signer's issuer and serial number, or None."""
@@ -139,9 +140,18 @@ class Signature:
         digest.update(content)
         return digest.finalize() == self._message_digest
 
-    @lru_cache(maxsize=8)  # noqa: B019 - every vendor verifies the same few
     def is_intact(self, content: bytes, signer: x509.Certificate) -> bool:
         """Return whether the signature of ``content`` verifies with the key of ``signer``.
+
+        It is verified once, however many vendors ask.
+        """
+        known = self._verified.get((content, signer))
+        if known is None:
+            known = self._verified[content, signer] = self._verify(content, signer)
+        return known
+
+    def _verify(self, content: bytes, signer: x509.Certificate) -> bool:
+        """Return what `is_intact` does.
 
         The kind of the key says how: OpenSSL ignores the algorithm that the message names, and so
         accepts RSA-PSS of keys for nothing else only, and no Ed25519 (pk7_doit.c,

@@ -11,6 +11,7 @@ import pytest
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.errors import KeystoreError
+from sros_tool.keystore.reader import Keystore
 from sros_tool.resources import policies_dir
 from tests.checks.bench import DAY, Bench
 from tests.support.children import LONG
@@ -56,7 +57,7 @@ def test_damaged_keystores(seed: int, bench: Bench, tmp_path: Path) -> None:
         for path in chance.sample(files, chance.choice([1, 1, 2, 4])):
             damage(path, chance)
         try:
-            found = keystore_findings(copy, now=bench.now)
+            found = keystore_findings(Keystore(copy), now=bench.now)
         except KeystoreError as error:
             assert "is not a valid keystore" in str(error)
             continue
@@ -101,8 +102,8 @@ PERMISSIONS = (
 @pytest.mark.parametrize("changes", PERMISSIONS)
 def test_odd_permissions(changes: tuple[tuple[str, str], ...], bench: Bench) -> None:
     bench.permissions(*changes)
-    assert keystore_findings(bench.root, now=bench.now)
-    assert keystore_findings(bench.root, now=bench.now + 9999 * DAY)
+    assert keystore_findings(Keystore(bench.root), now=bench.now)
+    assert keystore_findings(Keystore(bench.root), now=bench.now + 9999 * DAY)
 
 
 @pytest.mark.parametrize(
@@ -115,4 +116,4 @@ def test_odd_permissions(changes: tuple[tuple[str, str], ...], bench: Bench) -> 
 )
 def test_odd_governance(changes: tuple[tuple[str, str], ...], bench: Bench) -> None:
     bench.governance(*changes)
-    assert keystore_findings(bench.root, now=bench.now)
+    assert keystore_findings(Keystore(bench.root), now=bench.now)

@@ -15,7 +15,7 @@ from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, subject_text
@@ -27,7 +27,7 @@ NOW = datetime.now(UTC)
 
 def ids(root: Path, now: datetime = NOW) -> list[str]:
     selection = FindingFilter(exclude=("enclave.node-cannot-start",))
-    chosen = selection.choose(keystore_findings(root, now=now))
+    chosen = selection.choose(keystore_findings(Keystore(root), now=now))
     return [each.id for each in chosen.shown]
 
 
@@ -195,5 +195,5 @@ def test_local_time_is_standard_time_in_summer_too(
     )
     assert cyclone.join().outcome.ok
     assert fast.join().outcome.ok is not found
-    told = {each.id for each in keystore_findings(root, now=at, zone=zone)}
+    told = {each.id for each in keystore_findings(Keystore(root), now=at, zone=zone)}
     assert ("enclave.permissions-local-time" in told) is found

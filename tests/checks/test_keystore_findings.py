@@ -15,6 +15,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import NOTE
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.lifecycle.create import create_keystore
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import load_key
@@ -33,7 +34,7 @@ as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as sev
 
 def ids(bench: Bench) -> set[str]:
     options = {"now": bench.now, **bench.options}
-    return {each.id for each in keystore_findings(bench.checked, **options)}
+    return {each.id for each in keystore_findings(Keystore(bench.checked), **options)}
 
 
 def test_nothing_in_a_sound_keystore(bench: Bench) -> None:
@@ -139,7 +140,7 @@ def test_a_ca_key_elsewhere_that_others_can_read(mode: int, found: bool, tmp_pat
     root = tmp_path / "ks"
     create_keystore(root, template=template, now=NOW, keyring=Keyring(places=places))
     (tmp_path / "permissions.pem").chmod(mode)
-    shown = {(each.id, each.file) for each in keystore_findings(root, now=NOW)}
+    shown = {(each.id, each.file) for each in keystore_findings(Keystore(root), now=NOW)}
     wanted = {("keystore.key-readable", str(tmp_path / "permissions.pem"))}
     assert shown == (wanted if found else set())
 
@@ -181,7 +182,7 @@ def test_what_strangers_reach_is_said(
 ) -> None:
     bench.governance(("participants>false", "participants>true"))
     bench.sign("enclaves/governance.p7s", lambda text: _present(text, changes))
-    found = keystore_findings(bench.checked, now=bench.now)
+    found = keystore_findings(Keystore(bench.checked), now=bench.now)
     assert words in next(each.text for each in found if each.id == "governance.unauthenticated")
 
 
@@ -204,7 +205,9 @@ def test_the_remedy_for_few_rounds_runs(elsewhere: bool, bench: Bench, tmp_path:
                 "[authorities]", f'[authorities]\nidentity_key = "file:{key}"'
             )
         )
-    (found,) = (each for each in keystore_findings(bench.root, now=bench.now) if each.id == kind)
+    (found,) = (
+        each for each in keystore_findings(Keystore(bench.root), now=bench.now) if each.id == kind
+    )
     command = found.remedy.removeprefix("Run `").removesuffix("`.")
     secrets = "pkcs8 -passin env:SECRET -passout env:SECRET"
     subprocess.run(
@@ -238,12 +241,14 @@ def test_a_secret_that_kubernetes_mounts_hides_no_enclave(bench: Bench, tmp_path
     mounted = enclave / "..2026_11_23_10_00_00.123"
     mounted.chmod(0o700)
     (mounted / "key.pem").chmod(0o600)
-    assert [each for each in keystore_findings(robot, now=NOW) if each.severity is not NOTE] == []
+    assert [
+        each for each in keystore_findings(Keystore(robot), now=NOW) if each.severity is not NOTE
+    ] == []
     (enclave / "..2025_11_23_10_00_00.123").mkdir()
     (enclave / "..2025_11_23_10_00_00.123/cert.pem").write_bytes(b"")
     listed = sros("list_enclaves", robot).ok()
     assert "/base/..2025_11_23_10_00_00.123" in listed.err
-    found = keystore_findings(robot, now=NOW)
+    found = keystore_findings(Keystore(robot), now=NOW)
     hidden = [each.subject for each in found if each.id == "keystore.hidden-enclave"]
     assert hidden == ["/base/..2025_11_23_10_00_00.123"]
 

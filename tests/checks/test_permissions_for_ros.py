@@ -10,6 +10,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.keystores.topic_names import ros_name_problem
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.keystore.reader import Keystore
 from tests.checks.bench import Bench, name_of
 from tests.checks.keystore_cases import (
     ALLOW,
@@ -36,7 +37,7 @@ UNCONTROLLED = (
 
 def found_in(bench: Bench, vendor: str = "") -> list[Finding]:
     """The findings about the changed permissions, but not that sros did not sign them."""
-    found = keystore_findings(bench.checked, now=bench.now, vendor=vendor)
+    found = keystore_findings(Keystore(bench.checked), now=bench.now, vendor=vendor)
     return [each for each in found if each.id != "keystore.not-in-ledger"]
 
 

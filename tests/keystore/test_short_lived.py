@@ -10,6 +10,7 @@ import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.keystore.expiry import survey
+from sros_tool.keystore.reader import Keystore
 from sros_tool.resources import policies_dir
 from sros_tool.validity import BACKDATE
 from tests.support.harness import sros
@@ -83,7 +84,7 @@ def test_its_expiry_is_accepted_and_that_of_others_is_found(days: float, tmp_pat
     at = datetime.now(UTC) + days * DAY
 
     def ids(*, accepted: bool) -> set[str]:
-        found = keystore_findings(root, now=at)
+        found = keystore_findings(Keystore(root), now=at)
         return {each.id for each in found if bool(each.accepted) is accepted}
 
     late = ids(accepted=True)

@@ -33,6 +33,7 @@ from sros_tool.keystore.lifecycle.update import (
     update_keystore,
 )
 from sros_tool.keystore.reader import (
+    Keystore,
     authority_files,
     governance_of,
     load_settings,
@@ -114,7 +115,7 @@ def told(update: KeystoreUpdate) -> str:
 
 
 def found(root: Path) -> set[str]:
-    every = keystore_findings(root, now=LATER)
+    every = keystore_findings(Keystore(root), now=LATER)
     return {each.id for each in every if each.kind.severity > NOTE} - {"enclave.node-cannot-start"}
 
 
@@ -279,7 +280,7 @@ def test_a_rule_that_would_never_apply_is_refused(root: Path, tmp_path: Path) ->
     sros("create_keystore", other := tmp_path / "other", "--template", template).ok()
     (finding,) = [
         each
-        for each in keystore_findings(other, now=LATER)
+        for each in keystore_findings(Keystore(other), now=LATER)
         if each.id == "governance.unreachable-rule"
     ]
     assert not finding.accepted
@@ -444,7 +445,7 @@ def test_what_is_left_until_each_ca_has_its_own_key(tmp_path: Path) -> None:
         words = f"sros rotate_ca {root}{' --permissions' if stage == 'none' else ''} --next"
         (remedy,) = [
             each.remedy
-            for each in keystore_findings(root, now=LATER)
+            for each in keystore_findings(Keystore(root), now=LATER)
             if each.id == "keystore.one-authority"
         ]
         assert re.findall("`(.+?)`", remedy) == [words]

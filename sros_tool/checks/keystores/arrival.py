@@ -32,7 +32,7 @@ from sros_tool.keystore.layout import (
     waits_for_answer,
 )
 from sros_tool.keystore.participant import evaluated
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.token import Secrets, TokenUri, open_enclave_key
 from sros_tool.values import Words, shows
 
@@ -186,19 +186,20 @@ def verify_arrival(
             if path.is_file() and path.name.endswith(SUFFIXES)
             else "Name the folder that `sros distribute_key` or `sros import` has written to.",
         )
-    enclaves = tuple(_enclave(root, name, now, domain, zone) for name in names)
+    keystore = Keystore(root)
+    enclaves = tuple(_enclave(keystore, name, now, domain, zone) for name in names)
     elsewhere = {
         str(enclave_path(root, each.name) / KEY_FILE) for each in enclaves if each.key_on_robot
     }
     found = [
         each
         for each in keystore_findings(
-            root, now=now, zone=zone, domain=domain, only=only, on_robot=True
+            keystore, now=now, zone=zone, domain=domain, only=only, on_robot=True
         )
         if not (each.file in elsewhere and each.id == _FILE_MISSING)
     ]
     if secrets:
-        found += [each for name in names for each in _token_findings(root, name, now, secrets)]
+        found += [each for name in names for each in _token_findings(keystore, name, now, secrets)]
     shown = FindingFilter().choose(found).shown
     return Arrival(
         path,
@@ -220,12 +221,14 @@ TOKEN_KEY = FindingKind(
 )
 
 
-def _token_findings(root: Path, name: str, now: datetime, secrets: Secrets) -> Iterator[Finding]:
+def _token_findings(
+    keystore: Keystore, name: str, now: datetime, secrets: Secrets
+) -> Iterator[Finding]:
     """Yield a finding unless the token signs for an enclave's certificate."""
-    state = open_enclave(enclave_path(root, name), now=now)
+    state = keystore.enclave(name, now=now)
     if not state.token:
         return
-    file = str(enclave_path(root, name) / KEY_URI_FILE)
+    file = str(keystore.folder(name) / KEY_URI_FILE)
     try:
         key = open_enclave_key(state.token, secrets)
         if state.certificate and not key.signs_for(state.certificate.public_key()):
@@ -245,18 +248,18 @@ def _why_none(path: Path) -> str:
 
 
 def _enclave(
-    root: Path, name: str, now: datetime, domain: int | None, zone: tzinfo
+    keystore: Keystore, name: str, now: datetime, domain: int | None, zone: tzinfo
 ) -> ArrivedEnclave:
-    folder = enclave_path(root, name)
+    folder = keystore.folder(name)
     if waits_for_answer(folder):
         return ArrivedEnclave(name, False, "", None)
-    state = open_enclave(folder, now=now, domain=domain)
+    state = keystore.enclave(name, now=now, domain=domain)
     domains = state.joined_domains()
     evaluation = evaluated(name, folder, state, at=now, domain=domain, zone=zone)
     state = evaluation.state
     loadable = not (state.problems or evaluation.stopped())
     # On the robot, where there is no ledger, a key that is missing is lost.
-    at_home = (root / LEDGER).is_file()
+    at_home = (keystore.root / LEDGER).is_file()
     elsewhere = at_home and state.key_on_robot and not state.problems_at_home
     until = state.valid_until()
     return ArrivedEnclave(name, loadable, str(domains or ""), until, elsewhere, state.token)

@@ -33,7 +33,6 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.loading import authority_refusals, refusals_text
-from sros_tool.keystore.reader import authority_files
 from sros_tool.keystore.recorded import RecordedRights
 from sros_tool.keystore.settings import edit_remedy
 from sros_tool.pki.certificates import (
@@ -48,7 +47,6 @@ from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, few_rounds, load_key
 from sros_tool.pki.token import is_token_uri
 from sros_tool.validity import iso
-from sros_tool.xml import read_bytes
 
 NOT_A_CA = FindingKind(
     "keystore.not-a-ca",
@@ -402,7 +400,7 @@ def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
         yield LEDGER_DAMAGED.found("ledger", gap, file)
     if count := keystore.ledger.unchained:
         yield LEDGER_UNCHAINED.found("ledger", f"{count} lines have no chain", file)
-        unproven = RecordedRights(keystore.root, keystore.ledger).unproven()
+        unproven = RecordedRights(keystore.opened, keystore.ledger).unproven()
         if names := [name for name in keystore.names if name in unproven]:
             yield LEDGER_UNPROVEN.found("ledger", some_names(names), file)
 
@@ -430,7 +428,7 @@ def _key(keystore: CheckedKeystore, role: str, certificate: x509.Certificate) ->
         yield from _key_elsewhere(keystore, role)
         return
     try:
-        pem = read_bytes(path, "key")
+        pem = keystore.opened.read(path, "key")
         key = load_key(pem, f"'{path}'", _locked)
     except _LockedError:
         yield from _few_rounds(role, path, pem)
@@ -454,7 +452,7 @@ def _key_elsewhere(keystore: CheckedKeystore, role: str) -> Iterator[Finding]:
         with suppress(OSError):  # it may be on a medium that is not there now
             yield from key_mode_findings(str(path), path.stat().st_mode)
         with suppress(SrosError):
-            yield from _few_rounds(role, path, read_bytes(path, "key"))
+            yield from _few_rounds(role, path, keystore.opened.read(path, "key"))
 
 
 def _few_rounds(role: str, path: Path, pem: bytes) -> Iterator[Finding]:
@@ -498,7 +496,7 @@ def _separation(keystore: CheckedKeystore) -> str:
     """Return what is left to do until identity CA and permissions CA have keys of their own."""
     try:
         stage = read_rotation(keystore.root).stage
-        files = authority_files(keystore.root)
+        files = keystore.opened.authority_files
     except SrosError:  # `sros rotate_ca` reports it
         return ""
     if stage is not RotationStage.NONE:

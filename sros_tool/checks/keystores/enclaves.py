@@ -43,7 +43,6 @@ from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.pki.token import TokenUri
 from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
-from sros_tool.xml import read_bytes
 
 _NOT_LOADABLE = "enclave.not-loadable"
 """The group id of all faults, for `--include` and `--exclude`."""
@@ -385,7 +384,7 @@ def _is_as_long(chosen: Span, length: timedelta) -> bool:
 
 def _copies(enclave: CheckedEnclave) -> Iterator[Finding]:
     xml, signed = enclave.folder / "permissions.xml", enclave.state.permissions_document
-    if signed and xml.is_file() and _plain_file(xml) != plain(signed):
+    if signed and xml.is_file() and _plain_file(enclave, xml) != plain(signed):
         text = "permissions.xml differs from the content of permissions.p7s"
         yield XML_DIFFERS.found(enclave.name, text, enclave.file("permissions.xml"))
     if enclave.keystore.crl and not (enclave.folder / "crl.pem").exists():
@@ -398,9 +397,9 @@ def plain(document: bytes) -> bytes:
     return document.replace(b"\r\n", b"\n").strip()
 
 
-def _plain_file(path: Path) -> bytes:
+def _plain_file(enclave: CheckedEnclave, path: Path) -> bytes:
     """Return a file's content for comparison, or b"" if it cannot be read."""
     try:
-        return plain(read_bytes(path, "file"))
+        return plain(enclave.keystore.opened.read(path, "file"))
     except SrosError:
         return b""

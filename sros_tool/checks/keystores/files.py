@@ -12,7 +12,7 @@ from shlex import quote
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
-from sros_tool.errors import KeystoreError
+from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
     CONFIRMED,
@@ -320,13 +320,13 @@ def _below(
             elif name in _KNOWN and inside.startswith(ENCLAVES) and name != KEY_FILE:
                 if name == KEY_URI_FILE or name.endswith("_ca.cert.pem"):
                     with suppress(OSError):  # `check_enclave` reports an unreadable one
-                        if _holds_key(path, info):
-                            yield from _other(path, root, info, home)
-            elif keystore.looks_like_home and _is_kept(path, root, info):
+                        if _holds_key(keystore, path, info):
+                            yield from _other(keystore, path, info, home)
+            elif keystore.looks_like_home and _is_kept(keystore, path, info):
                 kept.append(os.path.relpath(path, root))
                 yield from key_mode_findings(path, info.st_mode)
             else:
-                yield from _other(path, root, info, home)
+                yield from _other(keystore, path, info, home)
     for error in unread:
         yield _unread(error, root)
 
@@ -429,27 +429,42 @@ class _Links:
         return self._ends[end]
 
 
-def _holds_key(path: str, info: os.stat_result) -> bool:
+def _holds_key(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool:
     small = stat.S_ISREG(info.st_mode) and info.st_size <= _MOST_READ
-    return small and holds_private_key(Path(path).read_bytes())
+    return small and holds_private_key(_content(keystore, path))
 
 
-def _is_kept(path: str, root: str, info: os.stat_result) -> bool:
+def _content(keystore: CheckedKeystore, path: str) -> bytes:
+    """Return the content of a file; raise OSError if it cannot be read."""
+    try:
+        if Path(path) == keystore.root / LEDGER:
+            return b"".join(keystore.opened.ledger_file.content())
+        return keystore.opened.read(Path(path), "file")
+    except SrosError as error:
+        if isinstance(error.__cause__, OSError):
+            raise error.__cause__ from None
+        return b""  # it is no regular file any more
+
+
+def _is_kept(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool:
     """Return whether a file is a private key in a folder for those of CAs and revoked enclaves."""
-    if os.path.relpath(path, root).partition(os.sep)[0] not in (PRIVATE, REVOKED, RETIRED):
+    if os.path.relpath(path, keystore.root).partition(os.sep)[0] not in (PRIVATE, REVOKED, RETIRED):
         return False
     try:
-        return _holds_key(path, info)
+        return _holds_key(keystore, path, info)
     except OSError:
         return False  # reported as one that cannot be read
 
 
-def _other(path: str, root: str, info: os.stat_result, home: bool) -> Iterator[Finding]:
+def _other(
+    keystore: CheckedKeystore, path: str, info: os.stat_result, home: bool
+) -> Iterator[Finding]:
     """Yield findings about a file that is not one of an enclave, such as a misplaced key."""
+    root = os.fspath(keystore.root)
     inside = os.path.relpath(Path(path).parent, root)
     place = inside.partition(os.sep)[0]
     try:
-        holds_key = _holds_key(path, info)
+        holds_key = _holds_key(keystore, path, info)
     except OSError as error:
         yield _unread(error, root)
         return

@@ -30,13 +30,11 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.protection import less_protected
 from sros_tool.keystore.rights import load_rights
-from sros_tool.pki import smime
 from sros_tool.pki.certificates import fingerprints, load_certificates
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy.model import stated_protections
 from sros_tool.policy.rights import Right, compare, policy_rights
 from sros_tool.translate import grant_rights
-from sros_tool.xml import read_bytes
 
 SERIAL_TWICE = FindingKind(
     "keystore.serial-twice",
@@ -201,7 +199,7 @@ def _list_number(enclave: CheckedEnclave) -> int:
     if not path.exists():
         return -1
     try:
-        data = read_bytes(path, "revocation list")
+        data = enclave.keystore.opened.read(path, "revocation list")
     except SrosError:
         return -1  # another check reports it
     return _number_if_signed(data, enclave.state.files.get(IDENTITY_CA_FILE, b""))
@@ -241,7 +239,7 @@ def check_issued(
     if pairs:
         text = f"Cyclone DDS mistakes {some_pairs(pairs)}"
         yield ENCLAVE_NAMES.found(pairs[0][0], text, str(keystore.root))
-    if "/" in keystore.names and (text := within_root(load_rights(keystore.root).rights)):
+    if "/" in keystore.names and (text := within_root(load_rights(keystore.opened).rights)):
         yield ROOT_ENCLAVE.found("/", text, str(enclave_path(keystore.root, "/")))
     yield from _trust(keystore, summaries)
     yield from _exported_governance(keystore, summaries)
@@ -262,7 +260,7 @@ def _less_protected(keystore: CheckedKeystore) -> Iterator[Finding]:
     if not stated:
         return
     try:
-        governance = parse_governance(smime.parse(keystore.governance).document)
+        governance = parse_governance(keystore.opened.files.signed(keystore.governance).document)
     except SrosError:
         return  # another check reports it
     for each, level in less_protected(governance, stated):
@@ -320,7 +318,7 @@ def _lists(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> It
         if not older:
             continue
         path = enclave_path(keystore.root, newest.name) / CRL_FILE
-        crl = load_crl(read_bytes(path, "revocation list"), f"'{path}'")
+        crl = load_crl(keystore.opened.read(path, "revocation list"), f"'{path}'")
         for each in older:
             folder = str(enclave_path(keystore.root, each.name))
             of = f"the one of {newest.name} has number {newest.list_number}"

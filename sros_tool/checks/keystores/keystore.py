@@ -52,16 +52,13 @@ from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
-    enclave_path,
     waits_for_answer,
 )
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.unchanged import of_one_state
 from sros_tool.parallel import map_slices, tick
-from sros_tool.pki import smime
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right
-from sros_tool.xml import read_bytes
 
 _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
@@ -72,7 +69,7 @@ _OF_SEVERAL_FILES = frozenset({REFUSED.id, SOME_REFUSE.id})
 
 @of_one_state
 def keystore_findings(
-    root: Path,
+    opened: Keystore,
     *,
     now: datetime,
     zone: tzinfo = UTC,
@@ -86,7 +83,7 @@ def keystore_findings(
     """Return all findings in a keystore, or in some of its enclaves.
 
     Args:
-        root: the keystore.
+        opened: the keystore.
         now: the moment to check for.
         zone: the time zone of the host on which its enclaves run.
         domain: the ROS domain that its enclaves have to join.
@@ -97,10 +94,11 @@ def keystore_findings(
         vendor: the DDS vendor of its nodes, or ``zenoh``; "" if they may use any.
 
     Raises:
-        KeystoreError: ``root`` is no keystore.
+        KeystoreError: it is no keystore.
     """
+    root = opened.root
     keystore = read_keystore(
-        root,
+        opened,
         now=now,
         zone=zone,
         policies=policies,
@@ -121,7 +119,7 @@ def keystore_findings(
         issued: list[EnclaveSummary] = []
         topics: dict[str, frozenset[str]] = {}
         for name in share:
-            state = open_enclave(enclave_path(root, name), now=now, domain=domain)
+            state = opened.enclave(name, now=now, domain=domain)
             evaluation = evaluate(CheckedEnclave(keystore, name, state), vendors, domain)
             enclave = evaluation.enclave
             own = list(_enclave_findings(enclave, wanted, common, vendors))
@@ -156,7 +154,7 @@ def keystore_findings(
     real_root = os.path.realpath(root)
     located = (_at_real_file(each, root, real_root) for each in found)
     found = with_causes(joined([_with_names(each, root) for each in located]))
-    return with_cause_of_ros2(found, root) if keystore.is_home else found
+    return with_cause_of_ros2(found, opened) if keystore.is_home else found
 
 
 def _enclave_findings(
@@ -196,7 +194,7 @@ def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, by
     for name in names:
         own = b""
         with suppress(SrosError):  # it is a finding
-            own = read_bytes(enclave_path(keystore.root, name) / GOVERNANCE_FILE, "file")
+            own = keystore.opened.read(keystore.opened.folder(name) / GOVERNANCE_FILE, "file")
         if own and own == (common or own):
             return name, own
     return "", common
@@ -208,14 +206,14 @@ def _governance(
     """Yield the findings in the governance of an enclave, or of a keystore without enclaves."""
     yield from governance_copy_findings(keystore)
     if name:
-        state = open_enclave(enclave_path(keystore.root, name), now=keystore.now)
+        state = keystore.enclave(name)
         enclave = evaluate(CheckedEnclave(keystore, name, state), vendors, None).enclave
         if enclave.state.governance:
             file = enclave.file(GOVERNANCE_FILE)
             yield from governance_findings(keystore, enclave.state.governance, file, vendors)
         return
     with suppress(SrosError):  # `sros create_enclave` reports it
-        document = smime.parse(keystore.governance).document
+        document = keystore.opened.files.signed(keystore.governance).document
         governance = parse_governance(document, GOVERNANCE_P7S)
         file = keystore.shown(GOVERNANCE_P7S)
         yield from governance_findings(keystore, governance, file, vendors)

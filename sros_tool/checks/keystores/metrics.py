@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
 
 from sros_tool.checks.kind import Finding, Severity
 from sros_tool.errors import SrosError
@@ -19,19 +18,11 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
     ROLES,
-    enclave_path,
 )
-from sros_tool.keystore.reader import (
-    Keystore,
-    load_ca_certificate,
-    load_governance,
-    open_keystore,
-    read_certificate,
-)
+from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.crl import load_crl
 from sros_tool.prometheus import Metric, Sample
-from sros_tool.xml import read_bytes
 
 _KINDS = "certificate, permissions, governance, crl, identity_ca or permissions_ca"
 
@@ -46,26 +37,25 @@ class Expiry:
 
 
 def keystore_metrics(
-    root: Path, findings: Iterable[Finding], *, now: datetime, each_enclave: bool = True
+    keystore: Keystore, findings: Iterable[Finding], *, now: datetime, each_enclave: bool = True
 ) -> tuple[Metric, ...]:
     """Return the metrics of a keystore, or of an export for a robot.
 
     Args:
-        root: the keystore.
+        keystore: the keystore.
         findings: those of `keystore_findings`.
         now: the moment of which they are.
         each_enclave: also give the expiry of each enclave's files, not only the earliest.
 
     Raises:
-        KeystoreError: ``root`` is no keystore, or enclaves of it may be missing.
+        KeystoreError: it is no keystore, or enclaves of it may be missing.
     """
-    keystore = open_keystore(root)
-    lifetimes, unreadable = survey(root)
+    lifetimes, unreadable = survey(keystore)
     expiries = [*_shared(keystore), *_of_enclaves(keystore, lifetimes)]
     earliest: dict[str, datetime] = {}
     for each in expiries:
         earliest[each.kind] = min(each.moment, earliest.get(each.kind, each.moment))
-    place = {"keystore": str(root.absolute())}
+    place = {"keystore": str(keystore.root.absolute())}
     severities = Counter(each.severity for each in findings)
     kinds = Counter((each.severity, each.id) for each in findings)
     return (
@@ -130,8 +120,8 @@ def _shared(keystore: Keystore) -> Iterator[Expiry]:
     if (keystore.root / GOVERNANCE_P7S).exists():
         # It names no moment: it is valid for as long as the CA that signed it.
         with suppress(SrosError):
-            authority = load_ca_certificate(keystore.root, PERMISSIONS)
-            load_governance(keystore.root, authority)
+            authority = keystore.ca_certificate(PERMISSIONS)
+            keystore.governance_by(authority)
             yield Expiry("governance", "", validity_of(authority).not_after)
     with suppress(SrosError):
         if crl := keystore.revocation_list:
@@ -143,18 +133,19 @@ def _of_enclaves(keystore: Keystore, lifetimes: Iterable[Lifetime]) -> Iterator[
         yield Expiry("certificate", each.name, each.certificate.not_after)
         yield Expiry("permissions", each.name, each.permissions.not_after)
         if not keystore.is_home:
-            yield from _exported(enclave_path(keystore.root, each.name), each.name)
+            yield from _exported(keystore, each.name)
 
 
-def _exported(folder: Path, name: str) -> Iterator[Expiry]:
+def _exported(keystore: Keystore, name: str) -> Iterator[Expiry]:
     """Yield the expiry of what an export has for each enclave, and a keystore once."""
+    folder = keystore.folder(name)
     for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
         with suppress(SrosError):
-            moment = validity_of(read_certificate(folder / file)).not_after
+            moment = validity_of(keystore.certificate(folder / file)).not_after
             yield Expiry(file.removesuffix(".cert.pem"), name, moment)
     if (folder / CRL_FILE).exists():
         with suppress(SrosError):
-            crl = load_crl(read_bytes(folder / CRL_FILE, "revocation list"), CRL_FILE)
+            crl = load_crl(keystore.read(folder / CRL_FILE, "revocation list"), CRL_FILE)
             yield Expiry("crl", name, crl.next_update)
 
 

@@ -16,6 +16,7 @@ from sros_tool.checks.keystores.issued import UNEXPLAINED
 from sros_tool.checks.kind import WARNING, Cause, Finding, some_names
 from sros_tool.keystore.layout import KEY_FILE, enclave_path
 from sros_tool.keystore.of_ros2 import is_of_ros2
+from sros_tool.keystore.reader import Keystore
 
 _OF_A_KEYSTORE = (KEY_READABLE, FOLDER_OPEN, TIME_FORMAT, LONG_PERMISSIONS, ONE_AUTHORITY)
 """What ros2/sros2 writes into every keystore, and `update_keystore --template sros2` ends."""
@@ -24,9 +25,10 @@ _OF_AN_ENCLAVE = (UNEXPLAINED, KEY_READABLE, TIME_FORMAT, NOT_UNIQUE, LONG_PERMI
 _MOST_NAMED = 3
 
 
-def with_cause_of_ros2(findings: Sequence[Finding], root: Path) -> list[Finding]:
+def with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list[Finding]:
     """Return the findings; those in what ros2/sros2 made get one cause, if there are several."""
-    if is_of_ros2(root):
+    root = keystore.root
+    if is_of_ros2(keystore):
         chosen = [each for each in findings if each.kind in _OF_A_KEYSTORE]
         text = f"It has neither sros.toml nor ledger.jsonl. Found: {_kinds(chosen)}."
         return _with(

@@ -31,12 +31,11 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.ledger import Ledger
-from sros_tool.keystore.reader import OpenedEnclave, open_keystore
+from sros_tool.keystore.reader import Keystore, OpenedEnclave
 from sros_tool.keystore.settings import HandEdits, hand_edits
 from sros_tool.keystore.template import Template, load_template, template_names
 from sros_tool.pki.crl import RevocationList
 from sros_tool.policy.model import Policy
-from sros_tool.xml import read_bytes
 
 _Part = TypeVar("_Part")
 
@@ -71,7 +70,7 @@ class CheckedKeystore:
     "" is the latest.
     """
 
-    root: Path
+    opened: Keystore
     now: datetime
     names: tuple[str, ...]
     settings: Template | None
@@ -88,6 +87,15 @@ class CheckedKeystore:
     fleet: Fleet | None = None
     fleet_edited: str = ""
     distribution: str = ""
+
+    @property
+    def root(self) -> Path:
+        """Its folder."""
+        return self.opened.root
+
+    def enclave(self, name: str) -> OpenedEnclave:
+        """Return one of its enclaves at the moment of the check."""
+        return self.opened.enclave(name, now=self.now)
 
     @property
     def can_issue(self) -> bool:
@@ -146,7 +154,7 @@ class CheckedEnclave:
 
 
 def read_keystore(
-    root: Path,
+    keystore: Keystore,
     *,
     now: datetime,
     zone: tzinfo = UTC,
@@ -157,7 +165,7 @@ def read_keystore(
     """Return the readable parts of a keystore, and the list of unreadable ones.
 
     Args:
-        root: the keystore, or an export of it.
+        keystore: the keystore, or an export of it.
         now: the moment to check for.
         zone: the time zone of the host on which its enclaves run.
         policies: policies with which its permissions are compared.
@@ -165,9 +173,10 @@ def read_keystore(
         distribution: the ROS 2 distribution of its nodes; "" is the latest.
 
     Raises:
-        KeystoreError: ``root`` is no keystore.
+        KeystoreError: it is no keystore.
     """
-    keystore = open_keystore(root)
+    keystore.check()
+    root = keystore.root
     unread: list[UnreadablePart] = []
 
     def part(path: str, read: Callable[[], _Part], otherwise: _Part) -> _Part:
@@ -190,15 +199,15 @@ def read_keystore(
     signed = root / GOVERNANCE_P7S
     governance = part(
         GOVERNANCE_P7S,
-        lambda: read_bytes(signed, "governance document") if signed.is_file() else b"",
+        lambda: keystore.read(signed, "governance document") if signed.is_file() else b"",
         b"",
     )
     signed_governance: Governance | None = None
     with suppress(SrosError):  # what is wrong with it is a finding of each enclave
         signed_governance = keystore.governance
-    edits = hand_edits(root, ledger, settings, signed_governance)
+    edits = hand_edits(keystore, ledger, settings, signed_governance)
     return CheckedKeystore(
-        root,
+        keystore,
         now,
         search_enclaves(root)[0],  # `check_files` reports folders that cannot be read
         settings,
@@ -212,7 +221,7 @@ def read_keystore(
         keystore.is_home and not on_robot,
         keystore.is_home,
         edits,
-        part(FLEET, lambda: load_fleet(root), None),
-        part(FLEET, lambda: edited_fleet(root, ledger), ""),
+        part(FLEET, lambda: load_fleet(keystore), None),
+        part(FLEET, lambda: edited_fleet(keystore, ledger), ""),
         distribution,
     )

@@ -13,7 +13,6 @@ from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import PERMISSIONS, SETTINGS, enclave_path
-from sros_tool.keystore.reader import open_enclave, open_keystore
 from sros_tool.keystore.zenoh.opened import OpenedZenoh, ZenohFault, open_zenoh
 from sros_tool.keystore.zenoh.wanted import Drift, Drifted, zenoh_drift
 
@@ -129,12 +128,12 @@ def check_network(
     if network is None or not authorities:
         return
     try:
-        domains = open_keystore(keystore.root).domains
+        domains = keystore.opened.domains
     except SrosError:  # a finding of each enclave
         return
     try:
         drifts, left_out = zenoh_drift(
-            keystore.root, network, domains, authorities[0], keystore.now
+            keystore.opened, network, domains, authorities[0], keystore.now
         )
     except SrosError as error:
         yield CANNOT_BE_MADE.found("zenoh", str(error), keystore.shown(SETTINGS))
@@ -145,7 +144,7 @@ def check_network(
     for name, why in left_out.items():
         if only is None or name in only:
             folder = enclave_path(keystore.root, name)
-            faults = {e.fault for e in open_enclave(folder, now=keystore.now).problems_at_home}
+            faults = {e.fault for e in keystore.enclave(name).problems_at_home}
             remedy = _RENEW if faults and faults <= _EXPIRED else ""
             yield LEFT_OUT.found(name, why.rstrip("."), str(folder), remedy=remedy)
 
@@ -159,7 +158,7 @@ def _of_drift(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
     if drift.kind is Drift.MISSING:
         yield MISSING.found(drift.enclave, "it is missing, or cannot be read", file)
         return
-    state = open_enclave(enclave_path(keystore.root, drift.enclave), now=keystore.now)
+    state = keystore.enclave(drift.enclave)
     enclave = CheckedEnclave(keystore, drift.enclave, state)
     found = list(_of_opened(enclave, open_zenoh(enclave.folder, drift.enclave, state)))
     text = "it is not what the settings and the permissions of the keystore give"

@@ -20,12 +20,10 @@ from sros_tool.keystore.layout import (
     SESSION_FILE,
     ZENOH_SIGNED,
 )
-from sros_tool.keystore.reader import OpenedEnclave
+from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave
 from sros_tool.keystore.rights import joined_domains, recorded_rights
-from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of
 from sros_tool.translate_zenoh import domains_of, remote_of
-from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import joined
 from sros_tool.zenoh.configuration import Configuration, Mode, parse_rendered
 
@@ -89,7 +87,7 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
         text = "the enclave has neither it nor router.json5"
         problems.append(ZenohProblem(SESSION_FILE, text, ZenohFault.MISSING))
     for file in present:
-        read = _read(folder, file, state.permissions_ca)
+        read = _read(folder, file, state)
         if isinstance(read, ZenohProblem):
             problems.append(read)
             continue
@@ -103,10 +101,17 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
     return OpenedZenoh(present, found, tuple(problems))
 
 
-def is_signed(path: Path, document: bytes, authority: x509.Certificate) -> bool:
+def is_signed(
+    path: Path,
+    document: bytes,
+    authority: x509.Certificate,
+    files: FilesReadOnce | None = None,
+) -> bool:
     """Return whether the permissions CA signed a document next to its file ``path``."""
+    files = files or FilesReadOnce()
     try:
-        signed = smime.parse(read_bytes(path.with_name(ZENOH_SIGNED[path.name]), "signed document"))
+        message = files.read(path.with_name(ZENOH_SIGNED[path.name]), "signed document")
+        signed = files.signed(message)
         signed.verify(authority)
     except SrosError:
         return False
@@ -117,25 +122,23 @@ def _exists(path: Path) -> bool:
     return path.exists() or path.is_symlink()
 
 
-def _read(
-    folder: Path, file: str, authority: x509.Certificate | None
-) -> Configuration | ZenohProblem:
+def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | ZenohProblem:
     """Return a configuration that the permissions CA signed, or what is wrong with it."""
     signed_file = ZENOH_SIGNED[file]
     for each, fault in ((file, ZenohFault.MISSING), (signed_file, ZenohFault.UNSIGNED)):
         if not _exists(folder / each):
             return ZenohProblem(each, "missing", fault)
     try:
-        document = read_bytes(folder / file, "Zenoh configuration")
-        message = read_bytes(folder / signed_file, "signed document")
+        document = state.read_once.read(folder / file, "Zenoh configuration")
+        message = state.read_once.read(folder / signed_file, "signed document")
     except SrosError as error:
         return ZenohProblem(file, str(error), ZenohFault.UNREADABLE)
     try:
-        signed = smime.parse(message)
-        if authority is None:
+        signed = state.read_once.signed(message)
+        if state.permissions_ca is None:
             text = "the permissions CA of the enclave, which has to have signed it, is not there"
             return ZenohProblem(signed_file, text, ZenohFault.SIGNATURE)
-        signed.verify(authority)
+        signed.verify(state.permissions_ca)
     except SrosError as error:
         return ZenohProblem(signed_file, str(error).rstrip("."), ZenohFault.SIGNATURE)
     if signed.text != document:

@@ -27,11 +27,9 @@ from sros_tool.keystore.layout import (
     SESSION_FILE,
     ZENOH_SIGNED,
     enclave_folder,
-    enclave_names,
-    enclave_path,
 )
-from sros_tool.keystore.ledger import Ledger, read_ledger
-from sros_tool.keystore.reader import read_certificate, read_lists
+from sros_tool.keystore.ledger import Ledger
+from sros_tool.keystore.reader import Keystore, as_keystore
 from sros_tool.keystore.recorded import RecordedRights
 from sros_tool.keystore.rights import joined_domains, recorded_rights
 from sros_tool.keystore.zenoh.opened import is_signed
@@ -42,7 +40,6 @@ from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.policy.model import ALLOW, RIGHTS, Enclave
 from sros_tool.policy.rights import Rules
 from sros_tool.translate_zenoh import StatedRight, as_router, remote_of, remote_rights
-from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import AccessControl, Flow, Message, RemoteRights
 from sros_tool.zenoh.configuration import (
     Mode,
@@ -123,7 +120,7 @@ class Drifted:
 
 
 def drifted(
-    root: Path,
+    root: Path | Keystore,
     wanted: ZenohDocuments,
     authority: x509.Certificate,
     gone: Collection[str] = (),
@@ -132,30 +129,31 @@ def drifted(
 
     Those of enclaves that are ``gone`` do not count.
     """
+    keystore = as_keystore(root)
 
     def compare(paths: Sequence[str]) -> list[Drifted]:
         found = []
         for path in paths:
-            document, present = wanted.files[path], _present(root / path)
+            document, present = wanted.files[path], _present(keystore, path)
             kind = None
             if present is None:
                 kind = Drift.MISSING
             elif present != document:
                 kind = Drift.DIFFERS
-            elif not is_signed(root / path, document, authority):
+            elif not is_signed(keystore.root / path, document, authority, keystore.files):
                 kind = Drift.UNSIGNED
             if kind:
                 found.append(Drifted(wanted.enclaves[path], path, kind))
         return found
 
     found = [each for _, part in map_slices(list(wanted.files), compare) for each in part]
-    stale = stale_files(root, wanted.files, wanted.existing)
+    stale = stale_files(keystore.root, wanted.files, wanted.existing)
     found += (each for each in stale if each.enclave not in gone)
     return tuple(found)
 
 
 def zenoh_drift(
-    root: Path,
+    root: Path | Keystore,
     network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,
@@ -168,12 +166,13 @@ def zenoh_drift(
     Raises:
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
     """
-    wanted = zenoh_documents(root, network, domains, authority, now)
-    return drifted(root, wanted, authority), wanted.left_out
+    keystore = as_keystore(root)
+    wanted = zenoh_documents(keystore, network, domains, authority, now)
+    return drifted(keystore, wanted, authority), wanted.left_out
 
 
 def zenoh_documents(
-    root: Path,
+    root: Path | Keystore,
     network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,
@@ -187,8 +186,10 @@ def zenoh_documents(
     Without ``now``, permissions that have expired count, too.  ``existing`` are the enclaves of
     the keystore, which are looked for if they are not given.
     """
+    keystore = as_keystore(root)
+    root = keystore.root
     of_network = _domains(network, domains, root)
-    existing = enclave_names(root) if existing is None else existing
+    existing = keystore.names if existing is None else existing
     names = sorted({*existing, *change.issued}.difference(change.gone))
     if network.router not in names:
         raise KeystoreError(
@@ -205,7 +206,7 @@ def zenoh_documents(
             "Give the node an enclave of its own.",
         )
     names.remove(network.router)
-    reader = _RightsReader(root, authority, of_network, network.router, now, change)
+    reader = _RightsReader(keystore, authority, of_network, network.router, now, change)
     read: dict[str, _RulesOfEnclave | str] = {}
     for _, each in map_slices(names, reader.read):
         read |= each
@@ -273,22 +274,22 @@ class _RightsReader:
 
     def __init__(
         self,
-        root: Path,
+        keystore: Keystore,
         authority: x509.Certificate,
         domains: Sequence[int],
         router: str,
         now: datetime | None,
         change: ZenohChange,
     ) -> None:
-        self._root = root
+        self._keystore = keystore
         self._authority = authority
         self._domains = domains
         self._router = router
         self._now = now
         self._change = change
-        self.ledger = read_ledger(root)
-        self._recorded = RecordedRights(root, self.ledger)
-        self._revoked = {one.serial for each in read_lists(root) for one in each.revoked}
+        self.ledger = keystore.ledger
+        self._recorded = RecordedRights(keystore, self.ledger)
+        self._revoked = {one.serial for each in keystore.revocation_lists for one in each.revoked}
 
     def read(self, names: Sequence[str]) -> dict[str, _RulesOfEnclave | str]:
         """Return the rules of enclaves, or why they get none, as a clause."""
@@ -313,7 +314,7 @@ class _RightsReader:
         issued = {name: each for name in names if (each := self._change.issued.get(name))}
         certificates = for_each((e for e in names if e not in issued), self._certificate)
         messages = for_each(certificates, self._message)
-        signed = for_each(messages, lambda name: smime.parse(messages[name]))
+        signed = for_each(messages, lambda name: self._keystore.files.signed(messages[name]))
         verified = for_each(signed, lambda name: self._verify(name, messages[name], signed[name]))
         grants = for_each(
             verified, lambda name: self._grant(name, signed[name].document, certificates[name])
@@ -337,9 +338,9 @@ class _RightsReader:
         }
 
     def _certificate(self, name: str) -> x509.Certificate:
-        path = enclave_path(self._root, name) / CERTIFICATE_FILE
+        path = self._keystore.folder(name) / CERTIFICATE_FILE
         try:
-            certificate = read_certificate(path)
+            certificate = self._keystore.certificate(path)
         except SrosError as error:
             raise error if path.exists() else KeystoreError("it has no certificate yet") from None
         if certificate.serial_number in self._revoked:
@@ -352,9 +353,9 @@ class _RightsReader:
         return certificate
 
     def _message(self, name: str) -> bytes:
-        path = enclave_path(self._root, name) / PERMISSIONS_FILE
+        path = self._keystore.folder(name) / PERMISSIONS_FILE
         try:
-            return read_bytes(path, "permissions document")
+            return self._keystore.read(path, "permissions document")
         except SrosError as error:
             raise error if path.exists() else KeystoreError("it has no permissions") from None
 
@@ -448,11 +449,11 @@ def _examples(name: str) -> Iterable[str]:
 # ── files ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _present(path: Path) -> bytes | None:
-    if not os.path.lexists(path):
+def _present(keystore: Keystore, path: str) -> bytes | None:
+    if not os.path.lexists(keystore.root / path):
         return None
     try:
-        return read_bytes(path, "Zenoh configuration")
+        return keystore.read(path, "Zenoh configuration")
     except SrosError:
         return None
 
