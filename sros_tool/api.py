@@ -356,9 +356,10 @@ def explain_access(
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.explain.evaluator import Evaluator, action_meant
     from sros_tool.explain.question import ask
-    from sros_tool.keystore.layout import check_keystore, enclave_path, has_enclave, list_enclaves
+    from sros_tool.keystore.layout import has_enclave
     from sros_tool.keystore.missing import no_such_enclave
-    from sros_tool.keystore.participant import JoinContext, load_enclave
+    from sros_tool.keystore.participant import JoinContext, load_enclave_of
+    from sros_tool.keystore.reader import Keystore as OpenedOnce
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.rights import policy_rights
     from sros_tool.runtime.environment import choose_domain
@@ -369,21 +370,20 @@ def explain_access(
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
     root = Path(keystore)
-    check_keystore(root)
+    opened = OpenedOnce(root)
+    opened.check()
     if not has_enclave(root, enclave):
-        raise no_such_enclave(root, enclave, list_enclaves(root))
+        raise no_such_enclave(root, enclave, opened.names)
     at = _moment(now)
     stated = _policy(policy) if policy is not None else None
     own = stated.enclave(enclave) if stated else None
-    loaded = replace(
-        load_enclave(enclave, enclave_path(root, enclave), at=at), root=root, policy=own
-    )
+    loaded = replace(load_enclave_of(opened, enclave, at=at), root=root, policy=own)
     if domain is None:
         domain = choose_domain(loaded.joined_domains, None, root) if loaded.joined_domains else 0
     evaluator = Evaluator(Vendor(vendor), loaded, JoinContext(domain, at, zone))
     if kind is None:
         rights = [lambda: policy_rights(stated)] if stated else []
-        others = [*rights, lambda: load_rights(root).rights]
+        others = [*rights, lambda: load_rights(opened).rights]
         question = action_meant(evaluator, question, others) or question
     answer = evaluator.explain(question)
     decision = answer.decision
