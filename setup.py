@@ -17,8 +17,8 @@ PROJECT = tomllib.loads((HERE / "pyproject.toml").read_text())["project"]
 NAME = PROJECT["name"]
 LINKED = Path.cwd().resolve() != HERE
 """With --symlink-install, colcon runs a link to this file among links to all packages."""
-BESIDE = () if LINKED else ("policies", "keystore_templates")
-"""Folders at the top of the repository that belong into the package; linked, it finds them."""
+BESIDE = () if LINKED else ("policies",)
+"""What lies next to the package and belongs into it; the linked package finds it there."""
 
 
 class Distribution(setuptools.Distribution):
@@ -47,12 +47,12 @@ setuptools.setup(
     package_data={"": ["**/*"]},
     exclude_package_data={"": ["**/*.pyc"]},
     data_files=[
-        ("share/ament_index/resource_index/packages", [f"ros/{NAME}"]),
+        ("share/ament_index/resource_index/packages", [f"colcon/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        (f"share/{NAME}/environment", ["ros/ros2_security.sh"]),
+        (f"share/{NAME}/environment", ["colcon/ros2_security.sh"]),
         (
             f"share/{NAME}/ros2_security/sros_ros2_security.dist-info",
-            ["ros/METADATA", "ros/entry_points.txt"],
+            ["colcon/METADATA", "colcon/entry_points.txt"],
         ),
     ],
     entry_points={

@@ -32,11 +32,11 @@ from sros_tool.demo.runner import base_environment
 from sros_tool.demo.scenarios.model import Role
 from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC
 from sros_tool.errors import SrosError
+from sros_tool.files import policies_dir
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profiles
-from sros_tool.resources import policies_dir
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.netns import try_isolation
 from sros_tool.runtime.variables import DOMAIN

@@ -1,4 +1,4 @@
-"""Atomic replacement of single files in folders that others may write to; TOML with limits."""
+"""Replacing single files atomically in folders of others; TOML with limits; the shipped folders."""
 
 from __future__ import annotations
 
@@ -257,3 +257,29 @@ def parse_toml(text: str, longest: int = _LONGEST_DOCUMENT) -> dict[str, Any]:
         raise tomllib.TOMLDecodeError("it is nested too deeply") from error
     except ValueError as error:  # a number of thousands of digits, or a date that does not exist
         raise tomllib.TOMLDecodeError(str(error)) from error
+
+
+# ── files that ship with sros ─────────────────────────────────────────────────────────────────
+
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def _shipped(name: str) -> Path:
+    inside = _PACKAGE / name
+    return inside if inside.is_dir() else _PACKAGE.parent / name
+
+
+def policies_dir() -> Path:
+    """Return the folder of the example policies and the common files that they include."""
+    return _shipped("policies")
+
+
+def templates_dir() -> Path:
+    """Return the folder of the keystore templates, one TOML file each."""
+    return _shipped("keystore_templates")
+
+
+def unpacked_dds_dir() -> Path:
+    """Return the folder of a checkout for the Cyclone DDS that ``./dev`` unpacks without apt."""
+    return _PACKAGE.parent / ".dds"

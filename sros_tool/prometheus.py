@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from sros_tool.written import DryRun, FileChange, NamedKeystore, Notes
+from sros_tool.values import DryRun, FileChange, NamedKeystore, Notes
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z", re.ASCII)
 

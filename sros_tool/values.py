@@ -1,4 +1,4 @@
-"""Reading JSON, writing YAML, and conversion of dataclasses and other values to JSON types."""
+"""Values as JSON, the parts of it that many verbs print, reading JSON, and writing YAML."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import Enum
-from pathlib import PurePath
-from typing import Any, NamedTuple, TypeVar
+from pathlib import Path, PurePath
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
+from sros_tool.errors import Note
 from sros_tool.validity import iso
 
 _Value = TypeVar("_Value")
@@ -184,3 +185,42 @@ def _as_object(value: object, shape: ShownKeys) -> dict[str, Any]:
             empty = name in shape.null_if_empty and not part
             plain[key_of(name)] = None if empty else as_plain(part)
     return plain
+
+
+# ── parts of what many verbs print ────────────────────────────────────────────────────────────
+
+
+FILE_ACTIONS = Words(("create", "replace", "remove", "close", "adopt", "send"))
+
+
+class FileChange(NamedTuple):
+    """A file that was written or, with ``--dry-run``, would be."""
+
+    action: Annotated[str, FILE_ACTIONS]
+    """What is done with the file; ``close``: a private key or a folder of keys that other users
+    could open is closed to them; ``adopt``: a keystore of ros2/sros2 gets its settings and ledger.
+    """
+    path: str
+    """The file; for ``send``, its path in the archive on standard output."""
+
+
+NamedKeystore = Annotated[Path, "The keystore, as it was named."]
+DryRun = Annotated[bool, "Whether nothing was changed, because of `--dry-run`."]
+FileChanges = Annotated[
+    Sequence[FileChange], "The files that were written or, with `--dry-run`, would be."
+]
+Notes = Annotated[Sequence[Note], "Notes, which text output prints on standard error."]
+
+
+class PlannedFiles(NamedTuple):
+    """What would be written."""
+
+    changes: FileChanges
+    notes: Notes
+    dry_run: Literal[True] = True
+    """Nothing was written."""
+
+
+def file_change(path: Path, *, existed: bool) -> tuple[FileChange]:
+    """Return the change of a single file."""
+    return (FileChange("replace" if existed else "create", str(path)),)

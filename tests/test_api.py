@@ -14,7 +14,7 @@ import pytest
 
 import sros_tool
 from sros_tool import DocumentError, KeystoreError, UsageError
-from sros_tool.resources import policies_dir
+from sros_tool.files import policies_dir
 from tests.support.harness import policy_text, publish
 
 PROJECT = Path(__file__).parents[1]

@@ -29,9 +29,8 @@ LAYERS = {
         "validity",
         "values",
         "wording",
-        "written",
     }
-    | {"xml", "files", "folders", "parallel", "resources", "prometheus", "markdown", "terminal"},
+    | {"xml", "files", "folders", "parallel", "prometheus", "markdown", "terminal"},
     2: {"pki", "policy", "dds", "zenoh"},
     3: {"fleet", "translate", "translate_zenoh"},
     4: {"translate_from_zenoh", "reach", "keystore", "graph", "runtime"},
@@ -246,7 +245,7 @@ def circle(modules: Modules) -> list[str]:
     return []
 
 
-CROWDED = {"sros_tool", "keystore"}
+CROWDED = {"keystore"}
 """Folders that still have more than 25 modules."""
 
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.files import policies_dir
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, policy_rights
-from sros_tool.resources import policies_dir
 from tests.support.harness import (
     Ended,
     policy_text,

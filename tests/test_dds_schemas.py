@@ -11,10 +11,10 @@ from lxml import etree
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import render_governance
 from sros_tool.dds.permissions import render_permissions
+from sros_tool.files import policies_dir
 from sros_tool.keystore.template import load_template, template_names
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave
-from sros_tool.resources import policies_dir
 from sros_tool.translate import governance_for, permissions_for
 from sros_tool.validity import Window
 

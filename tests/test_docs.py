@@ -12,6 +12,7 @@ import sros_tool
 from sros_tool.cli.program import FAMILIES
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.demo.scenarios.zenoh.attacks import ATTACKS as ZENOH_ATTACKS
+from tests.support.checkout import known_files
 
 PROJECT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
@@ -53,6 +54,12 @@ def test_the_readme_says_what_sros_is_then_the_two_commands_and_is_short() -> No
     assert lines[2].startswith("**sros** is ")
     assert [line.split("#")[0].strip() for line in lines[5:7]] == ["./dev demo", "./dev test"]
     assert len(lines) <= 150
+
+
+def test_every_entry_at_the_top_says_who_looks_for_it() -> None:
+    rows = re.findall(r"^\| (`.+?) \| ", read("CONTRIBUTING.md"), re.MULTILINE)
+    said = {word.rstrip("/") for row in rows for word in re.findall(r"`([^`]+)`", row)}
+    assert {name.partition("/")[0] for name in known_files()} - said == set()
 
 
 def test_every_verb_is_described() -> None:

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from sros_tool.errors import DocumentError, PolicyError
+from sros_tool.files import policies_dir
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Rules, folded, policy_rights
-from sros_tool.resources import policies_dir
 from sros_tool.translate_from_zenoh import RightsBehindRules, name_of_key, policy_of, rights_behind
 from sros_tool.translate_zenoh import remote_rights
 from sros_tool.zenoh.access import AccessControl, Flow, Message

@@ -47,7 +47,7 @@ class Shapes(NamedTuple):
 _LIFECYCLE = "sros_tool.keystore.lifecycle.shown"
 
 SHARED_PARTS: dict[str, str] = {
-    "change": "sros_tool.written:FileChange",
+    "change": "sros_tool.values:FileChange",
     "note": "sros_tool.errors:Note",
     "right": "sros_tool.policy.rights:Right",
     "finding": "sros_tool.checks.kind:Finding",
@@ -75,7 +75,7 @@ VERBS: Mapping[str, str | Shapes] = {
         "Who may do what; `-o FILE` writes it to FILE instead.",
         {
             "the picture": "sros_tool.report.picture:Picture",
-            "--dry-run": "sros_tool.written:PlannedFiles",
+            "--dry-run": "sros_tool.values:PlannedFiles",
         },
     ),
     "policies": Shapes(

@@ -1,4 +1,4 @@
-"""Write man/sros.1, the manual page of the program with all its verbs, from their help.
+"""Write docs/man/sros.1, the manual page of the program with all its verbs, from their help.
 
 `python -m tools.man_page` writes it; the wheel has it as share/man/man1/sros.1, where `man` finds
 it for a program that is on the path.
@@ -13,7 +13,7 @@ import click
 from tools.steps import CHECKOUT
 from tools.verbs import families
 
-PAGE = CHECKOUT / "man" / "sros.1"
+PAGE = CHECKOUT / "docs" / "man" / "sros.1"
 
 _BEGINNING = """\
 .\\" Made by python -m tools.man_page; do not edit.
@@ -32,7 +32,7 @@ _END = """\
 
 
 def page() -> str:
-    """Return the text of man/sros.1."""
+    """Return the text of docs/man/sros.1."""
     lines = [_BEGINNING]
     for family, verbs in families():
         lines.append(f".SH {family.upper()}\n")

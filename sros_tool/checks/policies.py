@@ -31,6 +31,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
 from sros_tool.dds.portable import mistaken_names, outside, some_pairs
 from sros_tool.errors import DocumentError, PolicyError, SrosError
+from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.model import Fleet
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
@@ -59,7 +60,6 @@ from sros_tool.policy.model import (
 )
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
 from sros_tool.policy.rights import WHOLE, Right, Rules, parts, policy_rights
-from sros_tool.resources import policies_dir
 from sros_tool.topics import GOAL
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window

@@ -11,8 +11,7 @@ from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import DocumentError
 from sros_tool.policy.patterns import ComparisonLimit
 from sros_tool.translate_from_zenoh import RightsBehindRules, is_self_limiting
-from sros_tool.values import Words
-from sros_tool.written import DryRun, FileChange, Notes
+from sros_tool.values import DryRun, FileChange, Notes, Words
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import Message
 from sros_tool.zenoh.configuration import Mode

@@ -34,8 +34,8 @@ from sros_tool.cli.observing import (
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.terminal import echo
+from sros_tool.values import file_change
 from sros_tool.wording import counted
-from sros_tool.written import file_change
 
 if TYPE_CHECKING:
     from sros_tool.explain.audit import Audit, AuditedEnclaves

@@ -37,7 +37,7 @@ from sros_tool.cli.common import (
 from sros_tool.cli.progress import progress
 from sros_tool.errors import UsageError
 from sros_tool.terminal import Coloured, echo, echo_bytes
-from sros_tool.written import FileChange, file_change
+from sros_tool.values import FileChange, file_change
 
 if TYPE_CHECKING:
     from cryptography import x509

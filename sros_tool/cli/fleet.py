@@ -31,7 +31,7 @@ from sros_tool.cli.metrics import check_suffix
 from sros_tool.cli.progress import progress
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
-from sros_tool.written import file_change
+from sros_tool.values import file_change
 
 if TYPE_CHECKING:
     from datetime import datetime

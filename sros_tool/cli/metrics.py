@@ -26,7 +26,7 @@ from sros_tool.cli.common import (
 from sros_tool.cli.progress import progress
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo, echo_document
-from sros_tool.written import file_change
+from sros_tool.values import file_change
 
 if TYPE_CHECKING:
     from sros_tool.prometheus import Metric

@@ -27,9 +27,8 @@ from sros_tool.cli.common import (
 )
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.terminal import echo, echo_document
-from sros_tool.values import as_plain
+from sros_tool.values import FileChange, as_plain, file_change
 from sros_tool.wording import counted
-from sros_tool.written import FileChange, file_change
 
 if TYPE_CHECKING:
     from sros_tool.graph.document import Draft
@@ -401,11 +400,11 @@ def generate_policy(
     if node is not None:
         raise UsageError("--node is for --from-log only")
     check_duration(watch, spin_time)
+    from sros_tool.files import policies_dir
     from sros_tool.graph.document import draft, write
     from sros_tool.graph.enclaves import NamedEnclaves
     from sros_tool.graph.enclaves import enclave_per_node as name_enclaves
     from sros_tool.graph.learn import News, common_parts, is_tool_name, learn, listed
-    from sros_tool.resources import policies_dir
 
     common = common_parts(file.parent, policies_dir())
     news = News(common)
@@ -546,8 +545,8 @@ def _learned_from_logs(
 ) -> tuple[Learned, list[dict[str, Any]]]:
     """Return the rights that logs ask for, and the lines that ask for them, as JSON objects."""
     from sros_tool.explain.denials import as_learned, propose, read_denials
+    from sros_tool.files import policies_dir
     from sros_tool.graph.learn import common_parts
-    from sros_tool.resources import policies_dir
     from sros_tool.runtime.vendor_log import plain_text
 
     denials = {log: read_denials(plain_text(_log_text(log))) for log in logs}
@@ -592,10 +591,10 @@ def _propose(
     Raises:
         SrosError: there is something to write that was not accepted.
     """
+    from sros_tool.files import policies_dir
     from sros_tool.graph.document import draft, render, write
     from sros_tool.graph.learn import common_parts
     from sros_tool.graph.observation import Observation
-    from sros_tool.resources import policies_dir
 
     if not learned.profiles or file is None:
         if as_json:

@@ -30,9 +30,8 @@ from sros_tool.cli.common import (
 from sros_tool.cli.progress import progress
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines
-from sros_tool.values import as_plain
+from sros_tool.values import FileChange, as_plain, file_change
 from sros_tool.wording import first_few
-from sros_tool.written import FileChange, file_change
 
 if TYPE_CHECKING:
     from sros_tool.errors import Note
@@ -486,8 +485,8 @@ def minimize_policy(
 
 def _node_basics() -> Sequence[Group]:
     """Return the rights that every node needs, as groups of a profile."""
+    from sros_tool.files import policies_dir
     from sros_tool.policy.document import read_policy
-    from sros_tool.resources import policies_dir
 
     basics = read_policy(policies_dir() / "defaults" / "node_basics.xml")
     return [group for each in basics.enclaves for p in each.all_profiles() for group in p.groups]
@@ -707,8 +706,8 @@ def policies(
     more, which --with-node-rights adds. The result is one file: includes are resolved, and comments
     are lost. The exit status is 1 if a part was left out.
     """
+    from sros_tool.files import policies_dir
     from sros_tool.policy.document import PolicyFile, ShippedPolicies, read_policy
-    from sros_tool.resources import policies_dir
 
     if earlier is not None:
         if target is not None:
@@ -789,6 +788,7 @@ def _convert(
     dry_run: bool,
 ) -> int:
     """Convert a policy; return the exit status."""
+    from sros_tool.files import policies_dir
     from sros_tool.policy.document import (
         PrintedConversion,
         convert_policy,
@@ -796,7 +796,6 @@ def _convert(
         with_node_rights,
         write_policy,
     )
-    from sros_tool.resources import policies_dir
 
     if output:
         check_output(output, force=force)

@@ -39,7 +39,7 @@ from sros_tool.runtime.containers import COMPOSE, KUBERNETES, SECRET
 from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
 from sros_tool.runtime.units import Job
 from sros_tool.terminal import echo, echo_document, echo_lines
-from sros_tool.written import FileChange
+from sros_tool.values import FileChange
 
 if TYPE_CHECKING:
     from sros_tool.errors import Note

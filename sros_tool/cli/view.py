@@ -30,8 +30,7 @@ from sros_tool.cli.common import (
 from sros_tool.cli.progress import progress
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo, echo_document
-from sros_tool.values import as_plain, versioned
-from sros_tool.written import PlannedFiles, file_change
+from sros_tool.values import PlannedFiles, as_plain, file_change, versioned
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterator, Mapping, Sequence

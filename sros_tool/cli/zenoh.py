@@ -30,8 +30,8 @@ from sros_tool.cli.common import (
 from sros_tool.cli.progress import progress
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.terminal import echo
+from sros_tool.values import FileChange, file_change
 from sros_tool.wording import first_few
-from sros_tool.written import FileChange, file_change
 
 if TYPE_CHECKING:
     from sros_tool.keystore.template import Template

@@ -161,8 +161,8 @@ def template_default(digest: str) -> str:
 
     It is "everything" or "node_basics", a value of the template's ``permissions.default``.
     """
+    from sros_tool.files import policies_dir
     from sros_tool.policy.document import read_policy
-    from sros_tool.resources import policies_dir
 
     files = sorted((policies_dir() / "defaults").glob("*.xml"))
     return next((f.stem for f in files if read_policy(f).enclaves[0].digest == digest), "")

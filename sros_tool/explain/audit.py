@@ -53,9 +53,8 @@ from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, order
 from sros_tool.topics import dds_names
-from sros_tool.values import Words, shows
+from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
 from sros_tool.wording import counted
-from sros_tool.written import DryRun, FileChanges, Notes
 
 _DENY_RULE = "deny-rule"
 _USE = "use"

@@ -38,8 +38,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.names import check_enclave_name
 from sros_tool.validity import elapsed, iso, parse_iso
-from sros_tool.values import parse_json
-from sros_tool.written import DryRun, FileChange, NamedKeystore, Notes
+from sros_tool.values import DryRun, FileChange, NamedKeystore, Notes, parse_json
 from sros_tool.xml import read_bytes
 
 _FORMAT = 1

@@ -47,8 +47,7 @@ from sros_tool.keystore.reader import authority_files, certificates_of
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import digest
 from sros_tool.pki.crl import SUPERSEDED
-from sros_tool.values import Words, shows
-from sros_tool.written import NamedKeystore
+from sros_tool.values import NamedKeystore, Words, shows
 
 
 class State(StrEnum):

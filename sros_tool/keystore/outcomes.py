@@ -15,8 +15,7 @@ from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.layout import ROLES, enclave_path
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.pki.certificates import digest, subject_text, validity_of
-from sros_tool.values import Words
-from sros_tool.written import FileChange
+from sros_tool.values import FileChange, Words
 
 Outcome = TypeVar("Outcome", bound=str)
 Restart = Annotated[

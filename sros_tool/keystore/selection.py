@@ -12,8 +12,7 @@ from sros_tool.errors import KeystoreError, Note
 from sros_tool.fleet.enclaves import Unrecorded, robot_of, unrecorded_enclaves
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_fleet, words_for
 from sros_tool.keystore.layout import PRIVATE, SETTINGS, check_keystore, list_enclaves
-from sros_tool.values import shows
-from sros_tool.written import NamedKeystore
+from sros_tool.values import NamedKeystore, shows
 
 
 @shows(optional=("robots",))

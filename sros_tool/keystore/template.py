@@ -15,12 +15,11 @@ from typing import Any, NamedTuple
 
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, SrosError, UsageError
-from sros_tool.files import parse_toml
+from sros_tool.files import parse_toml, templates_dir
 from sros_tool.names import check_enclave_name, expand, expression_problem
 from sros_tool.pki.token import refuse_pin
 from sros_tool.policy.patterns import covers, matches
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
-from sros_tool.resources import templates_dir
 from sros_tool.validity import Span, duration_text, parse_duration, parse_span, span_text
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.configuration import Mode, is_endpoint

@@ -32,6 +32,7 @@ from urllib.parse import unquote
 from lxml import etree
 
 from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError
+from sros_tool.files import policies_dir
 from sros_tool.names import check_enclave_name, check_namespace, expand, expression_problem
 from sros_tool.policy.model import (
     RIGHTS,
@@ -53,9 +54,7 @@ from sros_tool.policy.placeholders import (
     sample,
 )
 from sros_tool.policy.protection import PROTECT, Level
-from sros_tool.resources import policies_dir
-from sros_tool.values import shows
-from sros_tool.written import DryRun, FileChanges, Notes
+from sros_tool.values import DryRun, FileChanges, Notes, shows
 from sros_tool.xml import parse, read_bytes, serialize, tag_of
 
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")

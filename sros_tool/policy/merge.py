@@ -36,9 +36,8 @@ from sros_tool.policy.rights import (
     order,
     policy_rights,
 )
-from sros_tool.values import shows
+from sros_tool.values import DryRun, FileChanges, Notes, shows
 from sros_tool.wording import first_few
-from sros_tool.written import DryRun, FileChanges, Notes
 from sros_tool.xml import parse, read_bytes, tag_of
 
 _SHOWN = 3

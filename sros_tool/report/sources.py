@@ -19,6 +19,7 @@ from cryptography import x509
 from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, SrosError
+from sros_tool.files import policies_dir
 from sros_tool.fleet.model import Fleet
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
@@ -45,7 +46,6 @@ from sros_tool.policy.model import Policy, StatedProtection
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.report.compose import PictureSource
 from sros_tool.report.picture import PicturedEnclave, PicturedFinding, SourceTitle, Validity
-from sros_tool.resources import policies_dir
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso
 from sros_tool.values import parse_json

@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from sros_tool.errors import SrosError, UnavailableError
-from sros_tool.resources import unpacked_dds_dir
+from sros_tool.files import unpacked_dds_dir
 
 _Value = TypeVar("_Value")
 

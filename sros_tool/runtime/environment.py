@@ -22,8 +22,7 @@ from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.runtime.zenoh_environment import REFUSING_ZENOH
-from sros_tool.values import yaml_text
-from sros_tool.written import Notes
+from sros_tool.values import Notes, yaml_text
 
 
 class PrintedEnvironment(NamedTuple):

@@ -20,7 +20,7 @@ from sros_tool.files import new_files, replace_file, write_new_folder
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.runtime.environment import render_environment
 from sros_tool.runtime.variables import DOMAIN, ENABLE, KEYSTORE, STRATEGY
-from sros_tool.written import DryRun, FileChanges, NamedKeystore, Notes
+from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes
 from sros_tool.xml import read_bytes
 
 

@@ -11,8 +11,8 @@ import pytest
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.errors import KeystoreError
+from sros_tool.files import policies_dir
 from sros_tool.keystore.reader import Keystore
-from sros_tool.resources import policies_dir
 from tests.checks.bench import DAY, Bench
 from tests.support.children import LONG
 

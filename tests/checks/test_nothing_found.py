@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.files import policies_dir
 from sros_tool.keystore.template import template_names
-from sros_tool.resources import policies_dir
 from tests.support.harness import sros
 from tests.support.long_form import some
 

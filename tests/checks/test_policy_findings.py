@@ -8,7 +8,7 @@ import pytest
 
 from sros_tool.checks.kind import WARNING, Finding
 from sros_tool.checks.policies import policy_file_findings
-from sros_tool.resources import policies_dir
+from sros_tool.files import policies_dir
 from tests.checks.policy_cases import (
     BASICS,
     CASES,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.resources import policies_dir
+from sros_tool.files import policies_dir
 from tests.support.harness import sros
 
 NODES = ("arm", "base", "camera", "drive", "grip", "head")

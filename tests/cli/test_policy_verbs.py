@@ -14,10 +14,9 @@ from types import FrameType
 import pytest
 
 from benchmarks.inputs import enclaves_policy, topics_policy
-from sros_tool.files import replace_file
+from sros_tool.files import policies_dir, replace_file
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.resources import policies_dir
 from tests.support.harness import policy_text, publish, snapshot, sros
 
 DENY = '<topics publish="DENY"><topic>cmd_vel</topic></topics>'

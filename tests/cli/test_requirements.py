@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.files import templates_dir
 from sros_tool.proof import findings
-from sros_tool.resources import templates_dir
 from tests.support.harness import policy_text, publish, sros
 
 LISTEN = '<topics subscribe="ALLOW"><topic>{}</topic></topics>'

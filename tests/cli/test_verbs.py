@@ -18,11 +18,11 @@ from pathlib import Path
 import pytest
 
 from sros_tool.cli.program import FAMILIES
+from sros_tool.files import policies_dir
 from sros_tool.keystore.layout import PRIVATE, REQUIRED_FILES
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, issue_ca, pem
 from sros_tool.pki.keys import generate_key
-from sros_tool.resources import policies_dir
 from sros_tool.runtime.environment import REFUSING, render_refusal
 from sros_tool.runtime.variables import DOMAIN
 from sros_tool.validity import Window

@@ -17,9 +17,9 @@ from sros_tool.demo.node_names import (
     nodes_named,
 )
 from sros_tool.demo.scenarios.model import Role
+from sros_tool.files import policies_dir
 from sros_tool.names import NODE_SERVICES
 from sros_tool.policy.document import read_policy
-from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
 from tests.support.harness import policy_text, publish

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from cryptography import x509
 
+from sros_tool.files import policies_dir
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
@@ -18,7 +19,6 @@ from sros_tool.pki.certificates import Issuer, common_name, issue_ca, load_certi
 from sros_tool.pki.crl import Revoked, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.policy.document import read_policy
-from sros_tool.resources import policies_dir
 from sros_tool.validity import Window, iso
 
 DAY = timedelta(days=1)

@@ -9,9 +9,9 @@ import pytest
 
 from sros_tool.errors import UsageError
 from sros_tool.explain.denials import Denial, MissingRights, as_learned, propose, read_denials
+from sros_tool.files import policies_dir
 from sros_tool.graph.learn import NodeRight, common_parts
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profiles
-from sros_tool.resources import policies_dir
 from sros_tool.runtime.vendor_log import plain_text
 
 LOGS = Path(__file__).with_name("denial_logs")

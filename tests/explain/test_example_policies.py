@@ -20,6 +20,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.change import policy_of
 from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import Question, ask
+from sros_tool.files import policies_dir
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, plan_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.names import is_expression
@@ -27,7 +28,6 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy
 from sros_tool.policy.patterns import common_name, matches
 from sros_tool.policy.rights import Right, Rules, policy_rights
-from sros_tool.resources import policies_dir
 from sros_tool.translate import governance_for
 from tests.support.long_form import some
 

@@ -14,11 +14,11 @@ from sros_tool.cli.common import now
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import Part, Question, ask
+from sros_tool.files import policies_dir
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.participant import JoinContext, load_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
-from sros_tool.resources import policies_dir
 from tests.support.children import python
 from tests.support.harness import sros
 

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from sros_tool.cli.common import now
+from sros_tool.files import policies_dir, templates_dir
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.resources import policies_dir
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
 from tests.support.harness import Ended, policy_text, publish, sros, with_includes
@@ -331,7 +331,7 @@ def test_domains(whole: Path) -> None:
 
 def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
     template = tmp_path / "open.toml"
-    shipped = policies_dir().parent / "keystore_templates/development.toml"
+    shipped = templates_dir() / "development.toml"
     text = shipped.read_text().replace(
         "[protection.default] ", "[protection.default]\nwrite_access_control = false\n#"
     )

@@ -15,11 +15,11 @@ import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain.log import LogFinding, explain_log
+from sros_tool.files import policies_dir
 from sros_tool.keystore import participant
 from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.participant import LoadedEnclave, load_enclave
 from sros_tool.pki.certificates import identity_of, load_certificate
-from sros_tool.resources import policies_dir
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
 from tests.support.harness import policy_text, publish, sros

@@ -16,11 +16,11 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import Part, Question
+from sros_tool.files import policies_dir
 from sros_tool.graph.observation import Endpoint
 from sros_tool.keystore.participant import JoinContext, plan_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
-from sros_tool.resources import policies_dir
 from sros_tool.translate import governance_for
 from tests.graph.graphs import common, endpoints
 

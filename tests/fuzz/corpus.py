@@ -9,11 +9,11 @@ from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from sros_tool.files import policies_dir
 from sros_tool.graph.observation import Endpoint, ObservedNode, make_observation
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.pki.keys import load_key
-from sros_tool.resources import policies_dir
 from sros_tool.values import as_plain
 from tests.policy.earlier_policies import EARLIER, policies
 from tests.support.harness import policy_text, publish, sros

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.files import policies_dir
 from sros_tool.graph.learn import PARTS, CommonParts, Learned, common_parts, learn
 from sros_tool.graph.observation import Endpoint, ObservedNode, make_observation
 from sros_tool.policy.model import ALLOW, Group
-from sros_tool.resources import policies_dir
 from tests.graph.graphs import common, endpoints, graph, node
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sros_tool.files import policies_dir
 from sros_tool.graph.learn import News, common_parts
-from sros_tool.resources import policies_dir
 from tests.graph.graphs import graph, node
 
 

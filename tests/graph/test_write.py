@@ -8,13 +8,12 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import DocumentError, PolicyError
-from sros_tool.files import replace_file
+from sros_tool.files import policies_dir, replace_file
 from sros_tool.graph.document import draft, render, write
 from sros_tool.graph.learn import Learned, common_parts, learn
 from sros_tool.graph.observation import Observation
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.resources import policies_dir
 from tests.graph.graphs import graph, node
 
 ROBOT = graph(

@@ -25,9 +25,9 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from sros_tool.files import templates_dir
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import PrivateKey, key_pem
-from sros_tool.resources import templates_dir
 from sros_tool.runtime.events import EventKind
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.integration.converse import SILENCE, Node, Party

@@ -13,13 +13,13 @@ import pytest
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.audit import audit, policy_enclaves
+from sros_tool.files import policies_dir
 from sros_tool.graph.observation import from_json
 from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.resources import policies_dir
 from sros_tool.translate import governance_for
 from tests.integration.test_generate_policy import live, process, stopped
 from tests.integration.test_nodes_fit_their_enclaves import nodes_of

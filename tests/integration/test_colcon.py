@@ -106,6 +106,6 @@ def test_the_package_is_the_project() -> None:
     wanted = {each.text for each in package.iter("exec_depend")} - {"ros2cli"}
     packages = {f"python3-{each.split('>')[0]}" for each in PROJECT["dependencies"]}
     assert wanted == packages | {"python3-argcomplete"}
-    own = (CHECKOUT / "ros/entry_points.txt").read_text()
+    own = (CHECKOUT / "colcon/entry_points.txt").read_text()
     value = PROJECT["entry-points"]["ros2cli.command"]["security"]
     assert own == f"[ros2cli.command]\nsecurity = {value}\n"

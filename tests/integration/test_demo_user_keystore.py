@@ -13,7 +13,7 @@ from sros_tool.demo.backend import RCLPY
 from sros_tool.demo.casting import open_user_keystore
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.errors import SrosError
-from sros_tool.resources import policies_dir
+from sros_tool.files import policies_dir
 from tests.demo.test_demo_keystores import HEARS, ROBOT, make_keystore
 from tests.demo.weak_robots import OTHERS, WEAK, WIDEST, Place
 from tests.integration.enforcing import BACKENDS, enforcing_backend

@@ -20,6 +20,7 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY
+from sros_tool.files import policies_dir
 from sros_tool.graph.learn import is_tool_name
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
@@ -28,7 +29,6 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Group, Policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from tests.integration.converse import converse, listener, talker

@@ -13,10 +13,10 @@ import pytest
 from lxml import etree
 
 from sros_tool.errors import SrosError
+from sros_tool.files import policies_dir
 from sros_tool.keystore.template import template_names
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
-from sros_tool.resources import policies_dir
 from tests.support.harness import sros
 
 SCHEMAS = Path(__file__).parents[1] / "schemas"

@@ -11,11 +11,11 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY
+from sros_tool.files import policies_dir
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
-from sros_tool.resources import policies_dir
 from tests.explain.test_operator import CASES, NEVER, STEPS, endpoints_of
 from tests.integration.enforcing import enforcing_backend
 from tests.support.children import PATIENCE, python

@@ -15,13 +15,13 @@ import pytest
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY
 from sros_tool.explain.log import explain_log
+from sros_tool.files import policies_dir
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.resources import policies_dir
 from tests.integration.enforcing import enforcing_backend
 from tests.integration.test_nodes_fit_their_enclaves import nodes_of
 from tests.support.children import PATIENCE, python

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from sros_tool.dds.domains import DomainSet
+from sros_tool.files import policies_dir, templates_dir
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.policy.document import read_policy
-from sros_tool.resources import policies_dir
 from tests.integration.converse import ENOUGH, converse, listener, talker
 from tests.support.children import run
 
@@ -82,7 +82,7 @@ def test_an_exported_pair_talks_when_the_original_is_gone(tmp_path: Path) -> Non
 def test_protection_by_name_is_what_is_on_the_wire(tmp_path: Path) -> None:
     """A stream that is signed only can be read, and commands beside it can not."""
     text = (
-        (policies_dir().parent / "keystore_templates/development.toml").read_text()
+        (templates_dir() / "development.toml").read_text()
         + '\n[[protection.topic]]\nnames = ["/camera/*"]\ndata = "SIGN"\nmetadata = "SIGN"\n'
         + '\n[[protection.topic]]\nnames = ["/camera/secret"]\ndata = "ENCRYPT"\n'
         + 'metadata = "ENCRYPT"\n'

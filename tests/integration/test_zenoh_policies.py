@@ -17,11 +17,11 @@ from typing import Any
 
 import pytest
 
+from sros_tool.files import policies_dir
 from sros_tool.names import is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import RIGHTS
 from sros_tool.policy.rights import KIND_OF, Rules, policy_rights, unfolded
-from sros_tool.resources import policies_dir
 from tests.support.children import LONG, run
 from tests.support.harness import policy_text, publish, sros
 

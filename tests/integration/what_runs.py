@@ -20,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sros_tool.resources import templates_dir
+from sros_tool.files import templates_dir
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.events import EventKind, read_events
 from sros_tool.runtime.netns import end_with_parent, enter_isolation

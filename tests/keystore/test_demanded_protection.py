@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from sros_tool.dds.governance import parse_governance
+from sros_tool.files import templates_dir
 from sros_tool.keystore.protection import less_protected
 from sros_tool.keystore.reader import load_settings
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import stated_protections
 from sros_tool.policy.protection import Level
-from sros_tool.resources import templates_dir
 from sros_tool.translate import governance_for
 from tests.support.harness import check_whole, snapshot, sros
 

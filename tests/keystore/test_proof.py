@@ -17,6 +17,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, parse_permissions
 from sros_tool.errors import KeystoreError
+from sros_tool.files import policies_dir
 from sros_tool.keystore.issuing import enclave as writer_of_enclaves
 from sros_tool.keystore.issuing import proof
 from sros_tool.keystore.issuing.proof import (
@@ -32,7 +33,6 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Policy, Qualifier
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Rules, policy_rights
-from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from tests.policy.drawn_policies import policies

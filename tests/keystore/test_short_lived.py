@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.files import policies_dir
 from sros_tool.keystore.expiry import survey
 from sros_tool.keystore.reader import Keystore
-from sros_tool.resources import policies_dir
 from sros_tool.validity import BACKDATE
 from tests.support.harness import sros
 

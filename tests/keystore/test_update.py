@@ -17,6 +17,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import NOTE
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.files import policies_dir, templates_dir
 from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.history import history
@@ -48,7 +49,6 @@ from sros_tool.keystore.template import (
     with_values,
 )
 from sros_tool.policy.document import read_policy
-from sros_tool.resources import policies_dir, templates_dir
 from sros_tool.translate import governance_for
 from tests.support import made_by_ros2
 from tests.support.harness import (

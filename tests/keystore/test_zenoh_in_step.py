@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.files import templates_dir
 from sros_tool.keystore.lifecycle.zenoh import set_zenoh
 from sros_tool.keystore.reader import load_ca_certificate
 from sros_tool.pki import smime
@@ -189,7 +190,7 @@ def test_who_has_no_valid_certificate_either_keeps_its_rules(folder: Path) -> No
 
 
 def test_a_template_may_choose_the_network(folder: Path) -> None:
-    text = (Path(__file__).parents[2] / "keystore_templates/production.toml").read_text()
+    text = (templates_dir() / "production.toml").read_text()
     (folder / "robot.toml").write_text(
         f'{text}\n[zenoh]\nrouter = "/way"\nendpoints = ["robot:7447"]\nmode = "peer"\n'
     )
@@ -213,7 +214,9 @@ def test_a_template_may_choose_the_network(folder: Path) -> None:
     ],
 )
 def test_a_template_with_another_network_is_refused(line: str, text: str, folder: Path) -> None:
-    production = (Path(__file__).parents[2] / "keystore_templates/production.toml").read_text()
+    production = (
+        Path(__file__).parents[2] / "sros_tool/keystore_templates/production.toml"
+    ).read_text()
     (folder / "robot.toml").write_text(f"{production}\n[zenoh]\n{line}\n")
     ended = sros("create_keystore", "ks", "--template", "robot.toml", cwd=folder)
     assert ended.status == 2 and text in ended.err

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import UsageError
+from sros_tool.files import templates_dir
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.pki.token import TokenUri, parse_token_uri
-from sros_tool.resources import templates_dir
 from tests.support.harness import sros
 
 PIN = "98765432"

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.files import templates_dir
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.proof.findings import Decided, decide_all, requirement_findings
 from sros_tool.proof.requirements import Only, Protected, parse_requirements
 from sros_tool.proof.suggest import suggest
 from sros_tool.proof.system import System, load_system, policy_system
-from sros_tool.resources import templates_dir
 from tests.support.harness import policy_text, sros
 
 NOW = datetime(2027, 1, 1, tzinfo=UTC)

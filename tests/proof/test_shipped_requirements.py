@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.files import policies_dir
 from sros_tool.proof.findings import decide_all
 from sros_tool.proof.requirements import Requirement, demand, read_requirements
 from sros_tool.proof.system import load_system
-from sros_tool.resources import policies_dir
 from tests.support.children import LONG
 
 NOW = datetime(2027, 1, 1, tzinfo=UTC)

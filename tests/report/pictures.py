@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
 
+from sros_tool.files import policies_dir
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Context, PictureSource, compose
 from sros_tool.report.picture import Edge, Picture, SourceTitle
 from sros_tool.report.sources import common_rights
-from sros_tool.resources import policies_dir
 from tests.support.children import PATIENCE
 from tests.support.harness import policy_text
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from sros_tool.files import templates_dir
 from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.reader import governance_of
 from sros_tool.keystore.rights import load_rights
@@ -22,7 +23,6 @@ from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.layout import scenes_of
 from sros_tool.report.page import render_page
 from sros_tool.report.picture import SourceTitle, Validity
-from sros_tool.resources import policies_dir
 from tests.report.pictures import (
     HOSTILE,
     MOBILE_ROBOT,
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 pytest_plugins = ["tests.report.browsing"]
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
-PRODUCTION = policies_dir().parent / "keystore_templates/production.toml"
+PRODUCTION = templates_dir() / "production.toml"
 ASKED_FOR_FLOW = ("/cmd_vel", "/scan", "/navigate_to_pose", "/lifecycle_manager/is_active")
 SIZES = {"desk": (1440, 900), "phone": (390, 844)}
 

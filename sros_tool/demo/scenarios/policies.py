@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Final
 
 from sros_tool.errors import UsageError
+from sros_tool.files import policies_dir
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Group, Policy, Profile
-from sros_tool.resources import policies_dir
 
 DEFAULT_TOPIC: Final = "/chatter"
 DENIED_TOPIC: Final = "/sros_not_allowed"

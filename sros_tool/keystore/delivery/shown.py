@@ -15,8 +15,7 @@ from sros_tool.keystore.outcomes import (
     trusted_authorities,
 )
 from sros_tool.keystore.reader import load_ca_certificate
-from sros_tool.values import Words, shows
-from sros_tool.written import DryRun, FileChange, FileChanges, NamedKeystore, Notes
+from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words, shows
 
 if TYPE_CHECKING:
     from sros_tool.keystore.delivery.answer import ImportedEnclave

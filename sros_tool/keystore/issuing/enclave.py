@@ -23,6 +23,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions, render_permissions
 from sros_tool.dds.portable import document_notes
 from sros_tool.errors import KeystoreError, Note, PolicyError, check_meaning
+from sros_tool.files import policies_dir
 from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.issuing.proof import prove
 from sros_tool.keystore.layout import (
@@ -50,7 +51,6 @@ from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem
 from sros_tool.pki.token import TokenKey
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Policy
-from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window, iso, window
 

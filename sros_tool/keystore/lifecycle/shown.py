@@ -25,8 +25,7 @@ from sros_tool.keystore.outcomes import (
 )
 from sros_tool.keystore.reader import load_ca_certificate
 from sros_tool.pki.certificates import load_certificate, subject_text
-from sros_tool.values import Words, shows
-from sros_tool.written import DryRun, FileChanges, NamedKeystore, Notes
+from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words, shows
 
 if TYPE_CHECKING:
     from sros_tool.keystore.comparison import SettingChange
