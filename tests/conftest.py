@@ -6,6 +6,7 @@ import gc
 import os
 import shutil
 import signal
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -46,6 +47,8 @@ def use_memory_for_folders() -> None:
     may_run = os.access(MEMORY, os.W_OK | os.X_OK) and not found.f_flag & os.ST_NOEXEC
     if may_run and found.f_bavail * found.f_frsize > ROOM:
         os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+        # For what the program itself makes for a moment, and flushes, in these processes.
+        tempfile.tempdir = str(MEMORY)
 
 
 use_memory_for_folders()

@@ -32,6 +32,7 @@ from tests.integration.enforcing import enforcing_backend
 from tests.integration.test_demo_run import without_security
 from tests.support.children import LONG, PATIENCE, finish, python, wait_for
 from tests.support.harness import sros
+from tests.support.long_form import some
 
 pytestmark = [
     pytest.mark.dds,
@@ -111,7 +112,7 @@ def test_every_scenario_on_an_rclpy_that_enforces_security(name: str, tmp_path: 
     assert summary.stat().st_size > 300
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", some([signal.SIGINT, signal.SIGTERM], 1))
 def test_nodes_take_ros_arguments_and_end_quietly(number: signal.Signals, tmp_path: Path) -> None:
     remap = ["--ros-args", "-r", f"chatter:=/renamed_{os.getpid()}"]
     listener = node("listener", tmp_path, *remap, "-r", "__node:=ear")

@@ -20,7 +20,7 @@ from tests.integration.enforcing import BACKENDS, enforcing_backend
 from tests.integration.test_demo_attacks import needs_isolation
 from tests.support.children import LONG
 from tests.support.harness import policy_text, publish, snapshot, sros
-from tests.support.long_form import ONLY_LONG, some
+from tests.support.long_form import ONLY_LONG, some, sometimes
 
 pytestmark = pytest.mark.dds
 
@@ -60,7 +60,7 @@ def test_a_robot_under_attack(backend: str, robot: Path) -> None:
     enforcing_backend(backend)
     before = snapshot(robot)
     words = some(
-        ["a talker listens", "a listener publishes", "was not given", "poses as", "injects"], 2
+        ["a talker listens", "a listener publishes", "was not given", "poses as", "injects"], 1
     )
     only = [argument for word in words for argument in ("--only", word)]
     ended = sros(
@@ -94,6 +94,7 @@ def test_a_right_that_nobody_else_has_to_lack_is_open_until_it_is_accepted(tmp_p
 ODD = ("/odd/expired", "/odd/foreign", "/odd/gone", "/odd/signed", "/odd/wild")
 
 
+@sometimes("many weaknesses of one keystore")
 @needs_isolation
 def test_weaknesses_of_one_keystore_are_each_named_and_nothing_else(tmp_path: Path) -> None:
     rights = ROBOT | {name: publish(f"/t{place}") for place, name in enumerate(ODD)}

@@ -69,7 +69,7 @@ def test_every_row_of_what_is_known(vendor: Vendor, workshop: Workshop) -> None:
 @pytest.mark.parametrize("vendor", [Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE])
 def test_the_engine_says_what_the_rows_say(vendor: Vendor) -> None:
     """Where only one Fast DDS is at hand, what another was seen to do stands in the rows."""
-    assert not contradictions(vendor)
+    assert not list(contradictions(vendor))
     assert any(row.later for row in rows())
 
 
@@ -114,10 +114,10 @@ def test_some_row_tells_every_rule(vendor: Vendor, monkeypatch: pytest.MonkeyPat
     unnoticed = set()
     for name, other in others(rules):
         monkeypatch.setattr(vendor, "traits", replace(rules, **{name: other}))
-        if not contradictions(vendor):
+        if next(contradictions(vendor), None) is None:
             unnoticed.add((vendor, name))
     monkeypatch.setattr(vendor, "traits", rules)
-    assert not contradictions(vendor)
+    assert not list(contradictions(vendor))
     assert unnoticed == {each for each in EQUIVALENT if each[0] is vendor}
 
 
@@ -133,16 +133,15 @@ def others(rules: VendorTraits) -> Iterator[tuple[str, Any]]:
             yield from ((rule.name, each) for each in type(value) if each is not value)
 
 
-def contradictions(vendor: Vendor) -> list[str]:
-    """Where the engine says something else than the rows."""
-    found = []
+def contradictions(vendor: Vendor) -> Iterator[str]:
+    """Yield where the engine says something else than the rows."""
     for row in rows():
         answer = answer_of(row, vendor)
         ended = answer in (REFUSED, CRASHES, PEERS_CRASH)
         reply = Reply(answer) if ended else Reply("joined", (answer,))
         at = datetime.now(UTC)
-        found += [f"{row.name}: {text}" for text in disagreements(vendor, row.case, reply, at)]
-    return found
+        for text in disagreements(vendor, row.case, reply, at):
+            yield f"{row.name}: {text}"
 
 
 def draw_sensible(count: int, number: int, now: datetime) -> list[Case]:

@@ -34,6 +34,7 @@ from sros_tool.validity import Window
 from tests.integration.converse import converse, listener, talker
 from tests.integration.enforcing import enforces
 from tests.support.children import python
+from tests.support.long_form import some, sometimes
 
 pytestmark = [
     pytest.mark.dds,
@@ -612,6 +613,7 @@ UNSECURED = [
 ]
 
 
+@sometimes("a robot without enclaves is learned")
 def test_a_robot_without_enclaves_is_learned_into_one_for_each_process(tmp_path: Path) -> None:
     commands = ("generate_policy own.xml --enclave-per-node", "generate_policy shared.xml --flat")
     own, shared = live(DOMAIN + 5, tmp_path, UNSECURED, list(commands))
@@ -682,7 +684,7 @@ def test_a_watch_keeps_who_came_and_went(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda each: each.name)
+@pytest.mark.parametrize("number", some([signal.SIGINT, signal.SIGTERM], 1))
 def test_a_signal_ends_a_watch_and_the_policy_is_written(
     tmp_path: Path, number: signal.Signals
 ) -> None:
@@ -702,7 +704,7 @@ def test_ctrl_c_in_a_snapshot_writes_nothing(tmp_path: Path) -> None:
 # ── nothing to see ─────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("how", ["--spin-time 1", "--watch 1s"])
+@pytest.mark.parametrize("how", some(["--spin-time 1", "--watch 1s"], 1))
 def test_no_nodes(how: str, tmp_path: Path) -> None:
     (ended,) = live(DOMAIN + 4, tmp_path, [], f"generate_policy empty.xml {how}")
     assert ended.status == 1

@@ -39,7 +39,8 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave
 from sros_tool.topics import dds_names
 from tests.integration.test_policies_live import all_dds_endpoints, observed_in, run_script, without
-from tests.support.long_form import ONLY_LONG
+from tests.support.children import LONG
+from tests.support.long_form import ONLY_LONG, some
 
 pytestmark = [
     pytest.mark.dds,
@@ -166,7 +167,7 @@ def cast(tmp_path_factory: pytest.TempPathFactory) -> list[Casting]:
 @pytest.fixture(scope="module")
 def seen(cast: list[Casting]) -> dict[Key, list[dict[str, Any]]]:
     """The nodes of every process that differs, as the graph shows them."""
-    keys = sorted({each.key for each in cast})
+    keys = some(sorted({each.key for each in cast}), 8)
     # The graph knows nodes by their names, so that those of one name go into separate networks.
     rounds: defaultdict[int, dict[str, Key]] = defaultdict(dict)
     borne: defaultdict[str, int] = defaultdict(int)
@@ -207,7 +208,7 @@ def test_demo_nodes_bear_their_names_and_offer_their_services(
     seen: dict[Key, list[dict[str, Any]]],
 ) -> None:
     """What is missing in the graph could not be found to be denied."""
-    assert len(seen) > 15
+    assert len(seen) > (15 if LONG else 7)
     for (role, names, topic), nodes in seen.items():
         shown = {expand(each["name"], each["ns"], "") for each in nodes}
         assert shown == set(names), role
@@ -227,6 +228,8 @@ def test_demo_nodes_do_what_their_enclave_allows_and_are_denied_what_the_row_wan
     for each in cast:
         if each.refused is RowStatus.NOT_LET_IN or each.row.attack == "world-readable keys":
             continue  # the documents or the files do not get as far as a right
+        if each.key not in seen:
+            continue  # not drawn
         identity = each.party.identity
         assert identity.keystore is not None
         root = each.keystores.keystores[identity.keystore]
@@ -252,7 +255,7 @@ def test_demo_nodes_do_what_their_enclave_allows_and_are_denied_what_the_row_wan
             others = sorted(refused - of_the_row)
             wrong.append(f"{each.row.name}: {each.party.name} is denied {others} besides")
     assert wrong == []
-    assert asked > 1000
+    assert asked > (1000 if LONG else 100)
 
 
 def test_it_would_see_a_node_under_another_name(cast: list[Casting]) -> None:

@@ -52,7 +52,7 @@ def restarts(root: Path, steps: dict[str, dict[str, bool]]) -> None:
     ("template", "revoked"),
     [
         ("production", True),
-        ("sros2", False),
+        pytest.param("sros2", False, marks=ONLY_LONG),
         pytest.param("production", False, marks=ONLY_LONG),
     ],
 )
@@ -67,6 +67,7 @@ def test_a_ca_with_the_same_key_disturbs_nobody_on_cyclone(tmp_path: Path) -> No
     restarts(tmp_path / "ks", {"same-key": ALL})
 
 
+@ONLY_LONG
 def test_all_stages_at_once_on_cyclone(tmp_path: Path) -> None:
     make(tmp_path / "ks", "production")
     restarts(tmp_path / "ks", {"finish": TOGETHER})
