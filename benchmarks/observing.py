@@ -99,7 +99,7 @@ def main() -> None:
 
 def _measured(folder: Path) -> dict[str, float]:
     from sros_tool.files import policies_dir
-    from sros_tool.graph.document import draft, write
+    from sros_tool.graph.draft import draft, write
     from sros_tool.graph.learn import common_parts, learn
     from sros_tool.graph.observation import Observation
     from sros_tool.graph.observe import RosGraph

@@ -231,8 +231,8 @@ def generate(
 
 
 def _fleet_policies(policies: Iterable[AnyPath | Policy], fleet: AnyPath) -> list[FleetPolicy]:
-    from sros_tool.fleet.document import read_fleet
     from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.policy.document import read_policy
 
     robots, found = read_fleet(Path(fleet)), []
@@ -488,7 +488,7 @@ def check_requirements(
         ...     print(finding.place, finding.text)
     """
     from sros_tool.checks.kind import NOTE
-    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.template import load_template
     from sros_tool.proof.findings import requirement_findings
     from sros_tool.proof.requirements import read_all_requirements
@@ -544,7 +544,7 @@ def new_access(
         ...     print(*gain.enclaves, gain.action, gain.name, gain.source)
         /camera subscribe /cmd_vel robot.xml:12
     """
-    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.proof.growth import compare_access
     from sros_tool.proof.sources import load_side
 

@@ -33,7 +33,7 @@ from sros_tool.dds.portable import mistaken_names, outside, some_pairs
 from sros_tool.errors import DocumentError, PolicyError, SrosError
 from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import read_policy_for
-from sros_tool.fleet.model import Fleet
+from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.keystore.protection import contradictions
 from sros_tool.names import (

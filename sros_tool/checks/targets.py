@@ -11,7 +11,7 @@ from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.checks.zenoh import configuration_findings
 from sros_tool.errors import DocumentError
-from sros_tool.fleet.model import Fleet
+from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (
     KEY_URI_FILE,
     PERMISSIONS_FILE,

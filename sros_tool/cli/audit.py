@@ -199,8 +199,8 @@ def _enclaves(
     """
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.audit import keystore_enclaves, policy_enclaves
-    from sros_tool.fleet.document import read_fleet
     from sros_tool.fleet.expansion import read_policy_for
+    from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.layout import enclave_names
     from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.rights import load_rights
@@ -234,7 +234,7 @@ def _enclaves(
 
 def _write_patch(found: Audit, patch: Path | None, *, dry_run: bool) -> str:
     """Write the rights to add to ``patch``; return what was done, "" if there is nothing to add."""
-    from sros_tool.graph.document import render
+    from sros_tool.graph.draft import render
 
     if patch is None or not found.missing.profiles:
         return ""

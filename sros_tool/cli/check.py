@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from sros_tool.checks.registry import ChosenFindings, FindingFilter
     from sros_tool.checks.targets import Circumstances
     from sros_tool.demo.doctor import Diagnosis
-    from sros_tool.fleet.model import Fleet
+    from sros_tool.fleet.robots import Fleet
     from sros_tool.proof.system import System
     from sros_tool.runtime.processes import RunningProcesses
     from sros_tool.runtime.ros2cli import SecurityProvider
@@ -373,8 +373,8 @@ def _circumstances(
 ) -> Circumstances:
     from sros_tool.checks.targets import Circumstances
     from sros_tool.cli.common import local_zone
-    from sros_tool.fleet.document import read_fleet
     from sros_tool.fleet.expansion import read_policy_for
+    from sros_tool.fleet.fleet_file import read_fleet
 
     fleet = read_fleet(fleet_file) if fleet_file else None
     read = tuple(read_policy_for(each, fleet) for each in policies)

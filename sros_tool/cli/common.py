@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from sros_tool.enclave_environment import EnclaveEnvironment
     from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
-    from sros_tool.fleet.model import Fleet
+    from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.authorities.keyring import Keyring
     from sros_tool.keystore.issuing.zenoh import KeptZenoh
     from sros_tool.keystore.transaction.stage import Change
@@ -152,7 +152,7 @@ def fleets_option(function: Decorated) -> Decorated:
 
 def fleets_of(files: Sequence[Path]) -> tuple[Fleet | None, Fleet | None]:
     """Return the fleets of two policies in the files that --fleet names."""
-    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.fleet_file import read_fleet
 
     if len(files) > 2:
         raise UsageError("there are more than two fleets", "", "Name one, or one for each policy.")
@@ -162,8 +162,8 @@ def fleets_of(files: Sequence[Path]) -> tuple[Fleet | None, Fleet | None]:
 
 def fleet_policies(files: Sequence[Path], fleet_file: Path) -> list[FleetPolicy]:
     """Return the policies in files, for the fleet in the file that --fleet names."""
-    from sros_tool.fleet.document import read_fleet
     from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.policy.document import read_policy
 
     fleet = read_fleet(fleet_file)
@@ -172,8 +172,8 @@ def fleet_policies(files: Sequence[Path], fleet_file: Path) -> list[FleetPolicy]
 
 def policy_for(file: Path, fleet_file: Path | None) -> Policy:
     """Return the policy in a file, for the fleet in the file that --fleet names, if it does."""
-    from sros_tool.fleet.document import read_fleet
     from sros_tool.fleet.expansion import read_policy_for
+    from sros_tool.fleet.fleet_file import read_fleet
 
     return read_policy_for(file, read_fleet(fleet_file) if fleet_file else None)
 

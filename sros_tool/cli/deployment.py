@@ -484,8 +484,8 @@ def sign_request(
 
 def _policy(file: Path | None, fleet_file: Path | None) -> Policy | FleetPolicy | None:
     """Return the policy in a file, for the robots of a fleet if one is named."""
-    from sros_tool.fleet.document import read_fleet
     from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.policy.document import read_policy
 
     if file is None:

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.question import Part, Question
     from sros_tool.explain.who import EnclaveOutcome
     from sros_tool.explain.zenoh import ZenohAnswer
-    from sros_tool.fleet.model import Fleet
+    from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.participant import JoinContext, LoadedEnclave
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.model import Enclave, Source
@@ -344,7 +344,7 @@ class _ContextOptions:
 
 def _fleet_of(file: Path | None, root: Path | None) -> Fleet | None:
     """Return the fleet in a file, or else that of the keystore ``root``."""
-    from sros_tool.fleet.document import read_fleet
+    from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.fleet import load_fleet
 
     if file:

@@ -31,7 +31,7 @@ from sros_tool.values import FileChange, as_plain, file_change
 from sros_tool.wording import counted
 
 if TYPE_CHECKING:
-    from sros_tool.graph.document import Draft
+    from sros_tool.graph.draft import Draft
     from sros_tool.graph.learn import Learned
     from sros_tool.graph.observation import Observation
     from sros_tool.graph.observe import ObserverError, RosGraph, Snapshot
@@ -401,7 +401,7 @@ def generate_policy(
         raise UsageError("--node is for --from-log only")
     check_duration(watch, spin_time)
     from sros_tool.files import policies_dir
-    from sros_tool.graph.document import draft, write
+    from sros_tool.graph.draft import draft, write
     from sros_tool.graph.enclaves import NamedEnclaves
     from sros_tool.graph.enclaves import enclave_per_node as name_enclaves
     from sros_tool.graph.learn import News, common_parts, is_tool_name, learn, listed
@@ -592,7 +592,7 @@ def _propose(
         SrosError: there is something to write that was not accepted.
     """
     from sros_tool.files import policies_dir
-    from sros_tool.graph.document import draft, render, write
+    from sros_tool.graph.draft import draft, render, write
     from sros_tool.graph.learn import common_parts
     from sros_tool.graph.observation import Observation
 

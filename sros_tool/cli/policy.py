@@ -35,7 +35,7 @@ from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
     from sros_tool.errors import Note
-    from sros_tool.fleet.model import Fleet
+    from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.merge import Merged
     from sros_tool.policy.minimize import EnclaveUse, MinimizedPolicy, WildcardProposal
@@ -434,8 +434,8 @@ def minimize_policy(
     sizes are those of the robot with the longest name.
     """
     from sros_tool.fleet import expansion as of_fleet
-    from sros_tool.fleet.document import read_fleet
     from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.document import read_policy, write_policy
     from sros_tool.policy.minimize import minimize

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from sros_tool.checks.kind import Finding as Checked
-    from sros_tool.fleet.model import Fleet, Robot
+    from sros_tool.fleet.robots import Fleet, Robot
     from sros_tool.report.compose import PictureSource
     from sros_tool.report.folding import Folding
     from sros_tool.report.picture import Picture, PicturedFinding

@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from sros_tool.errors import InvalidNameError
-from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import check_enclave_name
 from sros_tool.policy.placeholders import (
     Parts,

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from sros_tool.errors import DocumentError, UnavailableError
-from sros_tool.fleet.model import Fleet, Robot, name_problem
+from sros_tool.fleet.robots import Fleet, Robot, name_problem
 from sros_tool.values import parse_json
 
 _VALUES = {

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from sros_tool.errors import DocumentError, InvalidNameError
 from sros_tool.files import staged_file
-from sros_tool.fleet.model import name_problem
+from sros_tool.fleet.robots import name_problem
 from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,

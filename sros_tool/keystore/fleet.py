@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note
-from sros_tool.fleet.document import MAX_BYTES, parse_fleet, render_fleet
 from sros_tool.fleet.enclaves import enclaves_of, robot_of, size_problem
-from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.fleet.fleet_file import MAX_BYTES, parse_fleet, render_fleet
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.layout import FLEET, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import Keystore, as_keystore

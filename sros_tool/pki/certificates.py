@@ -28,8 +28,14 @@ from cryptography.x509.oid import (
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki import pem as pem_file
+from sros_tool.pki.distinguished_names import (
+    is_of_reading,
+    read_name,
+    reading,
+    same_name,
+    short_names,
+)
 from sros_tool.pki.keys import KEY_LABELS, PrivateKey, PublicKey, algorithm, check_key, is_weak
-from sros_tool.pki.names import is_of_reading, read_name, reading, same_name, short_names
 from sros_tool.pki.tolerant import TolerantName
 from sros_tool.validity import Window
 

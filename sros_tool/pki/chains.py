@@ -29,7 +29,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.names import canonical
+from sros_tool.pki.distinguished_names import canonical
 from sros_tool.pki.tolerant import UnreadableName, is_unread
 from sros_tool.validity import iso
 

@@ -27,9 +27,15 @@ from sros_tool.pki.certificates import (
     is_signed,
     subject_text,
 )
+from sros_tool.pki.distinguished_names import (
+    canonical,
+    is_of_reading,
+    read_name,
+    reading,
+    same_name,
+)
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.pki.kinds import kind_of
-from sros_tool.pki.names import canonical, is_of_reading, read_name, reading, same_name
 from sros_tool.pki.tolerant import ContradictoryPoint
 from sros_tool.validity import iso
 

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.padding import PKCS7
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
 from sros_tool.pki import pem as pem_file
-from sros_tool.pki.names import reading
+from sros_tool.pki.distinguished_names import reading
 from sros_tool.pki.tolerant import UnknownKey
 
 PrivateKey = ec.EllipticCurvePrivateKey | rsa.RSAPrivateKey

@@ -12,8 +12,8 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.errors import PkiError
 from sros_tool.pki.certificates import common_name, common_name_of, subject_text
+from sros_tool.pki.distinguished_names import reading
 from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm
-from sros_tool.pki.names import reading
 
 _MAX_BYTES = 64 * 1024
 """Largest request that is read, in bytes."""

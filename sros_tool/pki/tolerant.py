@@ -24,7 +24,7 @@ from cryptography.x509.oid import CRLEntryExtensionOID, ExtensionOID, ObjectIden
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
-from sros_tool.pki.names import read_name_der, short_names
+from sros_tool.pki.distinguished_names import read_name_der, short_names
 
 _TIMES = {der.UTC_TIME: "%y%m%d%H%M%SZ", der.GENERALIZED_TIME: "%Y%m%d%H%M%SZ"}
 """The forms of dates that OpenSSL compares (X509_cmp_time), by type."""

@@ -22,9 +22,9 @@ from sros_tool.checks.requirements import VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
 from sros_tool.errors import DocumentError, PolicyError, SrosError
 from sros_tool.faults import Fault
-from sros_tool.fleet.document import read_connections, read_fleet
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
-from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.fleet.fleet_file import read_connections, read_fleet
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import Lifetime, Threshold, UnreadableEnclave, due_enclaves
 from sros_tool.keystore.layout import KEY_FILE, SETTINGS, is_keystore

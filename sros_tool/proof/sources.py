@@ -16,7 +16,7 @@ from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Permissions
 from sros_tool.errors import DocumentError, Note, SrosError
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.fleet.model import Fleet
+from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,

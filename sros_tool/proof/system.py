@@ -22,7 +22,7 @@ from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.explain.evaluator import Evaluator
 from sros_tool.fleet.expansion import read_policy_for
-from sros_tool.fleet.model import Fleet
+from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_URI_FILE,

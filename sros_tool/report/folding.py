@@ -26,7 +26,7 @@ from collections.abc import (
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
-from sros_tool.fleet.model import Robot
+from sros_tool.fleet.robots import Robot
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.compose import edge_order, namespace_of
 from sros_tool.report.flow_layout import HOPS, flow_scene

@@ -8,7 +8,7 @@ import pytest
 
 from sros_tool.fleet import enclaves
 from sros_tool.fleet.enclaves import _candidates, enclaves_of, robot_of
-from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.fleet.robots import Fleet, Robot
 
 ROBOTS = (
     Robot("r1", "/r1", groups=("carriers",)),

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import SrosError
-from sros_tool.fleet.document import parse_fleet, read_fleet
+from sros_tool.fleet.fleet_file import parse_fleet, read_fleet
 from sros_tool.fleet.inventory import inventory, script_inventory
-from sros_tool.fleet.model import Fleet
+from sros_tool.fleet.robots import Fleet
 
 HOSTS = """
 all:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from sros_tool.fleet import enclaves
-from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.fleet import left_enclaves
 from tests.support.harness import Ended, policy_text, publish, snapshot, sros
 

@@ -19,8 +19,8 @@ from sros_tool.pki.certificates import (
     pem,
     subject_text,
 )
+from sros_tool.pki.distinguished_names import short_names
 from sros_tool.pki.keys import generate_key
-from sros_tool.pki.names import short_names
 from sros_tool.validity import Window, parse_iso
 
 WINDOW = Window(parse_iso("2020-01-01T00:00:00Z"), parse_iso("2040-01-01T00:00:00Z"))

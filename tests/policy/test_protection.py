@@ -10,7 +10,7 @@ from lxml import etree
 
 from sros_tool.errors import PolicyError
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.policy.minimize import minimize

@@ -20,7 +20,7 @@ from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import MEASURED, Style
 from sros_tool.errors import DocumentError, UsageError
-from sros_tool.fleet.document import read_fleet
+from sros_tool.fleet.fleet_file import read_fleet
 from sros_tool.proof import growth, sources
 from sros_tool.proof.growth import Gain, compare_access
 from sros_tool.proof.repository import Repository

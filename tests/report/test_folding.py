@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.fleet.model import Robot
+from sros_tool.fleet.robots import Robot
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.rights import Right
 from sros_tool.report.compose import PictureSource, compose

@@ -18,7 +18,7 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, so
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.fleet.enclaves import left_robot_of
-from sros_tool.fleet.model import Fleet
+from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import FLEET_REMEDY
 from sros_tool.keystore.layout import (
     CRL,

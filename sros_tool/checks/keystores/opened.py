@@ -16,7 +16,7 @@ from cryptography import x509
 from sros_tool.checks.kind import ERROR, FindingKind
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import SrosError
-from sros_tool.fleet.model import Fleet
+from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import edited_fleet, load_fleet
 from sros_tool.keystore.layout import (
     CRL,

@@ -19,7 +19,7 @@ from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosE
 from sros_tool.files import staged_file
 from sros_tool.fleet.enclaves import robot_of
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.fleet.model import Fleet
+from sros_tool.fleet.robots import Fleet
 from sros_tool.folders import Folder
 from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring

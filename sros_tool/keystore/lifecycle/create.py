@@ -23,7 +23,7 @@ from sros_tool.dds.permissions import parse_permissions
 from sros_tool.dds.portable import name_notes
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageError
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.fleet.model import Fleet
+from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.authorities.authority import (
     Authorities,
     create_authorities,

@@ -16,7 +16,7 @@ from sros_tool.errors import DocumentError
 from sros_tool.files import parse_toml
 from sros_tool.fleet.enclaves import MAX_PATTERNS, pattern_problem, size_problem
 from sros_tool.fleet.inventory import SHOWN, connections, fleet_table, is_json
-from sros_tool.fleet.model import (
+from sros_tool.fleet.robots import (
     MAX_ROBOTS,
     Fleet,
     Robot,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from sros_tool.errors import DocumentError
-from sros_tool.fleet.document import parse_fleet
-from sros_tool.fleet.model import Fleet, Robot
+from sros_tool.fleet.fleet_file import parse_fleet
+from sros_tool.fleet.robots import Fleet, Robot
 
 TEXT = """
 enclaves = ["/{robot}/base", "/fleet{namespace:carriers}/arm"]
