@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 
@@ -35,7 +35,8 @@ class Circumstances:
 
     ``distribution`` is the ROS 2 distribution of the nodes of policies; "" is the latest.
     ``vendor`` is the DDS vendor of the nodes, or ``zenoh``; "" if they may use any.
-    ``fleet`` has the robots that placeholders in policies stand for.
+    ``fleet`` has the robots that placeholders in policies stand for.  ``opened`` are the keystores
+    that were opened.
     """
 
     now: datetime
@@ -45,6 +46,11 @@ class Circumstances:
     distribution: str = ""
     vendor: str = ""
     fleet: Fleet | None = None
+    opened: dict[Path, Keystore] = field(default_factory=dict, repr=False, compare=False)
+
+    def keystore(self, root: Path) -> Keystore:
+        """Return the keystore at a path, which is opened once for all questions about it."""
+        return self.opened.setdefault(root, Keystore(root))
 
 
 def path_findings(path: Path, at: Circumstances) -> list[Finding]:
@@ -91,7 +97,7 @@ def policy_findings(path: Path, at: Circumstances) -> list[Finding]:
 
 def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:
     return keystore_findings(
-        Keystore(root),
+        at.keystore(root),
         now=at.now,
         zone=at.zone,
         domain=at.domain,

@@ -335,6 +335,7 @@ def _system(
 
     return load_system(
         path,
+        opened=at.opened.get(path),
         at=at.now,
         zone=at.zone,
         domain=at.domain,
@@ -401,7 +402,6 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.targets import path_findings, policy_findings
     from sros_tool.keystore.layout import is_keystore
-    from sros_tool.keystore.reader import Keystore
 
     if family == "runtime":
         return _runtime(at)
@@ -421,7 +421,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
             finding
             for root in roots
             for finding in keystore_findings(
-                Keystore(root),
+                at.keystore(root),
                 now=at.now,
                 zone=at.zone,
                 domain=at.domain,

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
     from sros_tool.checks.kind import Finding as Checked
     from sros_tool.fleet.robots import Fleet, Robot
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.report.compose import PictureSource
     from sros_tool.report.folding import Folding
     from sros_tool.report.picture import Picture, PicturedFinding
@@ -194,7 +195,13 @@ def view(
             picture = focused(picture, read, words)
         if requirements:
             picture = _with_requirements(
-                picture, requirements, sources, template, moment, fleets_of(fleet_files)[0]
+                picture,
+                requirements,
+                sources,
+                template,
+                moment,
+                fleets_of(fleet_files)[0],
+                read[0].keystore,
             )
         folding = Folding.of(picture, robots)
         picture = replace(picture, equal=folding.equal, different=folding.different)
@@ -308,6 +315,7 @@ def _with_requirements(
     template: str | None,
     moment: datetime,
     fleet: Fleet | None,
+    opened: Keystore | None,
 ) -> Picture:
     """Return the picture with what breaks requirements, decided as `sros check` does."""
     from sros_tool.cli.common import local_zone
@@ -327,6 +335,7 @@ def _with_requirements(
         zone=local_zone(os.environ),
         fleet=fleet,
         template=load_template(template) if template else None,
+        opened=opened,
     )
     decided = decide_all(wanted, system)
     found = decided_findings(decided, system)
@@ -370,6 +379,8 @@ def _checked(
     from sros_tool.cli.common import local_zone
 
     at = Circumstances(moment, local_zone(os.environ), fleet=fleet)
+    if source.keystore:
+        at.opened[path] = source.keystore
     try:
         found = (
             list(policy_file_findings(path, fleet=fleet, policy=source.policy))
@@ -419,8 +430,8 @@ def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str,
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.policy.document import read_policy
 
-    if source.origin.kind == "keystore":
-        fleet = load_fleet(path)
+    if source.keystore:
+        fleet = load_fleet(source.keystore)
     elif fleet and source.origin.kind == "policy":
         written = read_policy(path, placeholders=True)
         fleet = fleet.with_enclaves(FleetPolicy(written, fleet).patterns)

@@ -31,8 +31,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
-from sros_tool.keystore.reader import Keystore, OpenedEnclave, open_enclave
-from sros_tool.pki import smime
+from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave, open_enclave
 from sros_tool.pki.certificates import (
     digest,
     load_certificates,
@@ -45,14 +44,20 @@ from sros_tool.pki.keys import algorithm, holds_private_key, load_key
 from sros_tool.pki.token import TokenUri, read_token_file
 from sros_tool.translate import RosRight, ros_rights
 from sros_tool.validity import iso
-from sros_tool.xml import parse, read_bytes
+from sros_tool.xml import parse
 from sros_tool.zenoh.network import ZenohNetwork
 
 Description = dict[str, Any]
 _JSON = (".json5", ".json")
 
 
-def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Description:
+def describe(
+    path: Path,
+    *,
+    now: datetime,
+    authority: Path | None = None,
+    files: FilesReadOnce | None = None,
+) -> Description:
     """Describe the content of ``path`` as a JSON value; ``kind`` selects the other fields.
 
     Kinds: keystore, enclave, certificate, revocation list, private key, permissions, governance,
@@ -63,10 +68,12 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
         now: the moment for which validity is reported.
         authority: the permissions CA certificate that verifies a signed document; by default the
             one next to it.
+        files: those that were read before.
 
     Raises:
         DocumentError: ``path`` is none of these kinds, or cannot be read.
     """
+    files = files or FilesReadOnce()
     if path.is_dir():
         if is_keystore(path):
             return _keystore(path, now)
@@ -74,7 +81,9 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
             return {
                 "kind": "enclave",
                 "path": str(path),
-                **_describe_enclave(evaluated("", path, open_enclave(path, now=now), at=now)),
+                **_describe_enclave(
+                    evaluated("", path, open_enclave(path, now=now, files=files), at=now)
+                ),
                 **_zenoh(path, now),
             }
         refuse_earlier(path)
@@ -82,14 +91,16 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
             f"'{path}' is neither a keystore nor an enclave",
             "It has no enclaves folder, and neither cert.pem nor permissions.p7s.",
         )
-    data = read_bytes(path, "file")
+    data = files.read(path, "file")
     try:
-        return {"path": str(path), **_file(path, data, now, authority)}
+        return {"path": str(path), **_file(path, data, now, authority, files)}
     except SrosError as error:
         raise DocumentError(f"'{path}' cannot be read: {error.what}", error.why) from error
 
 
-def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
+def _file(
+    path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
+) -> Description:
     """Describe a file; its content decides the kind, not its name."""
     if b"-----BEGIN CERTIFICATE-----" in data:
         return {"kind": "certificate", **_certificates(data, "in it", now)}
@@ -102,26 +113,28 @@ def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Des
         key = load_key(data, "in it")
         return {"kind": "private key", "algorithm": algorithm(key), "mode": f"{mode:04o}"}
     if b"multipart/signed" in data[:1000].lower():
-        return _signed(path, data, now, authority)
+        return _signed(path, data, now, authority, files)
     if data.lstrip()[:1] == b"<":
         return {**_document(data, now), "signed": False, "signature_verified": False}
     if path.suffix in _JSON or data.lstrip()[:1] == b"{":
-        return _configuration(path, data, now, authority)
+        return _configuration(path, data, now, authority, files)
     raise DocumentError(
         "it is neither a PEM certificate, revocation list or key, nor a signed document, nor XML, "
         "nor a Zenoh configuration",
     )
 
 
-def _configuration(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
+def _configuration(
+    path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
+) -> Description:
     """Describe a Zenoh configuration, with the signature of the same document next to it."""
     described = describe_configuration(data)
     signature: Description = {"signed": False, "signature_verified": False}
     signed = path.with_name(ZENOH_SIGNED.get(path.name, path.name))
     if signed != path and signed.exists():
-        message = read_bytes(signed, "signed document")
-        signature = _signature(signed, message, now, authority)
-        if smime.parse(message).text != data:
+        message = files.read(signed, "signed document")
+        signature = _signature(signed, message, now, authority, files)
+        if files.signed(message).text != data:
             problem = f"it is not the document that was signed in {signed.name}"
             signature |= {"signature_verified": False, "signature_problem": problem}
     return {**described, "problems": content_problems(path, now), **signature}
@@ -137,7 +150,7 @@ def _keystore(root: Path, now: datetime) -> Description:
             continue
         try:
             authorities[role] = {
-                **_certificates(read_bytes(path, "file"), f"'{path}'", now),
+                **_certificates(keystore.read(path, "file"), f"'{path}'", now),
                 "key_present": (root / ca_key(role)).exists(),
             }
         except SrosError as error:
@@ -150,7 +163,7 @@ def _keystore(root: Path, now: datetime) -> Description:
     governance: Description | None = None
     if (root / GOVERNANCE_P7S).exists():
         try:
-            governance = describe(root / GOVERNANCE_P7S, now=now)
+            governance = describe(root / GOVERNANCE_P7S, now=now, files=keystore.files)
         except SrosError as error:
             governance = {"error": str(error)}
         if governance.get("kind", "governance") != "governance":
@@ -296,24 +309,28 @@ def _revocation_list(crl: RevocationList, now: datetime) -> Description:
     }
 
 
-def _signed(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
-    signed = smime.parse(data)
-    signature = _signature(path, data, now, authority)
+def _signed(
+    path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
+) -> Description:
+    signed = files.signed(data)
+    signature = _signature(path, data, now, authority, files)
     if signed.document.lstrip()[:1] == b"<":
         return {**_document(signed.document, now), **signature}
     described = describe_configuration(signed.text)
     return {**described, "problems": content_problems(path, now), **signature}
 
 
-def _signature(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
+def _signature(
+    path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
+) -> Description:
     """Describe the signature of the signed document ``data`` at ``path``."""
-    signed = smime.parse(data)
+    signed = files.signed(data)
     signer = signed.signer()
     found = authority or permissions_ca_for(path)
     reason = "no permissions CA certificate is next to it; name one with --ca"
     verified: bool | None = None
     if found:
-        certificates = load_certificates(read_bytes(found, "certificate"), f"'{found}'")
+        certificates = load_certificates(files.read(found, "certificate"), f"'{found}'")
         try:
             signed.verify(certificates[0])
             reason = chain_fault(certificates[0], certificates, at=now, checks=Checks.DOCUMENTS)

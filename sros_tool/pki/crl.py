@@ -261,9 +261,7 @@ def refusal_of(crl: x509.CertificateRevocationList) -> str:
 
 def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
     """Return whether ``authority`` issued and signed the revocation list."""
-    return same_name(crl.issuer, authority.subject) and is_signed(
-        crl, crl.tbs_certlist_bytes, authority
-    )
+    return same_name(crl.issuer, authority.subject) and _is_signed(_Content(crl), authority)
 
 
 def may_sign_lists(authority: x509.Certificate) -> bool:
@@ -443,16 +441,16 @@ def _identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certifi
 
 
 class _Content:
-    """A list with a hash, that of the object: all enclaves of a keystore have the same lists."""
+    """A list with a hash: all enclaves of a keystore have the same lists."""
 
     def __init__(self, crl: x509.CertificateRevocationList) -> None:
         self.crl = crl
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Content) and self.crl is other.crl
+        return isinstance(other, _Content) and self.crl == other.crl
 
     def __hash__(self) -> int:
-        return id(self.crl)
+        return hash(self.crl.signature)
 
 
 class _Entries(NamedTuple):

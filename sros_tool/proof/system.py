@@ -32,8 +32,9 @@ from sros_tool.keystore.layout import (
     has_zenoh_files,
     is_keystore,
 )
-from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave
+from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave_of
 from sros_tool.keystore.protection import with_stated
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
@@ -92,12 +93,13 @@ def load_system(
     fleet: Fleet | None = None,
     world: str = "",
     template: Template | None = None,
+    opened: Keystore | None = None,
 ) -> System:
     """Return the worlds of a policy file, or of a keystore as it is signed.
 
     ``template`` is the one of the keystore that a policy is for.  ``world`` is the only one that is
     wanted, of `WORLDS`; "" stands for all.  A keystore without configurations of Zenoh has no world
-    of Zenoh.
+    of Zenoh.  ``opened`` is the keystore at the path, if it was opened before.
 
     Raises:
         DocumentError: the file cannot be read, or only Zenoh is wanted and cannot carry it out.
@@ -111,7 +113,7 @@ def load_system(
                 "A template is for a policy that is not signed yet.",
                 "Leave --template out, or check the policy.",
             )
-        return _keystore_system(path, at, zone, domain, world)
+        return _keystore_system(opened or Keystore(path), at, zone, domain, world)
     policy = read_policy_for(path, fleet)
     return policy_system(policy, at=at, domain=domain or 0, world=world, template=template)
 
@@ -295,7 +297,7 @@ _MOST_GOVERNANCES = 4
 
 
 def _keystore_system(
-    root: Path, at: datetime, zone: tzinfo, domain: int | None, world: str
+    keystore: Keystore, at: datetime, zone: tzinfo, domain: int | None, world: str
 ) -> System:
     """Return the worlds of a keystore: one of each vendor for each kind of domain.
 
@@ -303,8 +305,9 @@ def _keystore_system(
     be loaded now: the robot may have others.  Permissions that become valid later count as well,
     and the governance of each enclave for all.  Enclaves in hidden folders are among them.
     """
+    root = keystore.root
     names = enclave_names(root, hidden=True)
-    source = load_rights(root, hidden=True)
+    source = load_rights(keystore, hidden=True)
     rights = frozenset(each for each in source.rights if each.qualifier is ALLOW)
     stated = _stated(names, rights)
     folders = {name: enclave_path(root, name) for name in names}
@@ -312,7 +315,7 @@ def _keystore_system(
     public = not any(
         os.path.lexists(folder / key) for folder in folders.values() for key in _KEY_FILES
     )
-    loaded = {name: load_enclave(name, folder, at=at) for name, folder in folders.items()}
+    loaded = {name: load_enclave_of(keystore, name, at=at) for name in names}
     if public:
         loaded = {name: replace(each, key_elsewhere=True) for name, each in loaded.items()}
     for name, each in loaded.items():
@@ -375,7 +378,7 @@ def _keystore_system(
         lenders = also_fitting(vendor.traits, subjects, granting)
         worlds.append(_dds_world(vendor, access, stated, title=title, idle=idle, lenders=lenders))
     if world == _ZENOH or (not world and has_zenoh_files(root, hidden=True)):
-        worlds += _zenoh_worlds(root, domain, stated)
+        worlds += _zenoh_worlds(keystore, domain, stated)
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}
     places = {
         name: [Place(each, Source(files[name], 0)) for each in rights if each.enclave == name]
@@ -416,14 +419,14 @@ def _later(name: str, grants: Iterable[Grant], at: datetime) -> tuple[datetime, 
 
 
 def _zenoh_worlds(
-    root: Path, domain: int | None, stated: Mapping[str, TopicAccess]
+    keystore: Keystore, domain: int | None, stated: Mapping[str, TopicAccess]
 ) -> Iterator[World]:
     """Yield the worlds of Zenoh as others enforce it: a session obeys itself only if it wants to.
 
     Raises:
         KeystoreError: there are no configurations of Zenoh, or it is not certain what they enforce.
     """
-    found = load_zenoh_rights(root, hidden=True)
+    root, found = keystore.root, load_zenoh_rights(keystore, hidden=True)
     for note in found.notes:
         if note.id in UNCERTAIN:
             raise KeystoreError(

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
+from sros_tool.keystore.reader import Keystore
 from sros_tool.names import ACTION_SEPARATOR, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier, StatedProtection
 from sros_tool.policy.patterns import Names, covers, literal_prefix, matches, overlap
@@ -63,7 +64,8 @@ class PictureSource:
 
     ``nodes`` maps enclaves to their nodes; ``enclaves`` has the enclaves with their certificates;
     ``scope`` has the enclaves that the source is about, or None for all.  ``protections`` are what
-    a policy says about the protection of names, and ``policy`` is that policy.
+    a policy says about the protection of names, and ``policy`` is that policy.  ``keystore`` is the
+    one that it was read from.
     """
 
     origin: SourceTitle
@@ -76,6 +78,7 @@ class PictureSource:
     scope: frozenset[str] | None = None
     protections: tuple[StatedProtection, ...] = ()
     policy: Policy | None = None
+    keystore: Keystore | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,14 +23,13 @@ from sros_tool.files import policies_dir
 from sros_tool.fleet.robots import Fleet
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
-from sros_tool.keystore.layout import PUBLIC, enclave_path
+from sros_tool.keystore.layout import PUBLIC, is_keystore
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.reader import (
     Keystore,
     OpenedEnclave,
     open_enclave,
-    read_lists,
 )
 from sros_tool.keystore.rights import is_zenoh, load_rights
 from sros_tool.keystore.template import load_template
@@ -67,7 +66,8 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
     data = read_bytes(path, "file") if path.is_file() else b""
     if data.lstrip()[:1] == b"{" and not is_zenoh(data):
         return _observation(path)
-    read = load_rights(path, fleet)
+    opened = Keystore(path) if path.is_dir() and is_keystore(path) else None
+    read = load_rights(opened or path, fleet)
     findings = tuple(PicturedFinding(note.id, "warning", note.text) for note in read.notes)
     source = PictureSource(
         SourceTitle(_base_name(path), read.kind), read.rights, findings=findings, scope=read.scope
@@ -75,8 +75,8 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
     if read.policy:
         nodes, stated = _nodes(read.policy), read.protections or ()
         source = replace(source, nodes=nodes, protections=stated, policy=read.policy)
-    elif read.kind == "keystore":
-        source = _with_keystore(source, path, now)
+    elif opened:
+        source = _with_keystore(source, opened, now)
     elif read.kind == "enclave":
         source = _with_enclave(source, path, now)
     places = _places(path)
@@ -158,10 +158,9 @@ def _observation(path: Path) -> PictureSource:
 # ── keystores ──────────────────────────────────────────────────────────────────────────────
 
 
-def _with_keystore(source: PictureSource, root: Path, now: datetime) -> PictureSource:
+def _with_keystore(source: PictureSource, keystore: Keystore, now: datetime) -> PictureSource:
     findings = list(source.findings)
     governance = None
-    keystore = Keystore(root)
     try:
         governance = keystore.governance
     except SrosError as error:
@@ -169,15 +168,16 @@ def _with_keystore(source: PictureSource, root: Path, now: datetime) -> PictureS
     enclaves, validities = [], set()
     for name in keystore.names:
         opened = keystore.enclave(name, now=now)
-        evaluation = evaluated(name, enclave_path(root, name), opened, at=now)
+        evaluation = evaluated(name, keystore.folder(name), opened, at=now)
         enclaves.append(_described(name, evaluation.state, evaluation.problems))
         validities |= set(_validities_of(name, evaluation.state))
     try:
-        validities |= set(_authorities(root))
+        validities |= set(_authorities(keystore))
     except SrosError as error:
         findings.append(PicturedFinding("view.no-authorities", "error", str(error)))
     return replace(
         source,
+        keystore=keystore,
         enclaves=tuple(enclaves),
         governance=governance,
         validities=tuple(sorted(validities)),
@@ -229,18 +229,18 @@ def _certificate(certificate: x509.Certificate, kind: str, title: str, name: str
     return Validity(iso(window.not_after), iso(window.not_before), kind, title, name)
 
 
-def _authorities(root: Path) -> Iterator[Validity]:
+def _authorities(keystore: Keystore) -> Iterator[Validity]:
     """Yield the validity of every CA certificate and revocation list."""
     roles: dict[x509.Certificate, list[str]] = defaultdict(list)
-    for path in sorted((root / PUBLIC).glob(_AUTHORITY_FILES)):
+    for path in sorted((keystore.root / PUBLIC).glob(_AUTHORITY_FILES)):
         role = path.name.removesuffix("_ca.cert.pem")
-        for certificate in load_certificates(read_bytes(path, "CA certificate"), "of the CA"):
+        for certificate in load_certificates(keystore.read(path, "CA certificate"), "of the CA"):
             roles[certificate].append(role)
     for certificate, found in roles.items():
         named = [role for role in found if role != "ca"] or found
         title = f"{' and '.join(dict.fromkeys(named))} CA, {authority_text(certificate)}"
         yield _certificate(certificate, "authority", title, "")
-    for crl in read_lists(root):
+    for crl in keystore.revocation_lists:
         title = f"revocation list {crl.number}"
         yield Validity(iso(crl.next_update), iso(crl.this_update), "revocation list", title)
 

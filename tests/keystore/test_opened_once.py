@@ -1,0 +1,108 @@
+"""A question opens each file of a keystore once, and verifies each signature once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+
+from sros_tool.pki import certificates, crl, smime
+from tests.support.harness import sros
+from tests.support.opens import can_count, count_opens
+
+ENCLAVES = [f"/e{number}" for number in range(13)]
+POLICY = f"""<policy version="0.2.0"><enclaves>{
+    "".join(
+        f'<enclave path="{name}"><profiles><profile ns="/" node="n"><topics publish="ALLOW" '
+        f'subscribe="ALLOW"><topic>chatter</topic></topics></profile></profiles></enclave>'
+        for name in ENCLAVES
+    )
+}</enclaves></policy>"""
+REQUIREMENTS = """[[only]]
+publish = ["/chatter"]
+enclaves = ["/e1"]
+why = "to be decided"
+"""
+QUESTIONS = {
+    "check": ("check", "ks"),
+    "check --requirements": ("check", "ks", "--requirements", "requirements.toml"),
+    "view": ("view", "ks", "-o", "view.html", "--force"),
+    "inspect": ("inspect", "ks"),
+    "verify": ("verify", "ks"),
+    "metrics": ("metrics", "ks"),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the keystore ``ks`` of thirteen enclaves, revoked ones, and requirements."""
+    folder = tmp_path_factory.mktemp("opened")
+    (folder / "policy.xml").write_text(POLICY)
+    (folder / "requirements.toml").write_text(REQUIREMENTS)
+    sros("create_keystore", "ks", "--template", "production", cwd=folder).ok()
+    sros("generate_artifacts", "-k", "ks", "-p", "policy.xml", cwd=folder).ok()
+    sros("create_enclave", "ks", "/gone", cwd=folder).ok()
+    sros("revoke", "ks", "/gone", cwd=folder).ok()
+    return folder
+
+
+@pytest.mark.skipif(not can_count(), reason="the system does not count what is opened")
+@pytest.mark.parametrize("words", QUESTIONS.values(), ids=QUESTIONS)
+def test_a_question_opens_each_file_once(words: tuple[str, ...], folder: Path) -> None:
+    def ask() -> None:
+        program = [sys.executable, "-P", "-m", "sros_tool", *words]
+        ended = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
+        assert ended.returncode in (0, 1), ended.stderr
+
+    opened = count_opens(folder / "ks", ask)
+    for file in (
+        "public/permissions_ca.cert.pem",
+        "enclaves/governance.p7s",
+        "public/identity_ca.crl.pem",
+    ):
+        assert opened[file] == 1
+    assert all(opened[f"enclaves{name}/permissions.p7s"] == 1 for name in ENCLAVES)
+    assert {file: count for file, count in opened.items() if count > 1} == {}
+
+
+def test_what_is_opened_twice_is_seen(tmp_path: Path) -> None:
+    (tmp_path / "inside").mkdir()
+    (tmp_path / "inside/file").write_text("content")
+    (tmp_path / "link").symlink_to("inside/file")
+
+    def read() -> None:
+        for name in ("inside/file", "link"):
+            (tmp_path / name).read_bytes()
+
+    assert count_opens(tmp_path, read) == {"inside/file": 2}
+
+
+@pytest.mark.parametrize("words", QUESTIONS.values(), ids=QUESTIONS)
+def test_a_question_verifies_each_signature_once(
+    words: tuple[str, ...], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    verified: Counter[tuple[bytes, x509.Certificate]] = Counter()
+    of_message, of_certificate = smime.Signature._verify, certificates.is_signed
+
+    def verify(self: smime.Signature, content: bytes, signer: x509.Certificate) -> bool:
+        verified[self._value, signer] += 1
+        return of_message(self, content, signer)
+
+    def is_signed(
+        made: x509.Certificate | x509.CertificateRevocationList,
+        signed: bytes,
+        authority: x509.Certificate,
+    ) -> bool:
+        verified[signed, authority] += 1
+        return of_certificate(made, signed, authority)
+
+    monkeypatch.setattr(smime.Signature, "_verify", verify)
+    for module in (certificates, crl):
+        monkeypatch.setattr(module, "is_signed", is_signed)
+    sros(*words, cwd=folder)
+    assert len(verified) > len(ENCLAVES)
+    assert max(verified.values()) == 1
