@@ -20,7 +20,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Context, PictureSource, compose
 from sros_tool.report.folding import Folding
-from sros_tool.report.page import render_page
+from sros_tool.report.pages import render_page
 from sros_tool.report.picture import SourceTitle
 from sros_tool.report.sources import common_rights
 from sros_tool.report.svg import render_svg

@@ -26,7 +26,6 @@ from benchmarks.ping_pong import ENDS, TOPICS
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.forger import encrypted, signed, unprotected
-from sros_tool.demo.network import Progress, RowNetwork, end_with_starter, run_isolated
 from sros_tool.demo.program import find_backend
 from sros_tool.demo.runner import base_environment
 from sros_tool.demo.scenarios.model import Role
@@ -38,7 +37,13 @@ from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.runtime.environment import secured_environment
-from sros_tool.runtime.netns import try_isolation
+from sros_tool.runtime.netns import (
+    Progress,
+    RowNetwork,
+    end_with_starter,
+    run_isolated,
+    try_isolation,
+)
 from sros_tool.runtime.variables import DOMAIN
 
 _UNSECURED = "unsecured"

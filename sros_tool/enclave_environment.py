@@ -93,7 +93,12 @@ def loadable_environment(
     from sros_tool.keystore.reader import open_enclave
     from sros_tool.names import check_enclave_name
     from sros_tool.pki.token import MODULE_VARIABLE
-    from sros_tool.runtime.environment import choose_domain, secured_environment
+    from sros_tool.runtime.environment import (
+        REFUSING_ZENOH,
+        RMW_ZENOH,
+        choose_domain,
+        secured_environment,
+    )
     from sros_tool.runtime.rmw import (
         RMW,
         chosen_rmw,
@@ -102,7 +107,6 @@ def loadable_environment(
         vendor_of,
     )
     from sros_tool.runtime.variables import DOMAIN, domain_from
-    from sros_tool.runtime.zenoh_environment import REFUSING_ZENOH, RMW_ZENOH
 
     if domain_text == "":
         raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
@@ -287,8 +291,8 @@ def _uses_zenoh(named: str | None, rmw: str) -> bool:
     Raises:
         UsageError: it would use an RMW of which sros knows no security.
     """
+    from sros_tool.runtime.environment import RMW_ZENOH
     from sros_tool.runtime.rmw import RMW, middleware_of
-    from sros_tool.runtime.zenoh_environment import RMW_ZENOH
 
     if named is not None and named not in RMWS:
         raise UsageError(
@@ -408,7 +412,7 @@ def _zenoh_environment(
         ROUTER_FILE,
         SESSION_FILE,
     )
-    from sros_tool.runtime.zenoh_environment import (
+    from sros_tool.runtime.environment import (
         ROUTER_URI,
         SESSION_URI,
         replaced_notes,

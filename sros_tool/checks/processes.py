@@ -34,15 +34,15 @@ from sros_tool.checks.zenoh_environment import (
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import IDENTITY_CA_FILE, enclave_path, search_enclaves
 from sros_tool.pki.certificates import load_certificates
-from sros_tool.runtime.processes import Process, RunningProcesses, plain
-from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
-from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
-from sros_tool.runtime.zenoh_environment import (
+from sros_tool.runtime.environment import (
     NO_CONFIGURATION,
     OVERRIDE,
     ROUTER_URI,
     SESSION_URI,
 )
+from sros_tool.runtime.processes import Process, RunningProcesses, plain
+from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
+from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 

@@ -11,9 +11,7 @@ from pathlib import Path
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.checks.zenoh import MALFORMED, document_findings
 from sros_tool.errors import SrosError
-from sros_tool.runtime.rmw import RMW
-from sros_tool.runtime.variables import ENABLE
-from sros_tool.runtime.zenoh_environment import (
+from sros_tool.runtime.environment import (
     NO_CONFIGURATION,
     OVERRIDE,
     RMW_ZENOH,
@@ -21,6 +19,8 @@ from sros_tool.runtime.zenoh_environment import (
     SESSION_URI,
     override_pairs,
 )
+from sros_tool.runtime.rmw import RMW
+from sros_tool.runtime.variables import ENABLE
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.document import (
     ConfigurationDocument,

@@ -48,11 +48,10 @@ if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.checks.registry import ChosenFindings, FindingFilter
     from sros_tool.checks.targets import Circumstances
-    from sros_tool.demo.doctor import Diagnosis
+    from sros_tool.demo.doctor import Diagnosis, SecurityProvider
     from sros_tool.fleet.robots import Fleet
     from sros_tool.proof.system import System
     from sros_tool.runtime.processes import RunningProcesses
-    from sros_tool.runtime.ros2cli import SecurityProvider
 
 _FAMILIES = ("policy", "keystore", "runtime")
 _LEVELS = click.Choice(["note", "warning", "error"])
@@ -685,8 +684,7 @@ def doctor(report: Path | None, force: bool, as_json: bool) -> None:
     such as misspelt ROS_SECURITY_* values, missing files or a wrong clock.
     """
     from sros_tool.checks.kind import ERROR, WARNING
-    from sros_tool.demo.doctor import diagnosis_text, examine
-    from sros_tool.runtime.ros2cli import security_provider
+    from sros_tool.demo.doctor import diagnosis_text, examine, security_provider
     from sros_tool.runtime.support import support_report
 
     if force and not report:

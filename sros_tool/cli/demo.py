@@ -269,7 +269,7 @@ def _echo_scenarios(scenarios: Sequence[Scenario]) -> None:
 def _write_report(report: Path, result: dict[str, Any], keep: Path | None) -> None:
     """Write the HTML page, with the paths of folders on this machine removed."""
     from sros_tool.files import replace_file
-    from sros_tool.report.demo_page import render_demo_page, without_folders
+    from sros_tool.report.pages import render_demo_page, without_folders
 
     places = [Path.home(), Path.cwd(), Path(tempfile.gettempdir()), *([keep] if keep else [])]
     folders = [str(place.absolute()) for place in places]

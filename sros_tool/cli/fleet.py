@@ -258,7 +258,7 @@ def _status(
 
         text = render_metrics(fleet_metrics(found, now=moment))
     elif html:
-        from sros_tool.report.fleet_page import render_fleet_page
+        from sros_tool.report.pages import render_fleet_page
         from sros_tool.values import as_plain
 
         text = render_fleet_page(as_plain(ComparedFleet(moment, found)))

@@ -402,9 +402,8 @@ def generate_policy(
     check_duration(watch, spin_time)
     from sros_tool.files import policies_dir
     from sros_tool.graph.draft import draft, write
-    from sros_tool.graph.enclaves import NamedEnclaves
-    from sros_tool.graph.enclaves import enclave_per_node as name_enclaves
-    from sros_tool.graph.learn import News, common_parts, is_tool_name, learn, listed
+    from sros_tool.graph.learn import NamedEnclaves, News, common_parts, is_tool_name, learn, listed
+    from sros_tool.graph.learn import enclave_per_node as name_enclaves
 
     common = common_parts(file.parent, policies_dir())
     news = News(common)

@@ -455,7 +455,7 @@ def _rendered(
     placed = form in ("html", "svg") and not graphviz
     scenes = folding.scenes(placed=placed, hops=hops or 0)
     if form == "html":
-        from sros_tool.report.page import render_page
+        from sros_tool.report.pages import render_page
 
         return render_page(picture, scenes, moment, folding.picture)
     scene = next((each for each in scenes if everything and each.id == "all"), scenes[0])

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sros_tool.demo.backend import CYCLONE, RCLPY, ZENOH, zenoh_backend
-from sros_tool.demo.network import end_with_starter
 from sros_tool.demo.scenarios.model import Role
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.runtime.events import Event, EventKind, parse_event
+from sros_tool.runtime.netns import end_with_starter
 from sros_tool.runtime.rcl_security import choose_loadable, domain_of
 from sros_tool.runtime.variables import ENABLE, ENCLAVE
 

@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.keystores import KeystoreSet
-from sros_tool.demo.network import ENDING_SIGNALS, Progress, RowNetwork, end_with_starter
 from sros_tool.demo.scenarios.model import (
     CALLING,
     DENIALS,
@@ -54,6 +53,7 @@ from sros_tool.demo.wire import (
     with_changed_bit,
 )
 from sros_tool.runtime.events import Event, EventKind, EventReader
+from sros_tool.runtime.netns import ENDING_SIGNALS, Progress, RowNetwork, end_with_starter
 from sros_tool.runtime.vendor_log import plain_text
 
 _LOG = logging.getLogger(__name__)

@@ -15,13 +15,13 @@ from sros_tool.keystore.layout import (
     enclave_path,
 )
 from sros_tool.keystore.lifecycle.zenoh import set_zenoh
-from sros_tool.runtime.variables import DOMAIN
-from sros_tool.runtime.zenoh_environment import (
+from sros_tool.runtime.environment import (
     OVERRIDE,
     ROUTER_URI,
     SESSION_URI,
     zenoh_environment,
 )
+from sros_tool.runtime.variables import DOMAIN
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.network import ZenohNetwork
 

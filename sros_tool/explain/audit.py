@@ -27,10 +27,11 @@ from sros_tool.errors import Note, PolicyError
 from sros_tool.explain.denials import nodes_served
 from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import Part, Question
-from sros_tool.graph.enclaves import UNSHOWN, enclave_per_node
 from sros_tool.graph.learn import (
+    UNSHOWN,
     Learned,
     RightsFound,
+    enclave_per_node,
     fold,
     is_tool,
     is_tool_name,

@@ -41,20 +41,18 @@ from sros_tool.runtime.vendor_log import (
     RUNS_OPEN,
     SECURITY_DIRECTORY,
     UNKNOWN,
+    ZENOH_IDS,
+    ZENOH_LINE,
+    DroppedMessage,
     LogText,
     denied_topic,
+    dropped_messages,
     labelled_line,
     log_lines,
     log_text,
     plain_refusal,
     plain_text,
     style_of,
-)
-from sros_tool.runtime.zenoh_log import (
-    ZENOH_IDS,
-    ZENOH_LINE,
-    DroppedMessage,
-    dropped_messages,
     zenoh_text,
 )
 from sros_tool.topics import SERVICE_ENDS

@@ -19,7 +19,7 @@ from sros_tool.report.layout import (
     Link,
     Scene,
 )
-from sros_tool.report.markup import escape
+from sros_tool.report.pages import escape
 from sros_tool.report.picture import (
     Overlay,
     OverlaySide,

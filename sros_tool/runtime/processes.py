@@ -19,7 +19,13 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
 
-from sros_tool.runtime.environment import ROS_ARGS
+from sros_tool.runtime.environment import (
+    NO_CONFIGURATION,
+    RMW_ZENOH,
+    ROS_ARGS,
+    ROUTER_URI,
+    SESSION_URI,
+)
 from sros_tool.runtime.process_files import (
     FileReader,
     LoadedFile,
@@ -29,7 +35,6 @@ from sros_tool.runtime.process_files import (
 )
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
 from sros_tool.runtime.variables import DOMAIN, ENABLE
-from sros_tool.runtime.zenoh_environment import NO_CONFIGURATION, RMW_ZENOH, ROUTER_URI, SESSION_URI
 
 _LIBRARIES = re.compile(
     rb"/(lib(?:rcl|rmw_[a-z_]+?|ddsc|dds_security_auth|fastrtps|fastdds|nddsc|nddscore|zenohc"

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.runtime.containers import FORMS
-from sros_tool.runtime.environment import render_refusal
-from sros_tool.runtime.zenoh_environment import NO_CONFIGURATION
+from sros_tool.runtime.environment import NO_CONFIGURATION, render_refusal
 from tests.runtime.test_containers import check
 from tests.support.children import importing
 from tests.support.harness import policy_text, publish, sros

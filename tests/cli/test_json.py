@@ -19,11 +19,9 @@ from referencing import Registry, Resource
 from sros_tool.demo import doctor
 from sros_tool.demo import program as demo
 from sros_tool.demo.casting import CastMember
-from sros_tool.demo.doctor import Diagnosis
+from sros_tool.demo.doctor import Diagnosis, SecurityProvider
 from sros_tool.demo.result import KeystoreSummary
-from sros_tool.runtime import ros2cli
 from sros_tool.runtime.processes import Process, ProcessTable, RunningProcesses
-from sros_tool.runtime.ros2cli import SecurityProvider
 from tests.checks.test_doctor_findings import CYCLONE, RMW
 from tests.cli.json_cases import (
     BINARY,
@@ -275,7 +273,7 @@ def test_what_doctor_prints(made_folder: Path, monkeypatch: pytest.MonkeyPatch) 
     for stacks, status in (((RMW, CYCLONE), 1), ((RMW,), 1), ((CYCLONE,), 0)):
         monkeypatch.setattr(doctor, "examine", lambda *_, found=stacks: Diagnosis(found))
         provider = SecurityProvider("sros_tool", ("sros2",)) if status else None
-        monkeypatch.setattr(ros2cli, "security_provider", lambda *_, found=provider: found)
+        monkeypatch.setattr(doctor, "security_provider", lambda *_, found=provider: found)
         wrong = {"ROS_SECURITY_ENABLE": "yes"} if status else {}
         ended = sros("doctor", "--json", env=wrong, cwd=made_folder)
         assert ended.status == status, ended

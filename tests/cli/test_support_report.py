@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.demo import doctor
-from sros_tool.demo.doctor import Diagnosis
-from sros_tool.runtime.ros2cli import security_provider
+from sros_tool.demo.doctor import Diagnosis, security_provider
 from sros_tool.runtime.stacks import Stack
 from tests.support.harness import sros
 

@@ -12,8 +12,7 @@ import pytest
 from sros_tool.keystore.reader import OpenedEnclave
 from sros_tool.keystore.zenoh import opened
 from sros_tool.pki import smime
-from sros_tool.runtime.environment import REFUSING, render_refusal
-from sros_tool.runtime.zenoh_environment import NO_CONFIGURATION
+from sros_tool.runtime.environment import NO_CONFIGURATION, REFUSING, render_refusal
 from tests.support.children import importing, run
 from tests.support.harness import policy_text, publish, sros
 

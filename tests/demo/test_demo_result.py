@@ -13,7 +13,7 @@ from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.scenarios.model import RowStatus
 from sros_tool.demo.show import demo_table, summary_page
 from sros_tool.demo.verdict import RowResult
-from sros_tool.report.demo_page import render_demo_page
+from sros_tool.report.pages import render_demo_page
 from sros_tool.runtime.netns import Isolation
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.graph.enclaves import enclave_per_node
-from sros_tool.graph.learn import learn
+from sros_tool.graph.learn import enclave_per_node, learn
 from sros_tool.graph.observation import ObservedNode
 from tests.graph.graphs import graph, node
 

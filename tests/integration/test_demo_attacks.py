@@ -16,11 +16,10 @@ from typing import Any
 import pytest
 
 from sros_tool.demo.backend import Backend, conditions
-from sros_tool.demo.network import RowNetwork, run_isolated
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.demo.scenarios.model import Row
 from sros_tool.keystore.template import load_template
-from sros_tool.runtime.netns import try_isolation
+from sros_tool.runtime.netns import RowNetwork, run_isolated, try_isolation
 from tests.integration.enforcing import BACKENDS, enforcing_backend
 from tests.integration.test_demo_run import processes_with, start
 from tests.integration.weak_keystores import WEAKNESSES, make_weak

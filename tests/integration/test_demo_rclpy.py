@@ -16,7 +16,6 @@ import pytest
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, choose_backend
 from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
-from sros_tool.demo.network import run_isolated
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.composition import COMPOSITION
@@ -26,7 +25,7 @@ from sros_tool.demo.scenarios.services import ACTIONS, SERVICES
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.events import Event, EventKind, ProcessStage, read_events
-from sros_tool.runtime.netns import try_isolation
+from sros_tool.runtime.netns import run_isolated, try_isolation
 from sros_tool.runtime.stacks import rclpy_stacks
 from tests.integration.enforcing import enforcing_backend
 from tests.integration.test_demo_run import without_security

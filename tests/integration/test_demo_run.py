@@ -16,14 +16,13 @@ import pytest
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.keystores import KeystoreSet
-from sros_tool.demo.network import run_isolated
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.isolation import ROWS
 from sros_tool.demo.scenarios.model import UNSECURED, Row, RowStatus
 from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.runtime.cyclone import load_cyclone
-from sros_tool.runtime.netns import try_isolation
+from sros_tool.runtime.netns import run_isolated, try_isolation
 from tests.support.children import PATIENCE
 from tests.support.long_form import some
 

@@ -10,7 +10,7 @@ import pytest
 from lxml import html
 
 from sros_tool.cli.demo import _write_report
-from sros_tool.report.demo_page import render_demo_page, without_folders
+from sros_tool.report.pages import render_demo_page, without_folders
 from sros_tool.terminal import visible_line
 from tests.report.pictures import HOSTILE, new_page
 

@@ -21,7 +21,7 @@ from sros_tool.policy.rights import policy_rights
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network, unguarded
 from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.layout import scenes_of
-from sros_tool.report.page import render_page
+from sros_tool.report.pages import render_page
 from sros_tool.report.picture import SourceTitle, Validity
 from tests.report.pictures import (
     HOSTILE,

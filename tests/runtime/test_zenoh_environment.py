@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
-from sros_tool.runtime.zenoh_environment import (
+from sros_tool.runtime.environment import (
     NO_CONFIGURATION,
     OVERRIDE,
     ROUTER_URI,

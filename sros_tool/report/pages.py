@@ -1,0 +1,399 @@
+"""The HTML pages of a picture, of a demo, and of a fleet, which contain all that they need.
+
+The content security policy allows only the script and style in the file, by their digests.  The
+data is JSON in which every character that could end its element is escaped, and the script inserts
+it only as text.  The pages of a demo and of a fleet have no script; their input is what
+``sros demo --json`` and ``sros fleet status --json`` print.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
+from itertools import groupby
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from sros_tool.names import is_expression
+from sros_tool.policy.model import ALLOW
+from sros_tool.reach import OF_EVERY_NODE
+from sros_tool.report.layout import Scene
+from sros_tool.report.picture import Bundle, Picture, PicturedEnclave, fold, lack_text
+from sros_tool.terminal import visible_json, visible_line
+from sros_tool.validity import iso
+from sros_tool.values import as_plain
+
+_ASSETS = Path(__file__).with_name("assets")
+_ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
+
+
+def render_page(
+    picture: Picture, scenes: tuple[Scene, ...], now: datetime, drawn: Picture | None = None
+) -> str:
+    """Return the HTML page of a picture with its scenes.
+
+    ``now`` is the date of its findings, ``drawn`` the picture in which equal units are one.
+    """
+    script, style = asset("view.js"), asset("view.css")
+    origins = ", ".join(f"{each.kind} {each.title}" for each in picture.origins)
+    made = f"{origins}. Findings are as of {iso(now)[:10]}."
+    return document(
+        f"{picture.title}: who may do what",
+        Template(asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),
+        style,
+        script,
+        _data(picture, scenes, drawn or picture),
+    )
+
+
+def escape(text: str) -> str:
+    """Return ``text`` as the content of an element or the value of an attribute.
+
+    What no XML document can have, and what could steer a terminal that shows the file or begin a
+    line in it, becomes a visible escape.
+    """
+    return html.escape(visible_line(text))
+
+
+def asset(name: str) -> str:
+    """Return the content of a file in assets/, which web/package.json builds from web/."""
+    return (_ASSETS / name).read_text("utf-8")
+
+
+def document(title: str, body: str, style: str, script: str = "", data: object = None) -> str:
+    """Return a self-contained HTML document; ``body`` is HTML, ``data`` the script's input."""
+    policy = f"default-src 'none'; style-src {_digest(style)}; base-uri 'none'; form-action 'none'"
+    if script:
+        policy += f"; script-src {_digest(script)}"
+    lines = [
+        "<!doctype html>",
+        '<html lang="en" data-theme="auto">',
+        "<head>",
+        '<meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        '<meta name="referrer" content="no-referrer">',
+        f"<title>{escape(title)}</title>",
+        f"<style>{style}</style>",
+        "</head>",
+        f"<body>{body}",
+    ]
+    if data is not None:
+        lines.append(f'<script type="application/json" id="picture">{_safe_json(data)}</script>')
+    if script:
+        lines.append(f"<script>{script}</script>")
+    return "\n".join((*lines, "</body>", "</html>", ""))
+
+
+def _safe_json(value: object) -> str:
+    """Return JSON for a script element: < > & and line separators are escaped."""
+    text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
+    return visible_json(text.translate(_ESCAPES))
+
+
+def _digest(text: str) -> str:
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return f"'sha256-{digest}'"
+
+
+# ── data ───────────────────────────────────────────────────────────────────────────────────
+
+
+def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[str, Any]:
+    """Return the script's data: bundles of names, which need much less space than edges."""
+    return {
+        "headlines": picture.headlines,
+        "overlay": as_plain(picture.overlay),
+        "of_every_node": OF_EVERY_NODE,
+        "enclaves": [_enclave(each) for each in picture.enclaves],
+        "bundles": [_bundle(each) for each in fold(picture.names, picture.edges, apart=True)],
+        "scenes": [_scene(each) for each in scenes],
+        "equal": as_plain(picture.equal),
+        "rows": [_row(each) for each in fold(drawn.names, drawn.edges)],
+        "differences": as_plain(picture.differences),
+        "validities": as_plain(picture.validities),
+        "findings": as_plain(picture.findings),
+    }
+
+
+def _enclave(enclave: PicturedEnclave) -> dict[str, Any]:
+    """Return an enclave as JSON, with only those statements that have wildcards."""
+    wild = [_with_deny(as_plain(each)) for each in enclave.statements if is_expression(each.name)]
+    return {**as_plain(enclave), "statements": wild}
+
+
+def _with_deny(value: dict[str, Any]) -> dict[str, Any]:
+    value["deny"] = value.pop("qualifier") != ALLOW
+    return value
+
+
+def _bundle(bundle: Bundle) -> dict[str, Any]:
+    ties = [_with_deny(as_plain(tie)) for tie in bundle.ties]
+    for tie in ties:
+        tie["enclave"] = tie.pop("node")
+        del tie["differs"]
+    return {
+        "kind": bundle.kind,
+        "names": bundle.names,
+        "asks": bundle.asks,
+        "lacks": lack_text(bundle.kind, bundle.lacks) if bundle.lacks else "",
+        "protection": as_plain(bundle.protection),
+        "ties": _table(ties),
+    }
+
+
+def _row(bundle: Bundle) -> dict[str, Any]:
+    """Return a row of the table of names: who may send, who may receive, and who is denied."""
+    ties = [tie for tie in bundle.ties if tie.qualifier is ALLOW]
+    return {
+        "kind": bundle.kind,
+        "names": bundle.names,
+        "level": bundle.protection.level.value,
+        "lacks": lack_text(bundle.kind, bundle.lacks) if bundle.lacks else "",
+        "common": all(tie.common for tie in bundle.ties),
+        "senders": sorted({tie.node for tie in ties if tie.sends}),
+        "receivers": sorted({tie.node for tie in ties if not tie.sends}),
+        "denied": sorted({tie.node for tie in bundle.ties if tie.qualifier is not ALLOW}),
+    }
+
+
+def _scene(scene: Scene) -> dict[str, Any]:
+    value: dict[str, Any] = as_plain(scene)
+    value["cards"] = _table(value["cards"])
+    value["links"] = _table([_with_deny(link) for link in value["links"]])
+    return value
+
+
+def _table(rows: list[dict[str, Any]]) -> list[list[Any]]:
+    """Return rows with the same keys as lists: first the keys, then the values of each row."""
+    if not rows:
+        return []
+    keys = list(rows[0])
+    return [keys, *([row[key] for key in keys] for row in rows)]
+
+
+# ── a demo ───────────────────────────────────────────────────────────────────────────────────────
+
+Json = Mapping[str, Any]
+_SKIPPED = "skipped"
+
+
+def render_demo_page(result: Json) -> str:
+    """Return the result of a demo as an HTML document."""
+    body = "\n".join((_demo_head(result), *map(_demo_scenario, result["scenarios"])))
+    title = f"sros demo on {result['dds']}"
+    return document(title, f"<main>{body}</main>", asset("demo.css"))
+
+
+def without_folders(value: Any, folders: Sequence[str]) -> Any:
+    """Return a JSON value with these folder paths replaced by "…" in all texts."""
+    if isinstance(value, str):
+        for folder in sorted(folders, key=len, reverse=True):
+            value = value.replace(folder, "…") if len(folder) > 1 else value
+        return value
+    if isinstance(value, Mapping):
+        return {key: without_folders(each, folders) for key, each in value.items()}
+    if isinstance(value, Sequence):
+        return [without_folders(each, folders) for each in value]
+    return value
+
+
+def _sentence(text: str) -> str:
+    return escape(f"{text[:1].upper()}{text[1:].rstrip('.')}.") if text else ""
+
+
+def _demo_head(result: Json) -> str:
+    rows = result["rows"]
+    good, skipped = _good(rows), sum(row["observed"] == _SKIPPED for row in rows)
+    not_tried = sum(len(_not_tried(scenario)) for scenario in result["scenarios"])
+    opened = sum(bool(row.get("open_because")) and not row.get("open_here") for row in rows)
+    here = sum(bool(row.get("open_here")) for row in rows)
+    where = (
+        "in a separate network namespace"
+        if result["own_network"]
+        else "in the network of the machine"
+    )
+    facts = [
+        f"{escape(result['dds'])}, nodes by {escape(result['backend'])}",
+        f"topic <code>{escape(result['topic'])}</code>",
+        f"keystore template {escape(result['template'])}",
+        where,
+    ]
+    tiles = [
+        (
+            ("good" if good == len(rows) else "") if result["as_expected"] else "error",
+            f"{good} of {len(rows)}",
+            "rows as expected",
+        ),
+        ("", str(sum(bool(row.get("defence_removed")) for row in rows)), "with a defence removed"),
+        ("warning" if opened else "", str(opened), "known to be open"),
+        ("error", str(here), "open in this keystore"),
+        ("", str(skipped), "skipped"),
+        ("", str(result.get("left_out", 0)), "left out"),
+        ("error", str(not_tried), "not tried, and needed for a proof"),
+    ]
+    shown = "".join(
+        f'<li class="tile {kind}"><b>{number}</b> {text}</li>'
+        for kind, number, text in tiles
+        if number != "0"
+    )
+    why = f'<p class="soft">{escape(result["why"])}</p>' if result.get("why") else ""
+    return (
+        f"<header><h1>Attempts and their results</h1><p>{', '.join(facts)}.</p>{why}"
+        f'<ul class="tiles">{shown}</ul></header>'
+    )
+
+
+def _good(rows: Sequence[Json]) -> int:
+    """Return the number of rows that were tried and are as expected."""
+    return sum(bool(row["as_expected"]) and row["observed"] != _SKIPPED for row in rows)
+
+
+def _not_tried(scenario: Json) -> Sequence[str]:
+    """Return what would have to be tried to prove a user's keystore sound, and was not."""
+    keystore = scenario.get("keystore")
+    return keystore["not_tried"] if keystore else ()
+
+
+def _demo_scenario(scenario: Json) -> str:
+    rows = scenario["rows"]
+    good = _good(rows)
+    parts = [f"<section><h2>{escape(scenario['title'])}</h2>"]
+    if scenario.get("cast"):
+        members = (
+            f"<b>{escape(each['part'])}</b> {escape(each['enclave'])}"
+            + (f" as node {escape(', '.join(each['nodes']))}" if each["nodes"] else "")
+            + (f" ({escape(each['why'])})" if each.get("why") else "")
+            for each in scenario["cast"]
+        )
+        parts.append(f'<p class="soft">Cast: {"; ".join(members)}.</p>')
+    if keystore := scenario.get("keystore"):
+        used = len({each["enclave"] for each in scenario["cast"]})
+        played = f"Parts are played by {used} of {keystore['enclaves']} enclaves"
+        elsewhere = keystore["elsewhere"]
+        played += f"; the keys of {elsewhere} are elsewhere" if elsewhere else ""
+        parts.append(f'<p class="soft">{played}.</p>')
+    if not_tried := _not_tried(scenario):
+        names = escape("; ".join(not_tried))
+        parts.append(f"<p>Not tried, and needed for a proof: {names}.</p>")
+    if rows:
+        count = f"{escape(scenario['name'])}: {good} of {len(rows)} rows as expected"
+        parts += [f'<p class="soft">{count}</p>', _demo_table(rows)]
+    return "\n".join((*parts, "</section>"))
+
+
+def _demo_table(rows: Sequence[Json]) -> str:
+    lines = [
+        '<table class="rows"><thead><tr><th scope="col"><span class="hidden">Result</span></th>'
+        '<th scope="col">Tried</th><th scope="col">Expected</th><th scope="col">Seen</th>'
+        '<th scope="col">Mechanism</th></tr></thead>'
+    ]
+    for attack, found in groupby(rows, key=lambda row: row.get("attack", "")):
+        lines.append("<tbody>")
+        if attack:
+            heading = f'<th colspan="5" scope="rowgroup">{escape(attack)}</th>'
+            lines.append(f'<tr class="attack">{heading}</tr>')
+        lines += [line for row in found for line in _demo_row(row)]
+        lines.append("</tbody>")
+    return "\n".join((*lines, "</table>"))
+
+
+def _demo_row(row: Json) -> Iterator[str]:
+    if row["observed"] == _SKIPPED:
+        mark = '<span class="chip">skipped</span>'
+    elif row["as_expected"]:
+        mark = '<span class="chip good">ok</span>'
+    else:
+        mark = f'<span class="chip error">{"open" if row.get("open_here") else "differs"}</span>'
+    tried = escape(row["name"])
+    if removed := row.get("defence_removed"):
+        tried += f' <span class="chip">without {escape(removed)}</span>'
+    mechanism = escape(row["mechanism"])
+    because, accepted = row.get("open_because", ""), row.get("accepted")
+    if because or accepted:
+        known = "accepted if it is open" if accepted else "known to be open"
+        opened = "open in this keystore" if row.get("open_here") else known
+        mechanism += (
+            f'<p><span class="chip warning">{opened}</span> {_sentence(because)} '
+            f"{_sentence(row.get('remedy', ''))}</p>"
+        )
+    seconds = f" ({row['seconds']:g} s)" if row.get("seconds") else ""
+    if row.get("detail"):
+        mechanism += (
+            f"<details><summary>what was counted{seconds}</summary>"
+            f"{escape(row['detail'])}</details>"
+        )
+    yield (
+        f'<tr class="{"" if row["as_expected"] else "wrong"}"><td>{mark}</td>'
+        f'<th scope="row" data-label="Tried">{tried}</th>'
+        f'<td data-label="Expected">{escape(row["expected"])}</td>'
+        f'<td data-label="Seen">{escape(row["observed"])}</td>'
+        f'<td data-label="Mechanism">{mechanism}</td></tr>'
+    )
+
+
+# ── a fleet ──────────────────────────────────────────────────────────────────────────────────────
+
+_GOOD = ("current", "none")
+_OUT_OF_DATE = ("earlier", "different", "missing", "never")
+
+
+def render_fleet_page(status: Json) -> str:
+    """Return the state of a fleet as an HTML document."""
+    body = f"{_fleet_head(status)}<section>{_fleet_table(status)}</section>"
+    return document(f"Fleet of {status['keystore']}", f"<main>{body}</main>", asset("demo.css"))
+
+
+def _fleet_head(status: Json) -> str:
+    tiles = "".join(
+        f'<li class="tile {_fleet_class(state)}"><b>{number}</b> {escape(state)}</li>'
+        for state, number in status["counts"].items()
+    )
+    facts = [f"keystore <code>{escape(status['keystore'])}</code>", f"as of {status['at']}"]
+    if status["stage"] != "complete":
+        facts.append(f"CA rotation at the stage {escape(status['stage'])}")
+    if status["unassigned"]:
+        facts.append(f"{status['unassigned']} enclaves of no robot")
+    return (
+        f"<header><h1>What is where</h1><p>{', '.join(facts)}.</p>"
+        f'<ul class="tiles">{tiles}</ul></header>'
+    )
+
+
+def _fleet_table(status: Json) -> str:
+    rows = sorted(status["robots"], key=lambda robot: (robot["state"] in _GOOD, robot["robot"]))
+    heads = ("robot", "state", "confirmed", "enclaves", "CA stage", "what differs")
+    return (
+        f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead>"
+        f"<tbody>{''.join(map(_fleet_row, rows))}</tbody></table>"
+    )
+
+
+def _fleet_row(robot: Json) -> str:
+    differences = Counter(
+        (each["kind"], each["state"], each["robot"] or each["enclave"] or "", each["since"] or "")
+        for each in robot["pending"]
+    )
+    what = [
+        f"{number} {kind} {state}{f' of {whose}' if whose else ''}{f', {since}' if since else ''}"
+        for (kind, state, whose, since), number in differences.items()
+    ]
+    cells = (
+        f"<code>{escape(robot['robot'])}</code>",
+        f'<span class="{_fleet_class(robot["state"])}">{escape(robot["state"])}</span>',
+        escape(robot["received"] or ""),
+        str(robot["enclaves"]),
+        escape(robot["stage"] or ""),
+        "<br>".join(map(escape, (*what, *robot["notes"]))),
+    )
+    return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
+
+
+def _fleet_class(state: str) -> str:
+    return "good" if state in _GOOD else "warning" if state in _OUT_OF_DATE else "error"
