@@ -40,12 +40,12 @@ def render_page(
 
     ``now`` is the date of its findings, ``drawn`` the picture in which equal units are one.
     """
-    script, style = asset("view.js"), asset("view.css")
+    script, style = _asset("view.js"), _asset("view.css")
     origins = ", ".join(f"{each.kind} {each.title}" for each in picture.origins)
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
-    return document(
+    return _document(
         f"{picture.title}: who may do what",
-        Template(asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),
+        Template(_asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),
         style,
         script,
         _data(picture, scenes, drawn or picture),
@@ -61,12 +61,12 @@ def escape(text: str) -> str:
     return html.escape(visible_line(text))
 
 
-def asset(name: str) -> str:
+def _asset(name: str) -> str:
     """Return the content of a file in assets/, which web/package.json builds from web/."""
     return (_ASSETS / name).read_text("utf-8")
 
 
-def document(title: str, body: str, style: str, script: str = "", data: object = None) -> str:
+def _document(title: str, body: str, style: str, script: str = "", data: object = None) -> str:
     """Return a self-contained HTML document; ``body`` is HTML, ``data`` the script's input."""
     policy = f"default-src 'none'; style-src {_digest(style)}; base-uri 'none'; form-action 'none'"
     if script:
@@ -188,7 +188,7 @@ def render_demo_page(result: Json) -> str:
     """Return the result of a demo as an HTML document."""
     body = "\n".join((_demo_head(result), *map(_demo_scenario, result["scenarios"])))
     title = f"sros demo on {result['dds']}"
-    return document(title, f"<main>{body}</main>", asset("demo.css"))
+    return _document(title, f"<main>{body}</main>", _asset("demo.css"))
 
 
 def without_folders(value: Any, folders: Sequence[str]) -> Any:
@@ -347,7 +347,7 @@ _OUT_OF_DATE = ("earlier", "different", "missing", "never")
 def render_fleet_page(status: Json) -> str:
     """Return the state of a fleet as an HTML document."""
     body = f"{_fleet_head(status)}<section>{_fleet_table(status)}</section>"
-    return document(f"Fleet of {status['keystore']}", f"<main>{body}</main>", asset("demo.css"))
+    return _document(f"Fleet of {status['keystore']}", f"<main>{body}</main>", _asset("demo.css"))
 
 
 def _fleet_head(status: Json) -> str:
