@@ -421,9 +421,13 @@ def test_writing_is_seen_and_nothing_else(source: str, seen: bool) -> None:
 PRINTER = "terminal.py"
 """It makes names visible that could steer a terminal."""
 
+_NODE = "a process of its own, without click; what it prints is read"
+
 OTHER_PRINTERS = {
     "cli/__init__.py": "interrupted while the program is imported",
-    "demo/nodes/": "processes of their own, some without click; what they print is read",
+    "demo/cyclone_node.py": _NODE,
+    "demo/ros_node.py": _NODE,
+    "demo/zenoh_node.py": _NODE,
 }
 
 _CLICK = {"echo", "secho", "style", "prompt", "confirm", "echo_via_pager", "getchar", "pause"}

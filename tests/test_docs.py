@@ -11,7 +11,7 @@ import pytest
 import sros_tool
 from sros_tool.cli.program import FAMILIES
 from sros_tool.demo.scenarios.attacks import ATTACKS
-from sros_tool.demo.scenarios.zenoh.attacks import ATTACKS as ZENOH_ATTACKS
+from sros_tool.demo.scenarios.on_zenoh import ATTACKS as ZENOH_ATTACKS
 from tests.support.checkout import known_files
 
 PROJECT = Path(__file__).parents[1]

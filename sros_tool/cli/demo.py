@@ -32,7 +32,7 @@ def _complete_scenario(
     _context: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[str]:
     from sros_tool.demo.scenarios import ALL, SCENARIOS
-    from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
+    from sros_tool.demo.scenarios.on_zenoh import ZENOH_SCENARIOS
 
     on_zenoh = _context.params.get("backend") == "zenoh"
     chosen = ZENOH_SCENARIOS if on_zenoh else SCENARIOS
@@ -179,8 +179,8 @@ def demo(
     if role is not None:
         _run_by_hand(ctx, role, backend, topic)
     from sros_tool.demo.program import DemoOptions, run_demo
+    from sros_tool.demo.result import demo_table
     from sros_tool.demo.scenarios import choose_scenarios
-    from sros_tool.demo.show import demo_table
     from sros_tool.files import replace_file
     from sros_tool.keystore.template import load_template
 
@@ -209,7 +209,7 @@ def demo(
     if report is not None:
         _write_report(report, result.as_json(), keep)
     if summary is not None:
-        from sros_tool.demo.show import summary_page
+        from sros_tool.demo.result import summary_page
 
         replace_file(summary, summary_page(result, moment).encode())
     if as_json:
@@ -241,7 +241,7 @@ def _run_by_hand(ctx: click.Context, role: str, backend: str, topic: str | None)
 def _list(backend: str, as_json: bool) -> None:
     """Print the scenarios of a backend, or of all."""
     from sros_tool.demo.scenarios import SCENARIOS
-    from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
+    from sros_tool.demo.scenarios.on_zenoh import ZENOH_SCENARIOS
 
     on_dds = () if backend == "zenoh" else SCENARIOS
     on_zenoh = ZENOH_SCENARIOS if backend in ("auto", "zenoh") else ()

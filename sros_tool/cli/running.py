@@ -291,7 +291,7 @@ class _WithCommand(click.Command):
     epilog="""\b
 Example:
   $ sros run keystore /talker_listener/talker -- \\
-        python3 -m sros_tool.demo.nodes.ros talker
+        python3 -m sros_tool.demo.ros_node talker
   [INFO] [talker]: Publishing: 'Hello World: 1'
   $ ros2 launch --launch-prefix 'sros run keystore --policy policy.xml --' \\
         demo_nodes_cpp talker_listener_launch.py""",

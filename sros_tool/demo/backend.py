@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import ProtectionKind
-from sros_tool.demo.node_names import naming_arguments
+from sros_tool.demo.grants import naming_arguments
 from sros_tool.demo.scenarios.model import Condition, Role
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import EVERYTHING, Template
@@ -105,14 +105,14 @@ class Backend:
         ``names`` are the absolute names of the role's ROS nodes, from `node_names`.
         """
         if self.library(role, secured=secured) == RCLPY:
-            program = [*_PYTHON, "-m", "sros_tool.demo.nodes.ros", role.value]
+            program = [*_PYTHON, "-m", "sros_tool.demo.ros_node", role.value]
             return [*program, *options, *naming_arguments(role, names)]
-        return [*_LEAN_PYTHON, "-m", "sros_tool.demo.nodes.cyclone", role.value, *options]
+        return [*_LEAN_PYTHON, "-m", "sros_tool.demo.cyclone_node", role.value, *options]
 
     def zenoh_command(self, role: Role, options: Sequence[str], enclave: str) -> list[str]:
         """Return the command line of a process on Zenoh, and the enclave that it announces."""
         named = ["--ros-args", "--enclave", enclave, "--"] if enclave else []
-        program = [*_LEAN_PYTHON, "-m", "sros_tool.demo.nodes.zenoh", role.value]
+        program = [*_LEAN_PYTHON, "-m", "sros_tool.demo.zenoh_node", role.value]
         return [*program, *options, *named]
 
     def environment(

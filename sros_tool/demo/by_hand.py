@@ -80,7 +80,7 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
     """
     say(f"{security_of(node, os.environ)} (stop with Ctrl-C)")
     events, writing = os.pipe()
-    module = f"sros_tool.demo.nodes.{_MODULES[node.backend]}"
+    module = f"sros_tool.demo.{_MODULES[node.backend]}_node"
     command = [sys.executable, "-P", "-m", module, node.role.value, "--period", "1"]
     if node.role is not Role.ROUTER:
         command += ["--topic", node.topic]

@@ -28,7 +28,7 @@ from sros_tool.demo.grants import (
     is_wild,
     may,
 )
-from sros_tool.demo.scenarios.attacks.keystores import (
+from sros_tool.demo.scenarios.attacks import (
     WIDEST,
     WIDEST_CLIENT,
     WIDEST_PUBLISHER,

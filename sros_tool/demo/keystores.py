@@ -16,8 +16,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.demo.casting import CastMember, UserKeystore
 from sros_tool.demo.forger import Forge, KeystoreCopy, UncastError, Undefended, name_of
-from sros_tool.demo.grants import enclave_grant
-from sros_tool.demo.node_names import node_names
+from sros_tool.demo.grants import enclave_grant, node_names
 from sros_tool.demo.scenarios.model import (
     FOREIGN,
     OWN,
@@ -29,7 +28,7 @@ from sros_tool.demo.scenarios.model import (
     SoundKeystore,
 )
 from sros_tool.demo.scenarios.policies import DENIED_TOPIC
-from sros_tool.demo.zenoh_files import start_network, zenoh_variables
+from sros_tool.demo.zenoh_forger import start_network, zenoh_variables
 from sros_tool.errors import SrosError
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts

@@ -32,7 +32,7 @@ from sros_tool.demo.casting import UserKeystore, open_user_keystore
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.result import DemoResult, KeystoreSummary, ScenarioResult
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
-from sros_tool.demo.scenarios.isolation import ISOLATION
+from sros_tool.demo.scenarios.communication import ISOLATION
 from sros_tool.demo.scenarios.model import Row, Scenario, joined
 from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, check_topic
 from sros_tool.demo.verdict import RowResult

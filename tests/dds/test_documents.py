@@ -241,7 +241,7 @@ def test_texts_are_written_as_the_standard_library_writes_them(text: str) -> Non
 
 def test_a_node_starts_without_what_it_does_not_need() -> None:
     """A demo starts dozens of them."""
-    words = "import sys, sros_tool.demo.nodes.cyclone; print(*sys.modules)"
+    words = "import sys, sros_tool.demo.cyclone_node; print(*sys.modules)"
     found = python("-c", words).stdout.split()
     assert "sros_tool.topics" in found
     heavy = {"http.client", "ssl", "urllib.request", "uuid", "lxml.etree", "sros_tool.translate"}

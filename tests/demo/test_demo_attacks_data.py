@@ -24,7 +24,7 @@ from sros_tool.demo.scenarios.model import (
     RowStatus,
     Scenario,
 )
-from sros_tool.demo.scenarios.zenoh.attacks import ATTACKS as ZENOH_ATTACKS
+from sros_tool.demo.scenarios.on_zenoh import ATTACKS as ZENOH_ATTACKS
 from sros_tool.errors import KeystoreError
 from tests.support.checkout import CHECKOUT
 

@@ -64,7 +64,7 @@ def test_a_hostile_topic_is_refused_before_a_node_starts() -> None:
 @pytest.mark.zenoh
 def test_a_node_on_zenoh_ends_at_once_while_it_waits_for_a_router() -> None:
     pytest.importorskip("zenoh")
-    program = [sys.executable, "-P", "-m", "sros_tool.demo.nodes.zenoh", "listener"]
+    program = [sys.executable, "-P", "-m", "sros_tool.demo.zenoh_node", "listener"]
     variables = {**os.environ, "ZENOH_CONFIG_OVERRIDE": 'connect/endpoints=["tcp/127.0.0.1:1"]'}
     with subprocess.Popen([*program, "--patience", "1000000"], env=variables) as node:
         status, end = Path(f"/proc/{node.pid}/status"), time.monotonic() + PATIENCE

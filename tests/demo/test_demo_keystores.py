@@ -13,10 +13,9 @@ from sros_tool.demo import forger
 from sros_tool.demo.casting import UserKeystore, open_user_keystore
 from sros_tool.demo.forger import KeystoreCopy
 from sros_tool.demo.program import DemoOptions, run_demo
-from sros_tool.demo.result import KeystoreSummary
+from sros_tool.demo.result import KeystoreSummary, demo_table, summary_page
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.demo.scenarios.model import RowStatus
-from sros_tool.demo.show import demo_table, summary_page
 from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.layout import CRL_FILE, REQUIRED_FILES
 from tests.demo.test_demo_result import CLOSED, OPEN, TWIN, result

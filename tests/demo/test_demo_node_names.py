@@ -9,8 +9,8 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
-from sros_tool.demo.grants import allows
-from sros_tool.demo.node_names import (
+from sros_tool.demo.grants import (
+    allows,
     is_node_allowed,
     naming_arguments,
     node_names,

@@ -12,12 +12,11 @@ import pytest
 
 from sros_tool.demo import backend as backends
 from sros_tool.demo.backend import Backend, choose_backend
-from sros_tool.demo.nodes.options import split_ros_args
+from sros_tool.demo.node_options import split_ros_args
 from sros_tool.demo.program import DemoOptions, run_demo
-from sros_tool.demo.result import DemoResult, ScenarioResult
+from sros_tool.demo.result import DemoResult, ScenarioResult, demo_table
 from sros_tool.demo.scenarios.model import Role, RowStatus
 from sros_tool.demo.scenarios.policies import check_topic, talking_policy
-from sros_tool.demo.show import demo_table
 from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import load_template
@@ -141,7 +140,7 @@ def test_backends(
         assert chosen.environment(Role.TALKER, wire=False) == {"RMW_IMPLEMENTATION": "rmw_x"}
         command = chosen.command(Role.TALKER, ["--topic", "/x"], ["/robot/mouth"])
         module, role, *options = command[command.index("-m") + 1 :]
-        assert (module, role) == ("sros_tool.demo.nodes.ros", "talker")
+        assert (module, role) == ("sros_tool.demo.ros_node", "talker")
         remapped = ["-r", "talker:__node:=mouth", "-r", "mouth:__ns:=/robot"]
         assert options == ["--topic", "/x", "--ros-args", *remapped, "--"]
     else:
@@ -149,9 +148,9 @@ def test_backends(
         assert list(variables) == ["PYTHONPATH"]
         command = chosen.command(Role.LISTENER, ["--topic", "/x"], ["/robot/ear"])
         # Without site packages, the module is found by the variable alone, wherever it is run.
-        found = [*command[: command.index("-m")], "-c", "import sros_tool.demo.nodes.cyclone"]
+        found = [*command[: command.index("-m")], "-c", "import sros_tool.demo.cyclone_node"]
         subprocess.run(found, env=dict(variables), cwd=tmp_path, check=True)
-        assert command[-4:] == ["sros_tool.demo.nodes.cyclone", "listener", "--topic", "/x"]
+        assert command[-4:] == ["sros_tool.demo.cyclone_node", "listener", "--topic", "/x"]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sros_tool.demo.scenarios import SCENARIOS, choose_scenarios
-from sros_tool.demo.scenarios.isolation import ROWS
+from sros_tool.demo.scenarios.communication import ROWS
 from sros_tool.demo.scenarios.model import (
     CALLING,
     SPEAKING,
@@ -14,7 +14,7 @@ from sros_tool.demo.scenarios.model import (
     Row,
     Scenario,
 )
-from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
+from sros_tool.demo.scenarios.on_zenoh import ZENOH_SCENARIOS
 from sros_tool.errors import UsageError
 
 EVERY_ROW = pytest.mark.parametrize(

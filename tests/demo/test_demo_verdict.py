@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from sros_tool.demo.scenarios.isolation import ROWS
+from sros_tool.demo.scenarios.communication import ROWS
 from sros_tool.demo.scenarios.model import Row, RowStatus
 from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, judge_row
 from sros_tool.demo.wire import WireCount

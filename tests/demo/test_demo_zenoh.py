@@ -15,8 +15,7 @@ import pytest
 from sros_tool.demo import backend, runner
 from sros_tool.demo.scenarios import choose_scenarios
 from sros_tool.demo.scenarios.model import Relation, Role, Row, RowStatus, joined, together
-from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
-from sros_tool.demo.scenarios.zenoh.attacks import ATTACKS
+from sros_tool.demo.scenarios.on_zenoh import ATTACKS, ZENOH_SCENARIOS
 from sros_tool.demo.verdict import (
     PartyRecord,
     RowRecord,

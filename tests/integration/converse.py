@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from sros_tool.demo.nodes import cyclone
+from sros_tool.demo import cyclone_node
 from sros_tool.demo.wire import Capture
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.events import Event, EventKind, read_events
@@ -199,9 +199,9 @@ def start(node: Node, domain: int, folder: Path) -> tuple[Running, Path]:
     arguments = [node.role, "--topic", node.topic, "--text", node.text, "--period", "0.1"]
     arguments += ["--report", str(report)]
     if not node.through:
-        work = partial(cyclone.main, arguments)
+        work = partial(cyclone_node.main, arguments)
         return Forked(work, env=environment, errors=report.with_suffix(".err")), report
-    command = [*node.through, sys.executable, "-m", "sros_tool.demo.nodes.cyclone"]
+    command = [*node.through, sys.executable, "-m", "sros_tool.demo.cyclone_node"]
     with report.with_suffix(".err").open("wb") as errors:
         return subprocess.Popen([*command, *arguments], env=environment, stderr=errors), report
 

@@ -81,7 +81,7 @@ def write_unit(robot: Robot) -> None:
         "ROS_DOMAIN_ID": str(DOMAIN),
     }
     role = "talker" if robot.name in TALKERS else "listener"
-    words = [sys.executable, "-m", "sros_tool.demo.nodes.cyclone", role, "--topic", "/chatter"]
+    words = [sys.executable, "-m", "sros_tool.demo.cyclone_node", role, "--topic", "/chatter"]
     words += ["--text", f"from {robot.name};", "--period", "0.2", "--report", str(report(robot))]
     assignments = "".join(
         f"export {key}={shlex.quote(each)}\n" for key, each in environment.items()

@@ -13,7 +13,7 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
-from sros_tool.demo.scenarios.isolation import ISOLATION, LISTENER, TALKER, TALKER_DENIED
+from sros_tool.demo.scenarios.communication import ISOLATION, LISTENER, TALKER, TALKER_DENIED
 from sros_tool.demo.scenarios.model import OWN, UNSECURED, Identity
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template

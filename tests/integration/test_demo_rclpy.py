@@ -18,10 +18,8 @@ from sros_tool.demo.backend import RCLPY, Backend, choose_backend
 from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios import SCENARIOS
-from sros_tool.demo.scenarios.composition import COMPOSITION
-from sros_tool.demo.scenarios.isolation import ISOLATION, TALKER
+from sros_tool.demo.scenarios.communication import ACTIONS, COMPOSITION, ISOLATION, SERVICES, TALKER
 from sros_tool.demo.scenarios.model import UNSECURED, RowStatus
-from sros_tool.demo.scenarios.services import ACTIONS, SERVICES
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.events import Event, EventKind, ProcessStage, read_events
@@ -48,7 +46,7 @@ def node(
     variables = {**os.environ, "ROS_DOMAIN_ID": DOMAIN, "ROS_LOG_DIR": str(folder), **more}
     report = ["--report", str(folder / f"{role}.jsonl")]
     return subprocess.Popen(
-        [sys.executable, "-m", f"sros_tool.demo.nodes.{on}", role, *report, *arguments],
+        [sys.executable, "-m", f"sros_tool.demo.{on}_node", role, *report, *arguments],
         env=variables,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -131,7 +129,7 @@ def test_nodes_take_ros_arguments_and_end_quietly(number: signal.Signals, tmp_pa
 
 _INTERRUPTED = """
 import os, signal, sys
-from sros_tool.demo.nodes import ros
+from sros_tool.demo import ros_node
 def build(node, options, events):
     def interrupted():
         try:
@@ -141,8 +139,8 @@ def build(node, options, events):
             rclpy.ok = lambda: True  # it ends a moment later
             raise RuntimeError("Unable to convert call argument '0' to Python object")
     node.create_timer(0.01, interrupted)
-ros._ROLES["talker"] = build
-sys.exit(ros.main(["talker", "--report", sys.argv[1]]))
+ros_node._ROLES["talker"] = build
+sys.exit(ros_node.main(["talker", "--report", sys.argv[1]]))
 """
 
 
@@ -190,8 +188,8 @@ def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
 STOPPED_WHILE_IT_IS_MADE = """
 import os, signal, sys
 from pathlib import Path
-from sros_tool.demo.nodes.options import NodeOptions
-from sros_tool.demo.nodes.ros import _run_role
+from sros_tool.demo.node_options import NodeOptions
+from sros_tool.demo.ros_node import _run_role
 
 def build(node, options, events):
     if "signal" in sys.argv:

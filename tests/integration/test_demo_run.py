@@ -17,7 +17,7 @@ import pytest
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.keystores import KeystoreSet
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
-from sros_tool.demo.scenarios.isolation import ROWS
+from sros_tool.demo.scenarios.communication import ROWS
 from sros_tool.demo.scenarios.model import UNSECURED, Row, RowStatus
 from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import SrosError, UnavailableError

@@ -16,8 +16,7 @@ import pytest
 
 from sros_tool.demo.program import DemoOptions, run_demo
 from sros_tool.demo.scenarios.model import Row, Scenario
-from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
-from sros_tool.demo.scenarios.zenoh.attacks import ATTACKS
+from sros_tool.demo.scenarios.on_zenoh import ATTACKS, ZENOH_SCENARIOS
 from tests.support.children import PATIENCE
 from tests.support.long_form import some
 

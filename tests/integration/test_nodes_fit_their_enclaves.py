@@ -24,8 +24,8 @@ from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, conditions
+from sros_tool.demo.grants import DEFAULT_NODE_NAMES
 from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
-from sros_tool.demo.node_names import DEFAULT_NODE_NAMES
 from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.model import DENIALS, Party, Relation, Role, Row, RowStatus, Scenario
 from sros_tool.files import policies_dir

@@ -42,7 +42,7 @@ FILES = {
 OTHERS = ("fine", "expired", "wrapped", "revoked", "permissive", "elsewhere", "named", "removed")
 QUIET = ("sh", "-c", "read line", "talker", "--ros-args")
 """A process that looks like a node and costs nothing; it ends with its standard input."""
-TALKER = (sys.executable, "-m", "sros_tool.demo.nodes.cyclone", "talker")
+TALKER = (sys.executable, "-m", "sros_tool.demo.cyclone_node", "talker")
 
 
 @dataclass

@@ -6,13 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sros_tool.demo.scenarios.attacks import ATTACKS
-from sros_tool.demo.scenarios.composition import COMPOSITION
+from sros_tool.demo.scenarios.communication import (
+    ACTIONS,
+    COMPOSITION,
+    GOVERNANCE,
+    ISOLATION,
+    SERVICES,
+)
 from sros_tool.demo.scenarios.custom import read_scenario
-from sros_tool.demo.scenarios.governance import GOVERNANCE
-from sros_tool.demo.scenarios.isolation import ISOLATION
 from sros_tool.demo.scenarios.model import Scenario
-from sros_tool.demo.scenarios.services import ACTIONS, SERVICES
-from sros_tool.demo.scenarios.zenoh import ZENOH_SCENARIOS
+from sros_tool.demo.scenarios.on_zenoh import ZENOH_SCENARIOS
 from sros_tool.errors import UsageError
 
 SCENARIOS: tuple[Scenario, ...] = (

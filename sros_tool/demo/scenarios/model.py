@@ -391,3 +391,44 @@ def joined(scenarios: Sequence[Scenario]) -> Scenario:
     if any((each.cast, each.policy) != (first.cast, first.policy) for each in scenarios):
         raise ValueError("scenarios with other enclaves cannot run together")
     return replace(first, rows=tuple(row for each in scenarios for row in each.rows))
+
+
+# ── words in which scenarios are written ───────────────────────────────────────────────────
+
+
+def hears(listener: str, talker: str, *, holds: bool = True) -> Claim:
+    """Return the claim that a listener hears a talker, or does not."""
+    return Claim(Relation.HEARS, listener, talker, holds=holds)
+
+
+def answered(client: str, server: str, *, holds: bool = True) -> Claim:
+    """Return the claim that a client is answered by a server, or is not."""
+    return Claim(Relation.IS_ANSWERED, client, server, holds=holds)
+
+
+def talker_and_listener(keystore: KeystoreChoice) -> tuple[Party, Party]:
+    """Return a talker and a listener that may use the topic in a keystore."""
+    return (
+        Party("talker", Role.TALKER, Identity(keystore, "talker")),
+        Party("listener", Role.LISTENER, Identity(keystore, "listener")),
+    )
+
+
+def known_open(row: Row, because: str, remedy: str) -> Row:
+    """Return the row of an attack that is known to succeed, with the reason and what to do."""
+    return replace(row, open_because=because, remedy=remedy)
+
+
+def tries(attack: str, *rows: Row) -> tuple[Row, ...]:
+    """Return rows as tries of one attack, also those that a vendor needs instead."""
+    return tuple(
+        replace(
+            row,
+            attack=attack,
+            variants=tuple(
+                replace(each, instead=each.instead and replace(each.instead, attack=attack))
+                for each in row.variants
+            ),
+        )
+        for row in rows
+    )

@@ -1,4 +1,4 @@
-"""The nodes of the demo on Zenoh: ``python -m sros_tool.demo.nodes.zenoh ROLE``.
+"""The nodes of the demo on Zenoh: ``python -m sros_tool.demo.zenoh_node ROLE``.
 
 They take the configuration from the variables of rmw_zenoh, and use its key expressions, graph
 tokens, attachments and messages in CDR (ros2/rmw_zenoh, docs/design.md).  Services and actions have
@@ -28,7 +28,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from sros_tool.demo.nodes.options import (
+from sros_tool.demo.node_options import (
     FIBONACCI_ORDER,
     NodeOptions,
     fibonacci,
@@ -477,7 +477,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     roles = (*_ROLES, _FLOODER)
-    options = parse_options("sros_tool.demo.nodes.zenoh", roles, arguments)
+    options = parse_options("sros_tool.demo.zenoh_node", roles, arguments)
     events = EventWriter(options.report)
     stop = threading.Event()
 

@@ -1,4 +1,4 @@
-"""The nodes of the demo on rclpy: ``python -m sros_tool.demo.nodes.ros ROLE [--ros-args ...]``.
+"""The nodes of the demo on rclpy: ``python -m sros_tool.demo.ros_node ROLE [--ros-args ...]``.
 
 They are ordinary ROS 2 nodes.  rclpy and the ROS interfaces are imported when a role starts, so
 that this module can be imported without ROS.
@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from sros_tool.demo.nodes.options import FIBONACCI_ORDER, NodeOptions, fibonacci, parse_options
+from sros_tool.demo.node_options import FIBONACCI_ORDER, NodeOptions, fibonacci, parse_options
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _LOG_FLUSH_SECONDS = 0.3
@@ -32,7 +32,7 @@ _Build = Callable[[Any, NodeOptions, EventWriter], Sequence[Any] | None]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a node in a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    options = parse_options("sros_tool.demo.nodes.ros", _ROLES, arguments)
+    options = parse_options("sros_tool.demo.ros_node", _ROLES, arguments)
     return _run_role(_ROLES[options.role], options, [sys.argv[0], *arguments])
 
 

@@ -1,4 +1,4 @@
-"""The nodes of the demo on Cyclone DDS: ``python -m sros_tool.demo.nodes.cyclone ROLE``.
+"""The nodes of the demo on Cyclone DDS: ``python -m sros_tool.demo.cyclone_node ROLE``.
 
 They read the environment of a ROS 2 node and use the DDS topics and types of its messages, so that
 rclpy nodes receive them, and a launcher can start both kinds of nodes in the same way.
@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from types import FrameType
 
-from sros_tool.demo.nodes.options import (
+from sros_tool.demo.node_options import (
     FIBONACCI_ORDER,
     NodeOptions,
     fibonacci,
@@ -274,7 +274,7 @@ class _Stopped(Exception):  # noqa: N818 - not an error
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    options = parse_options("sros_tool.demo.nodes.cyclone", _ROLES, arguments)
+    options = parse_options("sros_tool.demo.cyclone_node", _ROLES, arguments)
     _stop_on_signals()
     events = EventWriter(options.report)
     stage = ProcessStage.PARTICIPANT

@@ -1,0 +1,1139 @@
+"""The scenario of all known attacks on DDS, each with a control, and again without its defence.
+
+The attacker is the intruder of the row.  A row that expects the attack to fail has a control: the
+same listener must hear the permitted talker at the same time.  A row with ``removed`` shows that
+the same attack succeeds without that defence: an attack that never works would prove nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from sros_tool.demo import forger
+from sros_tool.demo.forger import Undefended
+from sros_tool.demo.scenarios.model import (
+    FOREIGN,
+    OWN,
+    UNSECURED,
+    Claim,
+    Condition,
+    Identity,
+    KeystoreChoice,
+    Party,
+    Relation,
+    Role,
+    Row,
+    RowStatus,
+    Scenario,
+    Variant,
+    Wire,
+    answered,
+    hears,
+    known_open,
+    talker_and_listener,
+    tries,
+)
+from sros_tool.demo.scenarios.policies import GUEST, SERVICE, attacked_policy
+
+# ── kinds of attacks ───────────────────────────────────────────────────────────────────────
+# Each function returns a row with the party "attacker".  The victims, and the controls unless
+# noted, have enclaves in the keystore `victims`: by default the attacker's, if a defence is
+# removed there, otherwise the scenario's own.
+
+_ATTACKER = "attacker"
+
+_LET_IN = (
+    "the template admits unauthenticated participants, and does not protect the topic",
+    "remove allow_unauthenticated_participants from the template, and encrypt the topic",
+)
+_UNCONTROLLED = (
+    "the template does not control access to this topic",
+    "keep read_access_control and write_access_control on",
+)
+
+
+def _open_to(success: RowStatus, expected: RowStatus) -> tuple[Variant, ...]:
+    """Return variants that expect ``success`` with templates that do not stop the attack."""
+    if expected is RowStatus.REFUSED:
+        return (Variant((Condition.UNCONTROLLED,), success, *_UNCONTROLLED),)
+    if expected is success or expected is RowStatus.NOT_LET_IN:
+        return ()
+    return (Variant((Condition.UNAUTHENTICATED,), success, *_LET_IN),)
+
+
+def _victims(attacker: Identity, removed: str) -> KeystoreChoice:
+    return attacker.keystore if removed and attacker.keystore is not None else OWN
+
+
+def _injection(
+    name: str,
+    attacker: Identity,
+    expected: RowStatus,
+    mechanism: str,
+    *variants: Variant,
+    removed: str = "",
+    victims: KeystoreChoice | None = None,
+) -> Row:
+    """Return a row that shows whether the attacker is heard on the topic.
+
+    The control is a permitted talker; a row with ``removed`` has no control.
+    """
+    talker, listener = talker_and_listener(victims or _victims(attacker, removed))
+    return Row(
+        name,
+        expected,
+        mechanism,
+        (
+            Party(_ATTACKER, Role.TALKER, attacker, intruder=True),
+            listener,
+            *(() if removed else (talker,)),
+        ),
+        (hears("listener", _ATTACKER).expecting(expected),),
+        () if removed else (hears("listener", "talker"),),
+        brief=True,
+        variants=(*variants, *_open_to(RowStatus.HEARD, expected)),
+        removed=removed,
+    )
+
+
+def _tampered(name: str, expected: RowStatus, mechanism: str, victims: KeystoreChoice) -> Row:
+    """Return a row in which an unsecured attacker tries a listener whose files were changed.
+
+    The listener may fail to start; the control is another listener with unchanged files.
+    """
+    row = _injection(name, UNSECURED, expected, mechanism, victims=victims)
+    attacker, listener, _ = row.parties
+    talker, untouched = talker_and_listener(OWN)
+    untouched = replace(untouched, name="untouched listener")
+    return replace(
+        row,
+        parties=(attacker, replace(listener, intruder=True), untouched, talker),
+        controls=(hears("untouched listener", "talker"),),
+    )
+
+
+def _succeeds(
+    name: str, attacker: Identity, removed: str, victims: KeystoreChoice | None = None
+) -> Row:
+    """Return a row in which the same attacker is heard, because its files are valid."""
+    mechanism = "an attacker with valid files is heard"
+    return _injection(name, attacker, RowStatus.HEARD, mechanism, removed=removed, victims=victims)
+
+
+def _listening(
+    name: str,
+    attacker: Identity,
+    expected: RowStatus,
+    mechanism: str,
+    *,
+    removed: str = "",
+    victims: KeystoreChoice | None = None,
+) -> Row:
+    """Return a row that shows whether the attacker hears the topic."""
+    return Row(
+        name,
+        expected,
+        mechanism,
+        (
+            Party(_ATTACKER, Role.LISTENER, attacker, intruder=True),
+            *talker_and_listener(victims or _victims(attacker, removed)),
+        ),
+        (hears(_ATTACKER, "talker").expecting(expected),),
+        (hears("listener", "talker"),),
+        brief=True,
+        variants=_open_to(RowStatus.HEARD, expected),
+        removed=removed,
+    )
+
+
+def _discovering(
+    name: str,
+    attacker: Identity,
+    expected: RowStatus,
+    mechanism: str,
+    *variants: Variant,
+    removed: str = "",
+    victims: KeystoreChoice = OWN,
+) -> Row:
+    """Return a row that shows whether the attacker discovers a publisher of the topic.
+
+    The control is that an unsecured attacker discovers another publisher, or if a secured one has
+    to fail, that an enclave which may listen discovers this one.
+    """
+    others: tuple[Party, ...] = ()
+    controls: tuple[Claim, ...] = ()
+    if attacker.keystore is None:
+        others = (Party("unsecured talker", Role.TALKER, other_topic=True),)
+        controls = (Claim(Relation.SEES, _ATTACKER, "unsecured talker"),)
+    elif expected is not RowStatus.VISIBLE:
+        others = (Party("looking listener", Role.OBSERVER, Identity(OWN, "listener")),)
+        controls = (Claim(Relation.SEES, "looking listener", "talker"),)
+    talker, _ = talker_and_listener(victims)
+    return Row(
+        name,
+        expected,
+        mechanism,
+        (Party(_ATTACKER, Role.OBSERVER, attacker, intruder=True), talker, *others),
+        (Claim(Relation.SEES, _ATTACKER, "talker").expecting(expected),),
+        controls,
+        brief=True,
+        variants=variants,
+        removed=removed,
+    )
+
+
+def _on_service(role: Role, identity: Identity, name: str = "") -> Party:
+    """Return a client or server of the service; the attacker has another name than its role."""
+    return Party(name or role.value, role, identity, SERVICE, intruder=bool(name))
+
+
+def _calling(
+    name: str, attacker: Identity, expected: RowStatus, mechanism: str, *, removed: str = ""
+) -> Row:
+    """Return a row that shows whether the attacker gets answers from a service."""
+    victims = _victims(attacker, removed)
+    return Row(
+        name,
+        expected,
+        mechanism,
+        (
+            _on_service(Role.CLIENT, attacker, _ATTACKER),
+            _on_service(Role.SERVER, Identity(victims, "server")),
+            _on_service(Role.CLIENT, Identity(victims, "client")),
+        ),
+        (answered(_ATTACKER, "server").expecting(expected),),
+        (answered("client", "server"),),
+        brief=True,
+        variants=() if removed else _open_to(RowStatus.ANSWERED, expected),
+        removed=removed,
+    )
+
+
+def _posing_as_server(
+    name: str, attacker: Identity, expected: RowStatus, mechanism: str, *, removed: str = ""
+) -> Row:
+    """Return a row that shows whether a client accepts answers from an attacker as server."""
+    victims = _victims(attacker, removed)
+    rightful = _on_service(Role.SERVER, Identity(victims, "server"))
+    return Row(
+        name,
+        expected,
+        mechanism,
+        (
+            _on_service(Role.SERVER, attacker, _ATTACKER),
+            _on_service(Role.CLIENT, Identity(victims, "client")),
+            *(() if removed else (rightful,)),
+        ),
+        (answered("client", _ATTACKER).expecting(expected),),
+        () if removed else (answered("client", "server"),),
+        brief=True,
+        variants=() if removed else _open_to(RowStatus.ANSWERED, expected),
+        removed=removed,
+    )
+
+
+# ── from the network ───────────────────────────────────────────────────────────────────────
+
+_IN_CLEAR = Undefended(template=forger.unprotected)
+_OPEN_GOVERNANCE = Undefended(forger.weaker_governance)
+_STRANGERS_REFUSED = "the refusal of unauthenticated participants"
+
+
+def _eavesdropping(
+    name: str,
+    expected: RowStatus,
+    mechanism: str,
+    keystore: KeystoreChoice,
+    wire: Wire = Wire.TEXT,
+    *,
+    brief: bool = True,
+) -> Row:
+    """Return a row that looks for a text in the packets of a talker."""
+    return Row(
+        name,
+        expected,
+        mechanism,
+        talker_and_listener(keystore),
+        (Claim(Relation.READABLE, "talker", wire=wire).expecting(expected),),
+        (hears("listener", "talker"),),
+        wire=True,
+        brief=brief,
+    )
+
+
+def _forged_packets(
+    name: str, relation: Relation, expected: RowStatus, mechanism: str, keystore: KeystoreChoice
+) -> Row:
+    """Return a row in which packets of a talker are sent again, as they were or changed."""
+    again = relation is Relation.HEARS_AGAIN
+    return Row(
+        name,
+        expected,
+        mechanism,
+        talker_and_listener(keystore),
+        (Claim(relation, "listener", "talker").expecting(expected),),
+        (hears("listener", "talker"),),
+        replay="talker" if again else "",
+        impersonate="" if again else "talker",
+        brief=True,
+    )
+
+
+_NETWORK_ROWS: tuple[Row, ...] = (
+    *tries(
+        "eavesdropping on the wire",
+        replace(
+            _eavesdropping(
+                "payload read on the wire",
+                RowStatus.NOT_READABLE,
+                "every packet with data is encrypted, with keys that only authenticated peers get",
+                OWN,
+                brief=False,
+            ),
+            variants=(
+                Variant(
+                    (Condition.IN_CLEAR,),
+                    RowStatus.READABLE,
+                    "the template does not encrypt the payload of this topic",
+                    'set data = "ENCRYPT" for this topic',
+                ),
+            ),
+        ),
+        replace(
+            _eavesdropping(
+                "payload read on the wire, not encrypted",
+                RowStatus.READABLE,
+                "with the protection kind NONE, access is controlled but nothing is encrypted",
+                _IN_CLEAR,
+            ),
+            removed="encryption",
+        ),
+    ),
+    *tries(
+        "replay of captured packets",
+        replace(
+            _forged_packets(
+                "packets of a secured talker sent again",
+                Relation.HEARS_AGAIN,
+                RowStatus.NOT_HEARD_AGAIN,
+                "every two participants agree on new keys, so that old packets are rejected",
+                OWN,
+            ),
+            variants=(
+                Variant(
+                    (Condition.UNAUTHENTICATED, Condition.FAST),
+                    RowStatus.NOT_HEARD_AGAIN,
+                    mechanism="the packets show an identity: Fast DDS waits until it authenticates",
+                ),
+                *_open_to(RowStatus.HEARD_AGAIN, RowStatus.NOT_HEARD_AGAIN),
+            ),
+        ),
+        replace(
+            _forged_packets(
+                "packets of an unsecured talker sent again",
+                Relation.HEARS_AGAIN,
+                RowStatus.HEARD_AGAIN,
+                "nothing in an unsecured packet proves when or by whom it was sent",
+                OWN,
+            ),
+            parties=(Party("talker", Role.TALKER), Party("listener", Role.LISTENER)),
+            removed="security",
+        ),
+    ),
+    *tries(
+        "changed packets",
+        replace(
+            _forged_packets(
+                "packets of a secured talker changed",
+                Relation.BELIEVES,
+                RowStatus.NOT_DECEIVED,
+                "every packet has a message authentication code, which nobody without the keys can"
+                " make",
+                OWN,
+            ),
+            variants=(
+                Variant(
+                    (Condition.UNSIGNED,),
+                    RowStatus.DECEIVED,
+                    "the template neither signs nor encrypts the messages of this topic",
+                    'set rtps = "SIGN" or "ENCRYPT", or protect the topic',
+                ),
+            ),
+        ),
+        replace(
+            _forged_packets(
+                "packets of a secured talker changed, not signed",
+                Relation.BELIEVES,
+                RowStatus.DECEIVED,
+                "with the protection kind NONE, nothing in a packet proves who sent it",
+                _IN_CLEAR,
+            ),
+            removed="signatures and encryption",
+        ),
+    ),
+    *tries(
+        "what the handshake reveals",
+        *(
+            known_open(
+                _eavesdropping(
+                    f"{what} read in the handshake",
+                    RowStatus.READABLE,
+                    "certificates and permissions are sent in clear before keys are agreed",
+                    OWN,
+                    wire,
+                ),
+                "DDS Security 1.1 sends certificates and permissions unencrypted",
+                "do not put secrets into names, and admit only trusted machines to the network",
+            )
+            for what, wire in (("topic names", Wire.TOPIC), ("certificates", Wire.CERTIFICATE))
+        ),
+    ),
+    *tries(
+        "an unsecured node listens",
+        _listening(
+            "an unsecured node listens",
+            UNSECURED,
+            RowStatus.NOT_HEARD,
+            "a node that cannot authenticate gets no keys and no messages",
+        ),
+        _listening(
+            "an unsecured node listens, open governance",
+            UNSECURED,
+            RowStatus.HEARD,
+            "the governance admits everybody and protects nothing",
+            removed=_STRANGERS_REFUSED,
+            victims=_OPEN_GOVERNANCE,
+        ),
+    ),
+    *tries(
+        "an unsecured node lists topics",
+        _discovering(
+            "an unsecured node lists topics",
+            UNSECURED,
+            RowStatus.NOT_VISIBLE,
+            "endpoint discovery is encrypted: the node sees no publisher of the topic",
+            Variant(
+                (Condition.UNAUTHENTICATED_SEE,),
+                RowStatus.VISIBLE,
+                "the template admits unauthenticated participants",
+                "remove allow_unauthenticated_participants from the template",
+            ),
+        ),
+        _discovering(
+            "an unsecured node lists topics, open governance",
+            UNSECURED,
+            RowStatus.VISIBLE,
+            "discovery is not protected, and everybody may join",
+            removed=_STRANGERS_REFUSED,
+            victims=_OPEN_GOVERNANCE,
+        ),
+    ),
+    *tries(
+        "an unsecured node injects",
+        _injection(
+            "an unsecured node injects",
+            UNSECURED,
+            RowStatus.NOT_HEARD,
+            "a listener in a closed domain ignores a talker that cannot authenticate",
+        ),
+        _injection(
+            "an unsecured node injects, open governance",
+            UNSECURED,
+            RowStatus.HEARD,
+            "the governance admits everybody and protects nothing",
+            removed=_STRANGERS_REFUSED,
+            victims=_OPEN_GOVERNANCE,
+        ),
+    ),
+    *tries(
+        "an authenticated node looks around",
+        known_open(
+            _discovering(
+                "an enclave without rights lists topics",
+                Identity(OWN, "guest"),
+                RowStatus.VISIBLE,
+                "endpoints are announced to every authenticated participant",
+            ),
+            "DDS Security 1.1 does not hide endpoints from authenticated participants",
+            "give an identity only to those who may see all endpoints of the robot",
+        ),
+    ),
+)
+
+
+# ── by an enclave that tries more than its permissions allow ───────────────────────────────
+
+_GUEST_MAY_DO_EVERYTHING = Identity(Undefended(forger.guest_may_do_everything), "guest")
+_LEAST_PRIVILEGE = "least privilege"
+_NOT_ALLOWED = "its signed permissions do not allow the topic"
+_OTHER_DIRECTION = "its signed permissions allow the topic only in the other direction"
+_EVERY_TOPIC = "permissions for * allow every topic"
+_BOTH_DIRECTIONS = "permissions for * allow both directions"
+
+_RIGHTS_ROWS: tuple[Row, ...] = (
+    *tries(
+        "an enclave publishes a topic",
+        _injection(
+            "an enclave publishes a topic that it was not given",
+            Identity(OWN, "guest"),
+            RowStatus.REFUSED,
+            _NOT_ALLOWED,
+        ),
+        _injection(
+            "an enclave publishes a topic, wildcard permissions",
+            _GUEST_MAY_DO_EVERYTHING,
+            RowStatus.HEARD,
+            _EVERY_TOPIC,
+            removed=_LEAST_PRIVILEGE,
+        ),
+    ),
+    *tries(
+        "an enclave hears a topic",
+        _listening(
+            "an enclave hears a topic that it was not given",
+            Identity(OWN, "guest"),
+            RowStatus.REFUSED,
+            _NOT_ALLOWED,
+        ),
+        _listening(
+            "an enclave hears a topic, wildcard permissions",
+            _GUEST_MAY_DO_EVERYTHING,
+            RowStatus.HEARD,
+            _EVERY_TOPIC,
+            removed=_LEAST_PRIVILEGE,
+        ),
+    ),
+    *tries(
+        "a listener publishes",
+        _injection(
+            "a listener publishes",
+            Identity(OWN, "listener"),
+            RowStatus.REFUSED,
+            _OTHER_DIRECTION,
+        ),
+        _injection(
+            "a listener publishes, wildcard permissions",
+            Identity(Undefended(forger.listener_may_do_everything), "listener"),
+            RowStatus.HEARD,
+            _BOTH_DIRECTIONS,
+            removed=_LEAST_PRIVILEGE,
+        ),
+    ),
+    *tries(
+        "a talker listens",
+        _listening(
+            "a talker listens", Identity(OWN, "talker"), RowStatus.REFUSED, _OTHER_DIRECTION
+        ),
+        _listening(
+            "a talker listens, wildcard permissions",
+            Identity(Undefended(forger.talker_may_do_everything), "talker"),
+            RowStatus.HEARD,
+            _BOTH_DIRECTIONS,
+            removed=_LEAST_PRIVILEGE,
+        ),
+    ),
+    *tries(
+        "an enclave calls a service",
+        _calling(
+            "an enclave calls a service that it was not given",
+            Identity(OWN, "guest"),
+            RowStatus.REFUSED,
+            "its signed permissions allow neither the request nor the reply",
+        ),
+        _calling(
+            "an enclave calls a service, wildcard permissions",
+            _GUEST_MAY_DO_EVERYTHING,
+            RowStatus.ANSWERED,
+            "permissions for * allow every service",
+            removed=_LEAST_PRIVILEGE,
+        ),
+    ),
+    *tries(
+        "a client poses as the server",
+        _posing_as_server(
+            "a client poses as the server",
+            Identity(OWN, "client"),
+            RowStatus.REFUSED,
+            "its signed permissions allow requests, not replies",
+        ),
+        _posing_as_server(
+            "a client poses as the server, wildcard permissions",
+            Identity(Undefended(forger.client_may_do_everything), "client"),
+            RowStatus.ANSWERED,
+            "permissions for * allow replies as well",
+            removed=_LEAST_PRIVILEGE,
+        ),
+    ),
+    *tries(
+        "an enclave without a policy",
+        _injection(
+            "an enclave without a policy publishes",
+            Identity(OWN, "newcomer"),
+            RowStatus.REFUSED,
+            "the template denies every topic of the robot to an enclave without a policy",
+            Variant(
+                (Condition.OPEN_DEFAULT,),
+                RowStatus.HEARD,
+                "the template allows everything to an enclave without a policy",
+                "give every enclave a policy, or use the template production",
+            ),
+        ),
+        _injection(
+            "an enclave without a policy publishes, open default",
+            Identity(Undefended(template=forger.open_default), "newcomer"),
+            RowStatus.HEARD,
+            "an enclave without a policy may do everything",
+            removed="the template's denial by default",
+        ),
+    ),
+)
+
+WIDEST_PUBLISHER, WIDEST_SUBSCRIBER = "widest publisher", "widest subscriber"
+WIDEST_CLIENT, WIDEST_SERVER = "widest client", "widest server"
+WIDEST: dict[str, Row] = dict(
+    zip(
+        (WIDEST_PUBLISHER, WIDEST_SUBSCRIBER, WIDEST_CLIENT, WIDEST_SERVER),
+        (
+            *tries(
+                "an enclave publishes a topic",
+                _injection(
+                    "the widest enclave publishes a topic that it was not given",
+                    Identity(OWN, WIDEST_PUBLISHER),
+                    RowStatus.REFUSED,
+                    _NOT_ALLOWED,
+                ),
+            ),
+            *tries(
+                "an enclave hears a topic",
+                _listening(
+                    "the widest enclave hears a topic that it was not given",
+                    Identity(OWN, WIDEST_SUBSCRIBER),
+                    RowStatus.REFUSED,
+                    _NOT_ALLOWED,
+                ),
+            ),
+            *tries(
+                "an enclave calls a service",
+                _calling(
+                    "the widest enclave calls a service that it was not given",
+                    Identity(OWN, WIDEST_CLIENT),
+                    RowStatus.REFUSED,
+                    "its signed permissions allow neither the request nor the reply",
+                ),
+            ),
+            *tries(
+                "a client poses as the server",
+                _posing_as_server(
+                    "the widest enclave poses as the server",
+                    Identity(OWN, WIDEST_SERVER),
+                    RowStatus.REFUSED,
+                    "its signed permissions do not allow replies",
+                ),
+            ),
+        ),
+        strict=True,
+    )
+)
+"""The attack of the enclave with the widest permissions, by its part, in a keystore of a user."""
+
+
+def joining(enclave: str, fault: str) -> Row:
+    """Return a row that shows whether an enclave with a ``fault`` in its files joins the others.
+
+    Endpoints are announced to whom the talker's DDS has authenticated, and to nobody else.
+    """
+    name = f"{enclave} joins the other enclaves"
+    return _discovering(name, Identity(OWN, enclave), RowStatus.VISIBLE, fault)
+
+
+def revoked_joining(enclave: str, own: bool) -> Row:
+    """Return a row that shows whether a revoked enclave joins the others.
+
+    ``own`` says whether the enclave itself has the list that revokes it.
+    """
+    return _discovering(
+        f"{enclave}, revoked, joins the other enclaves",
+        Identity(OWN, enclave),
+        RowStatus.NOT_LET_IN if own else RowStatus.NOT_VISIBLE,
+        "the revocation list of the keystore names its certificate",
+    )
+
+
+# ── with certificates and keys ─────────────────────────────────────────────────────────────
+
+_DATES_CHECKED = "the attacker's DDS checks the dates of the certificate first"
+_NO_LIST = "without crl.pem, DDS does not check for revocation"
+
+_IDENTITY_ROWS: tuple[Row, ...] = (
+    *tries(
+        "identity of another CA",
+        _injection(
+            "identity of another CA",
+            Identity(FOREIGN, "talker"),
+            RowStatus.NOT_HEARD,
+            "the listener does not trust the other CA: the handshake fails, and no keys are sent",
+        ),
+        _succeeds(
+            "identity of another CA, to a listener of that CA",
+            Identity(FOREIGN, "talker"),
+            "a different CA",
+        ),
+    ),
+    *tries(
+        "identity out of date",
+        _injection(
+            "expired identity",
+            Identity(forger.expired_identity, "talker"),
+            RowStatus.NOT_LET_IN,
+            _DATES_CHECKED,
+        ),
+        _injection(
+            "identity not yet valid",
+            Identity(forger.identity_not_yet_valid, "talker"),
+            RowStatus.NOT_LET_IN,
+            _DATES_CHECKED,
+        ),
+        _succeeds(
+            "the same identity in date",
+            Identity(Undefended(forger.identity_in_date), "talker"),
+            "the wrong dates",
+        ),
+    ),
+    *tries(
+        "revoked identity",
+        _injection(
+            "revoked identity",
+            Identity(OWN, "talker"),
+            RowStatus.NOT_HEARD,
+            "the listener's crl.pem lists the certificate",
+            victims=forger.talker_revoked,
+        ),
+        _injection(
+            "revoked identity, list not delivered",
+            Identity(Undefended(forger.talker_revocation_not_delivered), forger.STOLEN),
+            RowStatus.HEARD,
+            _NO_LIST,
+            removed="the listener's crl.pem",
+        ),
+    ),
+    *tries(
+        "key and certificate do not belong together",
+        _injection(
+            "certificate with the key of another enclave",
+            Identity(forger.key_of_another_enclave, "talker"),
+            RowStatus.NOT_HEARD,
+            "the handshake fails if the key does not belong to the certificate",
+            Variant(
+                (Condition.FAST,),
+                RowStatus.NOT_LET_IN,
+                mechanism="the attacker's DDS compares the key with the certificate",
+            ),
+        ),
+        _succeeds(
+            "certificate with its own key", Identity(Undefended(), "talker"), "the wrong key"
+        ),
+    ),
+    *tries(
+        "world-readable keys",
+        _injection(
+            "identity copied by another user of the robot",
+            Identity(forger.identity_copied_by_another_user, "talker"),
+            RowStatus.NOT_LET_IN,
+            "the file modes deny other users the key, and without the key no node starts",
+        ),
+        _injection(
+            "identity copied by another user, modes opened",
+            Identity(Undefended(forger.files_readable_for_all), "talker"),
+            RowStatus.HEARD,
+            "no DDS checks file modes: any user that can read the key can pose as the enclave",
+            removed="the modes of files and folders",
+        ),
+    ),
+)
+
+
+# ── with permissions and governance ────────────────────────────────────────────────────────
+
+_SIGNED_BY_CA = Identity(Undefended(forger.permissions_signed_by_the_ca), "guest")
+_SIGNED_WRONG = "the attacker's DDS verifies the signature with the permissions CA"
+_UNIQUE_SUBJECTS = "unique subjects"
+_ONE_CA = Variant(
+    (Condition.ONE_CA,),
+    RowStatus.HEARD,
+    "with one CA for identity and permissions, this DDS accepts permissions that any enclave has"
+    " signed (the class of CVE-2023-24011)",
+    "use a keystore with separate CAs (template development or production)",
+)
+_TRUSTED_AS_SIGNER = _injection(
+    "permissions signed by the enclave itself, a trusted signer",
+    Identity(Undefended(forger.enclave_among_the_signers), "guest"),
+    RowStatus.HEARD,
+    "every certificate in the file of the permissions CA may sign",
+    removed="a permissions CA file with only the CA in it",
+)
+_SAME_SUBJECT = _injection(
+    "permissions borrowed, the same subject",
+    Identity(Undefended(forger.borrowed_permissions_and_subject), "guest"),
+    RowStatus.HEARD,
+    "the same permissions are valid for two certificates with one subject name",
+    removed="a unique subject name",
+)
+
+_PERMISSIONS_ROWS: tuple[Row, ...] = (
+    *tries(
+        "forged permissions",
+        _injection(
+            "permissions copied from another enclave",
+            Identity(forger.permissions_of_another, "guest"),
+            RowStatus.NOT_LET_IN,
+            "the permissions are for another subject name than the certificate's",
+        ),
+        *(
+            _injection(name, Identity(forge, "guest"), RowStatus.NOT_LET_IN, _SIGNED_WRONG)
+            for name, forge in (
+                ("permissions edited", forger.edited_permissions),
+                ("permissions unsigned", forger.unsigned_permissions),
+                ("permissions signed by another CA", forger.permissions_of_another_ca),
+            )
+        ),
+        _succeeds(
+            "the same permissions, signed by the permissions CA",
+            _SIGNED_BY_CA,
+            "the wrong signature",
+        ),
+    ),
+    *tries(
+        "the attacker's own permissions CA",
+        _injection(
+            "the attacker's own permissions CA",
+            Identity(forger.own_permissions_ca, "guest"),
+            RowStatus.NOT_HEARD,
+            "the attacker's DDS accepts this CA; its peers verify with the CA that they trust",
+            Variant((Condition.FAST,), RowStatus.NOT_HEARD),
+        ),
+        _injection(
+            "the attacker's own permissions CA, trusted by the listener",
+            Identity(Undefended(forger.another_permissions_ca_trusted), "guest"),
+            RowStatus.HEARD,
+            "the listener accepts what the permissions CA that it trusts has signed",
+            removed="the listener's permissions CA",
+        ),
+    ),
+    *tries(
+        "permissions signed by the enclave itself",
+        _injection(
+            "permissions signed by the enclave itself",
+            Identity(forger.permissions_signed_by_itself, "guest"),
+            RowStatus.NOT_LET_IN,
+            "no enclave's certificate comes from the permissions CA: it signs only documents",
+            Variant(
+                (Condition.EXACT_SIGNER,),
+                RowStatus.NOT_LET_IN,
+                mechanism="Fast DDS accepts only the permissions CA itself as signer",
+            ),
+            _ONE_CA,
+        ),
+        _injection(
+            "permissions and governance signed by the enclave",
+            Identity(forger.permissions_and_governance_signed_by_itself, "guest"),
+            RowStatus.NOT_HEARD,
+            "the attacker changes the CA file for its DDS; its peers verify with the real CA",
+            Variant(
+                (Condition.EXACT_SIGNER,),
+                RowStatus.NOT_HEARD,
+                mechanism="the attacker changes the CA file for its DDS; its peers accept only the"
+                " real CA",
+            ),
+            _ONE_CA,
+        ),
+        _injection(
+            "permissions signed by the enclave itself, one CA",
+            Identity(Undefended(forger.permissions_signed_by_itself, forger.one_ca), "guest"),
+            RowStatus.HEARD,
+            "Cyclone DDS 0.10 accepts every signer whose certificate comes from the CA",
+            Variant((Condition.EXACT_SIGNER,), RowStatus.HEARD, instead=_TRUSTED_AS_SIGNER),
+            removed="a separate permissions CA",
+        ),
+    ),
+    *tries(
+        "permissions borrowed from a longer enclave name",
+        _injection(
+            "permissions borrowed from a longer enclave name",
+            Identity(forger.borrowed_permissions, "guest"),
+            RowStatus.NOT_LET_IN,
+            "every subject name has a unique part",
+            Variant(
+                (Condition.FAST,),
+                RowStatus.NOT_LET_IN,
+                mechanism="Fast DDS compares whole subject names, and no two are equal",
+            ),
+            Variant(
+                (Condition.SHARED_SUBJECTS, Condition.CYCLONE),
+                RowStatus.HEARD,
+                "Cyclone DDS 0.10 accepts permissions for a longer subject with the same parts",
+                "use the template production (unique_subject), or enclave names that do not contain"
+                " each other",
+            ),
+        ),
+        _injection(
+            "permissions borrowed, subjects not unique",
+            Identity(Undefended(forger.borrowed_permissions, forger.shared_subjects), "guest"),
+            RowStatus.HEARD,
+            "Cyclone DDS compares parts of subject names: /guest may use what is for /guest/admin",
+            Variant((Condition.FAST,), RowStatus.HEARD, instead=_SAME_SUBJECT),
+            removed=_UNIQUE_SUBJECTS,
+        ),
+    ),
+    *tries(
+        "old permissions put back",
+        known_open(
+            _injection(
+                "old permissions put back",
+                Identity(forger.permissions_signed_by_the_ca, "guest"),
+                RowStatus.HEARD,
+                "what the CA has signed is valid until it expires",
+            ),
+            "DDS Security 1.1 cannot revoke permissions (sros2#275)",
+            "after taking rights away: `sros renew` with the template production, or `sros revoke`"
+            " and a new enclave",
+        ),
+    ),
+    *tries(
+        "old permissions put back after renewal",
+        _injection(
+            "old permissions put back after renewal",
+            Identity(forger.old_permissions_after_renewal, "guest"),
+            RowStatus.NOT_LET_IN,
+            "the renewed certificate has another subject name than the old permissions",
+            Variant(
+                (Condition.SHARED_SUBJECTS,),
+                RowStatus.HEARD,
+                "the renewed certificate has the same subject name as the old one",
+                "use the template production (unique_subject), or `sros revoke` and a new enclave",
+            ),
+        ),
+        _injection(
+            "old permissions put back after renewal, subjects not unique",
+            Identity(
+                Undefended(forger.old_permissions_after_renewal, forger.shared_subjects), "guest"
+            ),
+            RowStatus.HEARD,
+            "the old and new permissions are for the same subject name",
+            removed=_UNIQUE_SUBJECTS,
+        ),
+    ),
+    *tries(
+        "old permissions put back after revocation",
+        _injection(
+            "old permissions put back after revocation",
+            Identity(forger.permissions_signed_by_the_ca, "guest"),
+            RowStatus.NOT_HEARD,
+            "the listener's crl.pem lists the certificate for which they were signed",
+            victims=forger.guest_revoked,
+        ),
+        _injection(
+            "old permissions put back after revocation, list not delivered",
+            Identity(Undefended(forger.guest_revocation_not_delivered), forger.STOLEN),
+            RowStatus.HEARD,
+            _NO_LIST,
+            removed="the listener's crl.pem",
+        ),
+    ),
+    *tries(
+        "permissions for another domain",
+        _injection(
+            "permissions for another domain",
+            Identity(forger.permissions_for_another_domain, "guest"),
+            RowStatus.NOT_LET_IN,
+            "the permissions have no rule for this domain",
+            Variant(
+                (Condition.OPEN_JOIN, Condition.UNCONTROLLED),
+                RowStatus.HEARD,
+                "the template controls neither who joins nor who uses the topic",
+                "keep join_access_control and the access control of topics on",
+            ),
+            Variant(
+                (Condition.FAST,),
+                RowStatus.NOT_HEARD,
+                mechanism="Fast DDS lets it start; its peers find no rule for the domain",
+            ),
+            Variant(
+                (Condition.OPEN_JOIN,),
+                RowStatus.REFUSED,
+                "the template does not control who joins the domain",
+                "keep join_access_control on",
+                mechanism="its DDS joins, and then finds no rule for the topic in this domain",
+            ),
+            *_open_to(RowStatus.HEARD, RowStatus.NOT_HEARD),
+            Variant(
+                (Condition.UNCONTROLLED,),
+                RowStatus.NOT_HEARD,
+                mechanism="its DDS controls no topic; its peers find no rule for the domain",
+            ),
+        ),
+        _discovering(
+            "an enclave of another domain lists topics",
+            Identity(forger.permissions_for_another_domain, "guest"),
+            RowStatus.NOT_LET_IN,
+            "the permissions have no rule for this domain",
+            Variant(
+                (Condition.OPEN_JOIN,),
+                RowStatus.VISIBLE,
+                "the template does not control who joins the domain",
+                "keep join_access_control on",
+            ),
+            Variant(
+                (Condition.FAST,),
+                RowStatus.NOT_VISIBLE,
+                mechanism="Fast DDS lets it start; its peers find no rule for the domain",
+            ),
+            Variant(
+                (Condition.UNAUTHENTICATED, Condition.UNAUTHENTICATED_SEE),
+                RowStatus.VISIBLE,
+                "the template admits unauthenticated participants, and does not protect the topic",
+                "remove allow_unauthenticated_participants from the template",
+            ),
+            Variant(
+                (Condition.UNCONTROLLED,),
+                RowStatus.NOT_VISIBLE,
+                mechanism="its DDS controls no topic; its peers find no rule for the domain",
+            ),
+        ),
+        _succeeds("the same permissions for this domain", _SIGNED_BY_CA, "the wrong domain"),
+    ),
+    *tries(
+        "weaker governance",
+        *(
+            _tampered(
+                name,
+                RowStatus.NOT_LET_IN,
+                "the listener's DDS verifies the signature of the permissions CA",
+                forge,
+            )
+            for name, forge in (
+                ("governance edited", forger.edited_governance),
+                ("governance of another CA", forger.governance_of_another_ca),
+            )
+        ),
+        known_open(
+            _tampered(
+                "an older, weaker governance put back",
+                RowStatus.HEARD,
+                "a governance that the CA has signed never expires: it has no dates",
+                forger.weaker_governance,
+            ),
+            "DDS Security 1.1 cannot revoke a governance document",
+            "after strengthening the governance (`sros update_keystore`): `sros rotate_ca "
+            "--permissions`, so that nobody trusts the CA that signed the weaker one",
+        ),
+        _injection(
+            "weaker governance, signed by the permissions CA",
+            UNSECURED,
+            RowStatus.HEARD,
+            "the governance admits everybody and protects nothing",
+            removed="the wrong signature",
+            victims=_OPEN_GOVERNANCE,
+        ),
+    ),
+)
+
+
+# ── on the files and environment variables with which a process starts ─────────────────────
+
+_ENABLE, _STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
+
+
+def _misconfigured(
+    name: str, identity: Identity, expected: RowStatus, mechanism: str, *, removed: str = ""
+) -> Row:
+    """Return a row that shows whether a misconfigured talker is heard by an unsecured listener."""
+    return Row(
+        name,
+        expected,
+        mechanism,
+        (
+            Party("misconfigured talker", Role.TALKER, identity, intruder=True),
+            Party("unsecured listener", Role.LISTENER),
+            Party("unsecured talker", Role.TALKER),
+        ),
+        (hears("unsecured listener", "misconfigured talker").expecting(expected),),
+        (hears("unsecured listener", "unsecured talker"),),
+        brief=True,
+        variants=_open_to(RowStatus.HEARD, expected),
+        removed=removed,
+    )
+
+
+def _misspelt(name: str, keystore: KeystoreChoice, variable: str, value: str, why: str) -> Row:
+    """Return a row in which a value is misspelt, and the talker runs unsecured."""
+    identity = Identity(keystore, "talker", ((variable, value),))
+    mechanism = f"{why}: the talker runs unsecured"
+    return known_open(
+        _misconfigured(name, identity, RowStatus.HEARD, mechanism),
+        "rcl ignores every other spelling, and the node does not warn",
+        "start nodes with `sros run`, which sets the variables; `sros doctor` finds misspelt ones",
+    )
+
+
+_VARIABLE_ROWS: tuple[Row, ...] = (
+    *tries(
+        "a file of the enclave missing",
+        _misconfigured(
+            "a file of the enclave missing, Enforce",
+            Identity(forger.missing_permissions, "talker"),
+            RowStatus.NOT_LET_IN,
+            "with Enforce, a node does not start if a file of its enclave is missing",
+        ),
+        _misconfigured(
+            "a file of the enclave missing, Permissive",
+            Identity(
+                Undefended(forger.missing_permissions), "talker", ((_STRATEGY, "Permissive"),)
+            ),
+            RowStatus.HEARD,
+            "with Permissive, the talker runs unsecured, and everybody hears it",
+            removed="ROS_SECURITY_STRATEGY=Enforce",
+        ),
+    ),
+    *tries(
+        "misspelt security variables",
+        _misconfigured(
+            "variables spelt right",
+            Identity(OWN, "talker"),
+            RowStatus.NOT_HEARD,
+            "the talker runs secured, and sends nothing to unsecured nodes",
+        ),
+        _misspelt(
+            f"{_ENABLE}=True",
+            OWN,
+            _ENABLE,
+            "True",
+            "every value but 'true' switches security off",
+        ),
+        _misspelt(
+            f"{_STRATEGY}=enforce and a file missing",
+            forger.missing_permissions,
+            _STRATEGY,
+            "enforce",
+            "every value but 'Enforce' means Permissive",
+        ),
+    ),
+)
+
+
+ATTACKS = Scenario(
+    "attacks",
+    "all attacks that sros knows, also without the defences that stop them",
+    (*_NETWORK_ROWS, *_RIGHTS_ROWS, *_IDENTITY_ROWS, *_PERMISSIONS_ROWS, *_VARIABLE_ROWS),
+    {
+        "talker": "/talker_listener/talker",
+        "listener": "/talker_listener/listener",
+        "guest": GUEST,
+        "admin": f"{GUEST}/admin",
+        "server": f"{SERVICE}/server",
+        "client": f"{SERVICE}/client",
+        "newcomer": "/talker_listener/newcomer",
+    },
+    attacked_policy,
+    unpermitted=("/talker_listener/newcomer",),
+    any_keystore=True,
+)

@@ -1,0 +1,912 @@
+"""The scenarios on Zenoh: nodes with the names, tokens and messages of rmw_zenoh.
+
+Every world has a router; several rows share a world.  Attackers are lawless: their process does not
+enforce its own rules, so that only the rules of others stop them.  Each attack has a control, and
+is tried again without the defence that stops it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from sros_tool.demo import forger, zenoh_forger
+from sros_tool.demo.forger import STOLEN
+from sros_tool.demo.scenarios.model import (
+    OWN,
+    UNSECURED,
+    Claim,
+    Identity,
+    KeystoreChoice,
+    Party,
+    Relation,
+    Role,
+    Row,
+    RowStatus,
+    Scenario,
+    Wire,
+    answered,
+    hears,
+    known_open,
+    talker_and_listener,
+    tries,
+)
+from sros_tool.demo.scenarios.policies import ACTION, SERVICE, zenoh_policy
+
+_ROUTER = "/router"
+_PEERS, _CLIENTS = "peers", "clients"
+"""The worlds with all defences: sessions connect to each other, or to the router alone."""
+_CAST = {
+    "talker": "/talker_listener/talker",
+    "listener": "/talker_listener/listener",
+    "guest": "/talker_listener/guest",
+    "admin": "/talker_listener/guest/admin",
+    "server": f"{SERVICE}/server",
+    "client": f"{SERVICE}/client",
+    "action server": f"{ACTION}/server",
+    "action client": f"{ACTION}/client",
+    "router": _ROUTER,
+}
+_TOPIC_OF = {
+    Role.SERVER: SERVICE,
+    Role.CLIENT: SERVICE,
+    Role.ACTION_SERVER: ACTION,
+    Role.ACTION_CLIENT: ACTION,
+}
+_CHATTER = (hears("listener", "talker"),)
+_CALLS = (answered("client", "server"),)
+_GOALS = (answered("action client", "action server"),)
+
+
+def _scenario(name: str, title: str, *rows: Row) -> Scenario:
+    return Scenario(name, title, rows, _CAST, zenoh_policy, router=_ROUTER)
+
+
+def _router(keystore: KeystoreChoice | None) -> Party:
+    """Return the router of a world, unsecured without a keystore."""
+    identity = UNSECURED if keystore is None else Identity(keystore, "router")
+    return Party("router", Role.ROUTER, identity)
+
+
+def _rightful(name: str, role: Role, keystore: KeystoreChoice, part: str = "") -> Party:
+    """Return a party that does what its enclave may do; ``part`` is its name by default."""
+    return Party(name, role, Identity(keystore, part or name), _TOPIC_OF.get(role, ""), turn=1)
+
+
+def _attacker(
+    name: str,
+    role: Role,
+    keystore: KeystoreChoice,
+    part: str = "guest",
+    topic: str = "",
+    *,
+    lawless: bool = True,
+) -> Party:
+    """Return an attacker in an enclave that has not the right, or with files that are not valid."""
+    identity = Identity(keystore, part, lawless=lawless)
+    return Party(name, role, identity, topic or _TOPIC_OF.get(role, ""), intruder=True, turn=2)
+
+
+def _attempt(
+    name: str,
+    expected: RowStatus,
+    mechanism: str,
+    claim: Claim,
+    parties: tuple[Party, ...],
+    controls: tuple[Claim, ...] = (),
+    *,
+    world: str = "",
+    removed: str = "",
+    evidence: str = "",
+) -> Row:
+    """Return a brief row with one claim, expected as ``expected``."""
+    return Row(
+        name,
+        expected,
+        mechanism,
+        parties,
+        (replace(claim.expecting(expected), evidence=evidence),),
+        controls,
+        brief=True,
+        world=world,
+        removed=removed,
+    )
+
+
+def _executes(server: str, client: str) -> Claim:
+    """Return the claim that a server executes a call of a client."""
+    return Claim(Relation.EXECUTES, server, client)
+
+
+def _topic_pair(keystore: KeystoreChoice = OWN) -> tuple[Party, Party, Party]:
+    """Return router, talker and listener."""
+    talker, listener = talker_and_listener(keystore)
+    return _router(keystore), replace(talker, turn=1), replace(listener, turn=1)
+
+
+def _service_pair(keystore: KeystoreChoice = OWN) -> tuple[Party, ...]:
+    """Return router, server and client."""
+    server = _rightful("server", Role.SERVER, keystore)
+    client = _rightful("client", Role.CLIENT, keystore)
+    return _router(keystore), server, client
+
+
+def _action_pair() -> tuple[Party, ...]:
+    """Return router, action server and action client."""
+    server = _rightful("action server", Role.ACTION_SERVER, OWN)
+    client = _rightful("action client", Role.ACTION_CLIENT, OWN)
+    return _router(OWN), server, client
+
+
+# ── who hears, who calls, and who serves ───────────────────────────────────────────────────
+
+
+def _topic_rows(how: str, keystore: KeystoreChoice, world: str) -> tuple[Row, ...]:
+    """Return the rows of one way in which sessions connect."""
+    pair = _topic_pair(keystore)
+    talker = _attacker("talker without permission", Role.TALKER, keystore, lawless=False)
+    listener = _attacker("listener without permission", Role.LISTENER, keystore, lawless=False)
+    rows = [
+        _attempt(
+            f"talker to listener, {how}",
+            RowStatus.HEARD,
+            "the rules allow the topic to both, by the names in their certificates",
+            hears("listener", "talker"),
+            pair,
+            world=world,
+        )
+    ]
+    for party, claim in (
+        (talker, hears("listener", talker.name)),
+        (listener, hears(listener.name, "talker")),
+    ):
+        rows.append(
+            _attempt(
+                f"{party.name}, {how}",
+                RowStatus.NOT_HEARD,
+                "no rule allows it, and what no rule allows is dropped",
+                claim,
+                (*pair, party),
+                _CHATTER,
+                world=world,
+            )
+        )
+    return tuple(rows)
+
+
+_ISOLATION = _scenario(
+    "isolation",
+    "nobody hears or is heard without permission on Zenoh",
+    *_topic_rows("directly", OWN, _PEERS),
+    *_topic_rows("through the router", zenoh_forger.through_the_router, _CLIENTS),
+    _attempt(
+        "unsecured talker to unsecured listener",
+        RowStatus.HEARD,
+        "no security: what rmw_zenoh does by itself",
+        hears("unsecured listener", "unsecured talker"),
+        (
+            _router(None),
+            Party("unsecured talker", Role.TALKER, turn=1),
+            Party("unsecured listener", Role.LISTENER, turn=1),
+        ),
+    ),
+    _attempt(
+        "talker in the graph of another enclave",
+        RowStatus.VISIBLE,
+        "every node needs the graph, and its token names the enclave of its certificate",
+        Claim(Relation.SEES, "observer", "talker"),
+        (*_topic_pair(), _rightful("observer", Role.OBSERVER, OWN, "client")),
+        world=_PEERS,
+    ),
+)
+
+
+def _unasked(name: str, role: Role, mechanism: str, party: str, server: str, client: str) -> Row:
+    """Return a row in which an enclave calls or serves what it has no right to."""
+    intruder = _attacker(party, role, OWN, lawless=False)
+    calls = role in (Role.CLIENT, Role.ACTION_CLIENT)
+    on_service = role in (Role.CLIENT, Role.SERVER)
+    return _attempt(
+        name,
+        RowStatus.NOT_EXECUTED if calls else RowStatus.NOT_ANSWERED,
+        f"{mechanism}: no rule allows it",
+        _executes(server, party) if calls else answered(client, party),
+        (*(_service_pair() if on_service else _action_pair()), intruder),
+        _CALLS if on_service else _GOALS,
+        world=_PEERS,
+    )
+
+
+_SERVICES = _scenario(
+    "services",
+    "who may call and who may serve services and actions on Zenoh",
+    _attempt(
+        "client of a service",
+        RowStatus.ANSWERED,
+        "the client may send requests and receive replies, the server the reverse",
+        answered("client", "server"),
+        _service_pair(),
+        world=_PEERS,
+    ),
+    _unasked(
+        "client without permission",
+        Role.CLIENT,
+        "the request is dropped before the server",
+        "client without permission",
+        "server",
+        "client",
+    ),
+    _unasked(
+        "enclave that poses as the server",
+        Role.SERVER,
+        "nobody hears that it offers the service",
+        "posing server",
+        "server",
+        "client",
+    ),
+    _attempt(
+        "client of an action",
+        RowStatus.ANSWERED,
+        "goal, feedback, status and result arrive: three services and two topics",
+        answered("action client", "action server"),
+        _action_pair(),
+        world=_PEERS,
+    ),
+    _unasked(
+        "action client without permission",
+        Role.ACTION_CLIENT,
+        "the goal is dropped before the server",
+        "action client without permission",
+        "action server",
+        "action client",
+    ),
+    _unasked(
+        "enclave that poses as the action server",
+        Role.ACTION_SERVER,
+        "nobody hears that it offers the action",
+        "posing action server",
+        "action server",
+        "action client",
+    ),
+)
+
+
+# ── attacks on the wire ────────────────────────────────────────────────────────────────────
+
+
+def _tapped(attack: str, wire: Wire, *, readable: bool) -> tuple[Row, ...]:
+    hidden = "TLS hides it: only the endpoints of a link have its keys"
+    row = Row(
+        f"{attack}, without TLS" if readable else attack,
+        RowStatus.READABLE if readable else RowStatus.NOT_READABLE,
+        "TCP sends it as it is" if readable else hidden,
+        _topic_pair(zenoh_forger.in_the_clear if readable else OWN),
+        (Claim(Relation.READABLE, "talker", holds=readable, wire=wire),),
+        _CHATTER,
+        wire=True,
+        brief=True,
+        world="tapped, open" if readable else "tapped",
+        removed="TLS" if readable else "",
+    )
+    return tries(attack, row)
+
+
+_WIRE_ROWS = tuple(
+    row
+    for readable in (False, True)
+    for attack, wire in (
+        ("payload read on the wire", Wire.TEXT),
+        ("topic names read on the wire", Wire.TOPIC),
+    )
+    for row in _tapped(attack, wire, readable=readable)
+)
+
+_LARGE = 64 * 1024
+
+
+def _shared(name: str, keystore: KeystoreChoice, *, readable: bool) -> Row:
+    wide, talker, listener = _topic_pair(keystore)
+    return Row(
+        name,
+        RowStatus.READABLE if readable else RowStatus.NOT_READABLE,
+        "a large message lies in shared memory as it is"
+        if readable
+        else "the files switch shared memory off: TLS carries large messages, too",
+        (wide, replace(talker, size=_LARGE), listener),
+        (Claim(Relation.READABLE, "talker", holds=readable, wire=Wire.MEMORY),),
+        _CHATTER,
+        brief=True,
+        removed="`shared_memory` off" if readable else "",
+    )
+
+
+_MEMORY_ROWS = tries(
+    "large messages in shared memory",
+    _shared("large messages in shared memory", OWN, readable=False),
+    _shared(
+        "large messages in shared memory, switched on",
+        zenoh_forger.in_shared_memory,
+        readable=True,
+    ),
+)
+
+
+# ── who gets a connection ──────────────────────────────────────────────────────────────────
+
+
+def _outsider(name: str, keystore: KeystoreChoice, mechanism: str, evidence: str) -> Row:
+    """Return a row in which a process in the name of the talker gets no connection."""
+    party = _attacker(f"talker with {name}", Role.TALKER, keystore, "talker")
+    return _attempt(
+        name,
+        RowStatus.NOT_LET_IN,
+        mechanism,
+        hears("listener", party.name),
+        (*_topic_pair(), party),
+        _CHATTER,
+        world=_PEERS,
+        evidence=evidence,
+    )
+
+
+def _let_in(name: str, keystore: KeystoreChoice, removed: str) -> Row:
+    """Return a row in which the same process is heard, because a defence is missing."""
+    wide, _, listener = _topic_pair(keystore)
+    party = _attacker("attacker", Role.TALKER, keystore, "talker")
+    return _attempt(
+        name,
+        RowStatus.HEARD,
+        "it gets a connection, and rules that are not for a name let it through",
+        hears("listener", party.name),
+        (wide, listener, party),
+        removed=removed,
+    )
+
+
+_IN_DATE = _attacker("talker in date", Role.TALKER, zenoh_forger.in_date, "talker")
+
+
+def _in_date(name: str, removed: str) -> Row:
+    return _attempt(
+        name,
+        RowStatus.HEARD,
+        "an attacker with valid files is heard",
+        hears("listener", _IN_DATE.name),
+        (*_topic_pair(), _IN_DATE),
+        world=_PEERS,
+        removed=removed,
+    )
+
+
+_CONNECTION_ROWS = (
+    *tries(
+        "no certificate",
+        _outsider(
+            "no certificate",
+            zenoh_forger.without_certificate,
+            "router and sessions ask for a certificate of the keystore's identity CA",
+            "peer sent no certificates",
+        ),
+        _let_in(
+            "no certificate, and none is asked for",
+            zenoh_forger.certificates_not_asked_for,
+            "mutual TLS and named subjects",
+        ),
+    ),
+    *tries(
+        "a certificate of another CA",
+        _outsider(
+            "a certificate of another CA",
+            zenoh_forger.identity_of_another_ca,
+            "it says the talker's name, but the identity CA has not signed it",
+            "UnknownIssuer",
+        ),
+        _let_in(
+            "a certificate of another CA, which is trusted",
+            zenoh_forger.both_cas_trusted,
+            "a different CA",
+        ),
+    ),
+    *tries(
+        "TCP instead of TLS",
+        _outsider(
+            "TCP instead of TLS",
+            zenoh_forger.plain_tcp,
+            "the router listens with TLS alone",
+            "InvalidContentType",
+        ),
+        _let_in(
+            "TCP instead of TLS, which the router also accepts",
+            zenoh_forger.tcp_next_to_tls,
+            "the list of protocols and named subjects",
+        ),
+    ),
+    *tries(
+        "identity out of date",
+        _outsider(
+            "an expired certificate",
+            forger.expired_identity,
+            "TLS checks the dates of the certificate",
+            "certificate expired",
+        ),
+        _outsider(
+            "a certificate that is not yet valid",
+            forger.identity_not_yet_valid,
+            "TLS checks the dates of the certificate",
+            "certificate not valid yet",
+        ),
+        _in_date("the same identity in date", "the wrong dates"),
+    ),
+    *tries(
+        "the key of another enclave",
+        _outsider(
+            "the key of another enclave",
+            forger.key_of_another_enclave,
+            "TLS needs the key that belongs to the certificate",
+            "KeyMismatch",
+        ),
+        _in_date("certificate with its own key", "the wrong key"),
+    ),
+)
+
+
+def _expiring(name: str, keystore: KeystoreChoice, *, cut: bool) -> Row:
+    steady = _rightful("steady talker", Role.TALKER, keystore, "admin")
+    return Row(
+        name,
+        RowStatus.CUT_OFF if cut else RowStatus.STILL_HEARD,
+        "router and sessions close a link when its certificate expires"
+        if cut
+        else "Zenoh looks at the dates of a certificate only when a link is opened",
+        (*_topic_pair(keystore), steady),
+        (Claim(Relation.HEARS_EXPIRED, "listener", "talker", holds=not cut),),
+        (hears("listener", steady.name),),
+        brief=True,
+        short_lived=True,
+        removed="" if cut else "close_link_on_expiration",
+    )
+
+
+_EXPIRY_ROWS = tries(
+    "certificate that expires during a link",
+    _expiring("certificate that expires during a link", zenoh_forger.short_lived, cut=True),
+    _expiring(
+        "certificate that expires, the link stays",
+        zenoh_forger.links_that_outlive_certificates,
+        cut=False,
+    ),
+)
+
+
+# ── enclaves without the right ─────────────────────────────────────────────────────────────
+
+
+def _trespass(
+    name: str,
+    party: Party,
+    expected: RowStatus,
+    mechanism: str,
+    keystore: KeystoreChoice,
+    world: str,
+    removed: str = "",
+) -> Row:
+    """Return a row in which a party uses the topic or the service in a keystore, or tries to."""
+    claim = {
+        Role.TALKER: hears("listener", party.name),
+        Role.LISTENER: hears(party.name, "talker"),
+        Role.CLIENT: _executes("server", party.name),
+        Role.SERVER: answered("client", party.name),
+    }[party.role]
+    on_service = party.role in (Role.CLIENT, Role.SERVER)
+    others = _service_pair(keystore) if on_service else _topic_pair(keystore)
+    identity = replace(party.identity, keystore=keystore)
+    return _attempt(
+        name,
+        expected,
+        mechanism,
+        claim,
+        (*others, replace(party, identity=identity)),
+        _CALLS if on_service else _CHATTER,
+        world=world,
+        removed=removed,
+    )
+
+
+_ENTRIES: tuple[tuple[Party, str, RowStatus, RowStatus], ...] = (
+    (
+        _attacker("guest that talks", Role.TALKER, OWN),
+        "publishes",
+        RowStatus.NOT_HEARD,
+        RowStatus.HEARD,
+    ),
+    (
+        _attacker("guest that listens", Role.LISTENER, OWN),
+        "listens",
+        RowStatus.NOT_HEARD,
+        RowStatus.HEARD,
+    ),
+    (
+        _attacker("guest that calls", Role.CLIENT, OWN),
+        "calls a service",
+        RowStatus.NOT_EXECUTED,
+        RowStatus.EXECUTED,
+    ),
+    (
+        _attacker("guest that serves", Role.SERVER, OWN),
+        "poses as a server",
+        RowStatus.NOT_ANSWERED,
+        RowStatus.ANSWERED,
+    ),
+)
+
+
+def _past_the_router(party: Party, attack: str, denied: RowStatus, done: RowStatus) -> list[Row]:
+    return [
+        _trespass(
+            attack,
+            party,
+            denied,
+            "every session enforces the rights of all others, by their certificates",
+            OWN,
+            _PEERS,
+        ),
+        _trespass(
+            f"{attack}, rules at the router only",
+            party,
+            done,
+            "sessions of a host connect to each other: the router sees nothing of it",
+            zenoh_forger.rules_at_the_router_only,
+            "rules at the router",
+            "the rules in the sessions",
+        ),
+    ]
+
+
+def _through_the_router(party: Party, attack: str, denied: RowStatus, done: RowStatus) -> list[Row]:
+    return [
+        _trespass(
+            attack,
+            party,
+            denied,
+            "the router enforces everybody's rights, whatever the attacker's own session does",
+            zenoh_forger.through_the_router,
+            _CLIENTS,
+        ),
+        _trespass(
+            f"{attack}, sessions that limit themselves",
+            party,
+            done,
+            "a process that does not enforce its own rules is not limited by them",
+            zenoh_forger.sessions_that_limit_themselves,
+            "limited by themselves",
+            "rules that others enforce",
+        ),
+    ]
+
+
+def _trespasses() -> tuple[Row, ...]:
+    """Return the rows past the router, and through it, with and without the defence."""
+    rows: list[Row] = []
+    for way, rows_of in (
+        ("past the router", _past_the_router),
+        ("through the router", _through_the_router),
+    ):
+        for party, does, denied, done in _ENTRIES:
+            attack = f"another enclave {does} {way}"
+            rows += tries(attack, *rows_of(party, attack, denied, done))
+    for party, does, _, done in _ENTRIES[:2]:
+        rows += tries(
+            f"another enclave {does} past the router",
+            _trespass(
+                f"an enclave that was given the topic {does}",
+                party,
+                done,
+                "the rules allow it",
+                zenoh_forger.guest_may_use_the_topic,
+                "rule added",
+                "the missing rule",
+            ),
+        )
+    return tuple(rows)
+
+
+# ── a router of another enclave ────────────────────────────────────────────────────────────
+
+
+def _rogue(
+    name: str,
+    keystore: KeystoreChoice,
+    world: str,
+    *,
+    reads: bool,
+    removed: str = "",
+    part: str = "guest",
+) -> Row:
+    """Return a row in which a talker and a listener are connected to a router that attacks.
+
+    It succeeds without a defence, and in the enclave of the router.
+    """
+    rogue = Party("attacking router", Role.RELAY, Identity(keystore, part), intruder=True)
+    succeeds = bool(removed) or part == "router"
+    return _attempt(
+        name,
+        RowStatus.HEARD if succeeds else RowStatus.NOT_HEARD,
+        "sessions believe this router"
+        if succeeds
+        else "a session believes only the router's name, and nobody else what passes the router",
+        hears(rogue.name, "talker") if reads else hears("listener", rogue.name),
+        (rogue, *_topic_pair(keystore)[1:]),
+        () if part == "router" else _CHATTER,
+        world=world,
+        removed=removed,
+    )
+
+
+_ROUTER_ROWS = tuple(
+    row
+    for suffix, keystore, world, removed in (
+        ("", zenoh_forger.another_router, "rogue router", ""),
+        (
+            ", a subject for everybody",
+            zenoh_forger.subject_for_everybody,
+            "believed router",
+            "a named subject for the router",
+        ),
+    )
+    for reads, attack in (
+        (False, "another enclave plays the router and injects"),
+        (True, "another enclave plays the router and reads"),
+    )
+    for row in tries(
+        attack, _rogue(f"{attack}{suffix}", keystore, world, reads=reads, removed=removed)
+    )
+)
+
+
+# ── wildcards and tokens ───────────────────────────────────────────────────────────────────
+
+_WILDCARDS: tuple[tuple[Party, str, RowStatus, RowStatus], ...] = (
+    (
+        _attacker("wildcard talker", Role.TALKER, OWN, topic="/*"),
+        "a put with a wildcard",
+        RowStatus.NOT_HEARD,
+        RowStatus.HEARD,
+    ),
+    (
+        _attacker("wildcard listener", Role.LISTENER, OWN, topic="/**"),
+        "a subscription with a wildcard",
+        RowStatus.NOT_HEARD,
+        RowStatus.HEARD,
+    ),
+    (
+        _attacker("wildcard client", Role.CLIENT, OWN, topic="/**"),
+        "a query with a wildcard",
+        RowStatus.NOT_EXECUTED,
+        RowStatus.EXECUTED,
+    ),
+)
+_WILDCARD_ROWS = (
+    *(
+        row
+        for party, attack, denied, _ in _WILDCARDS
+        for row in tries(
+            attack,
+            _trespass(
+                attack,
+                party,
+                denied,
+                "a rule applies only to what it includes as a whole, and sros writes no denials"
+                " inside wildcards",
+                OWN,
+                _PEERS,
+            ),
+        )
+    ),
+    *(
+        row
+        for party, attack, _, done in _WILDCARDS
+        for row in tries(
+            attack,
+            _trespass(
+                f"{attack}, denied inside a wildcard",
+                party,
+                done,
+                "a denial of the name holds only for the name, not for a wider expression",
+                zenoh_forger.denial_in_a_wildcard,
+                "denial in a wildcard",
+                "exact permission",
+            ),
+        )
+    ),
+)
+
+
+def _spoofing(name: str, keystore: KeystoreChoice, world: str, removed: str = "") -> Row:
+    impostor = _attacker("impostor", Role.TALKER, keystore, topic="/spoofed")
+    observer = _rightful("observer", Role.OBSERVER, keystore, "client")
+    wide, talker, _ = _topic_pair(keystore)
+    return _attempt(
+        name,
+        RowStatus.VISIBLE if removed else RowStatus.NOT_VISIBLE,
+        "anybody may announce nodes under any name"
+        if removed
+        else "a token passes only with the enclave of its sender's certificate",
+        Claim(Relation.SEES, "observer", "impostor"),
+        (wide, talker, observer, replace(impostor, announced="talker")),
+        (Claim(Relation.SEES, "observer", "talker"),),
+        world=world,
+        removed=removed,
+    )
+
+
+_TOKEN_ROWS = tries(
+    "spoofed graph token",
+    _spoofing("spoofed graph token", OWN, _PEERS),
+    _spoofing(
+        "spoofed graph token, tokens of any enclave",
+        zenoh_forger.tokens_of_any_enclave,
+        "",
+        "rules that bind tokens to enclaves",
+    ),
+)
+
+
+# ── what was valid earlier ─────────────────────────────────────────────────────────────────
+
+
+def _earlier(name: str, keystore: KeystoreChoice, expected: RowStatus, removed: str = "") -> Row:
+    guest = _attacker("guest with an earlier file", Role.TALKER, keystore, lawless=False)
+    return _attempt(
+        name,
+        expected,
+        "the file decides what its own process may do, and nobody else does"
+        if removed
+        else "a session file limits only others: what this enclave may do, they decide",
+        hears("listener", guest.name),
+        (*_topic_pair(keystore), guest),
+        _CHATTER,
+        removed=removed,
+    )
+
+
+def _thief(
+    name: str, keystore: KeystoreChoice, expected: RowStatus, mechanism: str, removed: str = ""
+) -> Row:
+    wide, _, listener = _topic_pair(keystore)
+    talker = _rightful("talker", Role.TALKER, keystore, "admin")
+    thief = _attacker("thief", Role.TALKER, keystore, STOLEN)
+    return _attempt(
+        name,
+        expected,
+        mechanism,
+        hears("listener", "thief"),
+        (wide, talker, listener, thief),
+        _CHATTER,
+        removed=removed,
+    )
+
+
+_EARLIER_ROWS = (
+    *tries(
+        "session file of an earlier policy",
+        _earlier(
+            "session file of an earlier policy",
+            zenoh_forger.earlier_session_file,
+            RowStatus.NOT_HEARD,
+        ),
+        _earlier(
+            "session file of an earlier policy, sessions that limit themselves",
+            zenoh_forger.earlier_session_file_of_one_that_limits_itself,
+            RowStatus.HEARD,
+            "rules that others enforce",
+        ),
+    ),
+    *tries(
+        "revoked identity",
+        _thief(
+            "revoked identity",
+            zenoh_forger.revoked_talker,
+            RowStatus.NOT_HEARD,
+            "it still gets a connection, but its name is in no rule any more",
+        ),
+        _thief(
+            "revoked identity, the rules not written again",
+            zenoh_forger.revoked_talker_in_the_rules,
+            RowStatus.HEARD,
+            "its name is still in the rules",
+            "the new rules",
+        ),
+    ),
+)
+
+
+# ── what is known to be open ───────────────────────────────────────────────────────────────
+
+
+def _open(row: Row, because: str, remedy: str) -> Row:
+    """Return the row of an attack that has only this row, and succeeds."""
+    return known_open(replace(row, attack=row.name), because, remedy)
+
+
+_LATE = replace(_rightful("late talker", Role.TALKER, OWN, "admin"), intruder=True, turn=3)
+_OPEN_ROWS = (
+    _open(
+        _thief(
+            "revoked identity whose name is used again",
+            zenoh_forger.revoked_name_in_use_again,
+            RowStatus.HEARD,
+            "the rules know the name alone, and the old certificate has it, too",
+        ),
+        "Zenoh has no revocation list (zenoh#2749)",
+        "give the enclave another name, or `sros rotate_ca`; short validity",
+    ),
+    replace(
+        _open(
+            _attempt(
+                "rights taken away while all run",
+                RowStatus.HEARD,
+                "Zenoh reads its configuration at start",
+                hears("listener", "talker"),
+                _topic_pair(zenoh_forger.rights_to_take_away),
+            ),
+            "Zenoh reads the rules only at start (zenoh#2169)",
+            "restart the processes that `sros` names after the change",
+        ),
+        meanwhile=zenoh_forger.rights_taken_away,
+    ),
+    *(
+        _open(
+            _rogue(
+                f"the router itself {'reads' if reads else 'injects'}",
+                zenoh_forger.talkative_router,
+                "believed",
+                reads=reads,
+                part="router",
+            ),
+            "TLS ends at the router, and sessions believe what it passes on",
+            "run the router as a user of its own, with its key readable to it alone",
+        )
+        for reads in (False, True)
+    ),
+    _open(
+        _attempt(
+            "an enclave without rights lists topics",
+            RowStatus.VISIBLE,
+            "every node may ask for the graph of its domain",
+            Claim(Relation.SEES, "guest that looks around", "talker"),
+            (*_topic_pair(), _attacker("guest that looks around", Role.OBSERVER, OWN)),
+            world=_PEERS,
+        ),
+        "a node of rmw_zenoh needs the whole graph, or it sees nothing",
+        "give an identity only to those who may see all names of the robot",
+    ),
+    _open(
+        _attempt(
+            "new connections during a flood of useless ones",
+            RowStatus.NOT_LET_IN,
+            "after each failed handshake the router accepts nobody for a moment",
+            hears("listener", _LATE.name),
+            (*_topic_pair(), _attacker("flooder", Role.FLOODER, OWN), _LATE),
+            _CHATTER,
+            evidence="InvalidContentType",
+        ),
+        "anybody who reaches the port keeps others out; open links go on",
+        "let the router listen on localhost, or limit connections with a firewall",
+    ),
+)
+
+ATTACKS = _scenario(
+    "attacks",
+    "attacks on Zenoh, also without the defences that stop them",
+    *_EXPIRY_ROWS,
+    *_WIRE_ROWS,
+    *_MEMORY_ROWS,
+    *_CONNECTION_ROWS,
+    *_trespasses(),
+    *_ROUTER_ROWS,
+    *_WILDCARD_ROWS,
+    *_TOKEN_ROWS,
+    *_EARLIER_ROWS,
+    *_OPEN_ROWS,
+)
+
+ZENOH_SCENARIOS: tuple[Scenario, ...] = (_ISOLATION, _SERVICES, ATTACKS)
