@@ -427,7 +427,6 @@ OTHER_PRINTERS = {
     "cli/__init__.py": "interrupted while the program is imported",
     "demo/cyclone_node.py": _NODE,
     "demo/ros_node.py": _NODE,
-    "demo/zenoh_node.py": _NODE,
 }
 
 _CLICK = {"echo", "secho", "style", "prompt", "confirm", "echo_via_pager", "getchar", "pause"}

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from sros_tool.demo.node_options import FIBONACCI_ORDER, NodeOptions, fibonacci, parse_options
+from sros_tool.demo.nodes import FIBONACCI_ORDER, NodeOptions, fibonacci, parse_options
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _LOG_FLUSH_SECONDS = 0.3

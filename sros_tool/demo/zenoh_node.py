@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import os
 import signal
@@ -19,8 +20,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -28,13 +28,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from sros_tool.demo.node_options import (
-    FIBONACCI_ORDER,
-    NodeOptions,
-    fibonacci,
-    parse_options,
-    split_ros_args,
-)
+from sros_tool.demo.nodes import ROLES, Call, Hear, enclave_in, parse_options
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _POLL_SECONDS = 0.02
@@ -87,9 +81,9 @@ def _configuration(variables: Mapping[str, str], *, router: bool) -> zenoh.Confi
     return config
 
 
-def _key_of(domain: str, name: str, kind: tuple[str, str]) -> str:
-    """Return the key expression of a ROS name with its type and the hash of the type."""
-    return "/".join((domain, name.strip("/"), *kind))
+def _type_of(name: str, default: tuple[str, str]) -> tuple[str, str]:
+    """Return the type of a name and its hash: of a part of an action, or else ``default``."""
+    return _ACTION_TYPES.get(name.rpartition("/_action/")[2], default)
 
 
 def _cdr_string(text: str, size: int = 0) -> bytes:
@@ -104,63 +98,118 @@ def _text_of(payload: zenoh.ZBytes | None) -> str:
     return data[8:].rstrip(b"\0 ").decode(errors="replace")
 
 
-class _Node:
-    """One node in the graph; its enclave in tokens is what the process says of itself."""
+class _ZenohNode:
+    """One node in the graph; its enclave in tokens is what the process says of itself.
 
-    def __init__(self, session: zenoh.Session, domain: str, enclave: str, name: str) -> None:
-        self.session, self.domain = session, domain
-        self._place = f"{_mangled(enclave)}/%/{name}"
+    Its messages have ``size`` bytes or more.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, domain: str, enclave: str, name: str, size: int
+    ) -> None:
+        self._session, self._domain, self._size = session, domain, size
+        self._place = f"{self.wire_name(enclave)}/%/{name}"
         self._entities = 0
-        self._tokens: list[zenoh.LivelinessToken] = []
+        self._graph: set[str] = set()
+        self._declared: list[object] = []
+        self._keep = self._declared.append  # what nobody keeps is undeclared
         self._announce("NN")
 
     def _announce(self, kind: str, name: str = "", types: tuple[str, str] = ("", "")) -> bytes:
         """Put an entity of the node into the graph, and return its GID."""
         number = self._entities
         self._entities += 1
-        identity = f"{self.session.info.zid()}/0/{number}/{kind}"
-        token = f"@ros2_lv/{self.domain}/{identity}/{self._place}"
+        identity = f"{self._session.info.zid()}/0/{number}/{kind}"
+        token = f"@ros2_lv/{self._domain}/{identity}/{self._place}"
         if name:
-            token = "/".join((token, _mangled(name), *types, _QOS))
-        self._tokens.append(self.session.liveliness().declare_token(token))
+            token = "/".join((token, self.wire_name(name), *types, _QOS))
+        self._keep(self._session.liveliness().declare_token(token))
         return hashlib.blake2b(token.encode(), digest_size=16).digest()
 
-    def publisher(self, name: str, kind: tuple[str, str] = _MESSAGE) -> _Publisher:
-        """Return a publisher; ``name`` may also be a key expression with wildcards."""
+    def publisher(self, name: str) -> Hear:
+        """Return a function that publishes a text; ``name`` may have wildcards of Zenoh."""
+        kind = _type_of(name, _MESSAGE)
         gid = _GID if "*" in name else self._announce("MP", name, kind)
-        return _Publisher(self.session, _key_of(self.domain, name, kind), gid)
+        key, numbers = self._key_of(name, kind), itertools.count(1)
 
-    def subscribe(self, name: str, hear: Any, kind: tuple[str, str] = _MESSAGE) -> Any:
+        def publish(text: str) -> None:
+            attachment = _attachment(next(numbers), gid)
+            self._session.put(key, _cdr_string(text, self._size), attachment=attachment)
+
+        return publish
+
+    def subscribe(self, name: str, hear: Hear) -> None:
         """Subscribe to a topic; ``hear`` gets each text."""
+        kind = _type_of(name, _MESSAGE)
         if "*" not in name:
             self._announce("MS", name, kind)
-        key = _key_of(self.domain, name, kind) if name != "/**" else f"{self.domain}/**"
-        return self.session.declare_subscriber(key, lambda each: hear(_text_of(each.payload)))
+        key = self._key_of(name, kind)
+        self._keep(self._session.declare_subscriber(key, lambda it: hear(_text_of(it.payload))))
 
-    def serve(self, name: str, answer: Any, kind: tuple[str, str] = _SERVICE) -> Any:
+    def serve(self, name: str, answer: Callable[[str], str]) -> None:
         """Offer a service; ``answer`` gets each request and returns the reply."""
+        kind = _type_of(name, _SERVICE)
         self._announce("SS", name, kind)
-        key = _key_of(self.domain, name, kind)
+        key = self._key_of(name, kind)
 
         def reply(query: zenoh.Query) -> None:
             with query:
                 text = answer(_text_of(query.payload))
                 query.reply(key, _cdr_string(text), attachment=_attachment(1, _GID))
 
-        return self.session.declare_queryable(key, reply, complete=True)
+        self._keep(self._session.declare_queryable(key, reply, complete=True))
 
-    def client(self, name: str, kind: tuple[str, str] = _SERVICE) -> _Client:
-        """Return a client of a service; ``name`` may also be a key expression with wildcards."""
+    def client(self, name: str) -> Call:
+        """Return a function that sends a request to a service, and passes on each reply.
+
+        ``name`` may have wildcards of Zenoh.
+        """
+        kind = _type_of(name, _SERVICE)
         gid = _GID if "*" in name else self._announce("SC", name, kind)
-        key = _key_of(self.domain, name, kind) if name != "/**" else f"{self.domain}/**"
-        return _Client(self.session, key, gid)
+        key, numbers = self._key_of(name, kind), itertools.count(1)
+        exact = "*" not in key
+
+        def call(request: str, hear: Hear) -> None:
+            replies = self._session.get(
+                key,
+                target=zenoh.QueryTarget.ALL_COMPLETE if exact else zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                payload=_cdr_string(request),
+                attachment=_attachment(next(numbers), gid),
+                timeout=_REPLY_SECONDS,
+            )
+            for reply in replies:
+                if reply.ok is not None:
+                    hear(_text_of(reply.ok.payload))
+
+        return call
+
+    def watch(self) -> None:
+        """Begin to discover publishers, by the tokens in the graph."""
+
+        def change(sample: zenoh.Sample) -> None:
+            added = sample.kind == zenoh.SampleKind.PUT
+            (self._graph.add if added else self._graph.discard)(str(sample.key_expr))
+
+        graph = self._session.liveliness()
+        self._keep(graph.declare_subscriber(f"@ros2_lv/{self._domain}/**", change, history=True))
+
+    def publications(self) -> Sequence[str]:
+        """Return the topics of the publishers that are there, as in their tokens."""
+        entities = [token.split("/") for token in tuple(self._graph)]
+        return [entity[9] for entity in entities if len(entity) > 9 and entity[5] == "MP"]
+
+    def wire_name(self, topic: str) -> str:
+        """Return a name as it is in tokens."""
+        return topic.replace("/", "%") or "%"
+
+    def _key_of(self, name: str, kind: tuple[str, str]) -> str:
+        """Return the key expression of a ROS name with its type and the hash of the type."""
+        parts = ("**",) if name == "/**" else (name.strip("/"), *kind)
+        return "/".join((self._domain, *parts))
 
 
 _GID = b"\1" * 16
-
-
-def _mangled(name: str) -> str:
-    return name.replace("/", "%") or "%"
 
 
 def _attachment(number: int, gid: bytes) -> zenoh.ZBytes:
@@ -175,216 +224,6 @@ def _attachment(number: int, gid: bytes) -> zenoh.ZBytes:
             gid,
         )
     )
-
-
-class _Publisher:
-    def __init__(self, session: zenoh.Session, key: str, gid: bytes) -> None:
-        self._session, self._key, self._gid = session, key, gid
-        self._sent = 0
-
-    def put(self, text: str, size: int = 0) -> None:
-        """Publish a text."""
-        self._sent += 1
-        self._session.put(
-            self._key, _cdr_string(text, size), attachment=_attachment(self._sent, self._gid)
-        )
-
-
-class _Client:
-    def __init__(self, session: zenoh.Session, key: str, gid: bytes) -> None:
-        self._session, self._key, self._gid = session, key, gid
-        self._asked = 0
-
-    def call(self, text: str) -> Iterator[str]:
-        """Send a request, and yield the replies."""
-        self._asked += 1
-        exact = "*" not in self._key
-        replies = self._session.get(
-            self._key,
-            target=zenoh.QueryTarget.ALL_COMPLETE if exact else zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            payload=_cdr_string(text),
-            attachment=_attachment(self._asked, self._gid),
-            timeout=_REPLY_SECONDS,
-        )
-        yield from (_text_of(each.ok.payload) for each in replies if each.ok is not None)
-
-
-class _Role:
-    """What a node does; ``step`` is called again and again, and does what is due."""
-
-    def __init__(self, node: _Node, options: NodeOptions, events: EventWriter) -> None:
-        self._node, self._options, self._events = node, options, events
-        self._kept: list[Any] = []
-        self._due = time.monotonic() + options.period
-        self._count = 0
-        self.prepare()
-
-    def prepare(self) -> None:
-        """Declare what the node offers and hears."""
-
-    def act(self) -> None:
-        """Do what the node does once in each period."""
-
-    def step(self) -> None:
-        """Act if it is time."""
-        if time.monotonic() >= self._due:
-            self._due = max(self._due + self._options.period, time.monotonic())
-            self.act()
-
-    def sent(self, text: str) -> None:
-        """Report a message that was sent."""
-        self._count += 1
-        self._events.report(EventKind.SENT, text, count=self._count)
-
-    def heard(self, text: str) -> None:
-        """Report a message that was received."""
-        self._events.report(EventKind.HEARD, text)
-
-
-class _Talker(_Role):
-    """A talker that publishes its text and a number."""
-
-    def prepare(self) -> None:
-        self._publisher = self._node.publisher(self._options.topic)
-
-    def act(self) -> None:
-        text = f"{self._options.text}: {self._count + 1}"
-        self._publisher.put(text, self._options.size)
-        self.sent(text)
-
-
-class _Listener(_Role):
-    """A listener that reports each message."""
-
-    def prepare(self) -> None:
-        self._kept.append(self._node.subscribe(self._options.topic, self.heard))
-
-
-class _Relay(_Talker):
-    """A talker that also listens."""
-
-    def prepare(self) -> None:
-        super().prepare()
-        self._kept.append(self._node.subscribe(self._options.topic, self.heard))
-
-
-class _Observer(_Role):
-    """An observer that counts the publishers of topics in the graph."""
-
-    def prepare(self) -> None:
-        self._tokens: set[str] = set()
-        graph = self._node.session.liveliness()
-        self._kept.append(
-            graph.declare_subscriber(f"@ros2_lv/{self._node.domain}/**", self._change, history=True)
-        )
-
-    def _change(self, sample: zenoh.Sample) -> None:
-        added = sample.kind == zenoh.SampleKind.PUT
-        (self._tokens.add if added else self._tokens.discard)(str(sample.key_expr))
-
-    def act(self) -> None:
-        entities = [each.split("/") for each in tuple(self._tokens)]
-        found = [each[9] for each in entities if len(each) > 9 and each[5] == "MP"]
-        topics = (self._options.topic, *self._options.also)
-        counts = {topic: found.count(_mangled(topic)) for topic in topics}
-        self._events.report(EventKind.SEEN, " ".join(sorted(set(found))), publishers=counts)
-
-
-class _Server(_Role):
-    """A server that adds two numbers, and reports the requests that it executes."""
-
-    def prepare(self) -> None:
-        self._kept.append(self._node.serve(self._options.topic, self._answer))
-
-    def _answer(self, request: str) -> str:
-        self.heard(request)
-        question = request.rpartition(": ")[2]
-        try:
-            first, second = map(int, question.split(" + "))
-        except ValueError:
-            return "no such sum"
-        answer = f"{self._options.text}: {question} = {first + second}"
-        self.sent(answer)
-        return answer
-
-
-class _Caller(_Role):
-    """A client that requests sums, and reports the right answers."""
-
-    def prepare(self) -> None:
-        self._client = self._node.client(self._options.topic)
-
-    def act(self) -> None:
-        first, second = self._count + 1, 3 * (self._count + 1) + 1
-        request = f"{self._options.text}: {first} + {second}"
-        self.sent(request)
-        for answer in self._client.call(request):
-            if answer.endswith(f": {first} + {second} = {first + second}"):
-                self.heard(answer)
-
-
-class _ActionServer(_Role):
-    """An action server that computes Fibonacci numbers, with feedback, status and result."""
-
-    def prepare(self) -> None:
-        action = f"{self._options.topic}/_action"
-        topics = {
-            each: self._node.publisher(f"{action}/{each}", _ACTION_TYPES[each])
-            for each in ("feedback", "status")
-        }
-
-        def accept(request: str) -> str:
-            self.heard(request)
-            goal = request.rpartition(": ")[2]
-            for length in range(2, FIBONACCI_ORDER + 1):
-                topics["feedback"].put(f"{goal} {fibonacci(length)}")
-            topics["status"].put(f"{goal} succeeded")
-            return "accepted"
-
-        def result(_request: str) -> str:
-            answer = f"{self._options.text}: {fibonacci(FIBONACCI_ORDER)}"
-            self.sent(answer)
-            return answer
-
-        answers = {"send_goal": accept, "get_result": result, "cancel_goal": lambda _: "refused"}
-        for each, answer in answers.items():
-            self._kept.append(self._node.serve(f"{action}/{each}", answer, _ACTION_TYPES[each]))
-
-
-class _ActionCaller(_Role):
-    """An action client that reports right results of goals with all their feedback."""
-
-    def prepare(self) -> None:
-        action = f"{self._options.topic}/_action"
-        self._clients = {
-            each: self._node.client(f"{action}/{each}", _ACTION_TYPES[each])
-            for each in ("send_goal", "get_result", "cancel_goal")
-        }
-        self._steps: dict[str, list[str]] = {"feedback": [], "status": []}
-        for each, heard in self._steps.items():
-            kept = self._node.subscribe(f"{action}/{each}", heard.append, _ACTION_TYPES[each])
-            self._kept.append(kept)
-
-    def act(self) -> None:
-        goal = f"goal {self._count + 1} of {os.getpid()}"
-        self.sent(f"{self._options.text}: {goal}")
-        if "accepted" not in self._clients["send_goal"].call(f"{self._options.text}: {goal}"):
-            return
-        latest = time.monotonic() + _REPLY_SECONDS
-        while not self._is_done(goal) and time.monotonic() < latest:
-            time.sleep(_POLL_SECONDS)
-        for answer in self._clients["get_result"].call(goal):
-            if self._is_done(goal) and answer.endswith(f": {fibonacci(FIBONACCI_ORDER)}"):
-                self.heard(answer)
-
-    def _is_done(self, goal: str) -> bool:
-        steps = [each for each in self._steps["feedback"] if each.startswith(f"{goal} ")]
-        return len(steps) == FIBONACCI_ORDER - 1 and f"{goal} succeeded" in self._steps["status"]
-
-
-class _Router(_Role):
-    """A router, which passes on what others say."""
 
 
 _FLOOD_AT_ONCE = 20
@@ -410,19 +249,6 @@ def _flood(endpoint: str, events: EventWriter, stop: threading.Event) -> None:
             socket.create_connection(_address(endpoint), 1) as useless,
         ):
             useless.sendall(_GARBAGE)
-
-
-_ROLES: Mapping[str, type[_Role]] = {
-    "talker": _Talker,
-    "listener": _Listener,
-    "relay": _Relay,
-    "observer": _Observer,
-    "server": _Server,
-    "client": _Caller,
-    "action_server": _ActionServer,
-    "action_client": _ActionCaller,
-    "router": _Router,
-}
 
 
 _FLOODER = "flooder"
@@ -476,7 +302,7 @@ def _address(endpoint: str) -> tuple[str, int]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    roles = (*_ROLES, _FLOODER)
+    roles = (*(role for role in ROLES if role != "composed"), _FLOODER)
     options = parse_options("sros_tool.demo.zenoh_node", roles, arguments)
     events = EventWriter(options.report)
     stop = threading.Event()
@@ -500,8 +326,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stage = ProcessStage.ENDPOINT
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         name = options.role if options.role != "router" else "rmw_zenohd"
-        node = _Node(session, domain, _enclave_in(arguments), name)
-        role = _ROLES[options.role](node, options, events)
+        node = _ZenohNode(session, domain, enclave_in(arguments, ""), name, options.size)
+        role = ROLES[options.role](node, options, events)
         stage = ProcessStage.RUNNING
         events.report(EventKind.READY)
         while not stop.wait(_POLL_SECONDS):
@@ -514,14 +340,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     events.report(EventKind.DONE)
     return 0
-
-
-def _enclave_in(arguments: Sequence[str]) -> str:
-    enclave = ""
-    for flag, value in pairwise(split_ros_args(arguments)[1]):
-        if flag in ("-e", "--enclave"):
-            enclave = value
-    return enclave
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import pytest
 
 from sros_tool.demo import backend as backends
 from sros_tool.demo.backend import Backend, choose_backend
-from sros_tool.demo.node_options import split_ros_args
+from sros_tool.demo.nodes import split_ros_args
 from sros_tool.demo.program import DemoOptions, run_demo
 from sros_tool.demo.result import DemoResult, ScenarioResult, demo_table
 from sros_tool.demo.scenarios.model import Role, RowStatus

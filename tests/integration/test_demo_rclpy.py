@@ -188,7 +188,7 @@ def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
 STOPPED_WHILE_IT_IS_MADE = """
 import os, signal, sys
 from pathlib import Path
-from sros_tool.demo.node_options import NodeOptions
+from sros_tool.demo.nodes import NodeOptions
 from sros_tool.demo.ros_node import _run_role
 
 def build(node, options, events):

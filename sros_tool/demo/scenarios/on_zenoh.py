@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sros_tool.demo import forger, zenoh_forger
+from sros_tool.demo import forger
 from sros_tool.demo.forger import STOLEN
+from sros_tool.demo.scenarios import zenoh_forger
 from sros_tool.demo.scenarios.model import (
     OWN,
     UNSECURED,

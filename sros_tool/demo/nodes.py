@@ -1,0 +1,376 @@
+"""What the demo's nodes share: their command line, and their roles on Cyclone DDS and Zenoh.
+
+Services and actions have the names and rights of ROS 2, but send strings: a request is text that
+ends with ``: FIRST + SECOND``, its answer text that ends with ``: FIRST + SECOND = SUM``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Protocol
+
+from sros_tool.runtime.events import EventKind, EventWriter
+
+_COMPOSED_SERVICE = "/add_two_ints"
+
+FIBONACCI_ORDER = 5
+"""The order of the sequence that an action client requests in each goal."""
+
+
+@dataclass(frozen=True)
+class NodeOptions:
+    """The options of a node.
+
+    ``topic`` is the ROS name of the role's topic, service or action.  ``period`` is in seconds.
+    ``text`` is sent in messages, and identifies a server.  ``server`` is the text of the action
+    server that an action client uses ("": unknown).  ``also`` are further topics for an observer.
+    On Zenoh, messages of a talker have ``size`` bytes or more, and ``patience`` is how long a
+    process waits for its connection, in seconds.
+    """
+
+    role: str
+    topic: str = "chatter"
+    period: float = 0.5
+    text: str = "Hello World"
+    report: Path | None = None
+    server: str = ""
+    also: tuple[str, ...] = ()
+    size: int = 0
+    patience: float = 60.0
+
+    @property
+    def service(self) -> str:
+        """The ROS service of the role; for a container, a fixed name."""
+        return self.topic if self.role in ("server", "client") else _COMPOSED_SERVICE
+
+
+def parse_options(module: str, roles: Collection[str], arguments: Sequence[str]) -> NodeOptions:
+    """Return the options on the command line of ``python -m module``, without ``--ros-args``.
+
+    Exits with status 2 on an error.
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {module}", description="Run a node in one role of the demo until stopped."
+    )
+    parser.add_argument("role", choices=tuple(roles))
+    parser.add_argument(
+        "--topic",
+        default=NodeOptions.topic,
+        help="ROS name of the topic, service or action (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--period",
+        type=_positive,
+        default=NodeOptions.period,
+        metavar="SECONDS",
+        help="time between two messages, requests, goals or counts (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--text",
+        default=NodeOptions.text,
+        help="text of a talker or server, sent before a number (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--server", default="", help="text of the only action server, for an action client"
+    )
+    parser.add_argument(
+        "--also",
+        action="append",
+        default=[],
+        help="another topic whose publishers an observer counts",
+    )
+    parser.add_argument(
+        "--size", type=int, default=NodeOptions.size, help="bytes of a message on Zenoh, at least"
+    )
+    parser.add_argument(
+        "--patience",
+        type=_positive,
+        default=NodeOptions.patience,
+        metavar="SECONDS",
+        help="time to wait for a connection on Zenoh (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--report", type=Path, metavar="FILE", help="append the events to FILE as JSON lines"
+    )
+    own, _ = split_ros_args(arguments)
+    parsed = vars(parser.parse_args(own))
+    return NodeOptions(**{**parsed, "also": tuple(parsed["also"])})
+
+
+def split_ros_args(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the arguments outside and inside ``--ros-args ... --``."""
+    own: list[str] = []
+    ros: list[str] = []
+    target = own
+    for argument in arguments:
+        if argument == "--ros-args":
+            target = ros
+        elif argument == "--" and target is ros:
+            target = own
+        else:
+            target.append(argument)
+    return own, ros
+
+
+def enclave_in(arguments: Sequence[str], default: str) -> str:
+    """Return the enclave of ``--ros-args --enclave`` on a command line, or ``default``."""
+    enclave = default
+    for flag, value in pairwise(split_ros_args(arguments)[1]):
+        if flag in ("-e", "--enclave"):
+            enclave = value
+    return enclave
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(text)
+    return value
+
+
+def fibonacci(order: int) -> list[int]:
+    """Return the Fibonacci sequence from 0 and 1 up to index ``order``."""
+    sequence = [0, 1]
+    while len(sequence) <= order:
+        sequence.append(sequence[-1] + sequence[-2])
+    return sequence[: order + 1]
+
+
+# ── roles ──────────────────────────────────────────────────────────────────────────────────
+
+Hear = Callable[[str], None]
+Call = Callable[[str, Hear], None]
+
+
+class Node(Protocol):
+    """A node on one of the libraries; names are absolute ROS names."""
+
+    def publisher(self, name: str) -> Hear:
+        """Return a function that publishes a text."""
+
+    def subscribe(self, name: str, hear: Hear) -> None:
+        """Subscribe to a topic; ``hear`` gets each text."""
+
+    def serve(self, name: str, answer: Callable[[str], str]) -> None:
+        """Offer a service; ``answer`` gets each request and returns the reply."""
+
+    def client(self, name: str) -> Call:
+        """Return a function that sends a request to a service, and passes on each reply."""
+
+    def watch(self) -> None:
+        """Begin to discover publishers."""
+
+    def publications(self) -> Sequence[str]:
+        """Return the topics of the publishers that are there, by their names on the wire."""
+
+    def wire_name(self, topic: str) -> str:
+        """Return the name of a ROS topic on the wire."""
+
+
+class NodeRole:
+    """What a node does; ``step`` is called again and again, and does what is due."""
+
+    def __init__(self, node: Node, options: NodeOptions, events: EventWriter) -> None:
+        self._node, self._options, self._events = node, options, events
+        self._due = time.monotonic() + options.period
+        self._sent = self._heard = 0
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Declare what the node offers and hears."""
+
+    def act(self) -> None:
+        """Do what the node does once in each period."""
+
+    def step(self) -> None:
+        """Act if it is time."""
+        if time.monotonic() >= self._due:
+            self._due = max(self._due + self._options.period, time.monotonic())
+            self.act()
+
+    def sent(self, text: str) -> None:
+        """Report a message that was sent."""
+        self._sent += 1
+        self._events.report(EventKind.SENT, text, count=self._sent)
+
+    def heard(self, text: str) -> None:
+        """Report a message that was received."""
+        self._heard += 1
+        self._events.report(EventKind.HEARD, text, count=self._heard)
+
+
+class _Talker(NodeRole):
+    """A talker that publishes its text and a number."""
+
+    def prepare(self) -> None:
+        self._publish = self._node.publisher(self._options.topic)
+
+    def act(self) -> None:
+        text = f"{self._options.text}: {self._sent + 1}"
+        self._publish(text)
+        self.sent(text)
+
+
+class _Listener(NodeRole):
+    """A listener that reports each message."""
+
+    def prepare(self) -> None:
+        self._node.subscribe(self._options.topic, self.heard)
+
+
+class _Relay(_Talker):
+    """A talker that also listens."""
+
+    def prepare(self) -> None:
+        super().prepare()
+        self._node.subscribe(self._options.topic, self.heard)
+
+
+class _Observer(NodeRole):
+    """An observer that counts the publishers of topics."""
+
+    def prepare(self) -> None:
+        self._node.watch()
+
+    def act(self) -> None:
+        seen = self._node.publications()
+        topics = (self._options.topic, *self._options.also)
+        counts = {topic: seen.count(self._node.wire_name(topic)) for topic in topics}
+        self._events.report(EventKind.SEEN, " ".join(sorted(set(seen))), publishers=counts)
+
+
+class _Server(NodeRole):
+    """A server that adds two numbers, and reports the requests that it executes."""
+
+    def prepare(self) -> None:
+        self._node.serve(self._options.service, self._answer)
+
+    def _answer(self, request: str) -> str:
+        self.heard(request)
+        question = request.rpartition(": ")[2]
+        try:
+            first, second = map(int, question.split(" + "))
+        except ValueError:
+            return "no such sum"
+        answer = f"{self._options.text}: {question} = {first + second}"
+        self.sent(answer)
+        return answer
+
+
+class _Client(NodeRole):
+    """A client that requests sums, each a different one, and reports the right answers."""
+
+    def prepare(self) -> None:
+        self._call = self._node.client(self._options.service)
+
+    def act(self) -> None:
+        first, second = self._sent + 1, 3 * (self._sent + 1) + 1
+
+        def check(answer: str) -> None:
+            if answer.endswith(f": {first} + {second} = {first + second}"):
+                self.heard(answer)
+
+        request = f"{self._options.text}: {first} + {second}"
+        self.sent(request)
+        self._call(request, check)
+
+
+class _ActionServer(NodeRole):
+    """An action server that computes Fibonacci numbers, with feedback, status and result."""
+
+    def prepare(self) -> None:
+        action = f"{self._options.topic}/_action"
+        self._feedback = self._node.publisher(f"{action}/feedback")
+        self._status = self._node.publisher(f"{action}/status")
+        self._node.serve(f"{action}/send_goal", self._accept)
+        self._node.serve(f"{action}/get_result", self._result)
+        self._node.serve(f"{action}/cancel_goal", lambda _request: "refused")
+
+    def _accept(self, request: str) -> str:
+        self.heard(request)
+        goal = request.rpartition(": ")[2]
+        for length in range(2, FIBONACCI_ORDER + 1):
+            self._feedback(f"{goal} {fibonacci(length)}")
+        self._status(f"{goal} succeeded")
+        return "accepted"
+
+    def _result(self, _request: str) -> str:
+        answer = f"{self._options.text}: {fibonacci(FIBONACCI_ORDER)}"
+        self.sent(answer)
+        return answer
+
+
+class _ActionClient(NodeRole):
+    """An action client that reports right results of goals with all their feedback."""
+
+    def prepare(self) -> None:
+        action = f"{self._options.topic}/_action"
+        self._call_goal = self._node.client(f"{action}/send_goal")
+        self._call_result = self._node.client(f"{action}/get_result")
+        self._node.client(f"{action}/cancel_goal")
+        self._feedback: list[str] = []
+        self._status: list[str] = []
+        self._node.subscribe(f"{action}/feedback", self._feedback.append)
+        self._node.subscribe(f"{action}/status", self._status.append)
+        self._accepted: list[str] = []
+
+    def act(self) -> None:
+        goal = f"goal {self._sent + 1} of {os.getpid()}"
+        request = f"{self._options.text}: {goal}"
+        self.sent(request)
+        self._call_goal(
+            request, lambda reply: self._accepted.append(goal) if reply == "accepted" else None
+        )
+
+    def step(self) -> None:
+        """Send a goal if it is time, and fetch the results of those that are done."""
+        super().step()
+        for goal in [goal for goal in self._accepted if self._is_done(goal)]:
+            self._accepted.remove(goal)
+            self._call_result(goal, self._check)
+
+    def _is_done(self, goal: str) -> bool:
+        steps = [text for text in self._feedback if text.startswith(f"{goal} ")]
+        return len(steps) == FIBONACCI_ORDER - 1 and f"{goal} succeeded" in self._status
+
+    def _check(self, answer: str) -> None:
+        if answer.endswith(f": {fibonacci(FIBONACCI_ORDER)}"):
+            self.heard(answer)
+
+
+class _Composed(NodeRole):
+    """A talker, a listener and a server in one process: one participant, one enclave."""
+
+    def prepare(self) -> None:
+        kinds = (_Talker, _Listener, _Server)
+        self._parts = [kind(self._node, self._options, self._events) for kind in kinds]
+
+    def step(self) -> None:
+        """Do a step of each part."""
+        for part in self._parts:
+            part.step()
+
+
+class _Router(NodeRole):
+    """A router, which passes on what others say."""
+
+
+ROLES: Mapping[str, type[NodeRole]] = {
+    "talker": _Talker,
+    "listener": _Listener,
+    "relay": _Relay,
+    "observer": _Observer,
+    "server": _Server,
+    "client": _Client,
+    "action_server": _ActionServer,
+    "action_client": _ActionClient,
+    "composed": _Composed,
+    "router": _Router,
+}
