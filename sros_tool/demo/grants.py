@@ -83,13 +83,13 @@ def application_topics(grant: Grant, verb: str) -> Iterator[str]:
 
     Topics of every node, hidden topics and topics of actions are left out.
     """
-    for topic in named_topics(grant, verb):
+    for topic in _named_topics(grant, verb):
         private = topic.startswith("rt/_") or ACTION_SEPARATOR in topic
         if topic not in _TOPICS_OF_EVERY_NODE and not private:
             yield topic
 
 
-def named_topics(grant: Grant, verb: str) -> Iterator[str]:
+def _named_topics(grant: Grant, verb: str) -> Iterator[str]:
     """Yield the DDS topics that a grant allows by a name without wildcards."""
     for rule in grant.rules:
         for topic in _expressions(rule, verb) if rule.allow else ():
@@ -120,7 +120,7 @@ def is_node_allowed(grant: Grant, node: str) -> bool:
 def nodes_named(grant: Grant) -> Iterator[str]:
     """Yield the absolute names of the nodes whose standard services a grant names and allows."""
     kind, service = _NODE_MARK
-    for topic in named_topics(grant, "publish"):
+    for topic in _named_topics(grant, "publish"):
         if topic.startswith(kind) and topic.endswith(service):
             node = topic.removeprefix(kind).removesuffix(service)
             if is_node_allowed(grant, node):
