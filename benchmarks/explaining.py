@@ -18,11 +18,12 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     """Measure ``sros explain --who`` and ``--reach``, and the proof of permissions to sign."""
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.dds.domains import DomainSet
+    from sros_tool.explain.asking import AskingContext
     from sros_tool.explain.question import ask
-    from sros_tool.explain.who import who
+    from sros_tool.explain.vendors import VendorOfKeystore
     from sros_tool.keystore.issuing.proof import prove
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
-    from sros_tool.keystore.participant import JoinContext
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.rights import load_rights
     from sros_tool.keystore.template import load_template
     from sros_tool.policy.document import read_policy
@@ -45,9 +46,9 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     ]
 
     def ask_all() -> None:
-        question = ask("publish", "/robot7/topic_0")
-        found = who(root, question, Vendor.FAST, lambda _: JoinContext(0, now), at=now)
-        assert [each.enclave for each in found if each.outcome.ok] == ["/robot7/part"]
+        asked = VendorOfKeystore(Keystore(root), Vendor.FAST, "", AskingContext(now, UTC, 0))
+        outcomes = asked.outcomes(ask("publish", "/robot7/topic_0"))
+        assert [each.enclave for each in outcomes if each.allowed] == ["/robot7/part"]
 
     def follow() -> None:
         Network(load_rights(root).rights).reach("/robot7/part")

@@ -354,46 +354,36 @@ def explain_access(
         (True, 'rule 1 allows publish rt/chatter by rt/chatter')
     """
     from sros_tool.dds.decision.vendors import Vendor
-    from sros_tool.explain.evaluator import Evaluator, action_meant
+    from sros_tool.explain.asking import AskedEnclave, AskingContext, meant, signed_enclave
+    from sros_tool.explain.evaluator import Evaluator
+    from sros_tool.explain.explanation import explain
     from sros_tool.explain.question import ask
-    from sros_tool.keystore.layout import has_enclave
-    from sros_tool.keystore.missing import no_such_enclave
-    from sros_tool.keystore.participant import JoinContext, load_enclave_of
     from sros_tool.keystore.reader import Keystore as OpenedOnce
-    from sros_tool.keystore.rights import load_rights
-    from sros_tool.policy.rights import policy_rights
-    from sros_tool.runtime.environment import choose_domain
 
     question = ask(action, name, kind)
     domain = _domain(domain)
     vendors = [each.value for each in Vendor]
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
-    root = Path(keystore)
-    opened = OpenedOnce(root)
+    opened = OpenedOnce(Path(keystore))
     opened.check()
-    if not has_enclave(root, enclave):
-        raise no_such_enclave(root, enclave, opened.names)
-    at = _moment(now)
+    asking = AskingContext(_moment(now), zone, domain)
     stated = _policy(policy) if policy is not None else None
     own = stated.enclave(enclave) if stated else None
-    loaded = replace(load_enclave_of(opened, enclave, at=at), root=root, policy=own)
-    if domain is None:
-        domain = choose_domain(loaded.joined_domains, None, root) if loaded.joined_domains else 0
-    evaluator = Evaluator(Vendor(vendor), loaded, JoinContext(domain, at, zone))
-    if kind is None:
-        rights = [lambda: policy_rights(stated)] if stated else []
-        others = [*rights, lambda: load_rights(opened).rights]
-        question = action_meant(evaluator, question, others) or question
-    answer = evaluator.explain(question)
-    decision = answer.decision
-    _, colon, reason = decision.text.partition(": ")
+    signed = signed_enclave(opened, enclave, asking.at)
+    assert signed
+    asked = AskedEnclave(replace(signed, keystore=opened, policy=own), stated)
+    context = asking.context(signed.joined_domains)
+    evaluator = Evaluator(Vendor(vendor), asked.enclave, context)
+    question, _ = meant(evaluator, asked, question, kind)
+    answer = explain(evaluator, question)
+    _, colon, reason = answer.text.partition(": ")
     return AccessAnswer(
         answer.allowed,
         answer.outcome.value,
-        (reason if colon else decision.text).removesuffix("."),
+        (reason if colon else answer.text).removesuffix("."),
         vendor,
-        decision.expression or "",
+        answer.decision.expression or "",
         tuple(str(each.source) for each in answer.lines),
         answer.until,
         answer.remedy,

@@ -7,6 +7,7 @@ Sources: ROS 2 design "Topic and Service Names" and "Actions"; rcl's ``validate_
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 from sros_tool.errors import InvalidNameError
 
@@ -28,6 +29,21 @@ PARAMETER_SERVICES = (
 
 NODE_SERVICES = (*PARAMETER_SERVICES, "get_type_description")
 """All services that a node of ROS 2 Jazzy offers under its own name, as ``~/NAME``."""
+
+_NODE_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
+
+
+def node_of_service(service: str) -> str:
+    """Return the full name of the node that offers one of `NODE_SERVICES`, or "" for others."""
+    own = _NODE_SERVICE.match(service)
+    return own["node"] if own else ""
+
+
+def nodes_served(rights: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    """Return the full names of the nodes whose standard services these (right, name) allow."""
+    nodes = {node_of_service(name) for right, name in rights if right == "reply"}
+    return tuple(sorted(nodes - {""}))
+
 
 READING_SERVICES = (
     "_container/list_nodes",

@@ -18,6 +18,7 @@ from collections.abc import Collection, Container, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
+from typing import NamedTuple
 
 from sros_tool.dds.governance import Governance
 from sros_tool.names import ACTION_SEPARATOR, READING_SERVICES, is_expression
@@ -73,8 +74,7 @@ _WRITER_RIGHTS = {
 
 
 @shows("source", "right", "name", "target")
-@dataclass(frozen=True, slots=True)
-class Hop:
+class Hop(NamedTuple):
     """A flow of information from enclave ``source`` to enclave ``target`` by one ROS name.
 
     ``right`` is the right of the source (publish, request, reply; call or execute for an action),

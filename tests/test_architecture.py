@@ -6,7 +6,7 @@ import ast
 import re
 import tomllib
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -60,7 +60,12 @@ def nodes_of(tree: ast.Module) -> tuple[ast.AST, ...]:
 
 def imported(source: str, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
     """Line and absolute name of each import in the text of `module`; also inside functions."""
-    for node in nodes_of(tree_of(source)):
+    yield from imported_names(tree_of(source), module)
+
+
+def imported_names(tree: ast.Module, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
+    """Line and absolute name of each import in the syntax of `module`; also inside functions."""
+    for node in nodes_of(tree):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, name.name) for name in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -216,6 +221,13 @@ def statements(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
 
 # ── no import circle ───────────────────────────────────────────────────────────────────────
 
+_KEYSTORE = "sros_tool.keystore"
+LEFT: dict[str, set[str]] = {
+    f"{_KEYSTORE}.ledger": {f"{_KEYSTORE}.authorities.authority", f"{_KEYSTORE}.of_ros2"},
+    f"{_KEYSTORE}.of_ros2": {f"{_KEYSTORE}.lifecycle.update"},
+}
+"""Imports inside functions, or for types, that still close a circle: no new ones."""
+
 
 def imported_at_once(name: str, modules: Modules) -> set[str]:
     """Return the modules that have to be there before `name` can be imported."""
@@ -235,9 +247,20 @@ def imported_at_once(name: str, modules: Modules) -> set[str]:
     return {each for each in found & modules.keys() if not f"{name}.".startswith(f"{each}.")}
 
 
-def circle(modules: Modules) -> list[str]:
-    """Return modules each of which needs the next one at import time, the last one the first."""
-    graph = {name: imported_at_once(name, modules) for name in modules}
+def imported_at_all(name: str, modules: Modules) -> set[str]:
+    """Return the modules that a module imports, also inside functions and for types alone."""
+    package = tuple(name.split("."))
+    named = {full for _, full in imported_names(modules[name], package)}
+    # Of `from MODULE import NAME`, the name is a module or stands in one.
+    found = {full if full in modules else full.rpartition(".")[0] for full in named}
+    return {each for each in found & modules.keys() if not f"{name}.".startswith(f"{each}.")}
+
+
+def circle(
+    modules: Modules, imports: Callable[[str, Modules], set[str]] = imported_at_once
+) -> list[str]:
+    """Return modules each of which imports the next one, the last one the first; or none."""
+    graph = {name: imports(name, modules) - LEFT.get(name, set()) for name in modules}
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -257,7 +280,18 @@ def test_a_folder_has_few_modules() -> None:
 
 
 def test_no_module_imports_itself_through_others() -> None:
-    assert circle(modules_of("sros_tool")) == []
+    assert circle(modules_of("sros_tool"), imported_at_all) == []
+
+
+def test_each_import_that_is_left_would_close_a_circle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The list only becomes shorter: an entry that is needed no more has to go."""
+    modules = modules_of("sros_tool")
+    for name, others in LEFT.items():
+        for other in others:
+            assert other in imported_at_all(name, modules)
+            monkeypatch.setitem(LEFT, name, others - {other})
+            assert circle(modules, imported_at_all), f"{name} may import {other}"
+            monkeypatch.setitem(LEFT, name, others)
 
 
 def test_a_circle_is_seen_where_it_would_stop_an_import_and_only_there() -> None:
@@ -273,6 +307,15 @@ def test_a_circle_is_seen_where_it_would_stop_an_import_and_only_there() -> None
     assert found("def late():\n    from p.a import y") == set()
     assert found("if TYPE_CHECKING:\n    from p.a import y\nelse:\n    y = 1") == set()
     assert found("x = 1", package="from p.a import x") == set()
+
+    def closed(second: str) -> set[str]:
+        modules = parse(p="", p__a="from p.b import x", p__b=second)
+        return set(circle(modules, imported_at_all))
+
+    assert closed("def late():\n    from p.a import y") == {"p.a", "p.b"}
+    assert closed("if TYPE_CHECKING:\n    from p.a import y") == {"p.a", "p.b"}
+    assert closed("from p import a") == {"p.a", "p.b"}
+    assert closed("import p") == set()
 
 
 # ── every file is written by two modules ───────────────────────────────────────────────────

@@ -21,7 +21,6 @@ from tools.json_schemas import object_schema, schemas, text_of
 BY_HAND = {
     "confirmation.json",
     "demo.json",
-    "explain.json",
     "generate_policy.json",
     "inspect.json",
     "minimize_policy.json",

@@ -71,6 +71,18 @@ VERBS: Mapping[str, str | Shapes] = {
     "verify": "sros_tool.checks.keystores.arrival:VerifiedFolder",
     "audit": "sros_tool.explain.audit:AuditResult",
     "fleet status": "sros_tool.keystore.fleet_status:ComparedFleet",
+    "explain": Shapes(
+        "What DDS or Zenoh decides, by which rule, and why.",
+        {
+            "a question": "sros_tool.explain.vendors:VendorExplanation",
+            "--all-vendors": "sros_tool.explain.vendors:VendorComparison",
+            "--vendor zenoh": "sros_tool.explain.zenoh:ZenohExplanation",
+            "--who": "sros_tool.explain.vendors:WhoByVendor",
+            "--who --vendor zenoh": "sros_tool.explain.zenoh:WhoOnZenoh",
+            "--reach": "sros_tool.explain.reached:FollowedReach",
+            "--log": "sros_tool.explain.log:ExplainedLog",
+        },
+    ),
     "view": Shapes(
         "Who may do what; `-o FILE` writes it to FILE instead.",
         {

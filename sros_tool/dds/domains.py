@@ -82,7 +82,13 @@ class DomainSet:
 
     def __iter__(self) -> Iterator[int]:
         """Yield every domain from 0 to 230 that is in the set."""
-        return (domain for domain in range(MAX_DOMAIN + 1) if domain in self)
+        domains: set[int] = set()
+        for part in self.ranges:
+            first = max(part.first or 0, 0)
+            domains.update(
+                range(first, 1 + (MAX_DOMAIN if part.last is None else min(part.last, MAX_DOMAIN)))
+            )
+        return iter(sorted(domains))
 
     def __str__(self) -> str:
         return ",".join(map(str, self.ranges))
@@ -119,6 +125,10 @@ class DomainSet:
         known = [each for each in sorted(borders) if any(each in one for one in listed)]
         kinds = {tuple(each in one for one in sets): each for each in reversed(known)}
         return tuple(sorted(kinds.values()))
+
+    def preferred(self) -> int:
+        """Return 0, the default of ROS, if it is in the set, else the first domain of the set."""
+        return 0 if 0 in self else next(iter(self))
 
     def only(self) -> int | None:
         """Return the domain, if the set has just one, else None."""

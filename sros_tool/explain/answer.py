@@ -1,4 +1,7 @@
-"""The answer to a question: the outcome, what decided it, and the lines of the policy behind it."""
+"""The answer to a question: the outcome, what decided it, and the lines of the policy behind it.
+
+What ``--json`` shows of an answer are the classes here, with their docstrings.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +10,23 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Annotated, NamedTuple
 
 from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.dds.governance import DomainRule
+from sros_tool.dds.governance import DomainRule, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Grant
 from sros_tool.explain.question import Part, Question
-from sros_tool.keystore.reader import Problem
+from sros_tool.keystore.participant import LoadedEnclave
+from sros_tool.keystore.reader import Keystore, Problem
 from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Profile, Qualifier, Source
 from sros_tool.policy.rights import Right
 from sros_tool.topics import dds_names
+from sros_tool.values import Words, shows
 
-if TYPE_CHECKING:
-    from sros_tool.explain.change import PolicyChange
+ADDITION = "allow.xml"
+"""Name of the file with the rights to add, in the commands that are proposed."""
 
 
 class Provenance(StrEnum):
@@ -40,64 +44,237 @@ class Provenance(StrEnum):
     """The answer is about the policy; nothing is signed yet."""
 
 
-@dataclass(frozen=True, slots=True)
-class PolicyLine:
-    """A name in a policy that became part of a rule, with its position and its right.
+@shows("file", "line", "qualifier", "right", "name", "protection")
+class PolicyLine(NamedTuple):
+    """A line.
 
     ``group`` and ``profile`` contain the name; ``right`` is the word of the policy language.
     """
 
     source: Source
     qualifier: Qualifier
+    """Whether it allows."""
     right: str
+    """The right."""
     name: str
+    """The name, as written."""
     group: Group
     profile: Profile
 
+    @property
+    def file(self) -> str:
+        """The file."""
+        return self.source.file
+
+    @property
+    def line(self) -> int:
+        """The line, from 1."""
+        return self.source.line
+
+    @property
+    def protection(self) -> Annotated[str, Words(("sign", "encrypt"))] | None:
+        """The protection that it demands at least, or null."""
+        return self.group.protect.lower() if self.group.protect else None
+
     def __str__(self) -> str:
         """Return text like ``robot.xml:12: ALLOW publish chatter``."""
-        return f"{self.source}: {self.qualifier.value} {self.right} {self.name}"
+        return f"{self.source}: {self.stated}"
+
+    @property
+    def stated(self) -> str:
+        """What it states, like ``ALLOW publish chatter``."""
+        return f"{self.qualifier.value} {self.right} {self.name}"
 
 
+@shows("file", "line", "xml")
+class GroupEdit(NamedTuple):
+    """A group."""
+
+    source: Source
+    xml: str
+    """Its new text; empty to remove it."""
+
+    @property
+    def file(self) -> str:
+        """The file."""
+        return self.source.file
+
+    @property
+    def line(self) -> int:
+        """The line, from 1."""
+        return self.source.line
+
+
+@shows(null_if_empty=("document",))
+class PolicyChange(NamedTuple):
+    """A change of the policy.
+
+    Without anything to add or to lift, no change is needed.
+    """
+
+    add: tuple[Right, ...]
+    """Rights to add."""
+    lift: tuple[Right, ...]
+    """Denials to remove."""
+    document: str
+    """A policy with the rights to add, for ``sros merge_policy``, or null."""
+    edits: tuple[GroupEdit, ...]
+    """Groups of the policy to change."""
+
+
+# ── what JSON shows of an answer ───────────────────────────────────────────────────────────
+
+
+class DecidingRule(NamedTuple):
+    """The rule of the permissions that decided."""
+
+    grant: int | None
+    """Index of its grant, from 0."""
+    grant_name: str
+    """Name of its grant."""
+    rule: int
+    """Index in the grant, from 0."""
+    allow: bool
+    """Whether it allows."""
+    expression: str | None
+    """The expression that matched, or null."""
+
+
+class StatedInPolicy(NamedTuple):
+    """What a policy says."""
+
+    file: str
+    """The policy."""
+    provenance: Provenance
+    """Whether the permissions were made from it."""
+    lines: tuple[PolicyLine, ...]
+    """The lines that the rule comes from."""
+    would_allow: bool
+    """Whether the policy allows it once it is signed."""
+
+
+class AppliedProtection(NamedTuple):
+    """Protection by the governance."""
+
+    rtps: ProtectionKind
+    """Protection of RTPS messages."""
+    discovery: ProtectionKind
+    """Protection of discovery."""
+    liveliness: ProtectionKind
+    """Protection of liveliness messages."""
+    topic_expression: str | None
+    """The topic rule that applies, or null; so for all that follow."""
+    data: ProtectionKind | None
+    """Protection of the payload."""
+    metadata: ProtectionKind | None
+    """Protection of submessages."""
+    read_access_control: bool | None
+    """Whether permissions decide who may read."""
+    write_access_control: bool | None
+    """Whether permissions decide who may write."""
+
+
+OutcomeWord = Annotated[
+    Outcome,
+    "What happens: creating it fails (`denied`), peers do not match it (`peer denies`), the "
+    "process does not start (`refused`), or it or its peers crash (`crashes`).",
+]
+ReasonWord = Annotated[str, "Why, as a stable word such as `no-rule`."]
+DecidingExpression = Annotated[str | None, "The expression that decided, or null."]
+
+
+@shows("verb", "topic", "role", "outcome", "reason", "expression", null_if_empty=("role",))
+class DecidedPart(NamedTuple):
+    """An endpoint."""
+
+    part: Part
+    decision: Decision
+
+    @property
+    def verb(self) -> AccessVerb:
+        """What it does."""
+        return self.part.verb
+
+    @property
+    def topic(self) -> str:
+        """Its DDS topic."""
+        return self.part.topic
+
+    @property
+    def role(self) -> str:
+        """What it is for, or null."""
+        return self.part.role
+
+    @property
+    def outcome(self) -> OutcomeWord:
+        """What happens."""
+        return self.decision.outcome
+
+    @property
+    def reason(self) -> ReasonWord:
+        """Why."""
+        return self.decision.reason
+
+    @property
+    def expression(self) -> DecidingExpression:
+        """The expression that decided, or null."""
+        return self.decision.expression
+
+
+@shows(
+    *("vendor", "vendor_title", "documented_only", "allowed", "outcome", "reason", "text"),
+    *("denied_by", "rule", "wildcard", "policy", "policy_sha256", "protection", "until"),
+    *("until_file", "problems", "parts", "remedy", "change", "commands"),
+    null_if_empty=("denied_by", "wildcard", "policy_sha256", "until_file", "remedy"),
+)
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer of one vendor to a question, with an explanation on request.
+    """The decision of a vendor.
 
     ``decision`` determines the outcome; ``part`` is the endpoint that it is about, None if it is
-    about joining.  ``parts`` are all endpoints of the question with the decisions on them.
-    ``problems`` are the faults of files that keep the vendor from loading the enclave.  ``grant``
-    and ``domain_rule`` are the parts of the documents that apply.  ``until`` is the time when
-    ``until_file``, the first of the files, expires; None if nothing is signed.
+    about joining.  ``grant`` and ``domain_rule`` are the parts of the documents that apply.
 
-    `Evaluator.explain` fills in the other fields.  ``lines`` are the lines of the policy file that
-    the deciding rule comes from, and ``provenance`` says whether the permissions were made from
-    that file; ``policy_sha256`` is the digest of the file that they were made from, "" if it is not
-    known.  For a denial, ``change`` is the necessary change of the policy, ``remedy`` is what to do
-    if no policy can help, and ``sign`` says that the present policy file, once signed, allows it.
+    `sros_tool.explain.explanation` fills in the other fields.  ``lines`` are the lines of the
+    policy file that the deciding rule comes from, and ``provenance`` says whether the permissions
+    were made from that file.  ``sign`` says that the present policy file, once signed, allows it.
     """
 
     vendor: Vendor
+    """The DDS vendor, as `--vendor` takes it."""
+    enclave: LoadedEnclave
     question: Question
-    outcome: Outcome
+    outcome: OutcomeWord
     decision: Decision
     part: Part | None = None
-    parts: tuple[tuple[Part, Decision], ...] = ()
+    parts: tuple[DecidedPart, ...] = ()
+    """The DDS endpoints that it needs."""
     problems: tuple[Problem, ...] = ()
+    """Faults that keep the vendor from loading the enclave."""
     grant: Grant | None = None
     domain_rule: DomainRule | None = None
     until: datetime | None = None
+    """When the first of its files expires, in UTC, or null."""
     until_file: str = ""
+    """That file, or null."""
     lines: tuple[PolicyLine, ...] = ()
     provenance: Provenance | None = None
     policy_sha256: str = ""
+    """SHA-256 of the policy that the permissions were made from, or null."""
     change: PolicyChange | None = None
+    """The smallest change of the policy that would allow it, or null."""
     remedy: str = ""
+    """What to do if no policy can help, or null."""
     sign: bool = False
 
     @property
-    def allowed(self) -> bool:
-        """Whether data can flow."""
-        return self.outcome.ok
+    def vendor_title(self) -> str:
+        """Its name and version."""
+        return self.vendor.title
+
+    @property
+    def documented_only(self) -> bool:
+        """Whether the decision is by its documentation, not by tests."""
+        return self.vendor.documented_only
 
     @property
     def as_documented(self) -> bool:
@@ -105,14 +282,23 @@ class Answer:
         return self.vendor.documented_only and not self.problems
 
     @property
-    def wildcard(self) -> str:
-        """The expression of the deciding rule if it is a wildcard, or ""."""
-        expression = self.decision.expression or ""
-        return expression if is_expression(expression) else ""
+    def allowed(self) -> bool:
+        """Whether data can flow."""
+        return self.outcome.ok
+
+    @property
+    def reason(self) -> ReasonWord:
+        """Why, as a stable word such as `no-rule`."""
+        return self.decision.reason
+
+    @property
+    def text(self) -> str:
+        """Why, as a sentence."""
+        return self.decision.text
 
     @property
     def denied_by(self) -> str:
-        """The process that denies it, with the consequence; "" if it is allowed."""
+        """Who denies it, or null."""
         match self.outcome:
             case Outcome.ALLOWED:
                 return ""
@@ -127,6 +313,65 @@ class Answer:
                 return f"DDS in the process itself: {what} is not created"
             case _:
                 return "DDS in the process itself: no node of the enclave starts"
+
+    @property
+    def rule(self) -> DecidingRule | None:
+        """The rule of the permissions that decided, or null."""
+        decision, grant = self.decision, self.grant
+        if decision.rule is None or grant is None:
+            return None
+        allow = grant.rules[decision.rule].allow
+        return DecidingRule(decision.grant, grant.name, decision.rule, allow, decision.expression)
+
+    @property
+    def wildcard(self) -> str:
+        """The expression, if it is a wildcard, or null."""
+        expression = self.decision.expression or ""
+        return expression if is_expression(expression) else ""
+
+    @property
+    def policy(self) -> StatedInPolicy | None:
+        """What `--policy` says, or null without it."""
+        if self.provenance is None:
+            return None
+        file = str(self.enclave.policy_file)
+        return StatedInPolicy(file, self.provenance, self.lines, self.sign)
+
+    @property
+    def topic_rule(self) -> TopicRule | None:
+        """The rule of the governance for the topic, None if it is not known."""
+        decisions = (self.decision, *(each.decision for each in self.parts))
+        return next((each.topic_rule for each in decisions if each.topic_rule), None)
+
+    @property
+    def protection(self) -> AppliedProtection | None:
+        """Protection by the governance, or null."""
+        topic, domain = self.topic_rule, self.domain_rule
+        if domain is None:
+            return None
+        return AppliedProtection(
+            rtps=domain.rtps_protection_kind,
+            discovery=domain.discovery_protection_kind,
+            liveliness=domain.liveliness_protection_kind,
+            topic_expression=topic.topic_expression if topic else None,
+            data=topic.data_protection_kind if topic else None,
+            metadata=topic.metadata_protection_kind if topic else None,
+            read_access_control=topic.enable_read_access_control if topic else None,
+            write_access_control=topic.enable_write_access_control if topic else None,
+        )
+
+    @property
+    def commands(self) -> list[str]:
+        """Commands that apply the change."""
+        if not self.change and not self.sign:
+            return []
+        file = str(self.enclave.policy_file or "POLICY")
+        commands = []
+        if self.change and self.change.document:
+            commands.append(f"sros merge_policy {file} {ADDITION} --in-place")
+        root = str(self.enclave.root or "KEYSTORE")
+        commands.append(f"sros create_permission {root} {self.enclave.name} {file}")
+        return commands
 
 
 _CREATED = {
@@ -143,15 +388,13 @@ _CREATED = {
 # ── the policy behind an answer ────────────────────────────────────────────────────────────
 
 
-def recorded_policy(root: Path, signed: bytes) -> str:
+def recorded_policy(keystore: Keystore, signed: bytes) -> str:
     """Return the SHA-256 of the policy that signed permissions were made from, or "".
 
-    It comes from the ledger of the keystore at ``root``; it is "" if there is no ledger or entry.
+    It comes from the ledger of the keystore; it is "" if there is no ledger or entry.
     """
-    from sros_tool.keystore.ledger import read_ledger
-
     digest = hashlib.sha256(signed).hexdigest()
-    ledger = read_ledger(root, having=("sha256", digest))
+    ledger = keystore.ledger_with("sha256", digest)
     found = (e.policy for e in reversed(ledger.certain) if e.sha256 == digest)
     return next(found, "")
 

@@ -24,7 +24,6 @@ from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import Note, PolicyError
-from sros_tool.explain.denials import nodes_served
 from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import Part, Question
 from sros_tool.graph.learn import (
@@ -49,7 +48,7 @@ from sros_tool.graph.observation import (
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave, plan_enclave
 from sros_tool.keystore.rights import RightsSource
-from sros_tool.names import expand, is_expression
+from sros_tool.names import expand, is_expression, nodes_served
 from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, order

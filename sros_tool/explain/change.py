@@ -7,19 +7,16 @@ the answer "allowed"; the decision engine checks the result before it is propose
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from difflib import get_close_matches
 
 from lxml import etree
 
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
-from sros_tool.explain.answer import Answer, lines_of_right
-from sros_tool.explain.denials import nodes_served
+from sros_tool.explain.answer import Answer, GroupEdit, PolicyChange, lines_of_right
 from sros_tool.explain.evaluator import Evaluator
-from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
-from sros_tool.names import NODE_SERVICES, is_expression
+from sros_tool.keystore.participant import plan_enclave
+from sros_tool.names import NODE_SERVICES, is_expression, nodes_served
 from sros_tool.policy.document import write_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.rights import Right, profile_rights
@@ -27,28 +24,6 @@ from sros_tool.topics import dds_names
 from sros_tool.translate import grant_rights
 
 _NO_RULE = frozenset({"no-rule", "default"})
-
-
-@dataclass(frozen=True, slots=True)
-class GroupEdit:
-    """A replacement for a group of a policy file; ``xml`` is "" if nothing is left of the group."""
-
-    source: Source
-    xml: str
-
-
-@dataclass(frozen=True, slots=True)
-class PolicyChange:
-    """Rights to add and denials to remove (``lift``); both are empty if no change is needed.
-
-    ``document`` is a policy with only the additions, for ``sros merge_policy``; ``edits`` are new
-    versions of the groups with denials, if the policy file is known.
-    """
-
-    add: tuple[Right, ...]
-    lift: tuple[Right, ...]
-    document: str
-    edits: tuple[GroupEdit, ...]
 
 
 def smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None:
@@ -61,7 +36,7 @@ def smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None
     if not question.right:
         return None
     try:
-        governance = parse_governance(enclave.governance)
+        governance = enclave.plain_governance or parse_governance(enclave.governance)
     except SrosError:
         return None
     wanted = question.allowed(enclave.name)
@@ -80,11 +55,11 @@ def smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None
                 _addition(add[0], _places(enclave.policy, answer)) if add else "",
                 tuple(_edits(lift, enclave.policy)) if enclave.policy else (),
             )
-        if tried.decision.reason in _NO_RULE and wanted not in present:
+        if tried.reason in _NO_RULE and wanted not in present:
             present.add(wanted)
             add.append(wanted)
             continue
-        blocking = _blocking(present, tried) if tried.decision.reason == "deny-rule" else []
+        blocking = _blocking(present, tried) if tried.reason == "deny-rule" else []
         if not blocking:
             return None
         present.difference_update(blocking)
@@ -170,14 +145,14 @@ _ALIKE = 0.9
 """The lowest similarity (`difflib`) of a typo in a ROS name."""
 
 
-def likely_names(answer: Answer, enclave: LoadedEnclave) -> tuple[str, ...]:
+def likely_names(answer: Answer) -> tuple[str, ...]:
     """Return at most three names of the same right that the denied name of a question may mean.
 
     For a standard service of a node, these are the services of the enclave's nodes; for any other
     name, those with the same last part, as a forgotten remapping leaves it, and else those that are
     spelled almost alike.
     """
-    question = answer.question
+    question, enclave = answer.question, answer.enclave
     names = {
         each.name
         for each in _present_rights(enclave.policy, enclave.name, answer)
@@ -187,6 +162,8 @@ def likely_names(answer: Answer, enclave: LoadedEnclave) -> tuple[str, ...]:
     same = sorted(each for each in names if each.rpartition("/")[2] == last)
     if (question.type == "service" and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
         return tuple(same) if len(same) <= _SHOWN else ()
+    from difflib import get_close_matches  # for this alone, which is asked last
+
     return tuple(get_close_matches(question.name, sorted(names), n=_SHOWN, cutoff=_ALIKE))
 
 

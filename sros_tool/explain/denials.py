@@ -11,7 +11,6 @@ rights that it should not have.  So each denial says which process printed it, a
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -30,11 +29,12 @@ from sros_tool.names import (
     ACTION_SEPARATOR,
     ACTION_SERVICES,
     ACTION_TOPICS,
-    NODE_SERVICES,
     action_part,
     check_enclave_name,
     expression_problem,
     is_expression,
+    node_of_service,
+    nodes_served,
 )
 from sros_tool.policy.model import Policy
 from sros_tool.policy.patterns import covers
@@ -163,23 +163,13 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
     )
 
 
-_OWN_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
-
-
 def serving_node(denial: Denial) -> str:
     """Return the full name of a node that was denied one of its standard services, or ""."""
     service, begin = service_of(denial.topic)
     if denial.remote or not service:
         return ""
     offered = (begin == "rq") == (denial.direction == SUBSCRIBE)
-    own = _OWN_SERVICE.match(service)
-    return own["node"] if own and denial.direction and offered else ""
-
-
-def nodes_served(rights: Iterable[tuple[str, str]]) -> tuple[str, ...]:
-    """Return the full names of the nodes whose standard services these (right, name) allow."""
-    found = (_OWN_SERVICE.match(name) for right, name in rights if right == "reply")
-    return tuple(sorted({own["node"] for own in found if own}))
+    return node_of_service(service) if denial.direction and offered else ""
 
 
 def _is_ros(topic: str) -> bool:

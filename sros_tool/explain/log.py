@@ -10,27 +10,31 @@ import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import islice
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.errors import SrosError
+from sros_tool.errors import Note, SrosError, UsageError
 from sros_tool.explain.answer import Answer
+from sros_tool.explain.asking import AskingContext, signed_enclave
 from sros_tool.explain.change import likely_names
-from sros_tool.explain.denials import Denial, nodes_served, read_denials, serving_node
+from sros_tool.explain.denials import Denial, read_denials, serving_node
 from sros_tool.explain.evaluator import Evaluator
+from sros_tool.explain.explanation import remedy
 from sros_tool.explain.question import Part, Question, ask
-from sros_tool.explain.remedy import remedy
 from sros_tool.faults import Fault
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
+from sros_tool.keystore.layout import is_keystore
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import load_rights
-from sros_tool.names import ACTION_SEPARATOR
+from sros_tool.names import ACTION_SEPARATOR, check_enclave_name, nodes_served
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import covers
@@ -58,6 +62,7 @@ from sros_tool.runtime.vendor_log import (
 from sros_tool.topics import SERVICE_ENDS
 from sros_tool.translate import grant_rights
 from sros_tool.translate_from_zenoh import name_of_key
+from sros_tool.values import shows
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """The forms of a topic in a line: without punctuation, or with punctuation of its name."""
@@ -66,28 +71,59 @@ _LONGEST = 8000
 """The number of characters of a line that are read: a line may have many megabytes."""
 
 
+@shows(
+    *("id", "vendor", "line", "count", "text", "process", "enclave", "cause", "checked", "found"),
+    "remedy",
+    null_if_empty=("process", "enclave"),
+)
 @dataclass(frozen=True, slots=True)
 class LogFinding:
-    """A message with its cause and remedy, and the causes found in the enclave.
+    """A message.
 
-    ``line`` is the line number (from 1) of the first of ``count`` messages; ``vendor`` is None for
-    messages of rcl and of Zenoh, which ``zenoh`` tells apart.  ``process`` is the label of the
-    process that printed them, "" without a label.  ``enclave`` is "" if the log does not name it.
-    ``checked`` says whether an enclave was examined, and ``found`` are the true causes found in it.
+    ``dds`` is the vendor whose message it is, None for messages of rcl and of Zenoh, which
+    ``zenoh`` tells apart.
     """
 
     id: str
-    vendor: Vendor | None
+    """A stable name."""
+    dds: Vendor | None
     line: int
+    """Its first line, from 1."""
     count: int
+    """How often it occurs."""
     text: str
+    """The line."""
     process: str
+    """The process that printed it, or null."""
     enclave: str
+    """The enclave, or null."""
     cause: str
+    """What it means."""
     remedy: str
+    """What to do."""
     found: tuple[str, ...] = ()
+    """Causes that were found in the enclave."""
     checked: bool = False
+    """Whether the enclave was examined."""
     zenoh: bool = False
+
+    @property
+    def vendor(self) -> str | None:
+        """The DDS vendor, zenoh, or null for ROS 2."""
+        if self.zenoh:
+            return "zenoh"
+        return self.dds.value if self.dds else None
+
+
+class ExplainedLog(NamedTuple):
+    """The messages of a log."""
+
+    log: str
+    """The log."""
+    findings: Sequence[LogFinding]
+    """The messages."""
+    notes: Sequence[Note]
+    """Notes, which text output prints on standard error."""
 
 
 class SearchedKeystore:
@@ -135,6 +171,59 @@ class SearchedKeystore:
 
 FindEnclave = Callable[[str], LoadedEnclave | None]
 """A function from an enclave's name ("": the one that the user named) to the enclave, or None."""
+
+
+def explain_log_of(
+    log: str, text: str, root: Path | None, name: str, asking: AskingContext
+) -> ExplainedLog:
+    """Return the faults that a log reports, with what is found in the enclaves that it names.
+
+    ``name`` is the enclave, or its folder, whose processes wrote the log, "" if the log names it.
+
+    Raises:
+        UsageError: an enclave is named, and no keystore.
+    """
+    keystore = Keystore(root) if root else None
+    named: LoadedEnclave | None = None
+    if name:
+        named = signed_enclave(keystore, name, asking.at)
+        if named is None:
+            raise UsageError(
+                f"no keystore is named for enclave {name}",
+                "",
+                "Write the keystore before the enclave.",
+            )
+
+    # Once for each enclave: whoever writes the log chooses how many it names, and how often.
+    @cache
+    def find(enclave: str) -> LoadedEnclave | None:
+        if named is not None and enclave in ("", named.name):
+            return named
+        if keystore is None or not enclave:
+            return None
+        try:
+            check_enclave_name(enclave)
+            return signed_enclave(keystore, enclave, asking.at, planned=True)
+        except SrosError:  # the log names an enclave of another keystore, or a path
+            return None
+
+    findings = explain_log(
+        text,
+        find,
+        lambda enclave: asking.context(enclave.joined_domains),
+        str(root or ""),
+        SearchedKeystore(root) if root and is_keystore(root) else None,
+    )
+    return ExplainedLog(log, findings, _NOTES if findings else ())
+
+
+_NOTES = (
+    Note(
+        "log.only-text",
+        "a process can print any line: only what is shown after 'found' was examined in the "
+        "enclave",
+    ),
+)
 
 
 def explain_log(
@@ -453,7 +542,7 @@ class _Examiner:
         for name, peer in peers.items():
             if peer is None:
                 continue
-            answer = self._answer(peer, finding.vendor or Vendor.FAST, ask("join"))
+            answer = self._answer(peer, finding.dds or Vendor.FAST, ask("join"))
             causes = list(self._causes(peer, answer, ()))
             found += [f"the peer is enclave {name}: {cause}" for cause, _ in causes]
             remedies += [f"{each} Then restart its processes." for _, each in causes if each]
@@ -464,7 +553,7 @@ class _Examiner:
         if peers and rotating and finding.id in _OF_ROTATION:
             of = f" of enclave {finding.enclave}" if finding.enclave else ""
             found.append("the CAs of this keystore are being replaced, and stage 2 is done")
-            remedies = [_NOT_RESTARTED[finding.vendor or Vendor.FAST].format(of=of)]
+            remedies = [_NOT_RESTARTED[finding.dds or Vendor.FAST].format(of=of)]
         text = " ".join(dict.fromkeys(remedies)) or finding.remedy
         only = next(iter(peers)) if len(peers) == 1 else ""
         text = re.sub(r"\bPEER\b", lambda _: quote(only), text) if only else text
@@ -539,7 +628,7 @@ class _Examiner:
         if len(words) != 1 or denial.by_rule:
             return [], ""
         asked = self._answer(enclave, denial.vendor, ask(words[0], name))
-        names = likely_names(asked, enclave)
+        names = likely_names(asked)
         if not names:
             return [], ""
         return [f"the enclave may {words[0]} {' and '.join(names)}: perhaps that is meant"], (

@@ -7,7 +7,7 @@ execute for actions.  Mapping of names: ROS 2 design "Topic and Service name map
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.errors import UsageError
@@ -15,6 +15,7 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC, expression_problem, is_expressi
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
 from sros_tool.topics import dds_names, service_of
+from sros_tool.values import shows
 
 _JOIN = "join"
 TYPES = ("topic", "service", "action")
@@ -34,8 +35,7 @@ WORDS = (*dict.fromkeys(word for word, _ in _RIGHTS), _JOIN)
 _ROLES = {"rq": "requests", "rr": "replies"}
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
+class Part(NamedTuple):
     """One DDS endpoint that a right needs; ``role`` names it in ROS terms, "" for a topic."""
 
     verb: AccessVerb
@@ -54,18 +54,22 @@ OWN_PARTS = (
 """The endpoints that every ROS 2 process needs to start."""
 
 
-@dataclass(frozen=True, slots=True)
-class Question:
-    """A question whether an enclave may do ``word`` with ``name``.
+@shows("word", "type", "right", "name", null_if_empty=("type", "right", "name"))
+class Question(NamedTuple):
+    """The question.
 
-    ``right`` is the policy's word for it, and ``name`` an absolute ROS name; both are "" in the
-    question whether the enclave may join.  ``only`` replaces the endpoints that the right needs.
+    It asks whether an enclave may do ``word`` with ``name``, an absolute ROS name, or may join if
+    that is "".  ``only`` replaces the endpoints that the right needs.
     """
 
     word: str
+    """The operation, such as `publish`."""
     type: str = ""
+    """`topic`, `service` or `action`, or null."""
     right: str = ""
+    """The right of the policy language, or null."""
     name: str = ""
+    """The ROS name, or null."""
     only: tuple[Part, ...] = ()
 
     @property

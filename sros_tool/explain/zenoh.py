@@ -13,9 +13,16 @@ from enum import StrEnum
 from functools import cache
 from pathlib import Path
 from shlex import quote
+from typing import Annotated, Literal, NamedTuple
 
-from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
+from sros_tool.explain.answer import Answer, PolicyChange, StatedInPolicy
+from sros_tool.explain.asking import Asked, AskedEnclave, AskingContext, ZenohInBrief, meant
+from sros_tool.explain.evaluator import Evaluator
+from sros_tool.explain.explanation import explain
 from sros_tool.explain.question import Question
+from sros_tool.explain.who import of_each
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY_CA_FILE,
@@ -23,25 +30,19 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     ROUTER_FILE,
     SESSION_FILE,
-    check_keystore,
-    enclave_names,
     enclave_path,
     has_zenoh_files,
+    is_keystore,
 )
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import (
-    load_ca_certificate,
-    load_settings,
-    open_enclave,
-    open_keystore,
-)
+from sros_tool.keystore.participant import JoinContext
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.zenoh.opened import is_signed
 from sros_tool.keystore.zenoh.wanted import Drift, signed_path, zenoh_drift
-from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import common_name_of, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, parts
-from sros_tool.xml import read_bytes
+from sros_tool.values import shows
 from sros_tool.zenoh.access import Message
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.delivery import (
@@ -70,7 +71,7 @@ _OTHER_SIDE = {
 }
 
 
-class ZenohOutcome(StrEnum):
+class _Outcome(StrEnum):
     """What happens to an enclave's messages."""
 
     ALLOWED = "allowed"
@@ -82,11 +83,10 @@ class ZenohOutcome(StrEnum):
     @property
     def ok(self) -> bool:
         """Whether data can flow."""
-        return self is ZenohOutcome.ALLOWED
+        return self is _Outcome.ALLOWED
 
 
-@dataclass(frozen=True, slots=True)
-class ZenohFile:
+class ZenohFile(NamedTuple):
     """The configuration of an enclave's process as it is in the keystore.
 
     ``process`` is None if it opens no session, and ``problem`` says why.  ``until`` is when the
@@ -101,39 +101,89 @@ class ZenohFile:
     endpoints: tuple[ZenohEndpoint, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Reached:
-    """Another enclave that has the right at the other end, and the deliveries to or from it.
-
-    ``problem`` says why its process opens no session, or is "".
-    """
+@shows("enclave", "problem", null_if_empty=("problem",))
+class Reached(NamedTuple):
+    """An enclave."""
 
     enclave: str
+    """The enclave."""
     deliveries: tuple[Delivery, ...]
     problem: str
+    """Why its process opens no session, or null."""
 
 
+class DecidingWildcard(NamedTuple):
+    """A key expression."""
+
+    expression: str
+    """The key expression."""
+    reaches: tuple[str, ...]
+    """The enclaves that a put or a query on all of it reaches."""
+
+
+class CheckedLink(NamedTuple):
+    """A link."""
+
+    enclaves: tuple[str, str]
+    """The enclaves at both ends."""
+    passes: bool
+    """Whether every message passes."""
+    checks: tuple[Check, ...]
+    """The decisions on the messages, in order."""
+
+
+_OutcomeWord = Annotated[
+    _Outcome,
+    "What happens: messages vanish (`dropped`), or the process opens no session (`refused`).",
+]
+
+
+@shows(
+    *("in_brief", "outcome", "links", "reached", "wildcards", "until", "unsigned"),
+    spread=("in_brief",),
+)
 @dataclass(frozen=True, slots=True)
 class ZenohAnswer:
     """The answer of Zenoh to a question about an enclave.
 
-    ``text`` says why, as a clause.  ``checks`` are the decisions on the right itself.  ``reached``
-    are the other enclaves with the right at the other end.  ``wildcards`` are key expressions with
-    wildcards that decide, each with the enclaves to which a message on all of it gets.  ``until``
-    is when the certificate expires.  ``unsigned`` are the files that decide without a signature.
+    ``text`` says why, as a clause.  ``checks`` are the decisions on the right itself.
     """
 
     enclave: str
     question: Question
-    domain: int
     mode: Mode | None
-    outcome: ZenohOutcome
+    outcome: _OutcomeWord
     text: str
     checks: tuple[Check, ...] = ()
     reached: tuple[Reached, ...] = ()
-    wildcards: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    """The enclaves that have the right at the other end."""
+    wildcards: tuple[DecidingWildcard, ...] = ()
+    """Key expressions with wildcards that decide."""
     until: datetime | None = None
+    """When the certificate expires, or null."""
     unsigned: tuple[str, ...] = ()
+    """The files that decide and that the permissions CA has not signed."""
+
+    @property
+    def in_brief(self) -> ZenohInBrief:
+        """Whether Zenoh allows it, and why."""
+        mode = self.mode.value if self.mode else None
+        return ZenohInBrief(self.allowed, mode, self.text, self.outcome)
+
+    @property
+    def allowed(self) -> bool:
+        """Whether data can flow."""
+        return self.outcome.ok
+
+    @property
+    def wildcard(self) -> str:
+        """The first key expression with a wildcard that decides, or ""."""
+        return self.wildcards[0].expression if self.wildcards else ""
+
+    @property
+    def stopped(self) -> str:
+        """Why its process opens no session, or ""."""
+        return self.text if self.outcome is _Outcome.REFUSED else ""
 
     @property
     def of_router(self) -> bool:
@@ -143,7 +193,7 @@ class ZenohAnswer:
     @property
     def dropped(self) -> Check | None:
         """The check that drops a message, or None; that of data if there are several."""
-        return _first((each for each in self.checks if not each.decision.allowed), self.enclave)
+        return _first((each for each in self.checks if not each.allowed), self.enclave)
 
     @property
     def deciding(self) -> Check | None:
@@ -151,13 +201,47 @@ class ZenohAnswer:
         return self.dropped or _first(self.checks, self.enclave)
 
     @property
-    def links(self) -> tuple[tuple[tuple[str, str], tuple[Check, ...]], ...]:
-        """The checks by the pair of processes whose link they are on, each pair once."""
-        found: dict[tuple[str, str], list[Check]] = {}
-        for each in self.checks:
-            ends = (self.enclave, each.remote if each.enforcer == self.enclave else each.enforcer)
-            found.setdefault(ends, []).append(each)
-        return tuple((ends, tuple(checks)) for ends, checks in found.items())
+    def links(self) -> tuple[CheckedLink, ...]:
+        """The links on which the right is decided."""
+        by_ends: dict[tuple[str, str], list[Check]] = {}
+        for check in self.checks:
+            other = check.remote if check.enforcer == self.enclave else check.enforcer
+            by_ends.setdefault((self.enclave, other), []).append(check)
+        return tuple(
+            CheckedLink(ends, all(each.allowed for each in checks), tuple(checks))
+            for ends, checks in by_ends.items()
+        )
+
+
+@shows(
+    *("enclave", "in_brief", "outcome", "wildcard"),
+    null_if_empty=("wildcard",),
+    spread=("in_brief",),
+)
+class ZenohEnclaveOutcome(NamedTuple):
+    """An enclave."""
+
+    enclave: str
+    """The enclave."""
+    in_brief: ZenohInBrief
+    outcome: _OutcomeWord
+    wildcard: str
+    """The key expression that allows it, if it is a wildcard, or null."""
+
+
+class WhoOnZenoh(NamedTuple):
+    """The enclaves that Zenoh lets do it."""
+
+    question: str
+    """The question."""
+    vendor: Literal["zenoh"]
+    """Zenoh."""
+    vendor_why: str
+    """Why Zenoh was asked."""
+    domain: int
+    """The ROS domain."""
+    enclaves: Sequence[ZenohEnclaveOutcome]
+    """All enclaves but the router's."""
 
 
 class ZenohEvaluator:
@@ -167,11 +251,12 @@ class ZenohEvaluator:
     routers': what they enforce together cannot be known then.
     """
 
-    def __init__(self, root: Path, *, at: datetime, domain: int) -> None:
-        check_keystore(root)
-        self.root = root
+    def __init__(self, keystore: Keystore, *, at: datetime, domain: int) -> None:
+        keystore.check()
+        self.keystore = keystore
+        self.root = keystore.root
         self.domain = domain
-        self.names = enclave_names(root)
+        self.names = keystore.names
         self._at = at
         self._file = cache(self._read)
         self.router = self._router()
@@ -216,9 +301,8 @@ class ZenohEvaluator:
         found = ZenohAnswer(
             enclave,
             question,
-            self.domain,
             own.process.mode if own.process else None,
-            ZenohOutcome.REFUSED,
+            _Outcome.REFUSED,
             own.problem,
             until=own.until,
             unsigned=self._unsigned(own),
@@ -227,7 +311,7 @@ class ZenohEvaluator:
             return found
         if own.process.mode is Mode.ROUTER:
             text = "it is the router's enclave, which passes on what others say and says nothing"
-            return replace(found, outcome=ZenohOutcome.DROPPED, text=text)
+            return replace(found, outcome=_Outcome.DROPPED, text=text)
         if self.router.process is None:
             text = f"no link to the router {self.router.enclave}: {self.router.problem}"
             return replace(found, text=text)
@@ -247,25 +331,15 @@ class ZenohEvaluator:
         why = found.deciding.decision.why
         text = f"{found.deciding}: {why}, in {self._file_of(by)} of {by}"
         if found.dropped:
-            return replace(found, outcome=ZenohOutcome.DROPPED, text=text)
+            return replace(found, outcome=_Outcome.DROPPED, text=text)
         reached = tuple(self._reached(own, wanted)) if reach else ()
         return replace(
             found,
-            outcome=ZenohOutcome.ALLOWED,
+            outcome=_Outcome.ALLOWED,
             text=text,
             reached=reached,
             wildcards=tuple(self._wildcards(own.process, wanted, checks, reached)),
         )
-
-    def who(self, question: Question, names: Sequence[str]) -> tuple[ZenohAnswer, ...]:
-        """Return the answers for several enclaves, without whom they reach; brief for peers."""
-
-        def work(part: Sequence[str]) -> list[ZenohAnswer]:
-            return [self.answer(name, question, reach=False, brief=True) for name in part]
-
-        names = [each for each in names if each != self.router.enclave]
-        found = [each for _, part in map_slices(names, work) for each in part]
-        return tuple(sorted(found, key=lambda each: each.enclave))
 
     def out_of_date(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
         """Return the files that decide an answer and are not what the permissions ask for.
@@ -273,11 +347,11 @@ class ZenohEvaluator:
         Return None if that cannot be told, such as in an export.
         """
         try:
-            network = load_settings(self.root).zenoh
+            network = self.keystore.template.zenoh
             if network is None:
                 return None
-            domains = open_keystore(self.root).domains
-            authority = load_ca_certificate(self.root, PERMISSIONS)
+            domains = self.keystore.domains
+            authority = self.keystore.ca_certificate(PERMISSIONS)
             drifts, _ = zenoh_drift(self.root, network, domains, authority, self._at)
         except SrosError:
             return None
@@ -304,11 +378,11 @@ class ZenohEvaluator:
         if not (folder / file).exists():
             return _closed(enclave, file, f"it has no {file}: its processes open no session")
         try:
-            data = read_bytes(folder / file, "Zenoh configuration")
+            data = self.keystore.read(folder / file, "Zenoh configuration")
             document = parse_configuration(data, str(folder / file), lines=False)
         except SrosError as error:
             return _closed(enclave, file, f"Zenoh does not accept its {file}: {error.why}".strip())
-        state = open_enclave(folder, now=self._at)
+        state = self.keystore.enclave(enclave, now=self._at)
         faults = [each for each in state.problems_at_home if each.file in _OF_TLS]
         if faults or state.certificate is None:
             problem = str(faults[0]) if faults else f"{CERTIFICATE_FILE} cannot be read"
@@ -328,8 +402,8 @@ class ZenohEvaluator:
 
     def _is_signed(self, path: Path) -> bool:
         try:
-            document = read_bytes(path, "Zenoh configuration")
-            return is_signed(path, document, load_ca_certificate(self.root, PERMISSIONS))
+            document = self.keystore.read(path, "Zenoh configuration")
+            return is_signed(path, document, self.keystore.ca_certificate(PERMISSIONS))
         except SrosError:
             return False
 
@@ -422,7 +496,7 @@ class ZenohEvaluator:
         wanted: Sequence[Right],
         checks: Sequence[Check],
         reached: Sequence[Reached],
-    ) -> Iterator[tuple[str, tuple[str, ...]]]:
+    ) -> Iterator[DecidingWildcard]:
         """Yield the wildcards that decide, with the enclaves that a message on all of it reaches.
 
         Only a put or a query can have such a key; it arrives where every rule is as wide.
@@ -435,7 +509,7 @@ class ZenohEvaluator:
                 if (other := self._file(each.enclave, SESSION_FILE).process)
                 and any(one.arrives for one in self._between(own, other, asked, wide))
             ]
-            yield wide, tuple(found)
+            yield DecidingWildcard(wide, tuple(found))
 
     def _wildcard(self, check: Check) -> str:
         """Return the key expression that allows data, if its name has a wildcard, or ""."""
@@ -475,3 +549,187 @@ def _listed(endpoints: Sequence[ZenohEndpoint]) -> str:
 
 def _closed(enclave: str, file: str, problem: str) -> ZenohFile:
     return ZenohFile(enclave, file, None, problem)
+
+
+# ── all enclaves ───────────────────────────────────────────────────────────────────────────
+
+
+class ZenohOfKeystore:
+    """Zenoh, asked about the enclaves of a keystore; all but the router's without ``names``."""
+
+    def __init__(
+        self,
+        keystore: Keystore,
+        why: str,
+        asking: AskingContext,
+        names: Sequence[str] | None = None,
+    ) -> None:
+        self.keystore = keystore
+        self._why = why
+        context = asking.context(keystore.domains)
+        self._evaluator = ZenohEvaluator(keystore, at=context.at, domain=context.domain)
+        chosen = names or self._evaluator.names
+        self._names = [name for name in chosen if name != self._evaluator.router.enclave]
+
+    @property
+    def title(self) -> str:
+        """Its name, and the reason to ask it."""
+        return f"Zenoh ({self._why})"
+
+    def outcomes(self, question: Question) -> tuple[ZenohAnswer, ...]:
+        """Return the answer for each enclave, without whom it reaches; brief for peers."""
+
+        def answer(name: str) -> ZenohAnswer:
+            return self._evaluator.answer(name, question, reach=False, brief=True)
+
+        return of_each(self._names, answer)
+
+    def printed(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> WhoOnZenoh:
+        """Return what ``--json`` prints of its outcomes."""
+        shown = [
+            ZenohEnclaveOutcome(each.enclave, each.in_brief, each.outcome, each.wildcard)
+            for each in outcomes
+        ]
+        return WhoOnZenoh(str(question), "zenoh", self._why, self._evaluator.domain, shown)
+
+    def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
+        """Yield a note if peers were asked by the file of the router."""
+        if any(each.mode is Mode.PEER for each in outcomes):
+            text = (
+                "peers decide by their own files, and this is by that of the router, which has the "
+                "same rights if `sros zenoh --check` says so; a question about one enclave reads "
+                "all."
+            )
+            yield Note("explain.zenoh-by-router", text)
+
+
+# ── one question ───────────────────────────────────────────────────────────────────────────
+
+
+@shows(
+    *("asked", "vendor", "vendor_title", "vendor_why", "answer", "out_of_date", "policy"),
+    *("permitted", "remedy", "change", "commands"),
+    null_if_empty=("remedy",),
+    spread=("asked", "answer"),
+)
+class ZenohExplanation(NamedTuple):
+    """What Zenoh does with the files of the keystore as they are.
+
+    ``stated`` is the answer by the signed permissions, from which the files are made.
+    """
+
+    asked: Asked
+    vendor_why: str
+    """Why Zenoh was asked."""
+    answer: ZenohAnswer
+    out_of_date: tuple[str, ...] | None
+    """The files that decide and are not what the permissions ask for; null if that is not known."""
+    stated: Answer
+    root: Path
+    notes: tuple[Note, ...]
+
+    @property
+    def vendor(self) -> Literal["zenoh"]:
+        """Zenoh."""
+        return "zenoh"
+
+    @property
+    def vendor_title(self) -> str:
+        """Its name."""
+        return "Zenoh"
+
+    @property
+    def allowed(self) -> bool:
+        """Whether Zenoh lets it through."""
+        return self.answer.allowed
+
+    @property
+    def policy(self) -> StatedInPolicy | None:
+        """What `--policy` says, or null without it."""
+        return self.stated.policy
+
+    @property
+    def permitted(self) -> bool:
+        """Whether the signed permissions allow it."""
+        return self.stated.allowed
+
+    @property
+    def wants_rights(self) -> bool:
+        """Whether more rights would help: the router's enclave shall have none."""
+        return not self.allowed and not self.permitted and not self.answer.of_router
+
+    @property
+    def remedy(self) -> str:
+        """What to do if no policy can help, or null."""
+        return self.written or (self.stated.remedy if self.wants_rights else "")
+
+    @property
+    def written(self) -> str:
+        """What to do if the files of Zenoh do not say what the permissions say, or ""."""
+        if self.answer.of_router:
+            return "Give the node an enclave of its own."
+        if self.allowed is self.permitted and not self.out_of_date:
+            return ""
+        text = "Look at the files"
+        if self.out_of_date:
+            text = "Write the files of Zenoh as the permissions are"
+        command = f"sros zenoh {quote(str(self.root))}"
+        return f"{text}: `{command}`; then restart the processes that it names."
+
+    @property
+    def change(self) -> PolicyChange | None:
+        """The smallest change of the policy that would allow it, or null."""
+        return self.stated.change if self.wants_rights else None
+
+    @property
+    def commands(self) -> list[str]:
+        """Commands that apply the change."""
+        return self.stated.commands if self.wants_rights else []
+
+
+def explain_on_zenoh(
+    asked: AskedEnclave,
+    question: Question,
+    why: str,
+    context: JoinContext,
+    *,
+    kind: str | None = None,
+) -> ZenohExplanation:
+    """Return what Zenoh decides, and what the permissions say, by which the files are made.
+
+    ``why`` is the reason to ask Zenoh; ``kind`` is the type of the name if the user said it.
+    """
+    enclave, keystore = asked.enclave, asked.enclave.keystore
+    if keystore is None or enclave.state is None or not is_keystore(keystore.root):
+        raise UsageError(
+            "Zenoh needs a keystore with the enclave",
+            "It decides by the files of the router and of other enclaves.",
+            "Name the keystore before the enclave.",
+        )
+    stated = Evaluator(Vendor.STANDARD, enclave, context)
+    question, taken = meant(stated, asked, question, kind)
+    evaluator = ZenohEvaluator(keystore, at=context.at, domain=context.domain)
+    answer = evaluator.answer(enclave.name, question)
+    outdated = evaluator.out_of_date(answer)
+    by_permissions = explain(stated, question)
+    notes = (*taken, *_notes(answer, by_permissions, outdated))
+    what = Asked(enclave.name, question, context)
+    return ZenohExplanation(what, why, answer, outdated, by_permissions, keystore.root, notes)
+
+
+def _notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) -> Iterator[Note]:
+    if answer.allowed is not stated.allowed and not stated.problems:
+        does, other = ("allow", "Zenoh drops") if stated.allowed else ("deny", "Zenoh lets through")
+        text = f"the signed permissions {does} it and {other} it: the two are not in step."
+        yield Note("explain.zenoh-differs", text)
+    if outdated:
+        text = f"out of date: {', '.join(outdated)}. The answer is by these files as they are."
+        yield Note("explain.zenoh-out-of-date", text)
+    if outdated is None:
+        text = "it was not compared with what the permissions ask for, which takes the keystore's "
+        text += "settings and all its enclaves: the answer is by the files as they are."
+        yield Note("explain.zenoh-not-compared", text)
+    if answer.unsigned:
+        text = f"the permissions CA has not signed {', '.join(answer.unsigned)}: whoever can write "
+        text += "it gives rights, since Zenoh verifies no signature."
+        yield Note("explain.zenoh-unsigned", text)

@@ -17,9 +17,16 @@ from cryptography import x509
 
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import Decision, Outcome, Refusal
-from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
+from sros_tool.dds.decision.documents import (
+    canonical_governance,
+    canonical_permissions,
+    is_plain_governance,
+    is_plain_permissions,
+    read_governance_as,
+    read_permissions_as,
+)
 from sros_tool.dds.decision.vendors import MEASURED, Vendor, VendorTraits
-from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import Permissions, render_permissions
 from sros_tool.errors import SrosError
@@ -70,8 +77,9 @@ class LoadedEnclave:
     ``folder`` at the time ``at``; None if they do not exist yet.  ``key_elsewhere`` says that the
     key is on the robot that generated it.
 
-    ``root`` is its keystore and ``policy`` its part of the policy file, if known.
+    ``keystore`` is that of the enclave, and ``policy`` its part of ``policy_file``, if known.
     ``portable`` are its permissions if all vendors read them alike, because sros wrote them.
+    What is planned has them in place of XML, and ``plain_governance`` in place of ``governance``.
     """
 
     name: str
@@ -84,9 +92,16 @@ class LoadedEnclave:
     state: OpenedEnclave | None = None
     at: datetime | None = None
     key_elsewhere: bool = False
-    root: Path | None = None
+    keystore: Keystore | None = None
     policy: Enclave | None = None
+    policy_file: Path | None = None
     portable: Permissions | None = None
+    plain_governance: Governance | None = None
+
+    @property
+    def root(self) -> Path | None:
+        """The folder of its keystore, if known."""
+        return self.keystore.root if self.keystore else None
 
     @property
     def joined_domains(self) -> DomainSet | None:
@@ -139,6 +154,11 @@ def loaded(name: str, folder: Path, state: OpenedEnclave, *, at: datetime) -> Lo
     )
 
 
+def _portable(permissions: Permissions | None, document: bytes) -> Permissions | None:
+    """Return permissions from a document if all vendors read it alike."""
+    return permissions if permissions and canonical_permissions(permissions, document) else None
+
+
 def plan_enclave(policy: Enclave, governance: Governance, *, at: datetime) -> LoadedEnclave:
     """Return the enclave that DDS would load if the policy were signed at ``at``."""
     from sros_tool.translate import permissions_for
@@ -149,46 +169,18 @@ def plan_enclave(policy: Enclave, governance: Governance, *, at: datetime) -> Lo
     permissions = permissions_for(
         policy, subject=subject, validity=window(at, _PLANNED), domains=domains
     )
+    # What all vendors read alike is handed on as it is.
+    plain = is_plain_permissions(permissions)
+    plain_governance = is_plain_governance(governance)
     return LoadedEnclave(
         policy.path,
         subject,
-        render_governance(governance),
-        render_permissions(permissions),
+        b"" if plain_governance else render_governance(governance),
+        b"" if plain else render_permissions(permissions),
         domains,
+        portable=permissions if plain else None,
+        plain_governance=governance if plain_governance else None,
     )
-
-
-def _portable(permissions: Permissions | None, document: bytes) -> Permissions | None:
-    """Return permissions whose document is as sros writes it, of names that are read in one way."""
-    if permissions is None or not _is_plain(permissions):
-        return None
-    written = document.replace(b"\r\n", b"\n").strip(b"\n")
-    return permissions if render_permissions(permissions).strip(b"\n") == written else None
-
-
-def _is_plain(permissions: Permissions) -> bool:
-    """Return whether no vendor reads a text, or a range of domains, in its own way."""
-    texts = []
-    for grant in permissions.grants:
-        if not (grant.name and grant.rules):
-            return False
-        texts += [grant.name, grant.subject, grant.not_before, grant.not_after]
-        for rule in grant.rules:
-            ends = [end for part in rule.domains.ranges for end in (part.first, part.last)]
-            if not ends or any(end is None or end > MAX_DOMAIN for end in ends):
-                return False
-            if rule.relay:
-                return False
-            for criteria in (*rule.publish, *rule.subscribe):
-                if criteria.partitions or criteria.data_tags or not all(criteria.topics or ("",)):
-                    return False
-                texts += criteria.topics
-    joined = f"|{'|'.join(texts)}|"
-    odd = "| " in joined or " |" in joined or any(each in joined for each in _MARKUP)
-    return joined.isascii() and joined.isprintable() and not odd
-
-
-_MARKUP = '&<>"'
 
 
 def _document(state: OpenedEnclave, file: str) -> bytes:
@@ -233,9 +225,15 @@ _ONLY_PEERS_NOTICE = {
 
 
 @lru_cache(maxsize=64)  # all enclaves of a keystore have the same governance
-def _governed_as(vendor: Vendor, document: bytes, domain: int) -> GovernedDomain | Refusal:
-    """Return what a governance document says of a domain to a vendor, or why it refuses it."""
-    governance = read_governance_as(vendor, document)
+def _governed_as(
+    vendor: Vendor, document: Governance | bytes, domain: int
+) -> GovernedDomain | Refusal:
+    """Return what a governance, or its document, says of a domain to a vendor, or its refusal."""
+    governance: Governance | Refusal
+    if isinstance(document, Governance):
+        governance = document
+    else:
+        governance = canonical_governance(document) or read_governance_as(vendor, document)
     if isinstance(governance, Refusal):
         return governance
     return GovernedDomain(vendor, governance, domain)
@@ -332,7 +330,9 @@ class VendorParticipant:
     def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
         """Return the access of the vendor's process, or the decision that keeps it from running."""
         late: Decision | None = None
-        governed = _governed_as(self.vendor, enclave.governance, context.domain)
+        governed = _governed_as(
+            self.vendor, enclave.plain_governance or enclave.governance, context.domain
+        )
         noticed = [
             each for each in self.problems if (self.vendor, each.fault) not in _ONLY_PEERS_NOTICE
         ]

@@ -627,15 +627,17 @@ def read_signed_grant(path: Path, subject: str, files: FilesReadOnce | None = No
 @shows("file", "text", "code")
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A fault of an enclave, with the file that has it and the reason as a clause."""
+    """A fault."""
 
     file: str
+    """The file."""
     text: str
+    """What is wrong, as a clause."""
     fault: Fault
 
     @property
     def code(self) -> str:
-        """The stable id of the fault, for programs, such as ``key-mismatch``."""
+        """A stable name, such as ``key-mismatch``."""
         return self.fault.id
 
     def __str__(self) -> str:

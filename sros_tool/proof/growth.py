@@ -834,7 +834,7 @@ def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | 
         for hop in network.hops(each):
             target = real.get(hop.target, hop.target)
             if target != source and target not in found[source]:
-                found[source][target] = replace(hop, source=source, target=target)
+                found[source][target] = hop._replace(source=source, target=target)
                 left -= 1
         if left < 0:
             return None

@@ -83,7 +83,7 @@ def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
                 "--allow-looser`.",
             )
         return wanted
-    return 0 if 0 in domains else next(iter(domains))
+    return domains.preferred()
 
 
 def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+from sros_tool.values import shows
 from sros_tool.zenoh.access import Flow, Message
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.enforcement import AccessDecision, Enforcement, Remote
@@ -26,16 +27,37 @@ class ZenohProcess:
     access: Enforcement
 
 
+@shows("enforcer", "remote", "flow", "message", "key", "allowed", "rules", "why")
 @dataclass(frozen=True, slots=True)
 class Check:
-    """The decision of process ``enforcer`` on one message on its link with ``remote``."""
+    """A decision of the process ``enforcer`` on one message on its link with ``remote``."""
 
     enforcer: str
+    """The enclave whose process decides."""
     remote: str
+    """The enclave at the other end."""
     flow: Flow
+    """From (`ingress`) or to (`egress`) the other end."""
     message: Message
+    """The kind of message, as Zenoh's rules name it."""
     key: str
+    """Its key; `type/hash` stands for every type."""
     decision: AccessDecision
+
+    @property
+    def allowed(self) -> bool:
+        """Whether it passes."""
+        return self.decision.allowed
+
+    @property
+    def rules(self) -> tuple[str, ...]:
+        """The ids of the rules that decide."""
+        return self.decision.rules
+
+    @property
+    def why(self) -> str:
+        """Why, as a clause."""
+        return self.decision.why
 
     def __str__(self) -> str:
         """Return text like ``put 0/chatter/*/* from /talker``."""
@@ -56,12 +78,12 @@ class Delivery:
     @property
     def arrives(self) -> bool:
         """Whether the message is heard, the request executed, or the token seen."""
-        return all(each.decision.allowed for each in self.checks)
+        return all(each.allowed for each in self.checks)
 
     @property
     def answered(self) -> bool:
         """Whether also the reply gets back."""
-        return self.arrives and all(each.decision.allowed for each in self.replies)
+        return self.arrives and all(each.allowed for each in self.replies)
 
 
 Route = tuple[ZenohProcess, ...]

@@ -19,6 +19,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.change import policy_of
 from sros_tool.explain.evaluator import Evaluator
+from sros_tool.explain.explanation import explain
 from sros_tool.explain.question import Question, ask
 from sros_tool.files import policies_dir
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, plan_enclave
@@ -89,7 +90,7 @@ def test_every_rule(file: Path, enclave: Enclave, vendor: Vendor) -> None:
             continue
         name = common_name([right.name], denials)
         assert name is not None
-        found = evaluator.explain(question(right.right, name))
+        found = explain(evaluator, question(right.right, name))
         assert found.outcome is Outcome.ALLOWED, (right, found.decision)
         assert bool(found.wildcard) == is_expression(found.decision.expression or "")
         assert found.change is None
@@ -120,7 +121,7 @@ def test_every_denied_twin(file: Path, enclave: Enclave, vendor: Vendor) -> None
         if any(matches(each, name) for each in expressions):
             continue  # a wildcard for everything has no twin that is denied
         asked = question(right.right, name)
-        found = evaluator.explain(asked)
+        found = explain(evaluator, asked)
         assert found.outcome is Outcome.DENIED, (right, found.decision)
         assert not rules.allow(enclave.path, right.right, name)
         assert found.change is not None and found.change.lift == ()
@@ -146,7 +147,7 @@ def test_every_denial(enclave: Enclave, right: Right, vendor: Vendor) -> None:
     name = common_name([right.name])
     assert name
     evaluator = Evaluator(vendor, planned(enclave), CONTEXT)
-    found = evaluator.explain(question(right.right, name))
+    found = explain(evaluator, question(right.right, name))
     assert (found.outcome, found.decision.reason) == ("denied", "deny-rule")
     assert [(each.qualifier, each.right) for each in found.lines] == [(DENY, right.right)]
     assert found.change is not None

@@ -67,7 +67,7 @@ def test_a_question_loads_only_what_answers_it(whole: Path) -> None:
         f"sros_tool.{each}"
         for each in (
             "explain.change",
-            "explain.remedy",
+            "explain.reached",
             "explain.zenoh",
             "keystore.transaction",
             "runtime.stacks",

@@ -14,6 +14,7 @@ import pytest
 from sros_tool.cli.common import now
 from sros_tool.explain.question import ask
 from sros_tool.explain.zenoh import ZenohEvaluator
+from sros_tool.keystore.reader import Keystore
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import Rules, policy_rights, unfolded
 from tests.explain.zenoh_policies import NAMES, OTHER_END, WORD, drawn_policy
@@ -320,7 +321,7 @@ def test_random_policies_are_answered_as_their_permissions_say(
     sros("generate_artifacts", "-k", root, "-p", policy).ok()
     sros("zenoh", root, "--mode", mode).ok()
     rules = Rules(unfolded(policy_rights(read_policy(policy))))
-    evaluator = ZenohEvaluator(root, at=now(), domain=0)
+    evaluator = ZenohEvaluator(Keystore(root), at=now(), domain=0)
     enclaves = [each for each in evaluator.names if each != "/router"]
     allowed = denied = 0
     for enclave, (right, other), name in product(enclaves, OTHER_END.items(), NAMES):

@@ -2,18 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import lru_cache
 from typing import TypeVar
 
-from sros_tool.dds.decision import cyclone, elements, fastdds
+from sros_tool.dds.decision import elements
 from sros_tool.dds.decision.answers import Refusal
 from sros_tool.dds.decision.elements import UnreadableError
 from sros_tool.dds.decision.vendors import DocumentReader, Vendor
-from sros_tool.dds.governance import Governance, parse_governance
-from sros_tool.dds.permissions import Permissions, parse_permissions
+from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
+from sros_tool.dds.governance import (
+    DomainRule,
+    Governance,
+    TopicRule,
+    attributes,
+    parse_governance,
+    render_governance,
+)
+from sros_tool.dds.permissions import Permissions, parse_permissions, render_permissions
 from sros_tool.errors import DocumentError
 
 _Document = TypeVar("_Document", Governance, Permissions)
+
+
+def _readers(
+    reader: DocumentReader,
+) -> tuple[Callable[[bytes], Governance], Callable[[bytes], Permissions]]:
+    """Return how a vendor reads governance and permissions; sros's own documents need no reader."""
+    match reader:
+        case DocumentReader.FAST:
+            from sros_tool.dds.decision import fastdds
+
+            return fastdds.read_governance, fastdds.read_permissions
+        case DocumentReader.CYCLONE:
+            from sros_tool.dds.decision import cyclone
+
+            return cyclone.read_governance, cyclone.read_permissions
+    return _standard_governance, _standard_permissions
 
 
 def _standard_governance(xml: bytes) -> Governance:
@@ -26,21 +52,14 @@ def _standard_permissions(xml: bytes) -> Permissions:
     return parse_permissions(xml, "permissions")
 
 
-_READERS = {
-    DocumentReader.STANDARD: (_standard_governance, _standard_permissions),
-    DocumentReader.FAST: (fastdds.read_governance, fastdds.read_permissions),
-    DocumentReader.CYCLONE: (cyclone.read_governance, cyclone.read_permissions),
-}
-
-
 def read_governance_as(vendor: Vendor, xml: bytes) -> Governance | Refusal:
     """Return the governance as ``vendor`` reads it from ``xml``, or its refusal."""
-    return _read(vendor, "governance", _READERS[vendor.traits.reader][0], xml)
+    return _read(vendor, "governance", _readers(vendor.traits.reader)[0], xml)
 
 
 def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
     """Return the permissions as ``vendor`` reads them from ``xml``, or its refusal."""
-    return _read(vendor, "permissions", _READERS[vendor.traits.reader][1], xml)
+    return _read(vendor, "permissions", _readers(vendor.traits.reader)[1], xml)
 
 
 def _read(
@@ -52,3 +71,74 @@ def _read(
         return error.refusal(vendor.title, what)
     except DocumentError as error:
         return Refusal("malformed", f"{vendor.title}: {error}")
+
+
+# ── documents that all vendors read alike ──────────────────────────────────────────────────
+
+
+@lru_cache(maxsize=8)  # all enclaves of a keystore have the same governance
+def canonical_governance(document: bytes) -> Governance | None:
+    """Return the governance in a document that all vendors read alike, as sros writes it."""
+    with suppress(DocumentError):
+        governance = parse_governance(document)
+        if is_plain_governance(governance) and _is_written(render_governance(governance), document):
+            return governance
+    return None
+
+
+def canonical_permissions(permissions: Permissions, document: bytes) -> bool:
+    """Return whether every vendor reads a document as these permissions, as sros wrote them."""
+    written = is_plain_permissions(permissions)
+    return written and _is_written(render_permissions(permissions), document)
+
+
+def _is_written(written: bytes, document: bytes) -> bool:
+    return document.replace(b"\r\n", b"\n").strip(b"\n") == written.strip(b"\n")
+
+
+def is_plain_governance(governance: Governance) -> bool:
+    """Return whether no vendor reads a text, a value or a range of domains in its own way."""
+    texts = []
+    for rule in governance.domain_access_rules:
+        if not (_are_plain_domains(rule.domains) and rule.topic_access_rules):
+            return False
+        rules: tuple[DomainRule | TopicRule, ...] = (rule, *rule.topic_access_rules)
+        if not all(_has_valid_values(each) for each in rules):
+            return False
+        texts += [topic.topic_expression for topic in rule.topic_access_rules]
+    return bool(texts) and all(texts) and _are_plain(texts)
+
+
+def _has_valid_values(rule: DomainRule | TopicRule) -> bool:
+    return all(getattr(rule, each.name) in each.values for each in attributes(type(rule)))
+
+
+def is_plain_permissions(permissions: Permissions) -> bool:
+    """Return whether no vendor reads a text, or a range of domains, in its own way."""
+    texts = []
+    for grant in permissions.grants:
+        if not (grant.name and grant.rules):
+            return False
+        texts += [grant.name, grant.subject, grant.not_before, grant.not_after]
+        for rule in grant.rules:
+            if rule.relay or not _are_plain_domains(rule.domains):
+                return False
+            for criteria in (*rule.publish, *rule.subscribe):
+                if criteria.partitions or criteria.data_tags or not all(criteria.topics or ("",)):
+                    return False
+                texts += criteria.topics
+    return _are_plain(texts)
+
+
+def _are_plain_domains(domains: DomainSet) -> bool:
+    ends = [end for part in domains.ranges for end in (part.first, part.last)]
+    return bool(ends) and all(end is not None and end <= MAX_DOMAIN for end in ends)
+
+
+def _are_plain(texts: Iterable[str]) -> bool:
+    joined = f"|{'|'.join(texts)}|"
+    odd = "| " in joined or " |" in joined or any(each in joined for each in _MARKUP)
+    return joined.isascii() and joined.isprintable() and not odd
+
+
+_MARKUP = '&<>"'

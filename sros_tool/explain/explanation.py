@@ -1,15 +1,23 @@
-"""Remedies for faults of an enclave, where the cause is not the policy.
+"""Explain an answer: the lines of the policy behind it, and what to do about a denial.
 
-A command in a remedy works on a keystore with that fault, and repairs it.
+Where the policy is not the cause, a command in a remedy works on a keystore with that fault, and
+repairs it.
 """
 
 from __future__ import annotations
 
 import hashlib
+import logging
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 
+from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import SrosError
+from sros_tool.explain.answer import Answer, Provenance, deciding_lines, recorded_policy
+from sros_tool.explain.evaluator import Evaluator
+from sros_tool.explain.question import Question
 from sros_tool.faults import FAULTS, REPLACE, Fault
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
@@ -24,7 +32,84 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     enclave_path,
 )
-from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+from sros_tool.keystore.participant import LoadedEnclave
+
+_LOG = logging.getLogger(__name__)
+
+
+def explain(evaluator: Evaluator, question: Question) -> Answer:
+    """Return the answer with its policy lines and, for a denial, a change or remedy."""
+    answer, enclave = evaluator.answer(question), evaluator.enclave
+    _LOG.info(
+        "asked %s: %s of enclave %s: %s",
+        evaluator.vendor.title,
+        " ".join(filter(None, (question.word, question.name))),
+        enclave.name,
+        answer.outcome,
+    )
+    keystore = enclave.keystore
+    known = keystore is not None and keystore.has(LEDGER)
+    recorded = recorded_policy(keystore, enclave.signed) if keystore and known else ""
+    answer = replace(
+        answer,
+        lines=deciding_lines(enclave.policy, answer) if enclave.policy else (),
+        provenance=_provenance(enclave, recorded),
+        policy_sha256=recorded,
+    )
+    if answer.allowed:
+        return answer
+    if not answer.problems and (changed := _changed(evaluator, answer)):
+        return changed
+    faulty = (each.file for each in answer.problems if each.fault.id == answer.reason)
+    found = remedy(answer.reason, str(enclave.root or ""), enclave.name, next(faulty, ""))
+    return replace(answer, remedy=found)
+
+
+def _provenance(enclave: LoadedEnclave, recorded: str) -> Provenance | None:
+    """Return whether the permissions were made from the policy, according to the ledger."""
+    if enclave.policy is None:
+        return None
+    if not enclave.signed:
+        return Provenance.PLANNED
+    if not recorded:
+        return Provenance.UNKNOWN
+    if not _states_policy(enclave):
+        return Provenance.CHANGED
+    return Provenance.SAME if recorded == enclave.policy.digest else Provenance.EQUAL
+
+
+def _states_policy(enclave: LoadedEnclave) -> bool:
+    """Return whether the grant that DDS reads has the rules of the policy on its domains."""
+    from sros_tool.translate import permissions_for
+
+    assert enclave.policy
+    with suppress(SrosError):
+        grant = parse_permissions(enclave.permissions).grant_of(enclave.subject)
+        if grant and grant.rules and not grant.default_allow:
+            meant = permissions_for(
+                enclave.policy,
+                subject=grant.subject,
+                validity=grant.validity,
+                domains=grant.rules[0].domains,
+            )
+            return meant.grants[0].rules == grant.rules
+    return False
+
+
+def _changed(evaluator: Evaluator, answer: Answer) -> Answer | None:
+    """Return the answer with the change of the policy that would allow it, or None."""
+    from sros_tool.explain.change import smallest_change  # an allowed question needs none
+
+    change = smallest_change(evaluator, answer)
+    if change is None:
+        return None
+    if change.add or change.lift:
+        return replace(answer, change=change)
+    # The present policy allows it.
+    return replace(answer, sign=True) if answer.provenance is Provenance.CHANGED else None
+
+
+# ── remedies ───────────────────────────────────────────────────────────────────────────────
 
 _ROTATION = (
     "The CAs of this keystore are being replaced: do the next stage with `sros rotate_ca {root} "
@@ -115,6 +200,8 @@ def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:
 
 
 def _is_rotating(keystore: Path) -> bool:
+    from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+
     try:
         return read_rotation(keystore).stage is not RotationStage.NONE
     except SrosError:

@@ -1,0 +1,307 @@
+"""What a question is about: the enclave of a keystore, a folder or a policy, when and where.
+
+The command line and the Python API open here what they ask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from datetime import datetime, tzinfo
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import parse_permissions
+from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError
+from sros_tool.explain.evaluator import Evaluator
+from sros_tool.explain.question import Question, about_action
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    PERMISSIONS_FILE,
+    has_enclave,
+    is_keystore,
+    list_enclaves,
+)
+from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave_of, loaded
+from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.values import Words, shows
+
+if TYPE_CHECKING:
+    from sros_tool.fleet.robots import Fleet
+    from sros_tool.policy.model import Enclave, Policy
+    from sros_tool.policy.rights import Right
+
+
+class AskingContext(NamedTuple):
+    """When, in which time zone and domain, and for which fleet a question is asked.
+
+    Without a ``domain`` it is one that the enclave may join; ``fleet_file`` is for the placeholders
+    of a policy.
+    """
+
+    at: datetime
+    zone: tzinfo
+    domain: int | None = None
+    fleet_file: Path | None = None
+
+    def context(self, domains: DomainSet | None) -> JoinContext:
+        """Return the domain, time and zone to decide for, if an enclave may join ``domains``."""
+        domain = self.domain
+        if domain is None:
+            domain = domains.preferred() if domains else 0
+        return JoinContext(domain, self.at, self.zone)
+
+
+def fleet_of(file: Path | None, root: Path | None) -> Fleet | None:
+    """Return the fleet in a file, or else that of the keystore ``root``."""
+    from sros_tool.fleet.fleet_file import read_fleet
+    from sros_tool.keystore.fleet import load_fleet
+
+    if file:
+        return read_fleet(file)
+    return load_fleet(root) if root else None
+
+
+# ── the enclave ────────────────────────────────────────────────────────────────────────────
+
+
+class AskedEnclave(NamedTuple):
+    """An enclave to ask about, and the policy that was named, with all of its enclaves."""
+
+    enclave: LoadedEnclave
+    policy: Policy | None = None
+
+    def other_rights(self, name: str) -> frozenset[Right]:
+        """Return the rights to a name in the policy and in the keystore, if they can be read."""
+        rights: frozenset[Right] = frozenset()
+        if self.policy:
+            from sros_tool.policy.rights import policy_rights
+
+            rights = policy_rights(self.policy)
+        keystore = self.enclave.keystore
+        if keystore and is_keystore(keystore.root):
+            rights |= frozenset(rights_naming(keystore, name))
+        return rights
+
+
+def rights_naming(keystore: Keystore, name: str) -> Iterator[Right]:
+    """Yield the rights of the enclaves of a keystore whose permissions have a ROS name.
+
+    Those that cannot be read are left out.  Most do not have the name, and are not parsed.
+    """
+    for enclave in keystore.names:
+        with suppress(SrosError, OSError):
+            data = keystore.read(keystore.folder(enclave) / PERMISSIONS_FILE, "permissions")
+            if _may_have(data, name):
+                yield from _rights_in(enclave, data)
+
+
+def _may_have(document: bytes, name: str) -> bool:
+    """Return whether a document may have a topic of a ROS name, perhaps written in another way."""
+    text = name.encode()
+    return text in document and (
+        b"rt" + text in document or b"rq" + text in document or b"rr" + text in document
+    )
+
+
+def _rights_in(enclave: str, data: bytes) -> Iterator[Right]:
+    """Yield the rights in a permissions document, by the first grant for each subject."""
+    from sros_tool.pki import smime
+    from sros_tool.translate import grant_rights
+
+    signed = b"multipart/signed" in data[:1000].lower()
+    grants = parse_permissions(smime.parse(data).document if signed else data).grants
+    for grant in {grant.subject: grant for grant in reversed(grants)}.values():
+        yield from grant_rights(enclave, grant)
+
+
+def is_enclave(folder: Path) -> bool:
+    """Return whether a folder is that of an enclave."""
+    return any((folder / name).exists() for name in (CERTIFICATE_FILE, PERMISSIONS_FILE))
+
+
+def open_to_ask(
+    root: Path | None, name: str, policy_file: Path | None, asking: AskingContext
+) -> AskedEnclave:
+    """Return an enclave of a keystore, in a folder ``name``, or in a policy alone.
+
+    Raises:
+        KeystoreError: the keystore does not have it.
+        PolicyError: the policy does not have it.
+    """
+    policy = own = None
+    if policy_file:
+        from sros_tool.fleet.expansion import read_policy_for
+
+        policy = read_policy_for(policy_file, fleet_of(asking.fleet_file, root))
+        own = policy.enclave(name)
+        if own is None and not is_enclave(Path(name)):
+            raise _not_in_policy(policy, name, policy_file)
+    keystore = Keystore(root) if root else None
+    enclave = signed_enclave(keystore, name, asking.at, planned=own is not None)
+    if enclave is None:
+        assert own is not None
+        enclave = _planned_enclave(own, keystore, asking)
+    elif own is None and policy_file and policy:
+        own = policy.enclave(enclave.name)
+        if own is None and not is_enclave(Path(enclave.name)):
+            raise _not_in_policy(policy, enclave.name, policy_file)
+    enclave = replace(enclave, keystore=keystore, policy=own, policy_file=policy_file)
+    return AskedEnclave(enclave, policy)
+
+
+def _not_in_policy(policy: Policy, name: str, file: Path) -> PolicyError:
+    from sros_tool.keystore.missing import likely_names
+
+    there = [each.path for each in policy.enclaves]
+    meant = likely_names(name, there)
+    return PolicyError(
+        f"unable to find enclave {name} in the policy '{file}'",
+        f"It has {', '.join(there)}.",
+        f"Perhaps you mean {' or '.join(meant)}." if meant else "",
+    )
+
+
+def signed_enclave(
+    keystore: Keystore | None, name: str, at: datetime, *, planned: bool = False
+) -> LoadedEnclave | None:
+    """Load an enclave from a keystore, or from the folder ``name``.
+
+    Returns None if there is neither keystore nor folder, or, with ``planned``, if the keystore does
+    not have the enclave yet.
+    """
+    if keystore is None:
+        folder = Path(name)
+        return _in_folder(folder, at) if is_enclave(folder) else None
+    root = keystore.root
+    if is_enclave(root) and not (root / "enclaves").is_dir():
+        enclave = _in_folder(root, at)
+        if enclave.name != name:
+            own = enclave.name or "no enclave"
+            raise KeystoreError(f"'{root}' is the folder of {own}, not of {name}")
+        return enclave
+    keystore.check()
+    if has_enclave(root, name):
+        return load_enclave_of(keystore, name, at=at)
+    if planned:
+        return None
+    from sros_tool.keystore.missing import no_such_enclave
+
+    raise no_such_enclave(root, name, list_enclaves(root))
+
+
+def _in_folder(folder: Path, at: datetime) -> LoadedEnclave:
+    """Load the enclave in a folder, by the common name of its certificate, or ""."""
+    from sros_tool.pki.certificates import common_name_of
+
+    state = open_enclave(folder, now=at)
+    name = common_name_of(state.certificate.subject) if state.certificate else ""
+    return loaded(name, folder, state, at=at)
+
+
+def _planned_enclave(
+    policy: Enclave, keystore: Keystore | None, asking: AskingContext
+) -> LoadedEnclave:
+    """Return the enclave as the policy would create it, with the keystore's governance.
+
+    Without a keystore, the governance is that of the default template, raised as the enclave says.
+    """
+    from sros_tool.keystore.participant import plan_enclave
+    from sros_tool.keystore.protection import with_stated
+    from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
+    from sros_tool.policy.model import stated_protections
+    from sros_tool.translate import governance_for
+
+    if keystore:
+        return plan_enclave(policy, keystore.governance, at=asking.at)
+    domain = asking.context(None).domain
+    stated = stated_protections([policy])
+    protection = with_stated(load_template(DEFAULT_TEMPLATE).protection, stated)
+    governance = governance_for(protection, DomainSet.of((domain, domain)))
+    return plan_enclave(policy, governance, at=asking.at)
+
+
+# ── a service or an action ─────────────────────────────────────────────────────────────────
+
+
+def _action_meant(
+    evaluator: Evaluator, question: Question, others: Callable[[], Iterable[Right]]
+) -> Question | None:
+    """Return the question about an action, if that is what the rights show the name to be.
+
+    The rights of the enclave come first; ``others``, such as those of its policy and of its
+    keystore, are read only if the service is denied.
+    """
+    if question.word not in ("call", "serve"):
+        return None
+    from sros_tool.translate import grant_rights  # most questions need no translation back
+
+    answer = evaluator.answer(question)
+    rights = set(grant_rights(evaluator.enclave.name, answer.grant)) if answer.grant else set()
+    if not answer.allowed:
+        rights.update(others())
+    return about_action(question, rights)
+
+
+def taken_for_action(question: Question, action: Question) -> Note:
+    """Return the note that a question was taken for one about an action."""
+    text = (
+        f"{action.name} is an action in the rights here, and no service: {question.word} is taken "
+        f"for '{action}'; --type service asks about a service."
+    )
+    return Note("explain.an-action", text)
+
+
+def meant(
+    evaluator: Evaluator, asked: AskedEnclave, question: Question, kind: str | None
+) -> tuple[Question, tuple[Note, ...]]:
+    """Return the question that is meant, and a note if it is another one."""
+    if not kind:
+        action = _action_meant(evaluator, question, lambda: asked.other_rights(question.name))
+        if action:
+            return action, (taken_for_action(question, action),)
+    return question, ()
+
+
+# ── what is answered ───────────────────────────────────────────────────────────────────────
+
+
+@shows("enclave", "question", "domain", "at", "time_zone")
+class Asked(NamedTuple):
+    """What was asked."""
+
+    enclave: str
+    """The enclave."""
+    question: Question
+    """The question."""
+    context: JoinContext
+
+    @property
+    def domain(self) -> int:
+        """The ROS domain."""
+        return self.context.domain
+
+    @property
+    def at(self) -> datetime:
+        """The moment, in UTC."""
+        return self.context.at
+
+    @property
+    def time_zone(self) -> str:
+        """The time zone of the robot."""
+        return str(self.context.zone)
+
+
+@shows("allowed", "mode", "text")
+class ZenohInBrief(NamedTuple):
+    """What Zenoh does."""
+
+    allowed: bool
+    """Whether data can flow."""
+    mode: Annotated[str, Words(("client", "peer", "router"))] | None
+    """How the process takes part, or null."""
+    text: str
+    """Why, as a clause."""
+    outcome: str
