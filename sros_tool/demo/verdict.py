@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import signal
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -71,6 +71,11 @@ class RowRecord:
     memory: Mapping[str, int] = field(default_factory=dict)
     skipped: str = ""
     applies: bool = True
+
+    @property
+    def seconds(self) -> float:
+        """The length of the observation."""
+        return self.window[1] - self.window[0] if self.window else 0.0
 
 
 @dataclass(frozen=True)
@@ -150,11 +155,14 @@ class _Finding:
     detail: str
 
 
+def _undecided(why: str) -> _Finding:
+    return _Finding(RowStatus.UNDECIDED, why)
+
+
 def judge_row(record: RowRecord) -> RowResult:
     """Return the result of a row from its record."""
     finding = _observe(record)
     row = record.row
-    seconds = record.window[1] - record.window[0] if record.window else 0.0
     return RowResult(
         row.name,
         row.expected,
@@ -162,7 +170,7 @@ def judge_row(record: RowRecord) -> RowResult:
         row.mechanism,
         finding.detail,
         record.domain,
-        seconds,
+        record.seconds,
         row.attack,
         row.removed,
         row.open_because,
@@ -191,10 +199,7 @@ def _observe(record: RowRecord) -> _Finding:
     for claim, finding in controls:
         if finding.status is not claim.expected:
             what = f"{claim.subject} {claim.relation} {claim.talker}".strip()
-            return _Finding(
-                RowStatus.UNDECIDED,
-                f"the control failed ({what}: {finding.status}, {finding.detail})",
-            )
+            return _undecided(f"the control failed ({what}: {finding.status}, {finding.detail})")
     details = [finding.detail for _, finding in claims]
     details += [f"control: {finding.detail}" for _, finding in controls]
     return _Finding(record.row.expected, "; ".join(details))
@@ -213,107 +218,90 @@ def _lost_import(party: Party, record: PartyRecord) -> str:
     return next((f"{what} cannot be loaded here: {text}" for text in failed), "")
 
 
+class _Case:
+    """A claim with the records of its row and of the two parties that it is about."""
+
+    def __init__(self, claim: Claim, record: RowRecord) -> None:
+        self.claim, self.record = claim, record
+        self.subject = record.parties[claim.subject]
+        self.talker = record.parties.get(claim.talker, self.subject)
+
+    def result(self, holds: bool, detail: str) -> _Finding:
+        """Return what was observed: that the claim holds, or that it does not."""
+        return _Finding(STATUS_OF[self.claim.relation, holds], detail)
+
+    def sent(self, party: PartyRecord) -> list[Event]:
+        """Return what a party sent in the window."""
+        return [e for e in party.events if e.kind is EventKind.SENT and _in_window(e, self.record)]
+
+    def heard(self) -> list[Event]:
+        """Return the messages of the talker that the subject heard, at any time."""
+        return _heard_of(self.talker, self.subject)
+
+
 def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
-    subject = record.parties[claim.subject]
-    if claim.relation is Relation.IS_REFUSED:
-        return _with_evidence(_judge_refusal(claim.subject, subject), claim, record)
     for name in filter(None, (claim.subject, claim.talker)):
         if problem := _why_not_running(name, record.parties[name]):
             return _with_evidence(problem, claim, record)
+    if claim.relation is Relation.IS_REFUSED:
+        return _Finding(RowStatus.STARTED, f"{claim.subject} was not refused")
     if claim.relation is Relation.STARTS:
         return _Finding(RowStatus.STARTED, f"{claim.subject} started")
     if record.window is None:
-        return _Finding(RowStatus.UNDECIDED, "not all processes were ready in time")
-    if claim.relation is Relation.READABLE:
-        return _judge_wire(claim, record, subject)
-    talker = record.parties[claim.talker]
-    if claim.relation is Relation.HEARS_AGAIN:
-        return _judge_replay(claim, record, subject, talker)
-    if claim.relation is Relation.BELIEVES:
-        return _judge_forgery(claim, record, subject, talker)
-    if claim.relation is Relation.IS_ANSWERED:
-        return _judge_answers(claim, record, subject, talker)
-    if claim.relation is Relation.EXECUTES:
-        return _judge_execution(claim, record, subject, talker)
-    if claim.relation is Relation.HEARS_EXPIRED:
-        return _judge_expiry(claim, record, subject, talker)
-    sent = {e.text for e in talker.events if e.kind is EventKind.SENT and _in_window(e, record)}
+        return _undecided("not all processes were ready in time")
+    return _JUDGES[claim.relation](_Case(claim, record))
+
+
+def _judge_hearing(case: _Case) -> _Finding:
+    claim, record = case.claim, case.record
+    sent = {event.text for event in case.sent(case.talker)}
     if not sent:
-        return _Finding(RowStatus.UNDECIDED, f"{claim.talker} sent nothing in the window")
-    if claim.relation is Relation.SEES:
-        return _judge_view(claim, record, subject, talker)
-    mark = f"{talker.text}: "
-    heard = [e for e in subject.events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
+        return _undecided(f"{claim.talker} sent nothing in the window")
+    heard = case.heard()
     if record.row.meanwhile is not None:  # what was heard before the change proves nothing
-        heard = [e for e in heard if _in_window(e, record)]
-    status = STATUS_OF[Relation.HEARS, bool(heard)]
-    seconds = record.window[1] - record.window[0]
+        heard = [event for event in heard if _in_window(event, record)]
     arrived = len(sent & {event.text for event in heard})
     heard_of = f"{arrived} of {len(sent)} messages of the {claim.talker}"
-    return _Finding(status, f"{claim.subject} heard {heard_of} in {seconds:.1f} s")
+    return case.result(bool(heard), f"{claim.subject} heard {heard_of} in {record.seconds:.1f} s")
 
 
-def _judge_answers(
-    claim: Claim, record: RowRecord, client: PartyRecord, server: PartyRecord
-) -> _Finding:
-    asked = [e for e in client.events if e.kind is EventKind.SENT and _in_window(e, record)]
+def _judge_answers(case: _Case) -> _Finding:
+    claim, asked = case.claim, case.sent(case.subject)
     if not asked:
-        return _Finding(RowStatus.UNDECIDED, f"{claim.subject} sent no request in the window")
-    answers = [e for e in client.events if e.kind is EventKind.HEARD and _is_of(e, server)]
-    status = STATUS_OF[Relation.IS_ANSWERED, bool(answers)]
-    within = sum(1 for event in answers if _in_window(event, record))
-    counted = f"{min(within, len(asked))} right answers from the {claim.talker}"
-    return _Finding(status, f"{claim.subject} asked {len(asked)} times and got {counted}")
+        return _undecided(f"{claim.subject} sent no request in the window")
+    answers = case.heard()
+    within = sum(_in_window(event, case.record) for event in answers)
+    right = f"{min(within, len(asked))} right answers from the {claim.talker}"
+    return case.result(bool(answers), f"{claim.subject} asked {len(asked)} times and got {right}")
 
 
-def _judge_execution(
-    claim: Claim, record: RowRecord, server: PartyRecord, client: PartyRecord
-) -> _Finding:
+def _judge_execution(case: _Case) -> _Finding:
     """Judge by the requests that reached the server: a reply may be lost after that."""
-    asked = [e for e in client.events if e.kind is EventKind.SENT and _in_window(e, record)]
+    claim, asked = case.claim, case.sent(case.talker)
     if not asked:
-        return _Finding(RowStatus.UNDECIDED, f"{claim.talker} sent no request in the window")
-    reached = [e for e in server.events if e.kind is EventKind.HEARD and _is_of(e, client)]
-    status = STATUS_OF[Relation.EXECUTES, bool(reached)]
-    counted = f"{min(len(reached), len(asked))} of {len(asked)} requests of the {claim.talker}"
-    return _Finding(status, f"{claim.subject} executed {counted}")
+        return _undecided(f"{claim.talker} sent no request in the window")
+    reached = case.heard()
+    number = f"{min(len(reached), len(asked))} of {len(asked)} requests of the {claim.talker}"
+    return case.result(bool(reached), f"{claim.subject} executed {number}")
 
 
 _ON_ITS_WAY = 1.0
 """Seconds after an expiry in which a message may still arrive: certificates have whole seconds."""
 
 
-def _expired_too_early(record: RowRecord) -> bool:
-    """Return whether a short-lived talker was not heard before its certificate expired."""
-    claim = record.row.claims[0]
-    if record.expiry is None or not record.parties:
-        return False
-    talker = record.parties[claim.talker]
-    heard = record.parties[claim.subject].events
-    return not any(
-        e.kind is EventKind.HEARD and _is_of(e, talker) and e.time < record.expiry for e in heard
-    )
-
-
-def _judge_expiry(
-    claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
-) -> _Finding:
-    if record.expiry is None or _expired_too_early(record):
-        return _Finding(
-            RowStatus.UNDECIDED, f"{claim.talker} was not heard before its certificate expired"
-        )
-    after = record.expiry + _ON_ITS_WAY
-    sent = [e for e in talker.events if e.kind is EventKind.SENT and e.time > after]
+def _judge_expiry(case: _Case) -> _Finding:
+    claim, expiry, heard = case.claim, case.record.expiry, case.heard()
+    if expiry is None or not any(event.time < expiry for event in heard):
+        return _undecided(f"{claim.talker} was not heard before its certificate expired")
+    after = expiry + _ON_ITS_WAY
+    sent = [e for e in case.talker.events if e.kind is EventKind.SENT and e.time > after]
     if not sent:
-        return _Finding(
-            RowStatus.UNDECIDED, f"{claim.talker} sent nothing after its certificate had expired"
-        )
-    heard = [e for e in listener.events if e.kind is EventKind.HEARD and _is_of(e, talker)]
-    late = [e for e in heard if e.time > after]
-    counted = f"{len(heard) - len(late)} messages of the {claim.talker} until its certificate"
-    return _Finding(
-        STATUS_OF[Relation.HEARS_EXPIRED, bool(late)],
-        f"{claim.subject} heard {counted} expired, and {len(late)} of {len(sent)} after that",
+        return _undecided(f"{claim.talker} sent nothing after its certificate had expired")
+    late = [event for event in heard if event.time > after]
+    before = f"{len(heard) - len(late)} messages of the {claim.talker} until its certificate"
+    return case.result(
+        bool(late),
+        f"{claim.subject} heard {before} expired, and {len(late)} of {len(sent)} after that",
     )
 
 
@@ -330,9 +318,7 @@ def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Findi
     lines = ((name, line) for name, output in outputs for line in output.splitlines())
     found = next(((name, line) for name, line in lines if claim.evidence in line), None)
     if found is None:
-        return _Finding(
-            RowStatus.UNDECIDED, f"{finding.detail}, but nobody logged {claim.evidence!r}"
-        )
+        return _undecided(f"{finding.detail}, but nobody logged {claim.evidence!r}")
     name, line = found
     return _Finding(finding.status, f"{finding.detail}; {name}: {_message_of(line)}")
 
@@ -343,98 +329,87 @@ def _message_of(line: str) -> str:
     return " ".join(message.split()).rstrip(".") or line.strip()
 
 
-def _judge_replay(
-    claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
-) -> _Finding:
-    injected = record.injected
+def _judge_replay(case: _Case) -> _Finding:
+    claim, injected = case.claim, case.record.injected
     if injected is None or not injected.packets:
-        return _Finding(RowStatus.UNDECIDED, "no packets of the talker were captured to send again")
-    heard = [e for e in listener.events if e.kind is EventKind.HEARD and _is_of(e, talker)]
-    again = sum(1 for event in heard if event.time >= injected.time)
-    status = STATUS_OF[Relation.HEARS_AGAIN, again > 0]
-    return _Finding(
-        status,
+        return _undecided("no packets of the talker were captured to send again")
+    again = sum(event.time >= injected.time for event in case.heard())
+    return case.result(
+        again > 0,
         f"{claim.subject} heard {again} messages in {injected.packets} packets of the"
         f" {claim.talker} that were sent again, twice, after it had left",
     )
 
 
-def _judge_forgery(
-    claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
-) -> _Finding:
-    injected = record.injected
+def _judge_forgery(case: _Case) -> _Finding:
+    claim, talker, injected = case.claim, case.talker, case.record.injected
     if injected is None or not injected.packets:
-        return _Finding(RowStatus.UNDECIDED, "no packet of the talker could be changed")
+        return _undecided("no packet of the talker could be changed")
     sent = {event.text for event in talker.events if event.kind is EventKind.SENT}
     sent.add(f"{talker.text}: {len(sent) + 1}")  # sent, and suspended before it was reported
     believed = sum(
-        1
-        for event in listener.events
-        if event.kind is EventKind.HEARD and event.time >= injected.time and event.text not in sent
+        event.kind is EventKind.HEARD and event.time >= injected.time and event.text not in sent
+        for event in case.subject.events
     )
-    return _Finding(
-        STATUS_OF[Relation.BELIEVES, believed > 0],
+    return case.result(
+        believed > 0,
         f"{claim.subject} heard {believed} messages that the {claim.talker} never sent, in"
         f" {injected.packets} changed packets",
     )
 
 
-def _is_of(event: Event, speaker: PartyRecord) -> bool:
-    return event.text.startswith(f"{speaker.text}: ")
+def _heard_of(speaker: PartyRecord, listener: PartyRecord) -> list[Event]:
+    mark = f"{speaker.text}: "
+    return [e for e in listener.events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
 
 
-def _judge_refusal(name: str, record: PartyRecord) -> _Finding:
-    problem = _why_not_running(name, record)
-    if problem is None:
-        return _Finding(RowStatus.STARTED, f"{name} was not refused")
-    return problem
-
-
-def _judge_view(
-    claim: Claim, record: RowRecord, observer: PartyRecord, talker: PartyRecord
-) -> _Finding:
-    looks = [e for e in observer.events if e.kind is EventKind.SEEN and _in_window(e, record)]
+def _judge_view(case: _Case) -> _Finding:
+    claim, observer, topic = case.claim, case.subject, case.talker.topic
+    if not case.sent(case.talker):
+        return _undecided(f"{claim.talker} sent nothing in the window")
+    looks = [e for e in observer.events if e.kind is EventKind.SEEN and _in_window(e, case.record)]
     if not looks:
-        return _Finding(RowStatus.UNDECIDED, f"{claim.subject} counted nothing in the window")
-    most = max(event.publishers.get(talker.topic, 0) for event in looks)
-    counted = f"{observer.through} counts {most} publishers on {talker.topic}"
-    return _Finding(STATUS_OF[Relation.SEES, most > 0], f"{counted} in {len(looks)} polls")
+        return _undecided(f"{claim.subject} counted nothing in the window")
+    most = max(event.publishers.get(topic, 0) for event in looks)
+    publishers = f"{observer.through} counts {most} publishers on {topic}"
+    return case.result(most > 0, f"{publishers} in {len(looks)} polls")
 
 
-def _judge_memory(claim: Claim, record: RowRecord) -> _Finding:
-    segments = record.memory.get(claim.subject, 0)
-    return _Finding(
-        STATUS_OF[Relation.READABLE, segments > 0],
-        f"{segments} segments of shared memory show the text",
-    )
-
-
-def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> _Finding:
+def _judge_wire(case: _Case) -> _Finding:
+    claim, record = case.claim, case.record
     if claim.wire is Wire.MEMORY:
-        return _judge_memory(claim, record)
+        segments = record.memory.get(claim.subject, 0)
+        return case.result(segments > 0, f"{segments} segments of shared memory show the text")
     count = record.wire.get(claim.subject)
     if count is None:
-        return _Finding(RowStatus.UNDECIDED, "no packets were captured")
+        return _undecided("no packets were captured")
     if claim.wire is not Wire.TEXT:
         shown = count.topics if claim.wire is Wire.TOPIC else count.certificates
         if not shown and not count.protected:
-            return _Finding(RowStatus.UNDECIDED, "no packets of the row were captured")
+            return _undecided("no packets of the row were captured")
         what = f"the {claim.wire}" if claim.wire is Wire.TOPIC else f"a {claim.wire}"
-        return _Finding(STATUS_OF[Relation.READABLE, shown > 0], f"{shown} packets show {what}")
+        return case.result(shown > 0, f"{shown} packets show {what}")
     if count.plain:
-        return _Finding(RowStatus.READABLE, f"{count.plain} packets show the text")
-    sent = sum(
-        1 for event in talker.events if event.kind is EventKind.SENT and _in_window(event, record)
-    )
+        return case.result(True, f"{count.plain} packets show the text")
+    sent = len(case.sent(case.subject))
     # Missing text proves something only if the messages were in the captured packets.
     if count.protected * 2 < max(2, sent):
-        return _Finding(
-            RowStatus.UNDECIDED,
-            f"only {count.protected} encrypted packets were captured for {sent} messages",
+        return _undecided(
+            f"only {count.protected} encrypted packets were captured for {sent} messages"
         )
-    return _Finding(
-        RowStatus.NOT_READABLE, f"0 packets show the text, {count.protected} are encrypted"
-    )
+    return case.result(False, f"0 packets show the text, {count.protected} are encrypted")
+
+
+_JUDGES: Mapping[Relation, Callable[[_Case], _Finding]] = {
+    Relation.HEARS: _judge_hearing,
+    Relation.HEARS_AGAIN: _judge_replay,
+    Relation.BELIEVES: _judge_forgery,
+    Relation.HEARS_EXPIRED: _judge_expiry,
+    Relation.IS_ANSWERED: _judge_answers,
+    Relation.EXECUTES: _judge_execution,
+    Relation.SEES: _judge_view,
+    Relation.READABLE: _judge_wire,
+}
 
 
 def _why_not_running(name: str, record: PartyRecord) -> _Finding | None:
