@@ -42,9 +42,9 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sros_tool.demo.scenarios.model import (
     OWN,
@@ -130,236 +130,215 @@ def read_scenario(path: Path) -> Scenario:
         raise DocumentError(
             f"the scenario '{path}' is not valid TOML", f"{error}.", "Correct the file."
         ) from error
-    return _Reader(path, text).scenario(data)
+    return _scenario(_Table(path, text.splitlines(), "", 0, data))
 
 
-class _Reader:
-    """A reader of one scenario file.
+class _Table(NamedTuple):
+    """A table of a scenario file: its ``kind`` ("party"; "": top level), and its ``place``.
 
-    Methods take the kind of a table ("party"; "": top level) and its index among the tables of that
-    kind, to find the line for an error.
+    The place is its index among the tables of that kind, to find the line for an error.
     """
 
-    def __init__(self, path: Path, text: str) -> None:
-        self._path = path
-        self._lines = text.splitlines()
+    path: Path
+    lines: Sequence[str]
+    kind: str
+    place: int
+    data: Mapping[str, Any]
 
-    def scenario(self, data: Mapping[str, Any]) -> Scenario:
-        self._check_keys(data, "", 0)
-        file = self._path.parent / self._text(data, "policy", "", 0)
-        try:
-            policy = read_policy(file)
-        except (SrosError, ValueError) as error:  # ValueError: NUL in the file name
-            raise self._error("", 0, "policy", str(error)) from error
-        parties: dict[str, Party] = {}
-        for place, table in enumerate(self._tables(data, "party")):
-            party = self._party(table, place, policy)
-            same = party.name.replace(" ", "_")
-            if any(each.replace(" ", "_") == same for each in parties):
-                raise self._error("party", place, "name", f"there are two parties {party.name!r}")
-            parties[party.name] = party
-        rows = tuple(
-            self._row(table, place, parties)
-            for place, table in enumerate(self._tables(data, "row"))
-        )
-        title = self._text(data, "title", "", 0, self._path.stem)
-        return Scenario(self._path.stem, title, rows, policy=lambda _topic: policy)
-
-    def _party(self, table: Mapping[str, Any], place: int, policy: Policy) -> Party:
-        self._check_keys(table, "party", place)
-        name = self._text(table, "name", "party", place)
-        if not _NAME.fullmatch(name):
-            problem = f"{name!r} is not the name of a party"
-            remedy = "Use at most 64 letters, digits, blanks, '.', '_' and '-'."
-            raise self._error("party", place, "name", problem, remedy)
-        roles = {role.value: role for role in Role}
-        word = self._text(table, "role", "party", place)
-        if word not in roles:
-            problem = f"{word!r} is not a role; use one of {', '.join(roles)}"
-            raise self._error("party", place, "role", problem)
-        role = roles[word]
-        topic = self._text(table, "topic", "party", place, "")
-        if not topic and role in _NAMED:
-            problem = f"the {word} {name!r} needs a topic: the name of its service or action"
-            raise self._error("party", place, "name", problem)
-        try:
-            topic = check_topic(topic) if topic else ""
-        except SrosError as error:
-            raise self._error("party", place, "topic", str(error)) from error
-        return Party(name, role, self._identity(table, place, policy), topic)
-
-    def _identity(self, table: Mapping[str, Any], place: int, policy: Policy) -> Identity:
-        enclave = self._text(table, "enclave", "party", place, "")
-        word = self._text(table, "keystore", "party", place, OWN)
-        keystores = {each.value: each for each in SoundKeystore}
-        if word not in keystores:
-            problem = f"{word!r} is not a keystore; use one of {', '.join(keystores)}"
-            raise self._error("party", place, "keystore", problem)
-        if not enclave:
-            for key in ("keystore", "variables"):
-                if key in table:
-                    problem = f"{key} needs an enclave, but this party is unsecured"
-                    raise self._error("party", place, key, problem, "Give it an enclave.")
-            return UNSECURED
-        if policy.enclave(enclave) is None:
-            paths = [each.path for each in policy.enclaves]
-            close = difflib.get_close_matches(enclave, paths, n=1)
-            hint = f"; did you mean {close[0]}?" if close else f"; it has {', '.join(paths)}"
-            raise self._error(
-                "party", place, "enclave", f"the policy has no enclave {enclave!r}{hint}"
-            )
-        variables = table.get("variables", {})
-        if not isinstance(variables, dict) or not all(
-            isinstance(value, str) for value in variables.values()
-        ):
-            raise self._error("party", place, "variables", "variables is not a table of strings")
-        for variable in variables:
-            if variable not in _VARIABLES:
-                problem = f"{variable!r} is not a variable for a party; use {', '.join(_VARIABLES)}"
-                raise self._error("party", place, "variables", problem)
-        return Identity(keystores[word], enclave, tuple(variables.items()))
-
-    def _row(self, table: Mapping[str, Any], place: int, parties: Mapping[str, Party]) -> Row:
-        self._check_keys(table, "row", place)
-        name = self._text(table, "name", "row", place)
-        claims = self._claims(table, "claim", place, parties)
-        controls = self._claims(table, "control", place, parties)
-        if not claims:
-            raise self._error("row", place, "name", f"the row {name!r} has no claim", _EXAMPLE)
-        self._check_controls(claims, controls, place)
-        used = {word for claim in (*claims, *controls) for word in (claim.subject, claim.talker)}
-        expected = claims[0].expected if len(claims) == 1 else RowStatus.UNDISTURBED
-        wire = any(claim.relation is Relation.READABLE for claim in (*claims, *controls))
-        return Row(
-            name,
-            expected,
-            self._text(table, "because", "row", place, ""),
-            tuple(party for party in parties.values() if party.name in used),
-            claims,
-            controls,
-            wire=wire,
-        )
-
-    def _claims(
-        self, table: Mapping[str, Any], key: str, place: int, parties: Mapping[str, Party]
-    ) -> tuple[Claim, ...]:
-        tables = table.get(key, [])
-        tables = [tables] if isinstance(tables, dict) else tables
-        if not isinstance(tables, list):
-            raise self._error("row", place, key, f"{key} is not a table", _EXAMPLE)
-        return tuple(self._claim(each, key, place, parties) for each in tables)
-
-    def _claim(self, table: Any, key: str, place: int, parties: Mapping[str, Party]) -> Claim:
-        if not isinstance(table, dict):
-            raise self._error("row", place, key, f"{table!r} is not a table", _EXAMPLE)
-        expected = table.get("expected")
-        if not isinstance(expected, str) or expected not in _CLAIMS:
-            problem = (
-                f"a {key} has no expected status"
-                if expected is None
-                else f"{expected!r} is not a status that can be expected"
-            )
-            raise self._error("row", place, key, f"{problem}; use one of {', '.join(_CLAIMS)}")
-        relation, holds = _CLAIMS[expected]
-        keys = _PARTIES[relation]
-        if set(table) != {*keys, "expected"}:
-            problem = (
-                f"a {key} {expected!r} needs {', '.join(keys)} and expected, and no other keys"
-            )
-            raise self._error("row", place, key, f"{problem}; it has {', '.join(table)}")
-        names = [table[each] for each in keys]
-        for each, name in zip(keys, names, strict=True):
-            if not isinstance(name, str) or name not in parties:
-                problem = f"there is no party {name!r}; use one of {', '.join(parties)}"
-                raise self._error("row", place, key, problem)
-            role = parties[name].role
-            if role not in (SPEAKING if relation is Relation.READABLE else _FITTING[each]):
-                problem = f"{name} is a {role}, and cannot be the {each} of status {expected!r}"
-                raise self._error("row", place, key, problem)
-        return Claim(relation, names[0], names[1] if len(names) > 1 else "", holds)
-
-    def _check_controls(
-        self, claims: Sequence[Claim], controls: Sequence[Claim], place: int
-    ) -> None:
-        happening = [claim for claim in (*claims, *controls) if _happens(claim)]
-        for claim in claims:
-            if _happens(claim):
-                continue
-            fitting = [
-                other
-                for other in happening
-                if claim.relation is not Relation.HEARS or other.talker == claim.talker
-            ]
-            if not fitting:
-                who = f"a listener hears {claim.talker}" if claim.talker else "something works"
-                raise self._error(
-                    "row",
-                    place,
-                    "claim",
-                    f"no claim or control shows that {who} meanwhile: a crash would look the same",
-                    "Add a control, such as a permitted listener that hears the same talker.",
-                )
-
-    # ── tables and lines ───────────────────────────────────────────────────────────────────
-
-    def _tables(self, data: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
-        tables = data.get(kind, [])
+    def tables(self, kind: str) -> Iterator[_Table]:
+        """Yield the tables of a kind, of which there is at least one."""
+        tables = self.data.get(kind)
         if (
             not isinstance(tables, list)
             or not tables
-            or not all(isinstance(each, dict) for each in tables)
+            or not all(isinstance(table, dict) for table in tables)
         ):
-            raise self._error(
-                "", 0, kind, f"the scenario needs {kind} tables", f"Write [[{kind}]] tables."
-            )
-        return tables
+            problem, remedy = f"the scenario needs {kind} tables", f"Write [[{kind}]] tables."
+            raise self.error(kind, problem, remedy)
+        for place, data in enumerate(tables):
+            table = self._replace(kind=kind, place=place, data=data)
+            table.check_keys()
+            yield table
 
-    def _check_keys(self, table: Mapping[str, Any], kind: str, place: int) -> None:
-        for key in table:
+    def check_keys(self) -> None:
+        """Check that the table has no key that means nothing."""
+        for key in self.data:
             if key in ("claims", "controls"):
                 problem = f"{key!r} is not a key here; write tables [[row.{key[:-1]}]]"
-                raise self._error(kind, place, key, problem, _EXAMPLE)
-            if key not in _KEYS[kind]:
-                known = ", ".join(sorted(_KEYS[kind]))
-                problem = f"{key!r} is not a key here; use one of {known}"
-                raise self._error(kind, place, key, problem)
+                raise self.error(key, problem, _EXAMPLE)
+            if key not in _KEYS[self.kind]:
+                known = ", ".join(sorted(_KEYS[self.kind]))
+                raise self.error(key, f"{key!r} is not a key here; use one of {known}")
 
-    def _text(
-        self,
-        table: Mapping[str, Any],
-        key: str,
-        kind: str,
-        place: int,
-        default: str | None = None,
-    ) -> str:
-        value = table.get(key, default)
+    def text(self, key: str, default: str | None = None) -> str:
+        """Return a text of the table."""
+        value = self.data.get(key, default)
         if not isinstance(value, str) or (default is None and not value):
-            what = f"the {kind or 'scenario'} has no {key}" if key not in table else ""
-            raise self._error(kind, place, key, what or f"{key} is {value!r}, not a string")
+            lacks = f"the {self.kind or 'scenario'} has no {key}"
+            present = f"{key} is {value!r}, not a string"
+            raise self.error(key, present if key in self.data else lacks)
         return value
 
-    def _error(
-        self, kind: str, place: int, key: str, problem: str, remedy: str = ""
-    ) -> DocumentError:
-        line = self._line(kind, place, key)
-        return DocumentError(f"the scenario '{self._path}', line {line}: {problem}", "", remedy)
-
-    def _line(self, kind: str, place: int, key: str) -> int:
-        """Return the line number of a key in a table, or of its head if it lacks the key."""
-        heads = [n for n, text in enumerate(self._lines) if re.match(rf"\s*\[\[{kind}\]\]", text)]
-        start = heads[place] if kind and place < len(heads) else 0
-        ends = (
-            n
-            for n in range(start + 1, len(self._lines))
-            if re.match(r"\s*\[\[\s*\w+\s*\]\]", self._lines[n])
+    def error(self, key: str, problem: str, remedy: str = "") -> DocumentError:
+        """Return the error about a key of the table."""
+        return DocumentError(
+            f"the scenario '{self.path}', line {self._line(key)}: {problem}", "", remedy
         )
-        for number in range(start, next(ends, len(self._lines))):
-            if re.match(
-                rf"\s*([\"']?{re.escape(key)}[\"']?\s*[=.]|\[\[row\.{re.escape(key)}\]\])",
-                self._lines[number],
-            ):
+
+    def _line(self, key: str) -> int:
+        """Return the line number of a key, or of the head of the table if it lacks the key."""
+        head = rf"\s*\[\[{self.kind}\]\]"
+        heads = [number for number, text in enumerate(self.lines) if re.match(head, text)]
+        start = heads[self.place] if self.kind and self.place < len(heads) else 0
+        ends = (
+            number
+            for number in range(start + 1, len(self.lines))
+            if re.match(r"\s*\[\[\s*\w+\s*\]\]", self.lines[number])
+        )
+        name = re.escape(key)
+        line = rf"\s*([\"']?{name}[\"']?\s*[=.]|\[\[row\.{name}\]\])"
+        for number in range(start, next(ends, len(self.lines))):
+            if re.match(line, self.lines[number]):
                 return number + 1
         return start + 1
+
+
+def _scenario(table: _Table) -> Scenario:
+    table.check_keys()
+    try:
+        policy = read_policy(table.path.parent / table.text("policy"))
+    except (SrosError, ValueError) as error:  # ValueError: NUL in the file name
+        raise table.error("policy", str(error)) from error
+    parties: dict[str, Party] = {}
+    for party_table in table.tables("party"):
+        party = _party(party_table, policy)
+        file = party.name.replace(" ", "_")
+        if any(name.replace(" ", "_") == file for name in parties):
+            raise party_table.error("name", f"there are two parties {party.name!r}")
+        parties[party.name] = party
+    rows = tuple(_row(row_table, parties) for row_table in table.tables("row"))
+    title = table.text("title", table.path.stem)
+    return Scenario(table.path.stem, title, rows, policy=lambda _topic: policy)
+
+
+def _party(table: _Table, policy: Policy) -> Party:
+    name = table.text("name")
+    if not _NAME.fullmatch(name):
+        problem = f"{name!r} is not the name of a party"
+        remedy = "Use at most 64 letters, digits, blanks, '.', '_' and '-'."
+        raise table.error("name", problem, remedy)
+    roles = {role.value: role for role in Role}
+    word = table.text("role")
+    if word not in roles:
+        raise table.error("role", f"{word!r} is not a role; use one of {', '.join(roles)}")
+    role = roles[word]
+    topic = table.text("topic", "")
+    if not topic and role in _NAMED:
+        problem = f"the {word} {name!r} needs a topic: the name of its service or action"
+        raise table.error("name", problem)
+    try:
+        topic = check_topic(topic) if topic else ""
+    except SrosError as error:
+        raise table.error("topic", str(error)) from error
+    return Party(name, role, _identity(table, policy), topic)
+
+
+def _identity(table: _Table, policy: Policy) -> Identity:
+    enclave = table.text("enclave", "")
+    word = table.text("keystore", OWN)
+    keystores = {keystore.value: keystore for keystore in SoundKeystore}
+    if word not in keystores:
+        problem = f"{word!r} is not a keystore; use one of {', '.join(keystores)}"
+        raise table.error("keystore", problem)
+    if not enclave:
+        for key in ("keystore", "variables"):
+            if key in table.data:
+                problem = f"{key} needs an enclave, but this party is unsecured"
+                raise table.error(key, problem, "Give it an enclave.")
+        return UNSECURED
+    if policy.enclave(enclave) is None:
+        paths = [known.path for known in policy.enclaves]
+        close = difflib.get_close_matches(enclave, paths, n=1)
+        hint = f"; did you mean {close[0]}?" if close else f"; it has {', '.join(paths)}"
+        raise table.error("enclave", f"the policy has no enclave {enclave!r}{hint}")
+    variables = table.data.get("variables", {})
+    if not isinstance(variables, dict) or not all(
+        isinstance(value, str) for value in variables.values()
+    ):
+        raise table.error("variables", "variables is not a table of strings")
+    for variable in variables:
+        if variable not in _VARIABLES:
+            problem = f"{variable!r} is not a variable for a party; use {', '.join(_VARIABLES)}"
+            raise table.error("variables", problem)
+    return Identity(keystores[word], enclave, tuple(variables.items()))
+
+
+def _row(table: _Table, parties: Mapping[str, Party]) -> Row:
+    name = table.text("name")
+    claims = _claims(table, "claim", parties)
+    controls = _claims(table, "control", parties)
+    if not claims:
+        raise table.error("name", f"the row {name!r} has no claim", _EXAMPLE)
+    _check_controls(table, claims, controls)
+    used = {word for claim in (*claims, *controls) for word in (claim.subject, claim.talker)}
+    return Row(
+        name,
+        claims[0].expected if len(claims) == 1 else RowStatus.UNDISTURBED,
+        table.text("because", ""),
+        tuple(party for party in parties.values() if party.name in used),
+        claims,
+        controls,
+        wire=any(claim.relation is Relation.READABLE for claim in (*claims, *controls)),
+    )
+
+
+def _claims(table: _Table, key: str, parties: Mapping[str, Party]) -> tuple[Claim, ...]:
+    claims = table.data.get(key, [])
+    claims = [claims] if isinstance(claims, dict) else claims
+    if not isinstance(claims, list):
+        raise table.error(key, f"{key} is not a table", _EXAMPLE)
+    return tuple(_claim(table, key, claim, parties) for claim in claims)
+
+
+def _claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party]) -> Claim:
+    if not isinstance(claim, dict):
+        raise table.error(key, f"{claim!r} is not a table", _EXAMPLE)
+    expected = claim.get("expected")
+    if not isinstance(expected, str) or expected not in _CLAIMS:
+        problem = f"{expected!r} is not a status that can be expected"
+        if expected is None:
+            problem = f"a {key} has no expected status"
+        raise table.error(key, f"{problem}; use one of {', '.join(_CLAIMS)}")
+    relation, holds = _CLAIMS[expected]
+    sides = _PARTIES[relation]
+    if set(claim) != {*sides, "expected"}:
+        problem = f"a {key} {expected!r} needs {', '.join(sides)} and expected, and no other keys"
+        raise table.error(key, f"{problem}; it has {', '.join(claim)}")
+    names = [claim[side] for side in sides]
+    for side, name in zip(sides, names, strict=True):
+        if not isinstance(name, str) or name not in parties:
+            problem = f"there is no party {name!r}; use one of {', '.join(parties)}"
+            raise table.error(key, problem)
+        role = parties[name].role
+        if role not in (SPEAKING if relation is Relation.READABLE else _FITTING[side]):
+            problem = f"{name} is a {role}, and cannot be the {side} of status {expected!r}"
+            raise table.error(key, problem)
+    return Claim(relation, names[0], names[1] if len(names) > 1 else "", holds)
+
+
+def _check_controls(table: _Table, claims: Sequence[Claim], controls: Sequence[Claim]) -> None:
+    """Check that something works meanwhile in a row that expects silence."""
+    happening = [claim for claim in (*claims, *controls) if _happens(claim)]
+    for claim in claims:
+        heard = claim.relation is Relation.HEARS
+        if _happens(claim) or any(not heard or e.talker == claim.talker for e in happening):
+            continue
+        who = f"a listener hears {claim.talker}" if claim.talker else "something works"
+        raise table.error(
+            "claim",
+            f"no claim or control shows that {who} meanwhile: a crash would look the same",
+            "Add a control, such as a permitted listener that hears the same talker.",
+        )
 
 
 def _happens(claim: Claim) -> bool:
