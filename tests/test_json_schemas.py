@@ -21,9 +21,7 @@ from tools.json_schemas import object_schema, schemas, text_of
 BY_HAND = {
     "confirmation.json",
     "demo.json",
-    "generate_policy.json",
     "inspect.json",
-    "minimize_policy.json",
 }
 """The schemas that no type makes: the confirmation, which robots write, and verbs not done yet."""
 

@@ -118,6 +118,8 @@ VERBS: Mapping[str, str | Shapes] = {
     "fleet confirm": "sros_tool.keystore.confirmation:KeptConfirmation",
     "metrics": "sros_tool.prometheus:KeystoreMetrics",
     "merge_policy": "sros_tool.policy.merge:MergedPolicy",
+    "minimize_policy": "sros_tool.keystore.issuing.size:PolicyMinimization",
+    "generate_policy": "sros_tool.graph.draft:LearnedPolicy",
     "create_request": "sros_tool.keystore.delivery.shown:MadeRequest",
     "distribute_key": "sros_tool.keystore.delivery.shown:ExportedEnclaves",
     "sign_request": "sros_tool.keystore.delivery.shown:SignedRequest",

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -27,11 +27,11 @@ from sros_tool.cli.common import (
 )
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.terminal import echo, echo_document
-from sros_tool.values import FileChange, as_plain, file_change
+from sros_tool.values import FileChange, file_change
 from sros_tool.wording import counted
 
 if TYPE_CHECKING:
-    from sros_tool.graph.draft import Draft
+    from sros_tool.graph.draft import AskingLine, Draft, LearnedPolicy
     from sros_tool.graph.learn import Learned
     from sros_tool.graph.observation import Observation
     from sros_tool.graph.observe import ObserverError, RosGraph, Snapshot
@@ -428,7 +428,7 @@ def generate_policy(
     learned = learn(found.observation, None if flat else common).noting(found.notes)
     if not learned.profiles:
         if as_json:
-            print_json(_json(None, file, learned, found.observation, dry_run))
+            print_json(_printed(None, file, learned, found.observation, dry_run))
         echo(_NO_NODES, err=True)
         print_notes(learned.notes)
         echo(why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
@@ -437,7 +437,7 @@ def generate_policy(
     if not dry_run:
         write(plan)
     if as_json:
-        print_json(_json(plan, file, learned, found.observation, dry_run))
+        print_json(_printed(plan, file, learned, found.observation, dry_run))
     else:
         _show(plan, learned, written=not dry_run)
     if gone := sorted(each for each in snapshot.gone if not is_tool_name(each.rpartition("/")[2])):
@@ -468,42 +468,36 @@ def _present_policy(file: Path | None) -> Policy | None:
     return None
 
 
-def _json(
+def _printed(
     plan: Draft | None, file: Path | None, learned: Learned, observation: Observation, dry_run: bool
-) -> dict[str, Any]:
-    """Return what was learned as JSON values; without a ``plan``, no file changes."""
+) -> LearnedPolicy:
+    """Return what ``--json`` prints of what was learned; without a ``plan``, no file changes."""
+    from sros_tool.graph.draft import LearnedPolicy
     from sros_tool.policy.merge import merge_notes
     from sros_tool.policy.rights import order, policy_rights
 
-    value: dict[str, Any] = {
-        "file": str(file) if file else None,
-        "source": learned.source.value,
-        "created": False,
-        "changed": False,
-        "dry_run": dry_run,
-        **as_plain(observation),
-        "added": as_plain(sorted(policy_rights(learned.policy()), key=order)),
-        "copied": [],
-        "changes": [],
-        "notes": as_plain(learned.notes),
-    }
+    copied = sorted(plan.copies) if plan else []
+    changes: list[FileChange] = []
     if plan:
-        copied = sorted(plan.copies)
-        changes = file_change(plan.path, existed=plan.before is not None) if plan.changes else []
-        value |= {
-            "created": plan.before is None,
-            "changed": plan.changes,
-            "added": as_plain(plan.added),
-            "copied": copied,
-            "changes": [*changes, *(_created(plan.path.parent / each) for each in copied)],
-            "notes": as_plain((*merge_notes(plan.contradictions), *learned.notes)),
-        }
-    return value
-
-
-def _created(path: Path) -> FileChange:
-    (change,) = file_change(path, existed=False)
-    return change
+        if plan.changes:
+            changes += file_change(plan.path, existed=plan.before is not None)
+        for name in copied:
+            changes += file_change(plan.path.parent / name, existed=False)
+    contradictions = merge_notes(plan.contradictions) if plan else ()
+    return LearnedPolicy(
+        file,
+        learned.source,
+        created=plan is not None and plan.before is None,
+        changed=plan is not None and plan.changes,
+        dry_run=dry_run,
+        observation=observation,
+        added=plan.added if plan else sorted(policy_rights(learned.policy()), key=order),
+        copied=copied,
+        accepted=None,
+        denials=None,
+        changes=changes,
+        notes=(*contradictions, *learned.notes),
+    )
 
 
 def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
@@ -541,10 +535,11 @@ def _learned_from_logs(
     enclave: str | None,
     node: str | None,
     present: Policy | None,
-) -> tuple[Learned, list[dict[str, Any]]]:
-    """Return the rights that logs ask for, and the lines that ask for them, as JSON objects."""
+) -> tuple[Learned, list[AskingLine]]:
+    """Return the rights that logs ask for, and the lines that ask for them."""
     from sros_tool.explain.denials import as_learned, propose, read_denials
     from sros_tool.files import policies_dir
+    from sros_tool.graph.draft import AskingLine
     from sros_tool.graph.learn import common_parts
     from sros_tool.runtime.vendor_log import plain_text
 
@@ -554,17 +549,17 @@ def _learned_from_logs(
     learned = as_learned(missing, enclave or "", _place(node), present, common)
     asked = {profile.enclave for profile in learned.profiles}
     lines = [
-        {
-            "log": str(log),
-            "line": each.line,
-            "process": each.process or None,
-            "enclave": each.enclave or enclave,
-            "direction": each.direction,
-            "topic": each.topic,
-        }
+        AskingLine(
+            log,
+            denial.line,
+            process=denial.process or None,
+            enclave=denial.enclave or enclave,
+            direction=denial.direction,
+            topic=denial.topic,
+        )
         for log, found in denials.items()
-        for each in found
-        if propose([each]).rights and (each.enclave or enclave) in asked
+        for denial in found
+        if propose([denial]).rights and (denial.enclave or enclave) in asked
     ]
     if not learned.profiles:
         print_notes(learned.notes)
@@ -579,7 +574,7 @@ def _learned_from_logs(
 
 def _propose(
     learned: Learned,
-    lines: Sequence[Mapping[str, Any]],
+    lines: Sequence[AskingLine],
     file: Path | None,
     accept: bool,
     dry_run: bool,
@@ -597,8 +592,8 @@ def _propose(
 
     if not learned.profiles or file is None:
         if as_json:
-            value = _json(None, file, learned, Observation(), dry_run)
-            print_json({**value, "source": "log", "accepted": accept, "denials": lines})
+            value = _printed(None, file, learned, Observation(), dry_run)
+            print_json(value._replace(accepted=accept, denials=lines))
         if not learned.profiles:
             return 1
         if not as_json:
@@ -612,10 +607,10 @@ def _propose(
     if written:
         write(plan)
     if as_json:
-        value = _json(plan, file, learned, Observation(), dry_run)
+        value = _printed(plan, file, learned, Observation(), dry_run)
         if not (written or dry_run):
-            value["changes"] = []
-        print_json({**value, "accepted": accept, "denials": lines})
+            value = value._replace(changes=())
+        print_json(value._replace(accepted=accept, denials=lines))
     else:
         _show(plan, learned, written=written)
         _show_lines(lines if plan.changes else ())
@@ -628,13 +623,13 @@ def _propose(
     return 0
 
 
-def _show_lines(lines: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:
+def _show_lines(lines: Sequence[AskingLine], *, err: bool = False) -> None:
     if lines:
         echo("these lines of logs ask for it; a process can print any line:", err=err)
-    for each in lines:
-        by = each["process"] or "a process without a label"
-        what = f"{each['direction']} {each['topic']} in {each['enclave']}"
-        echo(f"  {each['log']}:{each['line']}: {by}: {what}", err=err)
+    for line in lines:
+        by = line.process or "a process without a label"
+        what = f"{line.direction} {line.topic} in {line.enclave}"
+        echo(f"  {line.log}:{line.line}: {by}: {what}", err=err)
 
 
 def _log_text(log: Path) -> str:

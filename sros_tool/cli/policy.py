@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -36,10 +35,11 @@ from sros_tool.wording import first_few
 if TYPE_CHECKING:
     from sros_tool.errors import Note
     from sros_tool.fleet.robots import Fleet
+    from sros_tool.keystore.issuing.size import MinimizedEnclave
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.merge import Merged
-    from sros_tool.policy.minimize import EnclaveUse, MinimizedPolicy, WildcardProposal
-    from sros_tool.policy.model import Enclave, Group, Policy, StatedProtection
+    from sros_tool.policy.minimize import MinimizedPolicy
+    from sros_tool.policy.model import Group, Policy, StatedProtection
     from sros_tool.policy.rights import Right, RightsDifference
     from sros_tool.proof.growth import Gain, Growth, NewReach
     from sros_tool.proof.sources import AccessSource
@@ -368,8 +368,6 @@ def _difference_lines(
 
 
 _SHOWN = 5
-_MARGIN = 256
-"""Bytes kept free below the size limit: CA names and signatures vary in length."""
 
 
 class _SeveralObserved(SeveralValues):
@@ -436,6 +434,7 @@ def minimize_policy(
     from sros_tool.fleet import expansion as of_fleet
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.fleet_file import read_fleet
+    from sros_tool.keystore.issuing.size import PolicyMinimization, minimized_enclaves
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.document import read_policy, write_policy
     from sros_tool.policy.minimize import minimize
@@ -456,7 +455,7 @@ def minimize_policy(
     if robots:
         of_fleet.check_narrowed(robots, result, used)
     notes += _scope_notes(given, result, seen)
-    measured = _measure(stated, result, seen, fleet)
+    measured = minimized_enclaves(stated, result, seen, fleet)
     narrowed = of_fleet.written(result.policy)
     document = write_policy(narrowed)
     again = read_policy(output, document, placeholders=fleet is not None) if output else narrowed
@@ -469,12 +468,12 @@ def minimize_policy(
     changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, document) if output and not dry_run else ""
     if as_json:
-        value = _minimized_json(policy, result, measured, output if not dry_run else None)
-        value |= {"dry_run": dry_run, "changes": changes, "notes": notes}
-        print_json(_as_written(value))
+        kept = output if not dry_run else None
+        plain = as_plain(PolicyMinimization(policy, kept, measured, dry_run, changes, notes))
+        print_json({**plain, "enclaves": _as_written(plain["enclaves"])})
     else:
-        for use in result.uses:
-            for line in _use_lines(use, measured[use.enclave]):
+        for enclave in measured:
+            for line in _use_lines(enclave):
                 echo(of_fleet.as_written(line))
     print_notes(notes)
     if output and dry_run:
@@ -502,7 +501,7 @@ def _robot_notes(unobserved: dict[str, list[str]]) -> Iterator[Note]:
 
 
 def _scope_notes(given: Policy, result: MinimizedPolicy, seen: frozenset[Right]) -> Iterator[Note]:
-    unseen = [use.enclave for use in result.uses if not use.seen]
+    unseen = [use.enclave for use in result.uses if not use.observed_at_all]
     if unseen:
         text = f"never observed, and therefore not changed: {', '.join(unseen)}."
         yield Note("minimize.enclave-never-observed", text)
@@ -512,69 +511,24 @@ def _scope_notes(given: Policy, result: MinimizedPolicy, seen: frozenset[Right])
         yield Note("minimize.enclave-not-in-policy", text)
 
 
-@dataclass(frozen=True, slots=True)
-class _Measured:
-    """Sizes of an enclave's signed permissions, in bytes, and wildcards that would reduce them."""
-
-    before: int
-    after: int
-    proposals: tuple[WildcardProposal, ...] = ()
-
-
-def _measure(
-    given: Policy, result: MinimizedPolicy, seen: frozenset[Right], fleet: Fleet | None
-) -> dict[str, _Measured]:
-    from sros_tool.dds.permissions import MAX_SIGNED_BYTES
-    from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
-    from sros_tool.policy.minimize import propose_wildcards
-    from sros_tool.policy.model import Policy
-    from sros_tool.policy.rights import policy_rights
-
-    estimator = SizeEstimator()
-    measured = {}
-    for before, after in zip(given.enclaves, result.policy.enclaves, strict=True):
-        one, other = (_longest(Policy((each,)), fleet) for each in (before, after))
-        sizes = estimator.signed_bytes(one), estimator.signed_bytes(other)
-        proposals: tuple[WildcardProposal, ...] = ()
-        if sizes[1] > MAX_SIGNED_BYTES - _MARGIN:
-            proposals = propose_wildcards(
-                after.path,
-                policy_rights(result.policy),
-                policy_rights(given) | seen,
-                needed=sizes[1] - MAX_SIGNED_BYTES + _MARGIN,
-                size=right_bytes,
-            )
-        measured[before.path] = _Measured(*sizes, proposals)
-    return measured
-
-
-def _longest(policy: Policy, fleet: Fleet | None) -> Enclave:
-    """Return the only enclave of a policy, or the one of the robot with the longest path."""
-    from sros_tool.fleet.expansion import FleetPolicy, written
-
-    robots = FleetPolicy(written(policy), fleet) if fleet else None
-    return robots[max(robots, key=len)] if robots else policy.enclaves[0]
-
-
 def _ratio_text(ratio: float | None) -> str:
     """Return the over-privilege ratio as text, such as 3.5x."""
     return "none in use" if ratio is None else f"{ratio:.1f}x"
 
 
-def _use_lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
-    from sros_tool.dds.permissions import MAX_SIGNED_BYTES
-
-    if not use.seen:
-        yield f"{use.enclave}: allowed {use.allowed_pairs}, never observed, not changed"
+def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
+    use, sizes = enclave.use, enclave.bytes
+    if not use.observed_at_all:
+        yield f"{use.enclave}: allowed {use.allowed}, never observed, not changed"
     else:
-        counts = f"allowed {use.allowed_pairs}, observed {use.observed_pairs}"
+        counts = f"allowed {use.allowed}, observed {use.observed}"
         yield f"{use.enclave}: {counts}: {_ratio_text(use.ratio)}"
-        if use.unused:
+        if use.never_observed:
             yield "  never observed, and removed"
-            yield from (f"    {right.describe()}" for right in use.unused)
-    if use.wide:
+            yield from (f"    {right.describe()}" for right in use.never_observed)
+    if use.wildcards:
         yield "  wider than used"
-    for wide in use.wide:
+    for wide in use.wildcards:
         used = ", ".join(right.describe() for right in wide.used) or "nothing"
         instead = ", ".join(right.describe() for right in wide.replacement)
         if instead == used:
@@ -582,17 +536,16 @@ def _use_lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
         else:
             yield f"    {wide.rule.describe()}  covered {used}"
             yield f"      {f'becomes {instead}' if instead else 'not needed: other rules have it'}"
-    if use.common:
-        yield f"  never observed, but kept because every node needs it: {len(use.common)}"
-    if use.refused:
+    if use.kept_for_every_node:
+        number = len(use.kept_for_every_node)
+        yield f"  never observed, but kept because every node needs it: {number}"
+    if use.not_allowed:
         yield "  observed, and not allowed"
-        yield from (f"    {right.describe()}" for right in use.refused)
-    sizes = f"{measured.before} bytes"
-    if measured.after != measured.before:
-        sizes += f", then {measured.after}"
-    too_large = "" if measured.after < MAX_SIGNED_BYTES else ": TOO LARGE for Fast DDS 2.9"
-    yield f"  permissions.p7s: {sizes}, of at most {MAX_SIGNED_BYTES - 1}{too_large}"
-    for proposal in measured.proposals:
+        yield from (f"    {right.describe()}" for right in use.not_allowed)
+    then = f", then {sizes.after}" if sizes.after != sizes.before else ""
+    too_large = "" if sizes.after < sizes.limit else ": TOO LARGE for Fast DDS 2.9"
+    yield f"  permissions.p7s: {sizes.before} bytes{then}, of at most {sizes.limit - 1}{too_large}"
+    for proposal in enclave.proposals:
         names = [right.describe() for right in proposal.adds]
         adds = first_few(names, _SHOWN) or "no name known here"
         yield f"    {proposal.rule.describe()}  in place of {len(proposal.replaces)} names"
@@ -608,38 +561,6 @@ def _as_written(value: Any) -> Any:
     if isinstance(value, list):
         return list(map(_as_written, value))
     return as_written(value) if isinstance(value, str) else value
-
-
-def _minimized_json(
-    policy: Path, result: MinimizedPolicy, measured: dict[str, _Measured], output: Path | None
-) -> dict[str, Any]:
-    from sros_tool.dds.permissions import MAX_SIGNED_BYTES
-
-    return {
-        "policy": str(policy),
-        "output": str(output) if output else None,
-        "enclaves": [
-            {
-                "enclave": use.enclave,
-                "observed_at_all": use.seen,
-                "allowed": use.allowed_pairs,
-                "observed": use.observed_pairs,
-                "remaining": use.remaining_pairs,
-                "ratio": use.ratio,
-                "never_observed": as_plain(use.unused),
-                "kept_for_every_node": as_plain(use.common),
-                "wildcards": as_plain(use.wide),
-                "not_allowed": as_plain(use.refused),
-                "bytes": {
-                    "before": measured[use.enclave].before,
-                    "after": measured[use.enclave].after,
-                    "limit": MAX_SIGNED_BYTES,
-                },
-                "proposals": as_plain(measured[use.enclave].proposals),
-            }
-            for use in result.uses
-        ],
-    }
 
 
 # ── policies ────────────────────────────────────────────────────────────────────────────

@@ -292,7 +292,7 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
     """
     after = FleetPolicy(written(result.policy), policy.fleet)
     seen = _by_enclave(observed)
-    replaced = {use.enclave for use in result.uses if use.wide}
+    replaced = {use.enclave for use in result.uses if use.wildcards}
     for path in policy:
         if path not in seen and policy.stated(path)[0].path not in replaced:
             continue

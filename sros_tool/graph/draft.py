@@ -6,19 +6,22 @@ Names need no escaping: only plain ROS names are learned, and those contain no m
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
+from typing import Annotated, NamedTuple
 
 from sros_tool.errors import DocumentError, PolicyError
 from sros_tool.files import new_files, replace_file
 from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile, RightsFound
+from sros_tool.graph.observation import PUBLISH, SUBSCRIBE, Observation
 from sros_tool.names import check_namespace
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import Contradiction, EditedText, PlacedElement, merge_into
 from sros_tool.policy.model import VERSION
 from sros_tool.policy.rights import Right, Rules, order, policy_rights, profile_rights
+from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
 from sros_tool.xml import read_bytes
 
 _XINCLUDE = "http://www.w3.org/2001/XInclude"
@@ -42,6 +45,50 @@ _HEADERS = {
 """,
 }
 """The comment at the head of a learned policy."""
+
+
+class AskingLine(NamedTuple):
+    """A line of a log."""
+
+    log: Path
+    """The log."""
+    line: int
+    """The line, from 1."""
+    process: str | None
+    """The process that printed it, or null."""
+    enclave: str | None
+    """The enclave that it names, or null."""
+    direction: Annotated[str, Words((PUBLISH, SUBSCRIBE))]
+    """What was denied."""
+    topic: str
+    """The DDS topic."""
+
+
+@shows(optional=("accepted", "denials"), spread=("observation",))
+class LearnedPolicy(NamedTuple):
+    """What was learned, and how the policy changes."""
+
+    file: Path | None
+    """The policy, or null without FILE."""
+    source: RightsFound
+    """Where the rights come from."""
+    created: bool
+    """Whether the policy is a new file, or would be with `--accept`."""
+    changed: bool
+    """Whether the policy changes, or would with `--accept`."""
+    dry_run: DryRun
+    observation: Observation
+    """The nodes that were observed; empty for a log."""
+    added: Sequence[Right]
+    """The rights that are added."""
+    copied: Sequence[str]
+    """Common parts that are copied next to the policy."""
+    accepted: bool | None
+    """For a log: whether `--accept` was given; if not, no right is written."""
+    denials: Sequence[AskingLine] | None
+    """For a log: the lines that ask for the rights."""
+    changes: FileChanges
+    notes: Notes
 
 
 @dataclass(frozen=True, slots=True)

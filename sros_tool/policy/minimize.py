@@ -15,6 +15,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from sros_tool.errors import PolicyError
 from sros_tool.names import expand, is_expression
@@ -43,46 +44,53 @@ from sros_tool.policy.rights import (
     policy_rights,
     unfolded,
 )
+from sros_tool.values import shows
 
 _Pair = tuple[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class _WideRule:
-    """A wildcard, the observed rights that it allows, and the rights that can replace it.
-
-    ``replacement`` leaves out rights that other rules of the enclave allow by exact name.
-    """
+class WideRule(NamedTuple):
+    """A wildcard."""
 
     rule: Right
+    """The wildcard."""
     used: tuple[Right, ...]
+    """Observed rights that it gives."""
     replacement: tuple[Right, ...]
+    """Rights that replace it, without those that other rules of the enclave allow by exact name."""
 
 
+@shows(
+    *("enclave", "observed_at_all", "allowed", "observed", "remaining", "ratio"),
+    *("never_observed", "kept_for_every_node", "wildcards", "not_allowed"),
+)
 @dataclass(frozen=True, slots=True)
 class EnclaveUse:
-    """The rights of an enclave compared with its observed rights.
-
-    ``unused`` rights were never observed and are removed.  ``common`` rights were never observed
-    and stay, because every node needs them.  ``refused`` rights were observed, but the policy does
-    not allow them.  ``wide`` are the wildcards that are replaced.  An enclave that was never
-    ``seen`` does not change.
-    """
+    """The rights of an enclave compared with its observed rights."""
 
     enclave: str
-    seen: bool
-    unused: tuple[Right, ...]
-    common: tuple[Right, ...]
-    wide: tuple[_WideRule, ...]
-    refused: tuple[Right, ...]
-    allowed_pairs: int
-    observed_pairs: int
-    remaining_pairs: int
+    """The enclave."""
+    observed_at_all: bool
+    """Whether it was observed; if not, it does not change."""
+    never_observed: tuple[Right, ...]
+    """Rights that are removed."""
+    kept_for_every_node: tuple[Right, ...]
+    """Rights that were not observed, and stay because every node needs them."""
+    wildcards: tuple[WideRule, ...]
+    """Wildcards that are wider than used."""
+    not_allowed: tuple[Right, ...]
+    """Rights that were observed, and that the policy does not give."""
+    allowed: int
+    """Number of pairs of a right and a name that it has."""
+    observed: int
+    """Number of those that were observed."""
+    remaining: int
+    """Number of those that it keeps."""
 
     @property
     def ratio(self) -> float | None:
-        """Allowed pairs per observed pair, 1.0 at best; None if nothing was observed."""
-        return self.allowed_pairs / self.observed_pairs if self.observed_pairs else None
+        """Allowed divided by observed, or null."""
+        return self.allowed / self.observed if self.observed else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +231,7 @@ class _Narrowing:
         replacements = {each.rule: each.replacement for each in wide}
         return _narrowed_enclave(self._enclave, kept, replacements), self._use_of(kept, wide)
 
-    def _use_of(self, kept: set[Right], wide: Sequence[_WideRule]) -> EnclaveUse:
+    def _use_of(self, kept: set[Right], wide: Sequence[WideRule]) -> EnclaveUse:
         seen = bool(self._observed)
         unused = [right for right in self._stated if not self._is_observed(right)]
         rewritten = {each.rule for each in wide}
@@ -231,14 +239,16 @@ class _Narrowing:
         in_use = self._pairs(self._in_use)
         return EnclaveUse(
             enclave=self._enclave.path,
-            seen=seen,
-            unused=tuple(r for r in unused if not seen or (r not in kept and r not in rewritten)),
-            common=tuple(r for r in unused if seen and r in kept),
-            wide=tuple(wide),
-            refused=tuple(sorted(self._refused, key=order)),
-            allowed_pairs=len(self._pairs(self._stated) | in_use),
-            observed_pairs=len(in_use),
-            remaining_pairs=len(self._pairs(remaining) | in_use),
+            observed_at_all=seen,
+            never_observed=tuple(
+                r for r in unused if not seen or (r not in kept and r not in rewritten)
+            ),
+            kept_for_every_node=tuple(r for r in unused if seen and r in kept),
+            wildcards=tuple(wide),
+            not_allowed=tuple(sorted(self._refused, key=order)),
+            allowed=len(self._pairs(self._stated) | in_use),
+            observed=len(in_use),
+            remaining=len(self._pairs(remaining) | in_use),
         )
 
     # ── rules that stay, and replacements of wildcards ─────────────────────────────────────
@@ -256,7 +266,7 @@ class _Narrowing:
             for seen in self._use.meeting(part)
         )
 
-    def _narrowed(self, kept: set[Right]) -> tuple[_WideRule, ...]:
+    def _narrowed(self, kept: set[Right]) -> tuple[WideRule, ...]:
         """Return the used and common wildcards to replace, and the rights that replace each."""
         wide = [rule for rule in self._stated if is_expression(rule.name) and rule not in kept]
         owners: dict[Right, list[Right]] = defaultdict(list)
@@ -279,7 +289,7 @@ class _Narrowing:
         for right in folded(p for p in needed if self._is_allowed(p) and not others.cover(p)):
             replacement[homes(right)[0]].append(right)
         return tuple(
-            _WideRule(
+            WideRule(
                 rule,
                 tuple(sorted(used[rule], key=order)),
                 tuple(sorted(replacement[rule], key=order)),
@@ -413,18 +423,17 @@ _DIGITS = re.compile(r"\d+")
 _FEWEST = 3  # names that a wildcard must replace
 
 
-@dataclass(frozen=True, slots=True)
-class WildcardProposal:
-    """A wildcard in place of names, which ``saves`` that many bytes of the signed document.
-
-    ``adds`` are the known topics and services of other enclaves that it would newly allow.  A safe
-    proposal adds none of them, but still allows names that nobody uses so far.
-    """
+class WildcardProposal(NamedTuple):
+    """A wildcard in place of names: a safe one adds no known name, but allows unused names."""
 
     rule: Right
+    """The wildcard."""
     replaces: tuple[Right, ...]
+    """Rights that it replaces."""
     adds: tuple[Right, ...]
+    """Known names of other enclaves that it newly allows."""
     saves: int
+    """Bytes that it saves."""
 
 
 def propose_wildcards(

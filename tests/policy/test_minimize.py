@@ -61,10 +61,10 @@ def test_between_what_was_observed_and_what_was_allowed(
         assert new <= old
         assert old & meant(observed, path, allow=True) <= new
         assert listed(before, path, allow=False) == listed(result.policy, path, allow=False)
-        assert enclave_use.observed_pairs <= enclave_use.remaining_pairs
+        assert enclave_use.observed <= enclave_use.remaining
         # An observed wildcard can complete an action for the one count and not for the other.
         if not any(is_expression(right.name) for right in policy_rights(observed)):
-            assert enclave_use.remaining_pairs <= enclave_use.allowed_pairs
+            assert enclave_use.remaining <= enclave_use.allowed
     again = minimize(result.policy, policy_rights(observed), () if strict else COMMON)
     assert policy_rights(again.policy) == policy_rights(result.policy)
 
@@ -72,7 +72,7 @@ def test_between_what_was_observed_and_what_was_allowed(
 def test_an_action_that_rests_on_names_and_a_wildcard_counts_once() -> None:
     before = policy(group("topics", "/x /*", "publish") + group("services", "/x /*", "reply"))
     found = use(before, "publish /*", "execute /x")
-    assert found.observed_pairs <= found.remaining_pairs <= found.allowed_pairs
+    assert found.observed <= found.remaining <= found.allowed
 
 
 NARROWINGS = {
@@ -117,9 +117,9 @@ def test_an_enclave_that_was_never_observed_stays() -> None:
     result = minimize(given_policy, [Right("/b", ALLOW, "publish", "/x")])
     assert result.policy == given_policy
     (found,) = result.uses
-    assert not found.seen
+    assert not found.observed_at_all
     assert found.ratio is None
-    assert {right.name for right in found.unused} == {"/*", "/x"}
+    assert {right.name for right in found.never_observed} == {"/*", "/x"}
 
 
 def test_what_every_node_needs_stays_unless_strict() -> None:
@@ -130,8 +130,8 @@ def test_what_every_node_needs_stays_unless_strict() -> None:
     assert mild.policy == policy(
         group("topics", "/rosout /x", "publish") + group("services", "~/get_parameters", "reply")
     )
-    assert [right.name for right in mild.uses[0].common] == ["/rosout"]
-    (wide,) = mild.uses[0].wide
+    assert [right.name for right in mild.uses[0].kept_for_every_node] == ["/rosout"]
+    (wide,) = mild.uses[0].wildcards
     assert (wide.used, [right.name for right in wide.replacement]) == ((), ["/ns/n/get_parameters"])
     strict = minimize(given_policy, seen("publish /x"))
     assert strict.policy == policy(group("topics", "/x", "publish"))
@@ -142,9 +142,11 @@ def test_what_is_told() -> None:
         group("topics", "/x /y /cam/*", "publish") + group("topics", "/cam/secret", "-publish")
     )
     found = use(given_policy, "publish /x", "publish /cam/a", "publish /cam/secret", "call /f")
-    assert [right.describe() for right in found.unused] == ["publish topic /y"]
-    assert [(w.rule.name, [r.name for r in w.used]) for w in found.wide] == [("/cam/*", ["/cam/a"])]
-    assert {right.describe() for right in found.refused} == {
+    assert [right.describe() for right in found.never_observed] == ["publish topic /y"]
+    assert [(w.rule.name, [r.name for r in w.used]) for w in found.wildcards] == [
+        ("/cam/*", ["/cam/a"])
+    ]
+    assert {right.describe() for right in found.not_allowed} == {
         "publish topic /cam/secret",
         "call action /f",
     }
@@ -164,19 +166,19 @@ def test_the_ratio_counts_known_names() -> None:
     )  # fmt: skip
     # publish /p /x /y (known topics but /q, which is denied), subscribe /x /y
     found = use(given_policy, "publish /x", "subscribe /x")
-    assert (found.allowed_pairs, found.observed_pairs, found.remaining_pairs) == (5, 2, 2)
+    assert (found.allowed, found.observed, found.remaining) == (5, 2, 2)
     assert found.ratio == 2.5
 
 
 def test_what_every_node_needs_is_known() -> None:
     found = use(policy(group("topics", "/*", "publish")), "publish /x", common=COMMON)
-    assert (found.allowed_pairs, found.observed_pairs, found.remaining_pairs) == (2, 1, 2)
+    assert (found.allowed, found.observed, found.remaining) == (2, 1, 2)
 
 
 def test_wildcards_of_services_and_topics_count_known_actions() -> None:
     given_policy = policy(group("services", "/*", "request") + group("topics", "/*", "subscribe"))
     found = use(given_policy, "call /f", "request /s", "subscribe /t")
-    assert (found.allowed_pairs, found.observed_pairs) == (3, 3)
+    assert (found.allowed, found.observed) == (3, 3)
     assert found.ratio == 1.0
 
 

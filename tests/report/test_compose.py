@@ -63,8 +63,8 @@ def test_over_privilege_stands_out_and_agrees_with_minimize_policy(tmp_path: Pat
     assert {e.path: e.observed for e in picture.enclaves} == {"/talker": True, "/idle": False}
     use = minimize(read_policy(tmp_path / "policy.xml"), second.rights).uses[0]
     talker = [e for e in picture.edges if e.enclave == "/talker" and e.name != "/secret"]
-    assert use.allowed_pairs == sum(e.mark is not OverlaySide.SECOND for e in talker)
-    assert use.observed_pairs == sum(e.mark is OverlaySide.BOTH for e in talker)
+    assert use.allowed == sum(e.mark is not OverlaySide.SECOND for e in talker)
+    assert use.observed == sum(e.mark is OverlaySide.BOTH for e in talker)
 
 
 def test_what_a_wildcard_reaches_and_nobody_used_is_counted(tmp_path: Path) -> None:

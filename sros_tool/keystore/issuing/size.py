@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence, Set
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import render_permissions
+from sros_tool.dds.permissions import MAX_SIGNED_BYTES, render_permissions
+from sros_tool.fleet.expansion import FleetPolicy, written
+from sros_tool.fleet.robots import Fleet
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, issue_ca, subject_text
 from sros_tool.pki.keys import generate_key
-from sros_tool.policy.model import Enclave
-from sros_tool.policy.rights import Right
+from sros_tool.policy.minimize import (
+    EnclaveUse,
+    MinimizedPolicy,
+    WildcardProposal,
+    propose_wildcards,
+)
+from sros_tool.policy.model import Enclave, Policy
+from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.topics import dds_names
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
+from sros_tool.values import DryRun, FileChanges, Notes, shows
 
 _LINE = len("<topic></topic>\r\n")
 
@@ -49,3 +61,78 @@ def right_bytes(right: Right) -> int:
     """
     names = dds_names(right.right, right.name)
     return sum(_LINE + len(name) for name in (*names.publish, *names.subscribe))
+
+
+# ── of a minimized policy ──────────────────────────────────────────────────────────────────
+
+_MARGIN = 256
+"""Bytes kept free below the size limit: CA names and signatures vary in length."""
+
+
+class PermissionsBytes(NamedTuple):
+    """Size of the signed permissions."""
+
+    before: int
+    """Bytes before."""
+    after: int
+    """Bytes after."""
+    limit: int = MAX_SIGNED_BYTES
+    """Bytes that Fast DDS 2.9 no longer reads."""
+
+
+@shows(spread=("use",))
+class MinimizedEnclave(NamedTuple):
+    """An enclave."""
+
+    use: EnclaveUse
+    """Its rights, and those that were observed."""
+    bytes: PermissionsBytes
+    """Size of the signed permissions."""
+    proposals: tuple[WildcardProposal, ...]
+    """Wildcards that would make permissions small enough."""
+
+
+class PolicyMinimization(NamedTuple):
+    """The rights of a policy that were observed in use."""
+
+    policy: Path
+    """POLICY, as it was named."""
+    output: Path | None
+    """The file that was written, or null."""
+    enclaves: Sequence[MinimizedEnclave]
+    """The enclaves of the policy."""
+    dry_run: DryRun
+    changes: FileChanges
+    notes: Notes
+
+
+def minimized_enclaves(
+    given: Policy, result: MinimizedPolicy, seen: Set[Right], fleet: Fleet | None
+) -> list[MinimizedEnclave]:
+    """Return the enclaves of a minimized policy with their sizes.
+
+    With a fleet, sizes are those of the robot with the longest path.
+    """
+    estimator = SizeEstimator()
+    measured = []
+    for before, after, use in zip(given.enclaves, result.policy.enclaves, result.uses, strict=True):
+        sizes = PermissionsBytes(
+            *(estimator.signed_bytes(_longest(Policy((each,)), fleet)) for each in (before, after))
+        )
+        proposals: tuple[WildcardProposal, ...] = ()
+        if sizes.after > MAX_SIGNED_BYTES - _MARGIN:
+            proposals = propose_wildcards(
+                after.path,
+                policy_rights(result.policy),
+                policy_rights(given) | seen,
+                needed=sizes.after - MAX_SIGNED_BYTES + _MARGIN,
+                size=right_bytes,
+            )
+        measured.append(MinimizedEnclave(use, sizes, proposals))
+    return measured
+
+
+def _longest(policy: Policy, fleet: Fleet | None) -> Enclave:
+    """Return the only enclave of a policy, or the one of the robot with the longest path."""
+    robots = FleetPolicy(written(policy), fleet) if fleet else None
+    return robots[max(robots, key=len)] if robots else policy.enclaves[0]
