@@ -16,6 +16,7 @@ import sros_tool
 from sros_tool import DocumentError, KeystoreError, UsageError
 from sros_tool.files import policies_dir
 from tests.support.harness import policy_text, publish
+from tests.support.long_form import sometimes
 
 PROJECT = Path(__file__).parents[1]
 TALKER = "/talker_listener/talker"
@@ -63,6 +64,7 @@ def same_recursion_limit() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("same_recursion_limit")
+@sometimes("a type checker")
 def test_a_type_checker_knows_the_names_and_finds_a_wrong_call(tmp_path: Path) -> None:
     api = pytest.importorskip("mypy.api")
     script = tmp_path / "script.py"

@@ -80,7 +80,7 @@ def small_disk(folder: Path, blocks: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("verb", "free"), some([(verb, free) for verb in VERBS for free in (0, 1, 2, 5, 12, 25)], 24)
+    ("verb", "free"), some([(verb, free) for verb in VERBS for free in (0, 1, 2, 5, 12, 25)], 8)
 )
 def test_full_disk(verb: str, free: int, made: Path, tmp_path: Path) -> None:
     disk = tmp_path / "disk"

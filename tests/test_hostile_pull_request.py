@@ -26,6 +26,7 @@ from tests.support.code_host import (
     policy,
 )
 from tests.support.harness import publish
+from tests.support.long_form import some
 
 MARKS = "/run/sros-marks"
 """The folder in which a trap that springs makes a file of its name."""
@@ -303,14 +304,17 @@ INPUTS = {
 }
 
 
+JOBS = some(["action", "gitlab"], 1)
+
+
 @pytest.fixture(scope="module")
 def reviews(hostile: Origin, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Ran]:
-    """Return what both jobs did and said."""
+    """Return what the jobs did and said."""
     folder = tmp_path_factory.mktemp("runs")
     found = {}
-    for name, job_of in (("action", action_job), ("gitlab", gitlab_job)):
+    for name in JOBS:
         clone = clone_of(hostile, folder / name)
-        job = job_of(hostile, clone, **INPUTS)
+        job = (action_job if name == "action" else gitlab_job)(hostile, clone, **INPUTS)
         ended, marks = run_in_namespace(job, folder / f"{name}.seen")
         if name == "action":
             summary = job.files["GITHUB_STEP_SUMMARY"].read_text()
@@ -322,7 +326,7 @@ def reviews(hostile: Origin, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 
 
 @needs_root
-@pytest.mark.parametrize("job", ["action", "gitlab"])
+@pytest.mark.parametrize("job", JOBS)
 def test_no_trap_springs_in_a_job(reviews: dict[str, Ran], job: str) -> None:
     assert reviews[job].ended.returncode == 2, reviews[job]
     assert not reviews[job].marks

@@ -108,6 +108,7 @@ def test_the_action_on_pull_requests(origin: Origin, tmp_path: Path) -> None:
     assert status != 0, said
 
 
+@sometimes("requirements that a pull request drops")
 def test_requirements_that_a_pull_request_drops_are_decided(origin: Origin, tmp_path: Path) -> None:
     clone = origin.clone(tmp_path / "dropped", "merged/dropped")
     status, said, _ = run_action(origin, clone, **ALL)
@@ -120,6 +121,7 @@ def test_requirements_that_a_pull_request_drops_are_decided(origin: Origin, tmp_
     assert status == 0, said
 
 
+@sometimes("the installation of the action")
 def test_the_installation_runs_nothing_of_the_pull_request(tmp_path: Path) -> None:
     """Run the lines that install sros in a folder of traps, which import what Python offers."""
     install, _ = action()["runs"]["steps"]
@@ -163,6 +165,7 @@ def test_what_cannot_be_compared_fails_in_the_action(origin: Origin, tmp_path: P
     assert "'fial' is not one of 'fail', 'allow'" in found
 
 
+@sometimes("a checkout below the workspace")
 def test_a_checkout_below_the_workspace_is_reviewed(origin: Origin, tmp_path: Path) -> None:
     origin.clone(tmp_path / "workspace/robot-sources", "merged/wider")
     job = action_job(origin, tmp_path / "workspace", **ALL, checkout="robot-sources")
@@ -208,6 +211,7 @@ def test_no_comparison_is_asked_for_by_name(origin: Origin, tmp_path: Path) -> N
     assert "nothing is compared with an earlier commit, as asked" in said
 
 
+@sometimes("what the action compares with")
 def test_the_action_compares_with_what_is_merged_into(origin: Origin, tmp_path: Path) -> None:
     """The base of the event is older than what main has lost, and the merge brings it back."""
     began = origin.git("commit-tree", "wider^{tree}", "-m", "Before main lost the right")
@@ -255,6 +259,7 @@ def test_the_job_of_gitlab_has_no_result_of_the_merge_request(
     assert not list((clone / "sros-review").iterdir())
 
 
+@sometimes("what the job of gitlab compares with")
 def test_the_job_of_gitlab_compares_with_what_is_merged_into(
     origin: Origin, tmp_path: Path
 ) -> None:

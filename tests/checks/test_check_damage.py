@@ -18,7 +18,7 @@ from tests.support.children import LONG
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
-ROUNDS = 120 if LONG else 40
+ROUNDS = 120 if LONG else 15
 
 
 def damage(path: Path, chance: random.Random) -> None:

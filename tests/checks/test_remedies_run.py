@@ -30,6 +30,7 @@ from tests.checks.sound_keystore import NOW
 from tests.checks.test_policy_findings import enclave
 from tests.checks.test_policy_findings import policy as policy_of
 from tests.support.harness import Ended, forked, sros
+from tests.support.long_form import some
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
@@ -88,7 +89,7 @@ def at(moment: datetime, monkeypatch: pytest.MonkeyPatch) -> None:
 NAMED = [each for each in CASES if "`sros " in KINDS[each].remedy and each not in ELSEWHERE]
 
 
-@pytest.mark.parametrize("kind", NAMED)
+@pytest.mark.parametrize("kind", some(NAMED, 20))
 def test_no_remedy_names_a_command_that_refuses(
     kind: str, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ from sros_tool.files import policies_dir, replace_file
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from tests.support.harness import policy_text, publish, snapshot, sros
+from tests.support.long_form import sometimes
 
 DENY = '<topics publish="DENY"><topic>cmd_vel</topic></topics>'
 A = '<?xml version="1.0"?>\n<!-- mine -->\n' + policy_text({"/a": publish("x", "/cam/*") + DENY})
@@ -345,6 +346,7 @@ def calls_of(work: Callable[[], object]) -> int:
     return called
 
 
+@sometimes("the effort for large policies")
 def test_four_times_as_large_policies_take_four_times_the_effort(folder: Path) -> None:
     """Sixteen times would be quadratic; what is there anyway makes it less than four."""
     policies: dict[str, Callable[[int], tuple[str, str]]] = {

@@ -8,11 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from sros_tool.fleet.model import Fleet
 
 from sros_tool.errors import SrosError
 from sros_tool.fleet.fleet_file import parse_fleet, read_fleet
 from sros_tool.fleet.inventory import inventory, script_inventory
 from sros_tool.fleet.robots import Fleet
+from tests.support.long_form import sometimes
 
 HOSTS = """
 all:
@@ -56,6 +58,7 @@ def test_an_inventory_states_what_a_fleet_file_states(tmp_path: Path) -> None:
         assert fleet_in(tmp_path, "hosts.yaml", text) == wanted
 
 
+@sometimes("inventories as Ansible reads them")
 def test_ansible_reads_the_same_in_both_directions(tmp_path: Path) -> None:
     """The real `ansible-inventory` writes what is read here, and reads what is written here."""
     wanted = fleet_in(tmp_path, "hosts.yml", HOSTS)

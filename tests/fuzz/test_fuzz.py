@@ -13,7 +13,7 @@ from tests.fuzz.corpus import Corpus, make_corpus
 from tests.fuzz.readers import READERS, Place, Reader
 from tests.support.children import LONG
 
-COUNT = 20_000 if LONG else 1_000
+COUNT = 20_000 if LONG else 500
 
 
 @pytest.fixture(scope="module")

@@ -71,6 +71,7 @@ def test_the_program_of_the_workspace_works(workspace: Path) -> None:
     assert not list((workspace / "src").rglob("*.egg-info"))
 
 
+@sometimes("imports in a workspace")
 def test_nothing_is_imported_from_the_working_folder(workspace: Path) -> None:
     """An empty part of PYTHONPATH is the working folder, which anybody may own."""
     for before in ({}, {"PYTHONPATH": "/somewhere"}):

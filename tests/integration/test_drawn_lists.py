@@ -18,7 +18,7 @@ from tests.integration.libcrypto import CRL_CHECK, libcrypto
 from tests.support.children import LONG
 from tests.support.openssl import takes_changes_for_lists
 
-DRAWN = 6000 if LONG else 400
+DRAWN = 6000 if LONG else 200
 NOW = datetime.now(UTC).replace(microsecond=0)
 DAY = timedelta(days=1)
 KEYS = [ec.generate_private_key(ec.SECP256R1()) for _ in range(3)]

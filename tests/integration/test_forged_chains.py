@@ -26,7 +26,7 @@ from tests.integration.libcrypto import (
 )
 from tests.support.children import LONG
 
-DRAWN = 20_000 if LONG else 200
+DRAWN = 20_000 if LONG else 100
 SEED = int(os.environ.get("SROS_DIFFERENTIAL_SEED", "5"))
 UNREADABLE = "it cannot be read"
 NOW = datetime.now(UTC).replace(microsecond=0)

@@ -20,8 +20,8 @@ from tests.integration.forged_signatures import Forger, Libcrypto, Original, Sig
 from tests.integration.test_openssl import openssl_verdict, our_verdict
 from tests.support.children import LONG, run
 
-FORGERIES = 80_000 if LONG else 600
-ASKED = 400 if LONG else 40
+FORGERIES = 80_000 if LONG else 300
+ASKED = 400 if LONG else 20
 """How many forgeries the openssl program judges as well."""
 
 WAYS = (

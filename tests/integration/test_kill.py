@@ -13,6 +13,7 @@ from sros_tool.keystore.layout import enclave_folder
 from tests.integration.kills import Moments, Server, server
 from tests.support.children import LONG, python, run
 from tests.support.harness import check_whole, policy_text, publish, remains, topics_of
+from tests.support.long_form import sometimes
 
 __all__ = ["server"]
 
@@ -64,6 +65,7 @@ def test_killed_at_random_moments(server: Server, keystore: Path, tmp_path: Path
     assert not remains(tmp_path)
 
 
+@sometimes("killed while all cores sign")
 def test_killed_while_signing_with_every_core(
     server: Server, keystore: Path, tmp_path: Path
 ) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.harness import sros
+from tests.support.long_form import some
 
 
 def openssl(*words: object, accept: bool = True) -> str:
@@ -38,7 +39,7 @@ def verify_signatures(root: Path, enclave: Path) -> None:
         assert "Verification successful" in said
 
 
-@pytest.fixture(params=["development", "production", "sros2"])
+@pytest.fixture(params=some(["development", "production", "sros2"], 1))
 def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     keystore = tmp_path / "ks"
     sros("create_keystore", keystore, "--template", request.param).ok()

@@ -18,6 +18,7 @@ from sros_tool.keystore.template import template_names
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from tests.support.harness import sros
+from tests.support.long_form import some
 
 SCHEMAS = Path(__file__).parents[1] / "schemas"
 
@@ -36,7 +37,7 @@ def schema(name: str) -> etree.XMLSchema:
 # ── what sros makes ────────────────────────────────────────────────────────────────────────
 
 
-@pytest.fixture(scope="module", params=template_names())
+@pytest.fixture(scope="module", params=some(template_names(), 1))
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A keystore by each template, with enclaves of policies, without one, and exported ones."""
     folder = tmp_path_factory.mktemp(f"openssl-{request.param}")

@@ -348,3 +348,16 @@ def test_an_enclave_that_the_keystore_lost_is_named(keystore: Path, tmp_path: Pa
     assert not (robot / "enclaves/a").exists()
     again = sros("distribute_key", keystore, "--all", robot, "--force", "--json").ok()
     assert json.loads(again.out)["notes"] == []
+
+
+@pytest.mark.parametrize("file", ["public/identity_ca.cert.pem", "enclaves/a/cert.pem"])
+def test_no_export_has_a_private_key_beside_that_of_its_enclave(
+    file: str, keystore: Path, tmp_path: Path
+) -> None:
+    """Where a key was appended to a certificate, the robot would get it."""
+    with (keystore / file).open("ab") as certificates:
+        certificates.write((keystore / "private/identity_ca.key.pem").read_bytes())
+    for target in ("robot", "robot.tar.gz"):
+        ended = sros("distribute_key", keystore, "/a", tmp_path / target)
+        assert (ended.status, "holds a private key" in ended.err) == (2, True), ended
+        assert not (tmp_path / target).exists()

@@ -31,6 +31,7 @@ from tests.support.harness import (
     sros,
     topics_of,
 )
+from tests.support.long_form import sometimes
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 LATER = NOW + timedelta(days=100)
@@ -210,6 +211,7 @@ def test_all_that_expire(tmp_path: Path) -> None:
     assert renew(root, now=soon, expiring=month).changes == ()
 
 
+@sometimes("renewing with all cores")
 def test_many_are_renewed_by_several_processes(tmp_path: Path) -> None:
     names = [f"/n{index:03}" for index in range(230)]
     root = made(tmp_path / "ks", *names)

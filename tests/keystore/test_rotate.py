@@ -40,14 +40,14 @@ from sros_tool.policy.document import read_policy
 from tests.keystore.test_transaction import DIED, in_child
 from tests.support import made_by_ros2
 from tests.support.harness import check_enclave_whole, policy_text, publish, remains, snapshot, sros
-from tests.support.long_form import some
+from tests.support.long_form import ONLY_LONG, some
 
 NOW = datetime.now(UTC)
 STAGES = (RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE)
 NAMES = ("/a", "/a/inner", "/b")
 
 
-@pytest.fixture(params=["development", "production", "sros2"])
+@pytest.fixture(params=[pytest.param("development", marks=ONLY_LONG), "production", "sros2"])
 def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return make(tmp_path, request.param)
 

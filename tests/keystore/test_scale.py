@@ -23,7 +23,7 @@ from tests.support.children import LONG
 from tests.support.harness import sros
 
 ROBOTS = 100 if LONG else 3
-EACH = 100 if LONG else 70
+EACH = 100 if LONG else 40
 MANY = ROBOTS * EACH
 
 

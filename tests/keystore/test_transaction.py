@@ -383,7 +383,7 @@ def test_death_while_recovering_from_death(name: str, stage: Stage) -> None:
         shutil.rmtree(stopped)
 
 
-@pytest.mark.parametrize("name", some([*SCENARIOS], 4))
+@pytest.mark.parametrize("name", some([*SCENARIOS], 2))
 def test_no_space_at_every_step(name: str, stage: Stage) -> None:
     """An error leaves everything as it was, byte by byte; or else the verb succeeds."""
     scenario = SCENARIOS[name]
@@ -421,7 +421,7 @@ def cannot_exchange(monkeypatch: pytest.MonkeyPatch, *, hard_links: bool) -> lis
     ("name", "hard_links"),
     some(
         [(n, link) for n in ("create_permission", "completion", "links") for link in (True, False)],
-        3,
+        2,
     ),
 )
 def test_death_without_exchange(

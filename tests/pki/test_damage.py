@@ -31,7 +31,7 @@ FILES = (
     "enclaves/governance.p7s",
     "sros.toml",
 )
-ROUNDS = 150 if LONG else 50
+ROUNDS = 150 if LONG else 20
 _BASE64 = re.compile(rb"(?:-----BEGIN [A-Z ]+-----\n|smime\.p7s\"\r\n\r\n)([A-Za-z0-9+/=\s]+)")
 
 

@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import PkiError
-from sros_tool.pki import der
+from sros_tool.pki import der, keys
 from sros_tool.pki.keys import (
     PrivateKey,
     few_rounds,
@@ -23,6 +23,7 @@ from sros_tool.pki.keys import (
 )
 
 PASSPHRASE = "Öffne dich, Sesam"
+REPEATED = keys._P  # as it is before the tests begin, which need it less often
 KEYS: dict[str, PrivateKey] = {"EC": generate_key(), "RSA": rsa.generate_private_key(65537, 2048)}
 
 
@@ -41,7 +42,10 @@ def plain(key: PrivateKey) -> bytes:
 
 
 @pytest.mark.parametrize("key", KEYS.values(), ids=KEYS)
-def test_openssl_reads_an_encrypted_key(key: PrivateKey, tmp_path: Path) -> None:
+def test_openssl_reads_an_encrypted_key(
+    key: PrivateKey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keys, "_P", REPEATED)
     pem = key_pem(key, PASSPHRASE)
     right, wrong = (("-passin", f"pass:{word}") for word in (PASSPHRASE, "another"))
     read = openssl("pkcs8", "-topk8", "-nocrypt", "-outform", "DER", *right, data=pem)

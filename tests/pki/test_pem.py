@@ -18,7 +18,7 @@ from tests.dds.signer_rows import DAY, NOW, authority
 from tests.integration.libcrypto import Libcrypto, libcrypto
 from tests.support.children import LONG
 
-DRAWN = 20_000 if LONG else 500
+DRAWN = 20_000 if LONG else 250
 FIRST, SECOND = pem(authority("first")[0]), pem(authority("second")[0])
 KEY = key_pem(generate_key())
 BEGIN = b"-----BEGIN CERTIFICATE-----\n"

@@ -45,7 +45,7 @@ from tests.proof.brute_force import TOPICS, Finite, breaches, finite
 from tests.support.children import LONG
 
 NOW = datetime(2027, 1, 1, tzinfo=UTC)
-COUNT = int(os.environ.get("SROS_REQUIREMENTS", "20000" if LONG else "60"))
+COUNT = int(os.environ.get("SROS_REQUIREMENTS", "20000" if LONG else "30"))
 SEED = int(os.environ.get("SROS_REQUIREMENTS_SEED", "1"))
 OF_EACH = 40 if LONG else 10
 """Requirements for each policy: to try all names of a policy takes longer than to decide."""

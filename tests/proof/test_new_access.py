@@ -43,7 +43,7 @@ from tests.proof.drawn_sides import write as write_side
 from tests.support.children import LONG
 from tests.support.harness import policy_text, publish, sros
 
-PAIRS = int(os.environ.get("SROS_PAIRS", "5000" if LONG else "25"))
+PAIRS = int(os.environ.get("SROS_PAIRS", "5000" if LONG else "12"))
 SEED = int(os.environ.get("SROS_PAIRS_SEED", "1"))
 
 

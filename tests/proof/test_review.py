@@ -33,10 +33,11 @@ PERSON = {
 class Change:
     """A repository whose first commit is the base of a change."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, base: str = "") -> None:
         self.folder = folder
-        self.git("init", "--quiet", "--initial-branch", "main")
-        self.base = ""
+        self.base = base
+        if not base:
+            self.git("init", "--quiet", "--initial-branch", "main")
 
     def git(self, *words: str) -> str:
         nobody = {"GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_NOSYSTEM": "1"}
@@ -66,12 +67,19 @@ class Change:
         return sros("review", "--base", self.base, *words, cwd=self.folder)
 
 
-@pytest.fixture
-def change(tmp_path: Path) -> Change:
-    made = Change(tmp_path)
-    shutil.copytree(PROJECT / "policies/common", tmp_path / "common")
+@pytest.fixture(scope="module")
+def first_commit(tmp_path_factory: pytest.TempPathFactory) -> Change:
+    """A repository with a policy and its requirements; only to be copied."""
+    made = Change(tmp_path_factory.mktemp("change"))
+    shutil.copytree(PROJECT / "policies/common", made.folder / "common")
     made.commit({"robot.xml": policy_text(ROBOT), "robot.toml": ONLY})
     return made
+
+
+@pytest.fixture
+def change(first_commit: Change, tmp_path: Path) -> Change:
+    shutil.copytree(first_commit.folder, tmp_path, symlinks=True, dirs_exist_ok=True)
+    return Change(tmp_path, first_commit.base)
 
 
 # ── what is compared ───────────────────────────────────────────────────────────────────────
