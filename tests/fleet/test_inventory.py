@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from sros_tool.fleet.model import Fleet
 
 from sros_tool.errors import SrosError
 from sros_tool.fleet.fleet_file import parse_fleet, read_fleet
