@@ -14,11 +14,12 @@ from pathlib import Path
 import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.explain import asking
 from sros_tool.explain.log import LogFinding, explain_log
 from sros_tool.files import policies_dir
-from sros_tool.keystore import participant
 from sros_tool.keystore.ledger import Ledger
-from sros_tool.keystore.participant import LoadedEnclave, load_enclave
+from sros_tool.keystore.participant import LoadedEnclave, load_enclave_of
+from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import identity_of, load_certificate
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
@@ -819,14 +820,14 @@ def test_how_often_files_are_read_is_not_for_the_log_to_choose(
     (tmp_path / "log").write_text("".join(lines))
     read: list[str] = []
 
-    def opened(name: str, folder: Path, **more: object) -> LoadedEnclave:
+    def opened(opening: Keystore, name: str, *, at: datetime) -> LoadedEnclave:
         read.append(name)
-        return load_enclave(name, folder, **more)  # type: ignore[arg-type]
+        return load_enclave_of(opening, name, at=at)
 
     def refuse(_root: Path) -> Ledger:
         raise AssertionError("the ledger was read")
 
-    monkeypatch.setattr(participant, "load_enclave", opened)
+    monkeypatch.setattr(asking, "load_enclave_of", opened)
     monkeypatch.setattr("sros_tool.keystore.ledger.read_ledger", refuse)
     monkeypatch.setattr("sros_tool.keystore.missing.read_ledger", refuse)
     findings = json.loads(sros("explain", keystore, "--log", tmp_path / "log", "--json").out)
