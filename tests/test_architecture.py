@@ -223,7 +223,6 @@ def statements(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
 
 _KEYSTORE = "sros_tool.keystore"
 LEFT: dict[str, set[str]] = {
-    f"{_KEYSTORE}.ledger": {f"{_KEYSTORE}.authorities.authority", f"{_KEYSTORE}.of_ros2"},
     f"{_KEYSTORE}.of_ros2": {f"{_KEYSTORE}.lifecycle.update"},
 }
 """Imports inside functions, or for types, that still close a circle: no new ones."""

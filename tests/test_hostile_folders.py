@@ -182,11 +182,12 @@ def test_a_made_up_stage_moves_and_deletes_nothing(
 ) -> None:
     MADE_UP[name](stage(keystore), outside)
     before = snapshot(tmp_path)
-    for verb in (
+    verbs: list[Callable[[], object]] = [
         lambda: create_enclaves(keystore, ["/new"], now=NOW),
         lambda: renew(keystore, ["/a"], now=NOW),
         lambda: revoke(keystore, ["/a"], now=NOW),
-    ):
+    ]
+    for verb in verbs:
         with pytest.raises(KeystoreError):
             verb()
         assert snapshot(tmp_path) == before

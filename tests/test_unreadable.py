@@ -179,7 +179,7 @@ def test_a_link_to_enclaves_elsewhere_is_not_skipped(keystore: Path, tmp_path: P
     (keystore / "enclaves/a").unlink()
     (keystore / "enclaves/a").symlink_to("b")
     assert list_enclaves(keystore) == ("/b",)
-    assert renew(keystore, ["/b"], now=NOW).renewed == ("/b",)
+    assert renew(keystore, ["/b"], now=NOW).names("renewed") == ("/b",)
 
 
 @pytest.mark.parametrize("file", ["key.pem", "permissions.xml"])

@@ -23,7 +23,7 @@ from click.core import ParameterSource
 from sros_tool.cli.progress import paused
 from sros_tool.errors import DocumentError, PkiError, SrosError, UsageError
 from sros_tool.terminal import Coloured, ask_secret, echo, echo_lines, visible_json, visible_line
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import counted
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.authorities.keyring import Keyring
-    from sros_tool.keystore.issuing.zenoh import KeptZenoh
-    from sros_tool.keystore.transaction.stage import Change
     from sros_tool.policy.model import Policy
 
 
@@ -371,66 +369,6 @@ def print_notes(notes: Sequence[Note]) -> None:
     """Print notes on stderr."""
     for note in notes:
         echo(f"note [{note.id}]: {note.text}", err=True)
-
-
-def print_plan(root: Path, changes: Sequence[Change]) -> None:
-    """Print the changes that a dry run did not make."""
-    for change in changes:
-        echo(f"would {change.action} {root / change.path}")
-    if not changes:
-        echo("nothing would change")
-
-
-def print_closed(root: Path, changes: Sequence[Change]) -> None:
-    """Say on stderr what a first write did: keys closed to others, what was taken over on trust."""
-    if any(each.action == "adopt" for each in changes):
-        echo(
-            f"took over '{root}', which ros2/sros2 made: it has settings and a ledger from now on. "
-            "The certificates and permissions that were there, signed by its CA, are taken on "
-            "trust: nothing shows whether one of them was replaced or taken back before, and put "
-            "in again.",
-            err=True,
-        )
-    closed = [str(root / each.path) for each in changes if each.action == "close"]
-    if closed:
-        where = quote(str(root))
-        echo(
-            f"closed to other users, who could open them until now: {first_few(closed, 3)}. "
-            "Run the nodes as the owner of the keystore, or from an export of that user (`sros "
-            "distribute_key`). Replace keys that somebody may have copied: `sros renew "
-            f"{where} NAME --new-key --revoke-old` those of enclaves, `sros rotate_ca {where} "
-            "--next` those of CAs.",
-            err=True,
-        )
-
-
-_MAX_NAMES = 20
-"""Number of enclaves that a message names."""
-
-
-def print_remarks(remarks: Iterable[Note]) -> None:
-    """Print remarks on a result on stderr, each on a line."""
-    for remark in remarks:
-        echo(remark.text, err=True)
-
-
-def print_restart(
-    names: Sequence[str], zenoh: KeptZenoh | None = None, *, exported: bool = True
-) -> None:
-    """Print on stderr that the processes of the enclaves ``names`` have to be restarted.
-
-    ``zenoh`` says which of them on Zenoh.  With ``exported`` also that exports are out of date.
-    """
-    if not names:
-        return
-    number = counted(len(names), "enclave")
-    text = (
-        f"restart the processes of {number} for it to take effect: {first_few(names, _MAX_NAMES)}"
-    )
-    if zenoh and zenoh.files and set(zenoh.restart) != set(names):
-        text += f"; of those on Zenoh: {first_few(zenoh.restart, _MAX_NAMES) or 'none'}"
-    again = "; where they run from an export, export them again first" if exported else ""
-    echo(text + again, err=True)
 
 
 def check_output(output: Path, *, force: bool) -> None:

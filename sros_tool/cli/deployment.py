@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from sros_tool.cli.changed import print_changed, print_follow_up, print_plan
 from sros_tool.cli.common import (
     PATH,
     allow_refusal_option,
@@ -24,11 +26,8 @@ from sros_tool.cli.common import (
     moment_of,
     now,
     only_enclaves,
-    print_closed,
     print_json,
     print_notes,
-    print_plan,
-    print_restart,
     read_named,
     secrets,
     several_enclaves,
@@ -45,6 +44,8 @@ if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.keystore.delivery.answer import ImportedEnclave
+    from sros_tool.keystore.delivery.signing import Signed
     from sros_tool.policy.model import Policy
 
 _STREAM = Path("-")
@@ -407,9 +408,6 @@ def sign_request(
     one that the robot printed.
     """
     from sros_tool.keystore.delivery.signing import sign_request as sign
-    from sros_tool.keystore.layout import PERMISSIONS
-    from sros_tool.keystore.reader import load_ca_certificate
-    from sros_tool.pki.certificates import digest
     from sros_tool.runtime.variables import domain_from
 
     root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
@@ -454,32 +452,45 @@ def sign_request(
         allow_refusal=allow_refusal,
         dry_run=dry_run,
     )
-    if as_json:
-        from sros_tool.keystore.delivery.shown import shown_answer
+    _show_signed(signed, output, existed=existed, as_json=as_json)
 
-        more = () if stream else file_change(output, existed=existed)
-        print_json(shown_answer(root, signed, output, more, dry_run=dry_run))
-    elif dry_run:
-        print_plan(root, signed.changes)
-        if not stream:
-            echo(f"would {'replace' if existed else 'create'} {output}")
-    else:
-        if stream:
-            echo_bytes(signed.archive)
-        word = "renewed" if renew else "signed the request of"
-        echo(f"{word} enclave {signed.name} for the key {signed.key}", err=stream)
-        permissions_ca = load_ca_certificate(root, PERMISSIONS)
+
+def _show_signed(
+    signed: Signed, answer: Path | None, *, existed: bool = False, as_json: bool
+) -> None:
+    """Print what was done with signed requests; ``answer`` is the file for the robot."""
+    from sros_tool.pki.certificates import digest
+
+    stream = answer == _STREAM
+    if as_json:
+        from sros_tool.keystore.delivery.shown import shown_signed
+
+        more = file_change(answer, existed=existed) if answer and not stream else ()
+        print_changed(signed, shown_signed(signed, answer, more), restart=False)
+        return
+    if signed.dry_run:
+        print_plan(signed.root, signed.changes)
+        if answer and not stream:
+            echo(f"would {'replace' if existed else 'create'} {answer}")
+    elif stream:
+        echo_bytes(signed.archive)
+    for name, key in signed.keys.items() if not signed.dry_run else ():
+        outcome = signed.outcomes[name]
+        if outcome == "kept":
+            echo(f"the key of enclave {name} has a certificate already", err=True)
+            continue
+        word = "renewed" if outcome == "renewed" else "signed the request of"
+        echo(f"{word} enclave {name} for the key {key}", err=stream)
+    if answer and not signed.dry_run:
         echo(f"  the robot will trust {_named(signed.identity_ca)}", err=stream)
-        if permissions_ca != signed.identity_ca:
-            echo(f"  and {_named(permissions_ca)}", err=stream)
+        if signed.permissions_ca != signed.identity_ca:
+            echo(f"  and {_named(signed.permissions_ca)}", err=stream)
         if not stream:
             echo(
-                f"  send '{output}' to the robot: sros import {output.name} DIR --ca "
-                f"{digest(permissions_ca)}"
+                f"  send '{answer}' to the robot: sros import {answer.name} DIR --ca "
+                f"{digest(signed.permissions_ca)}"
             )
-    if not dry_run:
-        print_closed(root, signed.changes)
-    print_notes(signed.notes)
+    print_follow_up(signed, restart=False)
 
 
 def _policy(file: Path | None, fleet_file: Path | None) -> Policy | FleetPolicy | None:
@@ -526,22 +537,7 @@ def _certify(
         allow_refusal=allow_refusal,
         dry_run=dry_run,
     )
-    if as_json:
-        from sros_tool.keystore.delivery.shown import shown_certified
-
-        print_json(shown_certified(root, done, renew=renew, dry_run=dry_run))
-    elif dry_run:
-        print_plan(root, done.changes)
-    else:
-        for name, key in done.keys.items():
-            if name in done.kept:
-                echo(f"the key of enclave {name} has a certificate already", err=True)
-            else:
-                word = "renewed" if renew else "signed the request of"
-                echo(f"{word} enclave {name} for the key {key}")
-    if not dry_run:
-        print_closed(root, done.changes)
-    print_notes(done.notes)
+    _show_signed(done, None, as_json=as_json)
 
 
 @click.command(
@@ -600,33 +596,31 @@ def import_verb(
         allow_refusal=allow_refusal,
         dry_run=dry_run,
     )
-    if not dry_run:
-        print_closed(folder, done.changes)
+    shown = None
     if as_json:
         from sros_tool.keystore.delivery.shown import shown_import
 
-        print_json(shown_import(folder, done, pinned=bool(pinned), dry_run=dry_run))
+        shown = shown_import(done, pinned=bool(pinned))
+    there = f"enclave {done.name} in '{folder}' is already up to date"
+    if as_json or dry_run or not done.changes:
+        told = () if as_json or dry_run else (there,)
+        print_changed(done, shown, told=told, restart=False)
         return
-    if dry_run:
-        print_plan(folder, done.changes)
-        return
-    if not done.changes:
-        echo(f"enclave {done.name} in '{folder}' is already up to date", err=True)
-        return
+    print_changed(done, None, _imported_lines(done, pinned=bool(pinned)), exported=False)
+
+
+def _imported_lines(done: ImportedEnclave, *, pinned: bool) -> Iterator[str]:
     from sros_tool.validity import iso
 
-    echo(f"imported enclave {done.name}, which can run until {iso(done.until)}")
-    echo(f"  it trusts {_named(done.identity_ca)}")
+    yield f"imported enclave {done.name}, which can run until {iso(done.until)}"
+    yield f"  it trusts {_named(done.identity_ca)}"
     if done.permissions_ca != done.identity_ca:
-        echo(f"  and {_named(done.permissions_ca)}")
+        yield f"  and {_named(done.permissions_ca)}"
     if done.first and not pinned:
-        echo(
+        yield (
             "  compare both with the output of sign_request, or use --ca: otherwise they are "
             "not verified"
         )
-    print_notes(done.notes)
-    if done.restart_zenoh:
-        print_restart((done.name,), exported=False)
 
 
 def _named(certificate: x509.Certificate) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
 
 import click
 
+from sros_tool.cli.changed import print_changed, rights_lines, shown_names
 from sros_tool.cli.common import (
     PATH,
     SeveralValues,
@@ -27,12 +28,7 @@ from sros_tool.cli.common import (
     now,
     only_enclaves,
     policy_for,
-    print_closed,
     print_json,
-    print_notes,
-    print_plan,
-    print_remarks,
-    print_restart,
     print_signed,
     ros_domain,
     several_enclaves,
@@ -46,7 +42,6 @@ from sros_tool.wording import counted, first_few
 if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.keystore.lifecycle.create import Creation
-    from sros_tool.keystore.lifecycle.replaced import ReplacedRights
     from sros_tool.keystore.lifecycle.update import KeystoreUpdate
 
 
@@ -92,7 +87,7 @@ def create_enclave(words: tuple[str, ...], key: str, dry_run: bool, as_json: boo
             dry_run=dry_run,
             progress=step,
         )
-    _show(result, dry_run, as_json)
+    _show(result, as_json)
 
 
 _revoke_old_option = click.option(
@@ -162,7 +157,7 @@ def create_permission(
         allow_refusal=allow_refusal,
         dry_run=dry_run,
     )
-    _show(result, dry_run, as_json, [policy])
+    _show(result, as_json, [policy])
 
 
 _ORDER = "Write them in this order: `sros create_permission ROOT NAME... POLICY_FILE`."
@@ -287,77 +282,67 @@ def generate_artifacts(
     if result.new_keystore and not dry_run:
         echo(f"'{root}' is not a valid keystore, creating new keystore", err=True)
         if not as_json:
-            _print_new_keystore(root, template, result.domains)
-    _show(result, dry_run, as_json, policies)
+            for line in _new_keystore_lines(result):
+                echo(line)
+    _show(result, as_json, policies)
     if result.new_keystore:
         _print_open_rights(root, template)
 
 
 def _show(
     result: Creation,
-    dry_run: bool,
     as_json: bool,
     policies: Sequence[Policy | FleetPolicy] = (),
 ) -> None:
     from sros_tool.checks.signed import as_note, signed_findings
-    from sros_tool.keystore.layout import FLEET
     from sros_tool.keystore.lifecycle.replaced import lasting_text
 
     signed = {*result.created, *result.changed, *result.kept}
     found = signed_findings(policies, signed, os.environ.get("ROS_DISTRO", ""))
+    shown = None
     if as_json:
-        from sros_tool.keystore.lifecycle.shown import shown_creation
+        from sros_tool.keystore.lifecycle.shown import EnclaveCreation
+        from sros_tool.keystore.lifecycle.shown import shown as json_form
 
-        print_json(shown_creation(result, [as_note(each) for each in found], dry_run=dry_run))
-    elif dry_run:
-        print_plan(result.root, result.changes)
-    else:
-        same = {each.enclave for each in result.replaced if not (each.loses() or each.gains())}
-        again = [name for name in result.changed if name in same]
-        for names, text in (
-            (result.created, "created enclave {}"),
-            (
-                [name for name in result.changed if name not in same],
-                "replaced the permissions of enclave {}",
-            ),
-            (again, "signed the permissions of enclave {} again, with the same rights"),
-            (result.completed, "completed enclave {}"),
-        ):
-            for name in names:
-                echo(text.format(name))
-        if len(result.created) > _MANY_CREATED:
-            whose = "--robot NAME" if (result.root / FLEET).exists() else "NAME..."
-            echo(
-                f"created {len(result.created)} enclaves; to send them: `sros distribute_key "
-                f"{quote(str(result.root))} {whose} FOLDER`",
-                err=True,
-            )
-    if result.kept:
-        number = counted(len(result.kept), "enclave")
-        echo(f"unchanged: {number}: {first_few(result.kept, _NAMES_SHOWN)}", err=True)
-    if not dry_run:
-        print_closed(result.root, result.changes)
-    _show_rights(result.replaced, dry_run, err=True)  # stdout is that of ros2/sros2
-    for each in result.replaced:
-        if text := lasting_text(result.root, each):
-            echo(text, err=True)
-    print_restart(result.restart, result.zenoh)
-    print_remarks(result.remarks)
-    print_notes(result.notes)
+        shown = json_form(result, EnclaveCreation, notes=[as_note(each) for each in found])
+    lasting = (lasting_text(result.root, rights) for rights in result.rights)
+    print_changed(
+        result,
+        shown,
+        _created_lines(result),
+        told=_told_of(result, as_json),
+        after=filter(None, lasting),
+    )
     if not as_json:
-        print_signed(found, [each.file for each in policies])
+        print_signed(found, [policy.file for policy in policies])
 
 
-def _show_rights(replaced: Sequence[ReplacedRights], dry_run: bool, *, err: bool = False) -> None:
-    """Print what enclaves lose and gain, on stdout or with ``err`` on stderr."""
-    together: dict[tuple[str, str], list[str]] = {}
-    for each in replaced:
-        for verb, text in (("lose", each.loses()), ("gain", each.gains())):
-            if text:
-                together.setdefault((verb, text), []).append(each.enclave)
-    for (verb, text), names in together.items():
-        word = f"would {verb}" if dry_run else verb if len(names) > 1 else f"{verb}s"
-        echo(f"{first_few(names, _NAMES_SHOWN)} {word}: {text}", err=err)
+def _created_lines(result: Creation) -> Iterator[str]:
+    """Yield what was done with each enclave."""
+    same = {rights.enclave for rights in result.rights if not (rights.loses() or rights.gains())}
+    again = [name for name in result.changed if name in same]
+    others = [name for name in result.changed if name not in same]
+    for names, text in (
+        (result.created, "created enclave {}"),
+        (others, "replaced the permissions of enclave {}"),
+        (again, "signed the permissions of enclave {} again, with the same rights"),
+        (result.completed, "completed enclave {}"),
+    ):
+        yield from map(text.format, names)
+
+
+def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
+    """Yield how to send many new enclaves, and which enclaves did not change."""
+    from sros_tool.keystore.layout import FLEET
+
+    if len(result.created) > _MANY_CREATED and not (as_json or result.dry_run):
+        whose = "--robot NAME" if (result.root / FLEET).exists() else "NAME..."
+        yield (
+            f"created {len(result.created)} enclaves; to send them: `sros distribute_key "
+            f"{quote(str(result.root))} {whose} FOLDER`"
+        )
+    if result.kept:
+        yield f"unchanged: {counted(len(result.kept), 'enclave')}: {shown_names(result.kept)}"
 
 
 @click.command(
@@ -412,7 +397,6 @@ def list_enclaves(
 
 
 if TYPE_CHECKING:
-    from sros_tool.dds.domains import DomainSet
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.template import NamedValues, Template
     from sros_tool.policy.model import Policy
@@ -515,16 +499,12 @@ def create_keystore(
         imported=imported,
         dry_run=dry_run,
     )
-    print_notes(result.notes)
+    shown = None
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_keystore
 
-        notes = _open_rights(root, template)
-        print_json(shown_keystore(result, template, imported, notes, dry_run=dry_run))
-    elif dry_run:
-        print_plan(root, result.changes)
-    else:
-        _print_new_keystore(root, template, result.domains, frozenset(imported))
+        shown = shown_keystore(result, imported, _open_rights(root, template))
+    print_changed(result, shown, _new_keystore_lines(result, frozenset(imported)))
     if not dry_run:
         _print_open_rights(root, template)
 
@@ -567,27 +547,26 @@ def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
     }
 
 
-def _print_new_keystore(
-    root: Path, template: Template, domains: DomainSet, imported: frozenset[str] = frozenset()
-) -> None:
-    """Print the new keystore's domains, template, CAs, validity and CA fingerprints."""
+def _new_keystore_lines(result: Creation, imported: frozenset[str] = frozenset()) -> Iterator[str]:
+    """Yield the new keystore's domains, template, CAs, validity and CA fingerprints."""
     from sros_tool.keystore.layout import ROLES
     from sros_tool.keystore.reader import load_ca_certificate
     from sros_tool.pki.certificates import digest, validity_of
     from sros_tool.validity import iso, span_text
 
+    root, template = result.root, result.template
     layout = (
         "identity CA and permissions CA: separate"
         if template.separate_authorities
         else "one CA for identity and permissions"
     )
-    echo(f"created keystore '{root}' for domain {domains}")
-    echo(f"  template {template.name}: {template.description}")
+    yield f"created keystore '{root}' for domain {result.domains}"
+    yield f"  template {template.name}: {template.description}"
     roles = ROLES if template.separate_authorities else ROLES[:1]
     if not imported.issuperset(roles):
         new = "a new one " if imported else ""
         layout += f", {new}valid for {span_text(template.authority_validity)}"
-    echo(
+    yield (
         f"  {layout}; certificates "
         f"{span_text(template.certificate_validity)}, permissions "
         f"{span_text(template.permissions_validity)}"
@@ -596,9 +575,9 @@ def _print_new_keystore(
     for role in roles:
         name = f"{role} CA" if template.separate_authorities else "CA"
         certificate = load_ca_certificate(root, role)
-        echo(f"  {name} SHA-256 {digest(certificate)}")
+        yield f"  {name} SHA-256 {digest(certificate)}"
         if role in imported:
-            echo(f"    imported, valid until {iso(validity_of(certificate).not_after)}")
+            yield f"    imported, valid until {iso(validity_of(certificate).not_after)}"
 
 
 def _print_open_rights(root: Path, template: Template) -> None:
@@ -736,12 +715,12 @@ def update_keystore(
         raise UsageError("give only one of --template, --take-edits and --discard-edits")
     chosen = (template_name, values, rules, dropped, domain, take_edits, discard_edits)
     if trust_records:
-        from sros_tool.keystore.lifecycle.records import trust_records as trust
+        from sros_tool.keystore.lifecycle.update import trust_records as trust
 
         if next_stage or any(each not in (None, (), False) for each in chosen):
             raise UsageError("--trust-records changes nothing else", "", "Give it alone.")
         update = trust(root, now=now(), keyring=keyring(), dry_run=dry_run)
-        _show_update(update, (), "", dry_run=dry_run, as_json=as_json)
+        _show_update(update, (), "", as_json)
         return 0
     if not any(each not in (None, (), False) for each in chosen):
         again = f"sros update_keystore {quote(str(root))} --template production --next"
@@ -810,8 +789,8 @@ def update_keystore(
     flags += ("--revoke-old",) * (revoke_old and domain is not None)
     words = [each for name, given in options.items() for one in given for each in (name, one)]
     again = " ".join(map(quote, ("sros", "update_keystore", str(root), *words, *flags)))
-    _show_update(update, undone, again, dry_run=dry_run, as_json=as_json)
-    refused = bool(update.looser()) and not allow_looser
+    _show_update(update, undone, again, as_json)
+    refused = bool(update.looser) and not allow_looser
     if refused:  # only a dry run comes here
         echo("this would be refused: it needs --allow-looser", err=True)
     return 1 if refused else 0
@@ -846,62 +825,78 @@ def _named_rule(text: str) -> NamedValues:
     return NamedValues(kind, name, tuple(_key_and_value(each) for each in words[2:]))
 
 
-def _show_update(
-    update: KeystoreUpdate, undone: Sequence[str], again: str, *, dry_run: bool, as_json: bool
-) -> None:
+def _show_update(update: KeystoreUpdate, undone: Sequence[str], again: str, as_json: bool) -> None:
     """Print an update.
 
     ``undone`` are clauses about the edits by hand that it undoes, ``again`` is the command of the
     stage that is left.
     """
-    from sros_tool.validity import iso
-
     if as_json:
-        from sros_tool.keystore.lifecycle.shown import shown_update
+        from sros_tool.keystore.lifecycle.shown import TemplateChange, UpdatedKeystore, shown
 
-        print_json(shown_update(update, undone, dry_run=dry_run))
+        value = shown(
+            update,
+            UpdatedKeystore,
+            needs_allow_looser=bool(update.looser),
+            template=TemplateChange(update.before, update.after),
+            notes=[Note("keystore.edit-undone", clause) for clause in undone],
+        )
+        print_json(value)
         return
     if not (update.done or update.changes):
-        echo("nothing is left to do", err=True)
-        print_remarks(update.remarks)
+        for line in ("nothing is left to do", *(remark.text for remark in update.remarks)):
+            echo(line, err=True)
         return
+    for line in _update_lines(update, undone):
+        echo(line)
+    print_changed(
+        update,
+        lines=_issued_lines(update),
+        told=_replaced_lines(update),
+        rights=False,
+        exported=False,
+        restart=not update.dry_run,
+    )
+    if update.left:
+        echo(
+            f"stage {update.done[-1]} {'would be' if update.dry_run else 'is'} done; left: "
+            f"{', '.join(update.left)}. Once the processes were restarted, run `{again}`.",
+            err=True,
+        )
+
+
+def _update_lines(update: KeystoreUpdate, undone: Sequence[str]) -> Iterator[str]:
+    """Yield what changes in the settings and rights of a keystore."""
     template = f": template {update.before} -> {update.after}"
-    verb = "would update" if dry_run else "updated"
-    named = template if update.before != update.after else ""
-    echo(f"{verb} keystore '{update.root}'{named}")
+    verb = "would update" if update.dry_run else "updated"
+    yield f"{verb} keystore '{update.root}'{template if update.before != update.after else ''}"
     for clause in undone:
-        echo(f"  {'undone':7}  {clause}")
+        yield f"  {'undone':7}  {clause}"
     for change in update.settings:
-        echo(f"  {change.effect:7}  {change}")
-    _show_rights(update.rights, dry_run)
-    for names, what in ((update.renewed, "renewed"), (update.signed, "signed the permissions of")):
-        if names and not dry_run:
-            echo(f"{what} {first_few(names, _NAMES_SHOWN)}")
-    if dry_run:
-        print_plan(update.root, update.changes)
-    if not dry_run:
-        print_closed(update.root, update.changes)
+        yield f"  {change.effect:7}  {change}"
+    yield from rights_lines(update.rights, dry_run=update.dry_run)
+
+
+def _issued_lines(update: KeystoreUpdate) -> Iterator[str]:
+    for outcome, what in (("renewed", "renewed"), ("signed", "signed the permissions of")):
+        if names := update.names(outcome):
+            yield f"{what} {shown_names(names)}"
+
+
+def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:
+    """Yield until when what an update replaced works, and how to end that."""
+    from sros_tool.validity import iso
+
     if update.works_until:
-        names = (*update.renewed, *update.signed)
+        names = tuple(update.outcomes)
         shown = " ".join(map(quote, names)) if len(names) <= _NAMES_SHOWN else "NAME..."
         ends = f"run `sros renew {quote(str(update.root))} {shown} --revoke-old`"
         if update.left:
             ends = f"add --revoke-old to the stage {update.left[-1]}, or {ends}"
-        echo(
+        yield (
             "the replaced certificates and permissions, with the rights that they had, work until "
-            f"{iso(update.works_until)} for whoever kept them with the key. To end it, {ends}.",
-            err=True,
+            f"{iso(update.works_until)} for whoever kept them with the key. To end it, {ends}."
         )
-    if not dry_run:
-        print_restart(update.restart, update.zenoh, exported=False)
-    print_remarks(update.remarks)
-    if update.left:
-        echo(
-            f"stage {update.done[-1]} {'would be' if dry_run else 'is'} done; left: "
-            f"{', '.join(update.left)}. Once the processes were restarted, run `{again}`.",
-            err=True,
-        )
-    print_notes(update.notes)
 
 
 _NAMES_SHOWN = 5

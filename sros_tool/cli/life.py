@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from sros_tool.cli.changed import print_changed, print_follow_up, print_plan
 from sros_tool.cli.common import (
     PATH,
     allow_refusal_option,
@@ -22,12 +23,7 @@ from sros_tool.cli.common import (
     keyring,
     keystore_from_environment,
     now,
-    print_closed,
     print_json,
-    print_notes,
-    print_plan,
-    print_remarks,
-    print_restart,
     several_enclaves,
     split_root,
 )
@@ -37,7 +33,7 @@ from sros_tool.terminal import echo
 
 if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
-    from sros_tool.keystore.lifecycle.renew import Renewal
+    from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.pki.crl import RevocationList
 
 
@@ -118,42 +114,39 @@ def renew(
             dry_run=dry_run,
             progress=step,
         )
+    shown = None
     if as_json:
-        from sros_tool.keystore.lifecycle.shown import shown_renewal
+        from sros_tool.keystore.lifecycle.shown import RenewedEnclaves
+        from sros_tool.keystore.lifecycle.shown import shown as json_form
 
-        print_json(shown_renewal(result, dry_run=dry_run))
-    elif dry_run:
-        print_plan(root, result.changes)
-    else:
-        for name in result.renewed:
-            echo(f"renewed enclave {name}")
-    if not dry_run:
-        print_closed(root, result.changes)
-    if not result.renewed and not dry_run:
-        echo("no enclave needs to be renewed", err=True)
-    print_notes(result.notes)
-    _print_replaced(result)
+        shown = json_form(result, RenewedEnclaves)
+    print_changed(
+        result,
+        shown,
+        (f"renewed enclave {name}" for name in result.outcomes),
+        told=_replaced_lines(result),
+    )
 
 
-def _print_replaced(result: Renewal) -> None:
+def _replaced_lines(result: Changed) -> Iterator[str]:
+    """Yield until when replaced certificates work, and who still has them."""
     from sros_tool.validity import iso
 
+    if not result.outcomes and not result.dry_run:
+        yield "no enclave needs to be renewed"
     if result.works_until:
         end = iso(result.works_until)
         what = (
             f"the replaced certificate works until {end}"
-            if len(result.renewed) == 1
+            if len(result.outcomes) == 1
             else f"the replaced certificates work until {end} at the latest"
         )
-        echo(f"{what}, unless revoked: see --revoke-old", err=True)
-    if result.renewed and not result.restart:
-        echo(
+        yield f"{what}, unless revoked: see --revoke-old"
+    if result.outcomes and not result.restart:
+        yield (
             "exports and running processes still have the earlier certificates and permissions: "
-            "export again, and restart, before those expire",
-            err=True,
+            "export again, and restart, before those expire"
         )
-    print_restart(result.restart, result.zenoh)
-    print_remarks(result.remarks)
 
 
 def _complete_reason(
@@ -235,19 +228,14 @@ def revoke(
             dry_run=dry_run,
         )
     result = replace(result, remarks=(*selection_notes, *result.remarks))
+    shown = None
     if as_json:
-        from sros_tool.keystore.lifecycle.shown import shown_revocation
+        from sros_tool.keystore.lifecycle.shown import RevokedEnclave, RevokedEnclaves
+        from sros_tool.keystore.lifecycle.shown import shown as json_form
 
-        print_json(shown_revocation(result, reason_text, dry_run=dry_run))
-    elif dry_run:
-        print_plan(root, result.changes)
-    else:
-        for name in result.revoked:
-            echo(f"revoked enclave {name}")
-    if not dry_run:
-        print_closed(root, result.changes)
-    print_restart(result.restart, result.zenoh)
-    print_remarks(result.remarks)
+        enclaves = list(map(RevokedEnclave, result.outcomes))
+        shown = json_form(result, RevokedEnclaves, enclaves=enclaves)
+    print_changed(result, shown, (f"revoked enclave {name}" for name in result.outcomes))
 
 
 @click.command(
@@ -292,10 +280,7 @@ def crl(
         if dry_run and not as_json:
             print_plan(root, result.changes)
             return 0
-        if not dry_run:
-            print_closed(root, result.changes)
-            print_restart(result.restart)
-        print_remarks(result.remarks)
+        print_follow_up(result, restart=not dry_run)
     lists = read_lists(root)
     soon = bool(lists) and min(each.next_update for each in lists) - now() < timedelta(days=30)
     if as_json:
@@ -483,25 +468,26 @@ def rotate_ca(
                 dry_run=dry_run,
                 progress=tick,
             )
+    shown = None
     if as_json:
-        from sros_tool.keystore.lifecycle.shown import shown_step
+        from sros_tool.keystore.lifecycle.shown import RotationChange
+        from sros_tool.keystore.lifecycle.shown import shown as json_form
 
-        remarks = () if dry_run else rotation_status(root, now=now()).remarks
-        print_json(shown_step(step, remarks, dry_run=dry_run))
-    elif dry_run:
-        print_plan(root, step.changes)
-    else:
-        _print_step(step, rotation_status(root, now=now()), together=finish, same_key=same_key)
-    if not dry_run:
-        print_closed(root, step.changes)
-    if step.cut_off:
-        verb = "would be" if dry_run else "are"
-        echo(
-            f"cut off: {', '.join(step.cut_off)} {verb} unable to talk to robots with the files of "
-            "this stage until they get them, too",
-            err=True,
+        shown = json_form(
+            step,
+            RotationChange,
+            authorities=step.files,
+            old_keys_elsewhere=step.kept_elsewhere,
+            remarks=() if dry_run else rotation_status(root, now=now()).remarks,
         )
-    print_notes(step.notes)
+    elif not dry_run:
+        _print_step(step, rotation_status(root, now=now()), together=finish, same_key=same_key)
+    verb = "would be" if dry_run else "are"
+    cut_off = (
+        f"cut off: {', '.join(step.cut_off)} {verb} unable to talk to robots with the files of "
+        "this stage until they get them, too"
+    )
+    print_changed(step, shown, after=[cut_off] if step.cut_off else (), restart=False)
 
 
 def _print_step(
@@ -544,14 +530,16 @@ def _print_step(
 
 def _unconfirmed(root: Path) -> tuple[str, ...] | str:
     """Return the robots that have not confirmed the stage of a rotation, or why that is unknown."""
-    from sros_tool.keystore.lifecycle.rotation.confirmed import robots_cut_off
+    from sros_tool.keystore.lifecycle.rotation.stages import robots_cut_off
     from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+    from sros_tool.keystore.reader import Keystore
 
-    rotation = read_rotation(root)
+    keystore = Keystore(root)
+    rotation = read_rotation(keystore)
     if rotation.stage is RotationStage.NONE:
         return ()
     try:
-        return robots_cut_off(root, rotation, rotation.next_stage())
+        return robots_cut_off(keystore, rotation, rotation.next_stage())
     except SrosError as error:
         return error.what
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from sros_tool.cli.changed import print_follow_up, print_plan
 from sros_tool.cli.common import (
     PATH,
     check_output,
@@ -20,11 +21,8 @@ from sros_tool.cli.common import (
     keystore_from_environment,
     now,
     output_option,
-    print_closed,
     print_json,
     print_notes,
-    print_plan,
-    print_restart,
     save,
 )
 from sros_tool.cli.progress import progress
@@ -154,7 +152,7 @@ def zenoh(
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_zenoh
 
-        print_json(shown_zenoh(result, network, changed, dry_run=dry_run or only_check))
+        print_json(shown_zenoh(result, network, changed))
     elif dry_run and not only_check:
         print_plan(root, result.changes)
     else:
@@ -166,10 +164,7 @@ def zenoh(
             echo(f"{word} {root / path}")
     if not result.changes:
         echo("the files of Zenoh are up to date", err=True)
-    if not (dry_run or only_check):
-        print_closed(root, result.changes)
-        print_restart(result.restart)
-    print_notes(result.notes)
+    print_follow_up(result, restart=not (dry_run or only_check))
     if only_check and result.changes:
         raise SystemExit(1)
 

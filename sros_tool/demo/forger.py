@@ -51,7 +51,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.reader import load_settings
+from sros_tool.keystore.reader import Keystore, load_settings
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, pem, validity_of
@@ -115,7 +115,7 @@ class KeystoreCopy:
         """
         keyring = IN_KEYSTORE if root else self.keyring
         root = root or self.root
-        return load_authorities(root, load_settings(root), keyring, self.now)
+        return load_authorities(Keystore(root), load_settings(root), keyring, self.now)
 
     def put(self, part: str, name: str, data: bytes) -> None:
         """Replace a file of an enclave; a link is replaced, not followed."""

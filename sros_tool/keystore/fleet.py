@@ -160,13 +160,16 @@ class EnclaveDomains:
 
 
 def write_fleet(
-    transaction: Transaction, fleet: Fleet, patterns: Collection[str], now: datetime
+    transaction: Transaction,
+    keystore: Keystore,
+    fleet: Fleet,
+    patterns: Collection[str],
+    now: datetime,
 ) -> tuple[Fleet, tuple[Entry, ...]]:
     """Stage ``fleet`` as that of the keystore, if it is another; return it, and ledger entries.
 
     It gets the paths of enclaves that it names itself, that the keystore had, and ``patterns``.
     """
-    keystore = Keystore(transaction.root)
     before = load_fleet(keystore)
     known = (before.enclaves if before else (), fleet.enclaves, patterns)
     paths = dict.fromkeys(sorted(each for paths in known for each in paths))

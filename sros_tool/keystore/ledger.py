@@ -43,7 +43,6 @@ from sros_tool.validity import Window, iso
 from sros_tool.xml import open_at_once, read_bytes
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.authorities.authority import Authority
     from sros_tool.keystore.transaction.transaction import Transaction
 
 GAP = "gap"
@@ -652,24 +651,16 @@ def _verify(signed: smime.SignedDocument, authorities: Sequence[x509.Certificate
 def append(
     transaction: Transaction,
     entries: Collection[Entry],
-    authority: Authority,
+    sign: Callable[[bytes, str], bytes],
     now: datetime,
-    file: LedgerFile | None = None,
+    file: LedgerFile,
 ) -> None:
-    """Stage the ledger with ``entries`` added at its end, and its head, signed by ``authority``.
+    """Stage the ledger with ``entries`` added at its end, and its head.
 
-    ``file`` is the ledger as it was read under the lock; without it, it is read here.
-
-    What is wrong with the present ledger is recorded first, so that the new head hides nothing.
-    Before the first entry in a keystore of ros2/sros2 stands what is there already.
+    ``sign`` signs the head with a CA, as `Authority.sign` does.  ``file`` is the ledger as it was
+    read under the lock.  What is wrong with it is recorded first, so that the new head hides
+    nothing.
     """
-    from sros_tool.keystore.of_ros2 import take_over  # only writing needs it
-
-    if not entries:
-        return
-    entries = take_over(transaction, now, entries)
-    root, follow = transaction.root, transaction.dry_run
-    file = file or LedgerFile(root, lambda: _authorities(root), follow_link=follow)
     present = file.end()
     gaps = (Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded)
     links = _Links(chain(gaps, entries), present.previous)
@@ -684,7 +675,7 @@ def append(
         pass
     lines = present.ledger.lines + links.count
     head = f"sros ledger 1\nlines {lines}\nsha256 {links.previous}\n".encode()
-    transaction.write(LEDGER_HEAD, authority.sign(head, "the head of the ledger"))
+    transaction.write(LEDGER_HEAD, sign(head, "the head of the ledger"))
 
 
 class _Links:

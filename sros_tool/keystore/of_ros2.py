@@ -60,19 +60,21 @@ def is_of_ros2(root: Path | Keystore) -> bool:
     return False
 
 
-def take_over(transaction: Transaction, now: datetime, entries: Iterable[Entry]) -> list[Entry]:
+def take_over(
+    transaction: Transaction, keystore: Keystore, now: datetime, entries: Iterable[Entry]
+) -> list[Entry]:
     """Return ``entries``, after those of what ros2/sros2 left in a keystore; stage its settings.
 
     Only certificates and permissions that the CAs of the keystore signed are recorded.  For a
     keystore of sros, the entries are returned as they are.
     """
     added = list(entries)
-    if not is_of_ros2(transaction.root):
+    if not is_of_ros2(keystore):
         return added
-    before = list(_present(Keystore(transaction.root), transaction.enclaves, now))
+    before = list(_present(keystore, transaction.enclaves, now))
     transaction.adopt()
     if not any(each.what == "settings" for each in added):
-        before += _settings(transaction, now)
+        before += _settings(transaction, keystore, now)
     return [*before, *added]
 
 
@@ -96,10 +98,10 @@ def _present(keystore: Keystore, names: Iterable[str], now: datetime) -> Iterato
             yield replace(entry, reason=_ADOPTED)
 
 
-def _settings(transaction: Transaction, now: datetime) -> Iterator[Entry]:
+def _settings(transaction: Transaction, keystore: Keystore, now: datetime) -> Iterator[Entry]:
     from sros_tool.keystore.lifecycle.update import present_settings
     from sros_tool.keystore.settings import write_settings
 
-    present = present_settings(transaction.root)
+    present = present_settings(keystore)
     if protection_for(present.governance):  # else settings would say another protection
         yield write_settings(transaction, present.settings, now)

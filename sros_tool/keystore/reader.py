@@ -488,7 +488,7 @@ class Keystore:
         """
         path = self.folder(name) / PERMISSIONS_FILE
         return self.once(
-            ("grant", name, subject), lambda: read_signed_grant(path, subject, self.files)
+            ("grant", name, subject), lambda: _read_signed_grant(path, subject, self.files)
         )
 
 
@@ -524,11 +524,6 @@ def as_keystore(keystore: Path | Keystore) -> Keystore:
 def load_settings(root: Path) -> Template:
     """Return `Keystore.template` of a keystore that is opened for that alone."""
     return Keystore(root).template
-
-
-def load_governance(root: Path, authority: x509.Certificate) -> Governance:
-    """Return `Keystore.governance_by` of a keystore that is opened for that alone."""
-    return Keystore(root).governance_by(authority)
 
 
 def governance_of(root: Path) -> Governance:
@@ -567,24 +562,9 @@ def authority_files(root: Path) -> Mapping[str, tuple[str, ...]]:
     return Keystore(root).authority_files
 
 
-def identity_file(root: Path) -> str | None:
-    """Return `Keystore.identity_file` of a keystore that is opened for that alone."""
-    return Keystore(root).identity_file
-
-
 def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
     """Return `Keystore.certificates_of` of a keystore that is opened for that alone."""
     return Keystore(root).certificates_of(file)
-
-
-def embedded_crl(root: Path, file: str) -> RevocationList | None:
-    """Return `Keystore.embedded_list` of a keystore that is opened for that alone."""
-    return Keystore(root).embedded_list(file)
-
-
-def read_crl(root: Path) -> RevocationList | None:
-    """Return `Keystore.revocation_list` of a keystore that is opened for that alone."""
-    return Keystore(root).revocation_list
 
 
 def read_lists(root: Path) -> tuple[RevocationList, ...]:
@@ -608,7 +588,7 @@ class SignedGrant:
     grant: Grant | None
 
 
-def read_signed_grant(path: Path, subject: str, files: FilesReadOnce | None = None) -> SignedGrant:
+def _read_signed_grant(path: Path, subject: str, files: FilesReadOnce | None = None) -> SignedGrant:
     """Read a ``permissions.p7s`` and its grant to ``subject``, without verifying its signature.
 
     Raises:

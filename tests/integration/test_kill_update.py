@@ -13,7 +13,7 @@ from sros_tool.keystore.history import history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.update import present_settings, update_keystore
-from sros_tool.keystore.reader import authority_files, open_enclave, read_crl
+from sros_tool.keystore.reader import Keystore, authority_files, open_enclave
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child
@@ -48,7 +48,7 @@ def see(root: Path) -> State:
         assert state.grant
         days = (state.grant.validity.not_after - LATER).days + 1
         enclaves.append((len(state.certificate.subject.rdns), days))
-    present, crl = present_settings(root), read_crl(root)
+    present, crl = present_settings(root), Keystore(root).revocation_list
     assert present.written
     rtps = present.governance.domain_access_rules[0].rtps_protection_kind
     return present.written.name, rtps, tuple(enclaves), crl.number if crl else 0

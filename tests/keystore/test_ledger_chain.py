@@ -20,7 +20,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
-from sros_tool.keystore.reader import read_crl
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
@@ -56,7 +56,7 @@ def put(root: Path, lines: list[bytes]) -> None:
 
 
 def revoked(root: Path) -> set[int]:
-    found = read_crl(root)
+    found = Keystore(root).revocation_list
     return {each.serial for each in found.revoked} if found else set()
 
 

@@ -13,7 +13,7 @@ from sros_tool.keystore.layout import LEDGER, enclave_path
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.reader import read_crl
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from tests.support.harness import certificate
 
@@ -22,7 +22,7 @@ DAY = timedelta(days=1)
 
 
 def listed(root: Path) -> set[int]:
-    crl = read_crl(root)
+    crl = Keystore(root).revocation_list
     assert crl
     return {each.serial for each in crl.revoked}
 

@@ -18,7 +18,7 @@ from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.reader import open_enclave, read_crl
+from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
@@ -69,7 +69,7 @@ def test_one_is_renewed_and_nothing_else_changes(
     expected = {f"{folder.relative_to(root)}/{file}" for file in files} | LEDGERS
     assert changed(before, root) == expected
     assert {change.path for change in done.changes} == expected
-    assert done.renewed == (name,)
+    assert done.names("renewed") == (name,)
     new = certificate(folder / "cert.pem")
     assert new.serial_number != old.serial_number
     assert (new.public_key() == old.public_key()) is not new_key
@@ -205,9 +205,9 @@ def test_all_that_expire(tmp_path: Path) -> None:
     seen: list[str] = []
     month = parse_threshold("30d")
     done = renew(root, ["/b"], now=soon, expiring=month, progress=seen.append)
-    assert done.renewed == ("/b", "/a", "/c")
+    assert done.names("renewed") == ("/b", "/a", "/c")
     assert seen == ["/b", "/a", "/c"]
-    assert renew(root, now=soon, expiring=month).renewed == ()
+    assert renew(root, now=soon, expiring=month).names("renewed") == ()
     assert renew(root, now=soon, expiring=month).changes == ()
 
 
@@ -314,7 +314,7 @@ def test_every_one_that_cannot_be_renewed_is_named_at_once(tmp_path: Path) -> No
         with pytest.raises(KeystoreError, match="2 enclaves cannot be re.*: /n003, /n229"):  # noqa: RUF043
             call()
         assert snapshot(root) == before
-    assert len(renew(root, names[4:-1], now=LATER).renewed) == 225
+    assert len(renew(root, names[4:-1], now=LATER).names("renewed")) == 225
 
 
 # ── what becomes of the old ────────────────────────────────────────────────────────────────
@@ -327,7 +327,7 @@ def serials(root: Path, *names: str) -> dict[str, int]:
 
 
 def revoked(root: Path) -> dict[int, str]:
-    crl = read_crl(root)
+    crl = Keystore(root).revocation_list
     return {each.serial: each.reason for each in crl.revoked} if crl else {}
 
 
@@ -372,7 +372,7 @@ def test_nothing_is_revoked_where_nothing_is_renewed(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     before = snapshot(root)
     done = renew(root, now=NOW, expiring=parse_threshold("30d"), revoke_old=True)
-    assert (done.renewed, done.changes, done.restart) == ((), (), ())
+    assert (done.names("renewed"), done.changes, done.restart) == ((), (), ())
     assert snapshot(root) == before
     plan = renew(root, ["/a"], now=LATER, revoke_old=True, dry_run=True)
     assert snapshot(root) == before

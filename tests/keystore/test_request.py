@@ -172,7 +172,7 @@ def test_signing_records_everything_but_the_key(home: Path, robot: Path) -> None
     issued.verify_directly_issued_by(certificate(home / "public/identity_ca.cert.pem"))
     subject = issued.subject
     assert len(subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)) == 1
-    assert key_digest(issued.public_key()) == signed.key  # type: ignore[arg-type]
+    assert key_digest(issued.public_key()) == signed.keys[NAME]  # type: ignore[arg-type]
     entries = [entry for entry in read_ledger(home).entries if entry.enclave == NAME]
     assert [entry.what for entry in entries] == ["certificate", "permissions", "answer"]
     assert not history(home, now=NOW).unexplained

@@ -22,7 +22,7 @@ from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.reader import open_enclave, read_crl
+from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.crl import REASONS, RevocationList
 from tests.support.children import run
@@ -44,7 +44,7 @@ def serial(root: Path, name: str) -> int:
 
 
 def crl_of(root: Path) -> RevocationList:
-    found = read_crl(root)
+    found = Keystore(root).revocation_list
     assert found
     return found
 
@@ -63,7 +63,7 @@ def test_one_is_revoked(template: str, name: str, tmp_path: Path) -> None:
     number = serial(root, name)
     done = revoke(root, [name], now=NOW, reason="keyCompromise")
     others = tuple(each for each in names if each != name)
-    assert done.revoked == (name,)
+    assert done.names("revoked") == (name,)
     assert done.restart == list_enclaves(root) == others
     (entry,) = crl_of(root).revoked
     assert (entry.serial, entry.reason, entry.date) == (number, "keyCompromise", NOW)

@@ -27,10 +27,10 @@ from sros_tool.keystore.lifecycle.rotation.stages import RotationStep, renew_ide
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, retired_key, rotation_status
 from sros_tool.keystore.lifecycle.update import update_keystore
 from sros_tool.keystore.reader import (
+    Keystore,
     authority_files,
     certificates_of,
     open_enclave,
-    read_crl,
     read_lists,
 )
 from sros_tool.keystore.template import load_template
@@ -346,7 +346,7 @@ def test_revocation_lists_go_along(separate: Path) -> None:
     for stage in STAGES:
         rotate_ca(separate, stage, now=NOW)
         check(separate)
-        crl = read_crl(separate)
+        crl = Keystore(separate).revocation_list
         assert crl
         numbers.append(crl.number)
         text = (separate / "public/identity_ca.cert.pem").read_text()

@@ -17,7 +17,7 @@ from benchmarks.inputs import fleet_file, fleet_policy
 from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.reader import read_crl
+from sros_tool.keystore.reader import Keystore
 from sros_tool.validity import parse_iso
 from tests.support.children import LONG
 from tests.support.harness import sros
@@ -104,7 +104,7 @@ def test_revoking_a_robot_and_renewing_the_others(root: Path) -> None:
     rest = enclave_names(root)
     assert [name for name in before if name not in rest] == [n for n in before if "/r1/" in n]
     assert all((root / f"enclaves{name}/crl.pem").is_symlink() for name in rest)
-    found = read_crl(root)
+    found = Keystore(root).revocation_list
     assert found
     assert len(found.revoked) == EACH
     done = sros("renew", root, "--all-expiring", "100y").ok()

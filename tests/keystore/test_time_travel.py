@@ -26,7 +26,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
-from sros_tool.keystore.reader import certificates_of, open_enclave, read_crl, read_lists
+from sros_tool.keystore.reader import Keystore, certificates_of, open_enclave, read_lists
 from sros_tool.keystore.template import load_template
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import issued_by, validity_of
@@ -108,7 +108,7 @@ class Verified:
             self._known.clear()
             self._common, self._common_life = common, _lives(first)
         found = [f"{life}" for life in self._common_life if not life.contains(now)]
-        crl = read_crl(self._root)
+        crl = Keystore(self._root).revocation_list
         if crl:
             (authority, *_) = certificates_of(self._root, "identity_ca")
             assert signed_by(crl.list, authority)
@@ -283,7 +283,7 @@ def test_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert not verified.problems(names, now), now
         if month in ROTATION:
             assert rotate_ca(root, now=now).stage is ROTATION[month]
-        renewed += len(renew(root, now=now, expiring=DUE).renewed)
+        renewed += len(renew(root, now=now, expiring=DUE).names("renewed"))
         changed = chance.sample(names, CHANGED)
         permit(root, changed, month, now)
         rights |= {name: f"rt/v{month}{name}" for name in changed}
@@ -307,7 +307,7 @@ def test_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             why = refusal(root, thief, now)
             assert why, (thief, now)
             refused[stage, why] += 1
-        crl = read_crl(root)
+        crl = Keystore(root).revocation_list
         assert crl
         longest = max(longest, len(crl.revoked))
         if month % 12 == 0 or month in ROTATION or month - 2 in ROTATION:

@@ -21,7 +21,7 @@ from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.layout import REQUIRED_FILES, STAGE, enclave_folder, is_keystore
-from sros_tool.keystore.lifecycle import create
+from sros_tool.keystore.lifecycle import change
 from sros_tool.keystore.lifecycle.create import (
     create_enclaves,
     create_keystore,
@@ -500,12 +500,12 @@ def test_no_second_ca_where_another_process_was_faster(
     after: dict[str, tuple[int, bytes]] = {}
 
     def be_slow(*arguments: Any, **options: Any) -> Transaction:
-        monkeypatch.setattr(create, "Transaction", Transaction)
+        monkeypatch.setattr(change, "Transaction", Transaction)
         create_keystore(root, template=TEMPLATE, now=NOW)
         after.update(snapshot(tmp_path))
         return Transaction(*arguments, **options)
 
-    monkeypatch.setattr(create, "Transaction", be_slow)
+    monkeypatch.setattr(change, "Transaction", be_slow)
     with pytest.raises(KeystoreError, match="already exists"):
         if verb == "create_keystore":
             create_keystore(root, template=TEMPLATE, now=NOW)

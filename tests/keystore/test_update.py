@@ -39,7 +39,6 @@ from sros_tool.keystore.reader import (
     governance_of,
     load_settings,
     open_enclave,
-    read_crl,
 )
 from sros_tool.keystore.template import (
     NamedValues,
@@ -138,8 +137,8 @@ def test_from_development_to_production(root: Path) -> None:
     robot = topics_of(enclave_path(root, "/robot"))
     done = to(root, "production", allow_looser=False)
     assert (done.before, done.after, done.left) == ("development", "production", ())
-    assert done.renewed == ("/free", "/robot")
-    assert not done.looser()
+    assert done.names("renewed") == ("/free", "/robot")
+    assert not done.looser
     template = load_template("production")
     assert governance_of(root) == governance_for(template.protection, ZERO)
     assert load_settings(root) == template
@@ -168,7 +167,7 @@ def test_and_back(tmp_path: Path) -> None:
     assert load_settings(root) == load_template("development")
     assert len(certificate(enclave_path(root, "/robot") / "cert.pem").subject.rdns) == 1
     assert until(root, "/robot") == (5 * 365, 5 * 365)  # with the CAs, at the latest
-    assert any("/free gains" in each for each in done.looser())
+    assert any("/free gains" in each for each in done.looser)
     assert found(root) == found(make(tmp_path / "other"))
 
 
@@ -195,7 +194,10 @@ def test_only_what_follows_from_a_setting_changes(
     governance = (root / "enclaves/governance.p7s").read_bytes()
     done = change(root, value)
     names = ("/free", "/robot")
-    assert (done.renewed, done.signed) == (names if renewed else (), names if signed else ())
+    assert (done.names("renewed"), done.names("signed")) == (
+        names if renewed else (),
+        names if signed else (),
+    )
     assert ((root / "enclaves/governance.p7s").read_bytes() != governance) == governed
     assert done.restart == (names if renewed or signed or governed else ())
     assert value[1].replace("1y", "365d") in (root / "sros.toml").read_text()
@@ -207,9 +209,9 @@ def test_short_lived_enclaves_are_issued_again_alone(root: Path) -> None:
     settings = present_settings(root).settings
     short = (ShortLived("/free", timedelta(days=2)),)
     done = to(root, replace(settings, short_lived=short))
-    assert (done.renewed, done.signed) == (("/free",), ())
+    assert (done.names("renewed"), done.names("signed")) == (("/free",), ())
     assert until(root, "/free") == (2, 2)
-    assert to(root, settings).renewed == ("/free",)
+    assert to(root, settings).names("renewed") == ("/free",)
     assert until(root, "/free") == (3650, 3650)
 
 
@@ -217,7 +219,7 @@ def test_domains(root: Path) -> None:
     with pytest.raises(UsageError, match="may also join domain 7"):
         to(root, present_settings(root).settings, 0, 7, allow_looser=False)
     done = to(root, present_settings(root).settings, 0, 7)
-    assert done.signed == ("/free", "/robot")
+    assert done.names("signed") == ("/free", "/robot")
     for name in list_enclaves(root):
         folder = enclave_path(root, name)
         assert not open_enclave(folder, now=LATER, domain=7).problems
@@ -317,7 +319,7 @@ def test_an_enclave_whose_key_is_on_its_robot(root: Path) -> None:
     folder = enclave_path(root, "/robot")
     (folder / "key.pem").rename(folder / "request.pem")
     done = to(root, "production")
-    assert "/robot" in done.renewed
+    assert "/robot" in done.names("renewed")
     assert "answer the request again" in told(done)
 
 
@@ -349,7 +351,7 @@ def test_the_stages(root: Path) -> None:
     assert until(root, "/late") == (365, 180)
     second = to(root, target, next_stage=True)
     assert (second.done, second.left) == ((UpdateStage.GOVERNANCE,), ())
-    assert (second.renewed, second.signed) == ((), ())
+    assert (second.names("renewed"), second.names("signed")) == ((), ())
     assert "together" in second.remarks[0].text
     assert load_settings(root) == target
     third = to(root, target, next_stage=True)
@@ -371,7 +373,7 @@ def test_the_command_of_the_second_stage(root: Path) -> None:
     second = sros(*printed(first.err)).ok()
     assert "renewed" not in second.out
     assert load_settings(root) == load_template("production")
-    crl = read_crl(root)
+    crl = Keystore(root).revocation_list
     assert crl
     assert len(crl.revoked) == 2
     sound(root)
@@ -392,7 +394,7 @@ def test_revoking_the_old(root: Path) -> None:
     done = change(root, ("permissions.validity", "30d"), revoke_old=True)
     assert done.revoked == 2
     assert done.works_until is None
-    crl = read_crl(root)
+    crl = Keystore(root).revocation_list
     assert crl
     assert {each.serial for each in crl.revoked} == set(serials.values())
     assert "restart all processes together" in told(done)
@@ -465,7 +467,7 @@ def test_a_keystore_of_ros2_can_be_renewed_after_an_update(tmp_path: Path) -> No
     made_by_ros2.make(root, "/free", "/robot", now=NOW)
     assert present_settings(root).without_settings
     target = with_values(present_settings(root).settings, [("protection.rtps", "ENCRYPT")])
-    assert update_keystore(root, target, now=LATER).signed == ("/free", "/robot")
+    assert update_keystore(root, target, now=LATER).names("signed") == ("/free", "/robot")
     renew(root, ["/robot"], now=LATER)
     check_whole(root)
 
@@ -675,7 +677,7 @@ def test_a_governance_of_one_s_own_is_not_replaced_unasked(tmp_path: Path) -> No
 def _sign_governance(root: Path, old: str, new: str) -> None:
     """Edit the governance as its owner does who signs it with another tool."""
     _put(root / "enclaves/governance.xml", old, new)
-    authorities = load_authorities(root, load_settings(root), IN_KEYSTORE, NOW)
+    authorities = load_authorities(Keystore(root), load_settings(root), IN_KEYSTORE, NOW)
     document = (root / "enclaves/governance.xml").read_bytes()
     (root / "enclaves/governance.p7s").write_bytes(authorities.permissions.sign(document, "it"))
 

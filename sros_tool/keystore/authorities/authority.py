@@ -10,7 +10,6 @@ import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
 
 from cryptography import x509
 
@@ -27,7 +26,7 @@ from sros_tool.keystore.layout import (
     ca_key,
     enclave_folder,
 )
-from sros_tool.keystore.reader import load_ca_certificate
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki import smime
@@ -169,34 +168,35 @@ def create_authorities(
 
 
 def load_authorities(
-    root: Path, template: Template, keyring: Keyring, now: datetime
+    keystore: Keystore, template: Template, keyring: Keyring, now: datetime
 ) -> Authorities:
     """Return both CAs of a keystore with their keys, ready to sign.
 
     Raises:
         KeystoreError: a CA is missing, does not fit its key, or is not valid at ``now``.
     """
-    identity = load_authority(root, IDENTITY, template, keyring, now)
-    permissions = load_authority(root, PERMISSIONS, template, keyring, now)
+    identity = load_authority(keystore, IDENTITY, template, keyring, now)
+    permissions = load_authority(keystore, PERMISSIONS, template, keyring, now)
     return Authorities(identity, permissions)
 
 
 def load_authority(
-    root: Path, role: str, template: Template, keyring: Keyring, now: datetime
+    keystore: Keystore, role: str, template: Template, keyring: Keyring, now: datetime
 ) -> Authority:
     """Return the identity or permissions CA with its key, ready to sign.
 
     Raises:
         KeystoreError: the CA is missing, does not fit its key, or is not valid at ``now``.
     """
-    if not (root / ca_certificate(role)).exists() and not (root / ca_key(role)).exists():
+    root = keystore.root
+    if not keystore.has(ca_certificate(role)) and not keystore.has(ca_key(role)):
         raise KeystoreError(
             f"keystore '{root}' has no {role} CA",
             "It may be an export for a robot, which holds enclaves but no CA to create new ones.",
             "Use the keystore that it was exported from.",
         )
-    certificate = load_ca_certificate(root, role)
-    key = keyring.open(root, role, template)
+    certificate = keystore.ca_certificate(role)
+    key = keyring.open(keystore, role, template)
     if not same_key(certificate, key):
         raise KeystoreError(
             f"the key and the certificate of the {role} CA do not belong together",

@@ -16,6 +16,7 @@ from shlex import quote
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, UsageError
 from sros_tool.files import remove_file, write_new_file
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_path
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
@@ -74,13 +75,13 @@ class Keyring:
         role_key = {IDENTITY: template.identity_key}.get(role, template.permissions_key)
         return self.places.get(role) or role_key or ca_key(role)
 
-    def open(self, root: Path, role: str, template: Template) -> PrivateKey:
+    def open(self, keystore: Keystore, role: str, template: Template) -> PrivateKey:
         """Return the private key of the ``role`` CA.
 
         Raises:
             KeystoreError: the key is missing, or cannot be opened.
         """
-        place = self.place(role, template)
+        root, place = keystore.root, self.place(role, template)
         try:
             if is_token_uri(place):
                 token_key = open_token_key(place, self.secrets, named=self._is_named(role))
@@ -94,7 +95,7 @@ class Keyring:
                     f"Put it back for this command, or set SROS_{role.upper()}_KEY to its place. "
                     "No new CA is created, because it would lock out every existing enclave.",
                 )
-            pem = self._read(root, path, role)
+            pem = self._read(keystore, path, role)
             key = load_key(pem, f"'{path}'", self._passphrase(role))
             _LOG.info("opened the key of the %s CA, '%s'", role, path)
             return key
@@ -136,7 +137,7 @@ class Keyring:
             return create_token_key(place, self.secrets, named=named)
         if place and key_path(transaction.root, place).exists():
             self._check_chosen(role, place, compared=compared)
-            return self.open(transaction.root, role, template)
+            return self.open(Keystore(transaction.root), role, template)
         key = generate_key()
         pem = key_pem(key, self._new_passphrase(role) if self.encrypt else None)
         if not place:
@@ -163,17 +164,17 @@ class Keyring:
             permissions = identity
         return replace(template, identity_key=identity, permissions_key=permissions)
 
-    def _read(self, root: Path, path: Path, role: str) -> bytes:
+    def _read(self, keystore: Keystore, path: Path, role: str) -> bytes:
         """Return the PEM of a CA key.
 
         By its settings or a link, the keystore of another user could have a CA sign that only this
         user can read.  So its key has to belong to the owner of the keystore, too, unless the user
         named the place.
         """
-        what = f"{role} CA key"
+        what, root = f"{role} CA key", keystore.root
         owner = root.stat().st_uid if root.exists() else os.geteuid()
         if self._is_named(role) or owner in (0, os.geteuid()):
-            return read_bytes(path, what)
+            return keystore.read(path, what)
         try:
             return read_bytes(path, what, owner=owner)
         except DocumentError as error:

@@ -13,7 +13,7 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
 from sros_tool.files import write_new_file
 from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
@@ -33,6 +33,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     has_key,
 )
+from sros_tool.keystore.lifecycle.change import Changed
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import (
     OpenedEnclave,
@@ -41,7 +42,6 @@ from sros_tool.keystore.reader import (
     weaknesses,
 )
 from sros_tool.keystore.transaction.recovery import tidy
-from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh.opened import open_zenoh
 from sros_tool.names import check_enclave_name
@@ -82,14 +82,13 @@ class RequestAnswer:
         return self.files.get(f"{enclave_folder(self.name)}/{name}")
 
 
-@dataclass(frozen=True, slots=True)
-class ImportedEnclave:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImportedEnclave(Changed):
     """An enclave that was imported; without ``changes``, the same answer was installed already.
 
     ``first`` says whether the folder trusted no CA before, so that nothing vouched for the new
-    ones.  ``until`` is the first expiry of certificate and permissions.  ``restart_zenoh`` says
-    whether processes on Zenoh that run have other rules until they are restarted.  ``notes`` are
-    about vendors whose nodes stop.
+    ones.  ``until`` is the first expiry of certificate and permissions.  ``restart`` is the enclave
+    if processes on Zenoh that run have other rules until they are restarted.
     """
 
     name: str
@@ -97,9 +96,6 @@ class ImportedEnclave:
     permissions_ca: x509.Certificate
     first: bool
     until: datetime
-    changes: tuple[Change, ...]
-    restart_zenoh: bool = False
-    notes: tuple[Note, ...] = ()
 
 
 def seal(files: dict[str, bytes], number: int, authority: Authority) -> bytes:
@@ -272,17 +268,22 @@ def import_answer(
         for file in _OPTIONAL:
             if answer.file(file) is None and (place / file).exists():
                 transaction.remove(f"{enclave_folder(name)}/{file}")
-        notes = refuse_stopping(transaction, now, allowed=allow_refusal, remedy=_AGAIN)
+        notes = refuse_stopping(transaction, now, allowed=allow_refusal, remedy=lambda: _AGAIN)
         transaction.commit()
+    changes = transaction.changes
+    other_rules = ran and any(Path(each.path).name in ZENOH_SIGNED for each in changes)
     return ImportedEnclave(
-        name,
-        state.identity_ca,
-        state.permissions_ca,
-        not known,
-        until,
-        tuple(transaction.changes),
-        ran and any(Path(each.path).name in ZENOH_SIGNED for each in transaction.changes),
-        notes,
+        root=folder,
+        dry_run=dry_run,
+        outcomes={name: "imported" if changes else "kept"},
+        changes=changes,
+        restart=(name,) if other_rules else (),
+        notes=notes,
+        name=name,
+        identity_ca=state.identity_ca,
+        permissions_ca=state.permissions_ca,
+        first=not known,
+        until=until,
     )
 
 

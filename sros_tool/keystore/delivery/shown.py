@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-from sros_tool.keystore.layout import PERMISSIONS, enclave_folder
+from sros_tool.keystore.layout import enclave_folder
+from sros_tool.keystore.lifecycle.shown import enclave_results, shown
 from sros_tool.keystore.outcomes import (
     AuthorityFacts,
     EnclaveResult,
@@ -14,13 +15,12 @@ from sros_tool.keystore.outcomes import (
     enclave_result,
     trusted_authorities,
 )
-from sros_tool.keystore.reader import load_ca_certificate
 from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words, shows
 
 if TYPE_CHECKING:
     from sros_tool.keystore.delivery.answer import ImportedEnclave
     from sros_tool.keystore.delivery.request import Requested
-    from sros_tool.keystore.delivery.signing import Certified, Signed
+    from sros_tool.keystore.delivery.signing import Signed
 
 
 class ExportedEnclaves(NamedTuple):
@@ -122,39 +122,18 @@ class SignedRequest(NamedTuple):
     notes: Notes
 
 
-def shown_answer(
-    root: Path, signed: Signed, answer: Path, more: Sequence[FileChange], *, dry_run: bool
+def shown_signed(
+    signed: Signed, answer: Path | None = None, more: Sequence[FileChange] = ()
 ) -> SignedRequest:
-    """Return what is printed of a signed request; ``more`` are changes outside of the keystore."""
-    outcome = "renewed" if signed.renewed else "created"
-    enclave = enclave_result(root, signed.name, outcome, written=not dry_run)
-    return SignedRequest(
-        root,
-        dry_run,
-        answer,
-        [CertifiedKey(enclave, signed.key)],
-        trusted_authorities(signed.identity_ca, load_ca_certificate(root, PERMISSIONS)),
-        (*changes_below(root, signed.changes), *more),
-        signed.notes,
-    )
-
-
-def shown_certified(root: Path, done: Certified, *, renew: bool, dry_run: bool) -> SignedRequest:
-    """Return what is printed of requests that were certified without answers."""
-    enclaves = []
-    for name, key in done.keys.items():
-        kept = name in done.kept
-        outcome = "kept" if kept else "renewed" if renew else "created"
-        enclave = enclave_result(root, name, outcome, written=kept or not dry_run)
-        enclaves.append(CertifiedKey(enclave, key))
-    return SignedRequest(
-        root,
-        dry_run,
-        None,
-        enclaves,
-        trusted_authorities(done.identity_ca, load_ca_certificate(root, PERMISSIONS)),
-        changes_below(root, done.changes),
-        done.notes,
+    """Return what is printed of signed requests; ``more`` are changes outside of the keystore."""
+    keys = [CertifiedKey(enclave, signed.keys[enclave.name]) for enclave in enclave_results(signed)]
+    return shown(
+        signed,
+        SignedRequest,
+        answer=answer,
+        enclaves=keys,
+        authorities=trusted_authorities(signed.identity_ca, signed.permissions_ca),
+        changes=(*changes_below(signed.root, signed.changes), *more),
     )
 
 
@@ -184,18 +163,12 @@ class ImportedAnswer(NamedTuple):
     notes: Notes
 
 
-def shown_import(
-    folder: Path, done: ImportedEnclave, *, pinned: bool, dry_run: bool
-) -> ImportedAnswer:
+def shown_import(imported: ImportedEnclave, *, pinned: bool) -> ImportedAnswer:
     """Return what is printed of an imported answer."""
-    outcome, known = "imported" if done.changes else "kept", not (dry_run and done.changes)
-    return ImportedAnswer(
-        folder,
-        dry_run,
-        [enclave_result(folder, done.name, outcome, written=known)],
-        trusted_authorities(done.identity_ca, done.permissions_ca),
-        authorities_verified=pinned or not done.first,
-        restart_zenoh=(done.name,) if done.restart_zenoh else (),
-        changes=changes_below(folder, done.changes),
-        notes=done.notes,
+    return shown(
+        imported,
+        ImportedAnswer,
+        authorities=trusted_authorities(imported.identity_ca, imported.permissions_ca),
+        authorities_verified=pinned or not imported.first,
+        restart_zenoh=imported.restart,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime
@@ -19,21 +19,15 @@ from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosE
 from sros_tool.files import staged_file
 from sros_tool.fleet.enclaves import robot_of
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.fleet.robots import Fleet
 from sros_tool.folders import Folder
-from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
-    checked_fleet,
     refuse_stale_domains,
-    write_fleet,
 )
-from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.enclave import (
-    EnclaveWriter,
     Issuance,
     Issued,
     NewIdentity,
@@ -44,7 +38,7 @@ from sros_tool.keystore.issuing.enclave import (
     shared_files,
     stated_enclave,
 )
-from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
+from sros_tool.keystore.issuing.zenoh import KeptZenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -57,10 +51,9 @@ from sros_tool.keystore.layout import (
     SEAL,
     ZENOH_FILES,
     enclave_folder,
-    enclave_path,
-    list_enclaves,
 )
-from sros_tool.keystore.ledger import Entry, append, document_entry, read_ledger
+from sros_tool.keystore.ledger import document_entry
+from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.governed import refuse_less_protected
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
@@ -68,19 +61,8 @@ from sros_tool.keystore.lifecycle.replaced import (
     lasting_text,
     replaced_rights,
 )
-from sros_tool.keystore.reader import (
-    check_domain,
-    load_governance,
-    load_settings,
-    read_certificate,
-    read_signed_grant,
-)
-from sros_tool.keystore.recorded import EarlierRights, RecordedRights
-from sros_tool.keystore.settings import edit_notes
-from sros_tool.keystore.transaction.recovery import tidy
-from sros_tool.keystore.transaction.stage import Change
-from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.keystore.zenoh.wanted import ZenohChange
+from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.recorded import EarlierRights
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import enclave_subject, has_unique_part, pem, validity_of
 from sros_tool.pki.certificates import subject_text as text_of
@@ -89,24 +71,22 @@ from sros_tool.pki.requests import SigningRequest, key_digest, load_request
 from sros_tool.policy.model import Enclave, Policy, stated_protections
 from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.validity import iso
-from sros_tool.xml import read_bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Signed:
-    """A signed request.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Signed(Changed):
+    """Signed requests.
 
-    ``key`` is the SHA-256 of the enclave's public key, ``identity_ca`` the certificate of the CA
-    that the robot will trust, ``archive`` the answer for the robot (``.tar.gz``).
+    ``keys`` maps each enclave to the SHA-256 of its public key.  ``outcomes`` has the enclaves that
+    were created, renewed, and kept because their key had a certificate already.  ``identity_ca``
+    and ``permissions_ca`` are the CAs that robots will trust.  ``archive`` is the answer for the
+    robot (``.tar.gz``), if one was made.
     """
 
-    name: str
-    key: str
+    keys: Mapping[str, str]
     identity_ca: x509.Certificate
-    archive: bytes
-    renewed: bool
-    changes: tuple[Change, ...]
-    notes: tuple[Note, ...]
+    permissions_ca: x509.Certificate
+    archive: bytes = b""
 
 
 def sign_request(
@@ -155,35 +135,26 @@ def sign_request(
     stated = _stated(policy, [name])
     if answer is not None:
         _check_free(answer, force)
-    if not dry_run:
-        tidy(root)
-    list_enclaves(root)
-    with Transaction(root, dry_run=dry_run) as transaction:
-        signer = _Signer(transaction, keyring, domain, now, stated)
+    change = KeystoreChange(
+        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
+    )
+    with change:
+        signer = _Signer(change, domain, stated)
         issued = signer.certify(request, renew=renew, named=bool(only) and not refuse_revoked)
-        kept = signer.keep_zenoh()
-        files = _answer_files(root, issued, kept)
-        number = read_ledger(root, having=("what", "answer")).next_number()
-        sealed = seal(files, number, signer.authorities.permissions)
+        signer.keep_zenoh()
+        files = _answer_files(root, issued, change.zenoh)
+        number = change.ledger.next_number()
+        sealed = seal(files, number, change.permissions)
         _check_result(RequestAnswer(name, files, sealed), request, now)
         archive = pack({SEAL: sealed, **files})
-        sent = document_entry(now, "answer", sealed, enclave=name, number=number)
-        signer.record(sent)
+        change.entries.append(document_entry(now, "answer", sealed, enclave=name, number=number))
+        change.record()
         staged = staged_file(answer, archive) if answer and not dry_run else nullcontext()
         with staged as put_in_place:
-            stopped = refuse_stopping(transaction, now, allowed=allow_refusal)
-            transaction.commit()
+            change.finish()
             if put_in_place:
                 put_in_place()
-    return Signed(
-        name,
-        key_digest(request.public_key),
-        signer.authorities.identity.certificate,
-        archive,
-        renew,
-        tuple(transaction.changes),
-        (*signer.all_notes(), *stopped),
-    )
+    return signer.result([request], renew=renew, archive=archive)
 
 
 class _Stated(NamedTuple):
@@ -208,21 +179,6 @@ def _stated(policy: Policy | FleetPolicy | None, names: Sequence[str]) -> dict[s
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class Certified:
-    """Requests that were certified without answers.
-
-    ``keys`` maps each enclave to the SHA-256 of its public key; ``kept`` are those of them whose
-    key had a certificate already.
-    """
-
-    keys: Mapping[str, str]
-    kept: tuple[str, ...]
-    identity_ca: x509.Certificate
-    changes: tuple[Change, ...]
-    notes: tuple[Note, ...]
-
-
 def certify_requests(
     root: Path,
     data: bytes,
@@ -236,7 +192,7 @@ def certify_requests(
     allow_refusal: Sequence[Vendor] = (),
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
-) -> Certified:
+) -> Signed:
     """Certify the keys of several requests (PEM, one after the other), all or none.
 
     As `sign_request`, but no answers are made: an export without keys brings the enclaves to their
@@ -256,31 +212,27 @@ def certify_requests(
         _check_asked(requests, only)
     _check_distinct(requests)
     stated = _stated(policy, [check_enclave_name(each.name) for each in requests])
-    if not dry_run:
-        tidy(root)
-    list_enclaves(root)
+    change = KeystoreChange(
+        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
+    )
     kept: tuple[str, ...] = ()
-    stopped: tuple[Note, ...] = ()
-    with Transaction(root, dry_run=dry_run) as transaction:
+    with change:
         if not renew:
-            existing = set(list_enclaves(root))
-            kept = tuple(each.name for each in requests if _is_certified(root, each, existing))
-        signer = _Signer(transaction, keyring, domain, now, stated)
+            existing = frozenset(change.names)
+            kept = tuple(
+                each.name for each in requests if _is_certified(change.keystore, each, existing)
+            )
+        signer = _Signer(change, domain, stated)
         for request in requests:
             if request.name not in kept:
                 signer.certify(request, renew=renew, named=bool(only) and not refuse_revoked)
         if len(kept) < len(requests):
             signer.keep_zenoh()
-            signer.record()
-            stopped = refuse_stopping(transaction, now, allowed=allow_refusal)
-            transaction.commit()
-    return Certified(
-        {each.name: key_digest(each.public_key) for each in requests},
-        kept,
-        signer.authorities.identity.certificate,
-        tuple(transaction.changes),
-        (*signer.all_notes(), *stopped),
-    )
+            change.record()
+            change.finish()
+        else:
+            change.notes += signer.name_notes()
+    return signer.result(requests, renew=renew, kept=kept)
 
 
 _END = b"-----END CERTIFICATE REQUEST-----"
@@ -325,66 +277,46 @@ def _check_distinct(requests: Sequence[SigningRequest]) -> None:
             )
 
 
-def _is_certified(root: Path, request: SigningRequest, existing: Collection[str]) -> bool:
+def _is_certified(keystore: Keystore, request: SigningRequest, existing: Collection[str]) -> bool:
     """Return whether the enclave of a request has a certificate for its key."""
     if request.name not in existing:
         return False
-    return _present_certificate(root, request.name).public_key() == request.public_key
+    return keystore.certificate_of(request.name).public_key() == request.public_key
 
 
 class _Signer:
-    """The certification of requests in one transaction."""
+    """The certification of requests in one change."""
 
     def __init__(
-        self,
-        transaction: Transaction,
-        keyring: Keyring,
-        domain: int | None,
-        now: datetime,
-        stated: Mapping[str, _Stated],
+        self, change: KeystoreChange, domain: int | None, stated: Mapping[str, _Stated]
     ) -> None:
-        root = transaction.root
-        self._transaction = transaction
-        self._root = root
-        self._now = now
-        self._existing = list_enclaves(root)
-        self._known = KnownKeys(root)
-        self._template = load_settings(root)
-        self.authorities = load_authorities(root, self._template, keyring, now)
-        self._governance = load_governance(root, self.authorities.permissions.certificate)
-        self._domains = self._governance.domains().closed()
-        check_domain(self._domains, domain, root)
-        self._notes: list[Note] = []
-        fleet, self._fleet_entries = self._recorded(stated)
-        self._enclave_domains = EnclaveDomains(self._domains, fleet)
-        self._writer = EnclaveWriter(
-            transaction,
-            self._template,
-            now,
-            identity=self.authorities.identity,
-            permissions=self.authorities.permissions,
-        )
+        self._change = change
+        self._root = change.root
+        change.open_authorities()
+        change.check_domain(domain)
         self._stated = stated
+        self._record_paths()
+        self._domains = EnclaveDomains(change.domains, change.fleet)
+        self._writer = change.writer()
         self._certified: dict[str, Enclave | None] = {}
         self._new: list[str] = []
 
-    def _recorded(self, stated: Mapping[str, _Stated]) -> tuple[Fleet | None, tuple[Entry, ...]]:
-        """Return the fleet of the keystore with the paths of what is stated, and ledger entries.
+    def _record_paths(self) -> None:
+        """Add the paths of what is stated to the fleet of the keystore.
 
         Its robots stay the same, whatever fleet the policy was filled in for.
         """
-        root = self._root
-        fleet = checked_fleet(root)
+        change, root, stated = self._change, self._root, self._stated
+        fleet = change.fleet
         paths = {each.path for each in stated.values() if each.path}
-        entries: tuple[Entry, ...] = ()
         if fleet and not paths <= set(fleet.enclaves):
-            before = EnclaveDomains(self._domains, fleet)
-            fleet, entries = write_fleet(self._transaction, fleet, paths, self._now)
+            before = EnclaveDomains(change.domains, fleet)
+            fleet = change.write_fleet(fleet, paths)
             refuse_stale_domains(root, before, fleet, stated)
         for name, each in stated.items():
             if each.path and not (fleet and robot_of(fleet, name)):
                 lacks = "its fleet does not have the robot" if fleet else "it has no fleet for that"
-                self._notes.append(
+                change.notes.append(
                     Note(
                         "fleet.unrecorded-enclaves",
                         f"The keystore does not record whose enclave {name} is: {lacks} of enclave "
@@ -393,76 +325,84 @@ class _Signer:
                         "FLEET_FILE`.",
                     )
                 )
-        return fleet, entries
 
     def certify(self, request: SigningRequest, *, renew: bool, named: bool) -> Issued:
         """Write all files of an enclave except its key; its rights are stated, or kept.
 
         ``named`` is whether the enclave was named at home, and not by the request alone.
         """
-        root, name = self._root, request.name
+        change, root, name = self._change, self._root, request.name
+        known, authority = change.known, change.permissions.certificate
         stated = self._stated[name].enclave
-        _check_name(root, name, renew, name in self._existing)
+        _check_name(root, name, renew, name in change.names)
         if stated is not None:
-            refuse_less_protected(root, self._governance, stated_protections([stated]))
-        _check_key(root, request, self._known, renew)
-        if not renew and not named and name in self._known.revoked_enclaves:
+            refuse_less_protected(root, change.governance, stated_protections([stated]))
+        present = change.keystore.certificate_of(name) if renew else None
+        _check_key(change.keystore, request, known, present)
+        if not renew and not named and name in known.revoked_enclaves:
             raise KeystoreError(
                 f"enclave {name} was revoked in keystore '{root}'",
                 "Whoever has the revoked key could have made this request, to be let in again.",
                 f"If the robot is yours again and shall have the enclave, add --enclave {name}.",
             )
-        if renew:
-            note = _new_key_note(root, request)
-            self._notes += note or [*self._known.shared_notes([name])]
+        if present:
+            note = _new_key_note(present, request)
+            change.notes += note or [*known.shared_notes([name])]
         else:
             self._new.append(name)
-            self._notes += self._known.revoked_before_notes([name])
-        authority = self.authorities.permissions.certificate
+            change.notes += known.revoked_before_notes([name])
         rights: EarlierRights | StatedRights
-        if renew and stated is None:
-            rights = _earlier_rights(root, name, authority)
+        if present and stated is None:
+            rights = _earlier_rights(change, name, present)
         else:
-            domains = self._enclave_domains.of(name)
-            rights = StatedRights(stated or default_rights(self._template, name), domains)
-        unique = self._template.unique_subject or (
-            renew and has_unique_part(_present_certificate(root, name).subject)
+            enclave = stated or default_rights(change.template, name)
+            rights = StatedRights(enclave, self._domains.of(name))
+        unique = change.template.unique_subject or (
+            present is not None and has_unique_part(present.subject)
         )
         identity = NewIdentity(enclave_subject(name, unique=unique), request.public_key)
-        earlier = earlier_permissions(root, name, authority) if renew else None
+        earlier = (
+            earlier_permissions(change.keystore, name, authority, present) if present else None
+        )
         issued = self._writer.write(Issuance(name, identity, rights))
         if earlier:
-            self._notes += _lost_rights(root, earlier, issued, self._now)
-        self._transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
-        link_shared_files(self._transaction, name, present_files(root, name))
-        self._notes += issued.notes()
+            change.notes += _lost_rights(root, earlier, issued, change.now)
+        change.transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
+        link_shared_files(change.transaction, name, present_files(root, name))
+        change.notes += issued.notes()
         self._certified[name] = stated
         return issued
 
-    def keep_zenoh(self) -> KeptZenoh:
+    def keep_zenoh(self) -> None:
         """Write what follows for the files of Zenoh, after all requests."""
-        permissions = self.authorities.permissions
-        self._notes += [*self._writer.notes, *edit_notes(self._root, self._governance)]
-        kept = keep_zenoh(
-            self._transaction,
-            self._template.zenoh,
-            self._domains,
-            permissions.certificate,
-            lambda: permissions,
-            self._now,
-            ZenohChange(self._writer.grants, stated=self._certified),
+        change = self._change
+        change.notes += [*self._writer.notes, *change.edit_notes()]
+        change.keep_zenoh(self._writer.grants, stated=self._certified)
+        change.notes += self.name_notes()
+        change.entries += self._writer.entries
+
+    def name_notes(self) -> Iterator[Note]:
+        """Yield notes on names of new enclaves."""
+        return name_notes({*self._change.names, *self._new}, self._new)
+
+    def result(
+        self,
+        requests: Sequence[SigningRequest],
+        *,
+        renew: bool,
+        kept: Collection[str] = (),
+        archive: bytes = b"",
+    ) -> Signed:
+        """Return what was done with requests, of which ``kept`` had a certificate already."""
+        done = "renewed" if renew else "created"
+        return self._change.result(
+            Signed,
+            outcomes={each.name: "kept" if each.name in kept else done for each in requests},
+            keys={each.name: key_digest(each.public_key) for each in requests},
+            identity_ca=self._change.identity.certificate,
+            permissions_ca=self._change.permissions.certificate,
+            archive=archive,
         )
-        self._notes += kept.notes
-        return kept
-
-    def record(self, *more: Entry) -> None:
-        """Write the ledger."""
-        entries = [*self._fleet_entries, *self._writer.entries, *more]
-        append(self._transaction, entries, self.authorities.identity, self._now)
-
-    def all_notes(self) -> tuple[Note, ...]:
-        """Return all remarks."""
-        return (*self._notes, *name_notes({*self._existing, *self._new}, self._new))
 
 
 def _check_free(answer: Path, force: bool) -> None:
@@ -495,21 +435,22 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
         )
 
 
-def _check_key(root: Path, request: SigningRequest, known: KnownKeys, renew: bool) -> None:
+def _check_key(
+    keystore: Keystore, request: SigningRequest, known: KnownKeys, present: x509.Certificate | None
+) -> None:
     """Refuse a revoked key, the key of another enclave, and a key that does not fit the keystore.
 
     An enclave that already shares its key with another one is renewed with a note.
     """
     remedy = "Create a new key on the robot, with `sros create_request` in another folder."
-    present = _present_certificate(root, request.name) if renew else None
     same = present if present and present.public_key() == request.public_key else None
     known.refuse_revoked(request.public_key, f"the request for {request.name}", remedy, same)
     if not same:
         known.refuse_second(request.public_key, request.name, remedy)
-    folder = enclave_path(root, request.name)
+    root, folder = keystore.root, keystore.folder(request.name)
     path, fits = folder / KEY_FILE, True
     if path.exists():
-        key = load_key(read_bytes(path, "private key"), f"'{path}'")
+        key = load_key(keystore.read(path, "private key"), f"'{path}'")
         fits = key.public_key() == request.public_key
     elif (path := folder / KEY_URI_FILE).exists():
         fits = same is not None
@@ -533,9 +474,8 @@ def _check_result(answer: RequestAnswer, request: SigningRequest, now: datetime)
         ) from error
 
 
-def _new_key_note(root: Path, request: SigningRequest) -> list[Note]:
+def _new_key_note(old: x509.Certificate, request: SigningRequest) -> list[Note]:
     """Return a note if the request's key is not the key of the present certificate."""
-    old = _present_certificate(root, request.name)
     if old.public_key() == request.public_key:
         return []
     until = iso(validity_of(old).not_after)
@@ -562,23 +502,18 @@ def _lost_rights(
     return [Note("request.rights-lost", f"{lost} {text} {again}")]
 
 
-def _earlier_rights(root: Path, name: str, authority: x509.Certificate) -> EarlierRights:
+def _earlier_rights(change: KeystoreChange, name: str, present: x509.Certificate) -> EarlierRights:
     """Return the rights in an enclave's present permissions, after verifying their signature."""
-    subject = text_of(_present_certificate(root, name).subject)
-    old = read_signed_grant(enclave_path(root, name) / PERMISSIONS_FILE, subject)
-    old.signed.verify(authority)
+    subject = text_of(present.subject)
+    old = change.keystore.signed_grant(name, subject)
+    old.signed.verify(change.permissions.certificate)
     if old.grant is None:
         raise PkiError(
             f"the permissions of enclave {name} have no grant for {subject}",
             "They belong to another certificate.",
             "State the rights with -p POLICY_FILE.",
         )
-    return RecordedRights(root).of(name, old.digest, old.grant)
-
-
-def _present_certificate(root: Path, name: str) -> x509.Certificate:
-    path = enclave_path(root, name) / CERTIFICATE_FILE
-    return read_certificate(path)
+    return change.recorded.of(name, old.digest, old.grant)
 
 
 def _answer_files(root: Path, issued: Issued, zenoh: KeptZenoh) -> dict[str, bytes]:

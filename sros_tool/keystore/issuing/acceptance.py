@@ -11,7 +11,7 @@ evaluated for all.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -46,6 +46,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.participant import JoinContext, VendorParticipant, load_enclave
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki import smime
@@ -104,8 +105,9 @@ def refuse_stopping(
     transaction: Transaction,
     now: datetime,
     *,
+    keystore: Keystore | None = None,
     allowed: Collection[Vendor] = (),
-    remedy: str = "",
+    remedy: Callable[[], str] = str,
 ) -> tuple[Note, ...]:
     """Refuse a transaction after which vendors refuse enclaves that they accept today.
 
@@ -114,8 +116,9 @@ def refuse_stopping(
     Args:
         transaction: the transaction, with all its files staged.
         now: the time at which the enclaves are evaluated.
+        keystore: the keystore as it was opened for the change.
         allowed: vendors whose nodes may stop, because the user named them.
-        remedy: what to do instead, as sentences; by default the changed files are named.
+        remedy: returns what to do instead, as sentences; by default the changed files are named.
 
     Returns:
         Notes on what stops on the ``allowed`` vendors, and on what a dry run did not look at.
@@ -123,12 +126,13 @@ def refuse_stopping(
     Raises:
         KeystoreError: nodes of a vendor that is not ``allowed`` would stop.
     """
-    found = _stopped_enclaves(transaction, now)
+    files = _FilesOfChange(transaction, keystore or Keystore(transaction.root))
+    found = _stopped_enclaves(files, now)
     if refused := {vendor: each for vendor, each in found.items() if vendor not in allowed}:
-        raise _would_stop(transaction.root, refused, remedy)
-    old = _authority_without_list(transaction)
+        raise _would_stop(transaction.root, refused, remedy())
+    old = _authority_without_list(files)
     if old and (cut_off := [each for each in _READ_SEVERAL if each not in allowed]):
-        raise _would_be_shut_out(transaction.root, old, cut_off, remedy)
+        raise _would_be_shut_out(transaction.root, old, cut_off, remedy())
     notes = [
         Note(
             "vendor.refuses",
@@ -143,12 +147,12 @@ def refuse_stopping(
     return tuple(notes)
 
 
-def _stopped_enclaves(transaction: Transaction, now: datetime) -> dict[Vendor, _Refusals]:
+def _stopped_enclaves(files: _FilesOfChange, now: datetime) -> dict[Vendor, _Refusals]:
     """Return the vendors that would refuse enclaves which they accept today, or which are new."""
     stopped: dict[Vendor, dict[str, list[str]]] = {}
-    for (_, own, _), names in _kinds(transaction, now).items():
+    for (_, own, _), names in _kinds(files, now).items():
         for tried, name in enumerate(names, 1):
-            before, after = _files_before(transaction.root, name), _files_after(transaction, name)
+            before, after = files.before(name), files.after(name)
             accepted = set(MEASURED) - refusals(name, before, now).keys() if before else set()
             if accepted or not before or tried == _MOST_BROKEN:
                 break
@@ -210,14 +214,14 @@ def _would_stop(root: Path, found: Mapping[Vendor, _Refusals], remedy: str) -> K
 _READ_SEVERAL = tuple(each for each in MEASURED if not each.traits.reads_first_authority)
 
 
-def _authority_without_list(transaction: Transaction) -> x509.Certificate | None:
+def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
     """Return a CA before the present one that may not sign lists, where a first list is added.
 
     Where there is a list, OpenSSL asks for one of the CA of a certificate.
     """
-    if not transaction.content_after(CRL) or _content(transaction.root / CRL):
+    if not files.content_after(CRL) or files.content(CRL):
         return None
-    data = transaction.content_after(ca_certificate(IDENTITY)) or b""
+    data = files.content_after(ca_certificate(IDENTITY))
     present, *others = load_certificates(data, "of the identity CA")
     return next(
         (
@@ -351,67 +355,92 @@ def _example(
 # ── the enclaves that change ───────────────────────────────────────────────────────────────
 
 
-def _kinds(transaction: Transaction, now: datetime) -> dict[_Kind, list[str]]:
+class _FilesOfChange:
+    """The files of enclaves before and after a transaction; a shared one is read once."""
+
+    def __init__(self, transaction: Transaction, keystore: Keystore) -> None:
+        self.transaction = transaction
+        self.changed = transaction.changed_folders()
+        self._keystore = keystore
+        self._after: dict[str, bytes] = {}
+
+    def places_after(self, name: str) -> dict[str, str]:
+        """Map the files of an enclave to where their content will be."""
+        folder = enclave_folder(name)
+        return {file: self.transaction.place_after(f"{folder}/{file}") for file in _LOADED}
+
+    def before(self, name: str) -> Files:
+        """Return the files of an enclave as they are; none if one is missing."""
+        folder = enclave_folder(name)
+        return _complete({file: self.content(f"{folder}/{file}") for file in _LOADED})
+
+    def after(self, name: str) -> Files:
+        """Return the files of an enclave as they will be; none if one is missing."""
+        places = self.places_after(name)
+        return _complete({file: self.content_after(place) for file, place in places.items()})
+
+    def content(self, path: str, *, kept: bool = True) -> bytes:
+        """Return the content of a file as it is, or nothing; only if ``kept`` it is remembered."""
+        try:
+            if kept:
+                return self._keystore.read(path, "file")
+            return read_bytes(self._keystore.root / path, "file")
+        except SrosError:
+            return b""
+
+    def content_after(self, place: str, *, kept: bool = True) -> bytes:
+        """Return the content that a file, not a link, will have, or nothing."""
+        if not self.transaction.is_staged(place):
+            return self.content(place, kept=kept)
+        if place not in self._after:
+            self._after[place] = self.transaction.content_after(place) or b""
+        return self._after[place]
+
+
+def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
     """Return the complete enclaves that change, by all in which vendors could see a difference."""
-    changed = transaction.changed_folders()
+    changed, enclaves = files.changed, files.transaction.enclaves
     shared = changed.get(PUBLIC, set()) | changed.get(ENCLAVES, set()) & {GOVERNANCE_FILE}
     documents = not shared <= _ONLY_IDENTITY
     names = {
         f"/{folder.removeprefix(ENCLAVES).lstrip('/')}"
-        for folder, files in changed.items()
-        if folder.split("/", 1)[0] == ENCLAVES and not files.isdisjoint(_LOADED)
+        for folder, changed_files in changed.items()
+        if folder.split("/", 1)[0] == ENCLAVES and not changed_files.isdisjoint(_LOADED)
     }
     if shared:
-        names.update(transaction.enclaves)
-    present = frozenset(transaction.enclaves)
+        names.update(enclaves)
+    present = frozenset(enclaves)
     lists: dict[str, frozenset[int]] = {}
-    found: dict[_Kind, list[str]] = {}
+    kinds: dict[_Kind, list[str]] = {}
     for name in sorted(names):
         folder = enclave_folder(name)
-        places = {file: transaction.place_after(f"{folder}/{file}") for file in _LOADED}
+        places = files.places_after(name)
         own = frozenset(changed.get(folder, ())).intersection(_LOADED)
         shared_places = tuple(place.removeprefix(f"{folder}/") for place in places.values())
         looks: tuple[object, ...] = ()
         if name in present:  # otherwise this transaction issues it, as all others that are new
-            data = transaction.content_after(places[CERTIFICATE_FILE])
+            # What the change has not read is not kept: a large keystore has many certificates.
+            data = files.content_after(places[CERTIFICATE_FILE], kept=bool(own))
             if not data:
                 continue  # it is revoked, or its request is not answered yet
             crl = places[CRL_FILE]
             if crl not in lists:
-                lists[crl] = _listed(transaction.content_after(crl) or b"")
-            old = transaction.root / folder / CERTIFICATE_FILE
-            before = _content(old) if CERTIFICATE_FILE in own else b""
+                lists[crl] = _listed(files.content_after(crl))
+            is_new = CERTIFICATE_FILE in own
+            before = files.content(f"{folder}/{CERTIFICATE_FILE}") if is_new else b""
             signed = documents or PERMISSIONS_FILE in own
             looks = (
                 _certificate_kind(data, lists[crl], now),
                 _certificate_kind(before, frozenset(), now),
-                signed and _signers(transaction.content_after(places[PERMISSIONS_FILE]) or b""),
+                signed and _signers(files.content_after(places[PERMISSIONS_FILE])),
             )
-        found.setdefault((shared_places, own, looks), []).append(name)
-    return found
-
-
-def _files_after(transaction: Transaction, name: str) -> Files:
-    """Return the files of an enclave as they will be; none if one is missing."""
-    places = {f: transaction.place_after(f"{enclave_folder(name)}/{f}") for f in _LOADED}
-    return _complete({file: transaction.content_after(place) for file, place in places.items()})
-
-
-def _files_before(root: Path, name: str) -> Files:
-    """Return the files of an enclave as they are; none if one is missing."""
-    return _complete({file: _content(root / enclave_folder(name) / file) for file in _LOADED})
+        kinds.setdefault((shared_places, own, looks), []).append(name)
+    return kinds
 
 
 def _complete(found: Mapping[str, bytes | None]) -> Files:
     files = {file: data for file, data in found.items() if data}
     return files if all(file in files for file in _NEEDED) else {}
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return read_bytes(path, "file")
-    except SrosError:
-        return b""
 
 
 def _certificate_kind(data: bytes, listed: frozenset[int], now: datetime) -> tuple[object, ...]:

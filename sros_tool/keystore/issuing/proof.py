@@ -261,13 +261,20 @@ def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
     found: set[str | None] = {each for each in known if not is_expression(each)}
     for index, one in enumerate(wild):
         found.add(_only(one, known))
-        found.add(common_name([one], absolute=False))
+        found.add(_matched(one))
         for other in wild[index + 1 :]:
             if overlap(one, other):
                 found.add(common_name([one, other], absolute=False))
     for prefix in ("rt/*", "rq/*Request", "rr/*Reply", "*"):
         found.add(_only(prefix, known))
     return tuple(sorted(each for each in found if each))
+
+
+def _matched(expression: str) -> str | None:
+    """Return a name that an expression matches, or None if no valid name does."""
+    name = expression.replace("*", "n")
+    # The search for the shortest name is only worth its time where this is none.
+    return common_name([expression], absolute=False) if is_expression(name) else name
 
 
 def _only(one: str, known: list[str]) -> str | None:

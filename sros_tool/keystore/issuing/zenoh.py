@@ -16,6 +16,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import Note
 from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.ledger import Ledger
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh.wanted import (
     NO_CHANGE,
@@ -52,17 +53,20 @@ class KeptZenoh:
 
 def keep_zenoh(
     transaction: Transaction,
-    network: ZenohNetwork | None,
+    *,
+    keystore: Keystore,
+    network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,
     signer: Callable[[], Authority],
     now: datetime,
     change: ZenohChange = NO_CHANGE,
 ) -> KeptZenoh:
-    """Stage the configurations as the keystore will need them; nothing without a ``network``.
+    """Stage the configurations as the keystore will need them.
 
     Args:
         transaction: the transaction, before its commit.
+        keystore: the keystore, as it was opened for the change.
         network: the Zenoh network of the keystore's settings.
         domains: the ROS domains of the keystore's governance.
         authority: the permissions CA that signed what the keystore has.
@@ -74,12 +78,9 @@ def keep_zenoh(
         PolicyError: an enclave's rights cannot be stated to Zenoh.
         KeystoreError: the enclave of the router is missing.
     """
-    if network is None:
-        return KeptZenoh()
-    root = transaction.root
     existing = transaction.enclaves
-    wanted = zenoh_documents(root, network, domains, authority, now, change, existing=existing)
-    drifts = drifted(root, wanted, authority, change.gone)
+    wanted = zenoh_documents(keystore, network, domains, authority, now, change, existing=existing)
+    drifts = drifted(keystore, wanted, authority, change.gone)
     for each in drifts:
         if each.kind is Drift.STALE:
             _remove(transaction, each.path)

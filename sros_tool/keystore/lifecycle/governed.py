@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from datetime import datetime
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 
-from sros_tool.dds.governance import Governance
-from sros_tool.errors import KeystoreError, Note
-from sros_tool.keystore.authorities.authority import Authority
+from sros_tool.dds.governance import Governance, parse_governance, render_governance
+from sros_tool.errors import KeystoreError, Note, check_meaning
+from sros_tool.keystore.authorities.authority import write_copies
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
-from sros_tool.keystore.issuing.governance import write_governance
-from sros_tool.keystore.layout import SETTINGS, enclave_path, key_on_robot
-from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.layout import (
+    GOVERNANCE_FILE,
+    GOVERNANCE_P7S,
+    GOVERNANCE_XML,
+    SETTINGS,
+    enclave_path,
+    key_on_robot,
+)
+from sros_tool.keystore.ledger import document_entry
+from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.protection import less_protected, with_stated
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy.model import StatedProtection
 from sros_tool.policy.protection import Level
 from sros_tool.translate import governance_for
@@ -26,48 +31,39 @@ from sros_tool.translate import governance_for
 _SHOWN = 5
 
 
-@dataclass(frozen=True, slots=True)
-class Governed:
-    """The settings of a keystore with what policies demand, and what follows from the change.
+def write_governance(
+    change: KeystoreChange, governance: Governance, *, names: Sequence[str]
+) -> None:
+    """Sign, stage and record the governance of a keystore that is made from settings.
 
-    ``restart`` are the enclaves whose processes have to be restarted, with new files.
+    Of the enclaves ``names``, those that have a copy in place of the link get the new document,
+    too.
     """
+    document, what = render_governance(governance), "the governance document"
+    check_meaning(parse_governance(document), governance, what)
+    message = change.permissions.sign(document, what)
+    change.transaction.write(GOVERNANCE_XML, document)
+    change.transaction.write(GOVERNANCE_P7S, message)
+    # The governance of the keystore itself is in the folder of the enclave /.
+    below = [name for name in names if name != "/"]
+    write_copies(change.transaction, below, GOVERNANCE_FILE, message)
+    change.entries.append(document_entry(change.now, "governance", message))
 
-    template: Template
-    entries: tuple[Entry, ...] = ()
-    restart: tuple[str, ...] = ()
-    remarks: tuple[Note, ...] = ()
 
-
-def protected_as_stated(
-    transaction: Transaction,
-    template: Template,
-    governance: Governance,
-    stated: Sequence[StatedProtection],
-    permissions: Authority,
-    names: Sequence[str],
-    now: datetime,
-) -> Governed:
+def raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection]) -> None:
     """Stage the governance and the settings of an existing keystore if policies demand more.
 
-    Args:
-        transaction: the transaction of the keystore.
-        template: its settings.
-        governance: its signed governance.
-        stated: what policies say about the protection of names.
-        permissions: the permissions CA.
-        names: its enclaves.
-        now: the time of the change.
+    ``stated`` is what policies say about the protection of names.
 
     Raises:
         PolicyError: the statements contradict each other, or the settings.
         KeystoreError: the files of the settings cannot state it, or were edited by hand.
     """
+    root, template, governance = change.root, change.template, change.governance
     protection = with_stated(template.protection, stated)
-    less = [each for each, _ in less_protected(governance, stated)]
+    less = [demanded for demanded, _ in less_protected(governance, stated)]
     if not less:
-        return Governed(template)
-    root = transaction.root
+        return
     demand = f"{less[0].source} demands that {less[0]} has protect={less[0].word!r}"
     if not (root / SETTINGS).exists():
         raise KeystoreError(
@@ -76,30 +72,29 @@ def protected_as_stated(
             f"Give it settings first: `sros update_keystore {quote(str(root))} --template "
             "NAME|FILE --dry-run` shows what they would change.",
         )
-    if edits := found_edits(root, governance):
+    if edits := found_edits(change.keystore, governance):
         raise KeystoreError(
             f"{demand}, and files of keystore '{root}' were edited by hand: "
             f"{'; '.join(edits.clauses())}",
             "It is unclear which governance to start from.",
             f"First carry it out or undo it: {edit_remedy(root)}",
         )
-    raised = replace(template, protection=protection)
-    after = governance_for(raised.protection, governance.domains().closed())
-    entries = (
-        write_governance(transaction, after, permissions, names, now),
-        write_settings(transaction, raised, now),
-    )
+    change.template = replace(template, protection=protection)
+    after = governance_for(protection, governance.domains().closed())
+    write_governance(change, after, names=change.names)
+    change.entries.append(write_settings(change.transaction, change.template, change.now))
     more = f" and {len(less) - _SHOWN} more" if len(less) > _SHOWN else ""
     changes = compare_governance(governance, after)
     text = (
         f"The governance of the keystore changes, because policies demand it: "
-        f"{', '.join(f'{each} {each.word} ({each.source})' for each in less[:_SHOWN])}{more}. "
+        f"{', '.join(f'{name} {name.word} ({name.source})' for name in less[:_SHOWN])}{more}. "
         f"{'; '.join(dict.fromkeys(each.meaning for each in changes[:_SHOWN]))}."
     )
-    remarks = (
+    change.restart = change.names
+    change.remarks += (
         Note("keystore.governance-by-policy", text),
         restart_note(mismatch(governance, after)),
-        exports_note(root, names),
+        exports_note(root, change.names),
         Note(
             "keystore.earlier-governance",
             "The governance of before is still validly signed: whoever changes the files of a "
@@ -108,7 +103,6 @@ def protected_as_stated(
         ),
         *_zenoh_notes(template),
     )
-    return Governed(raised, entries, tuple(names), remarks)
 
 
 def refuse_less_protected(

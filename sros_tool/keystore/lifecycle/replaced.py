@@ -18,8 +18,7 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
-from sros_tool.keystore.layout import CERTIFICATE_FILE, PERMISSIONS_FILE, enclave_path
-from sros_tool.keystore.reader import read_certificate, read_signed_grant
+from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, compare
@@ -70,19 +69,21 @@ class ReplacedRights:
 
 
 def earlier_permissions(
-    root: Path, name: str, authority: x509.Certificate, certificate: x509.Certificate | None = None
+    keystore: Keystore,
+    name: str,
+    authority: x509.Certificate,
+    certificate: x509.Certificate | None = None,
 ) -> EarlierPermissions | None:
     """Return the present permissions of an enclave; None if DDS would refuse them.
 
     ``authority`` is the permissions CA, ``certificate`` that of the enclave if it was read already.
     """
-    folder = enclave_path(root, name)
     with suppress(SrosError):
-        certificate = certificate or read_certificate(folder / CERTIFICATE_FILE)
-        found = read_signed_grant(folder / PERMISSIONS_FILE, subject_text(certificate.subject))
-        found.signed.verify(authority)
-        if found.grant:
-            return EarlierPermissions(certificate, found.grant)
+        certificate = certificate or keystore.certificate_of(name)
+        granted = keystore.signed_grant(name, subject_text(certificate.subject))
+        granted.signed.verify(authority)
+        if granted.grant:
+            return EarlierPermissions(certificate, granted.grant)
     return None
 
 

@@ -9,11 +9,11 @@ issuing CA alone (all measured).
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
-from pathlib import Path
 from shlex import quote
 
 from cryptography import x509
@@ -21,35 +21,35 @@ from cryptography import x509
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.keystore.authorities.authority import Authority, write_bundle
 from sros_tool.keystore.authorities.keyring import Keyring
-from sros_tool.keystore.layout import CRL, IDENTITY, revoked_certificates
-from sros_tool.keystore.ledger import Entry, Ledger, document_entry
+from sros_tool.keystore.layout import (
+    CRL,
+    IDENTITY,
+    PRIVATE,
+    enclave_folder,
+    revoked_certificates,
+)
+from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     RotationStage,
     crls_confusable,
     read_rotation,
 )
-from sros_tool.keystore.reader import (
-    authority_files,
-    certificates_of,
-    embedded_crl,
-    identity_file,
-    read_certificate,
-    read_crl,
-)
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.certificates import (
     authority_text,
+    common_name_of,
     digest,
     issued_by,
     pem,
     same_key,
     validity_of,
 )
-from sros_tool.pki.crl import REASONS, RevocationList, Revoked, sign_crl, signed_by
+from sros_tool.pki.crl import REASONS, SUPERSEDED, RevocationList, Revoked, sign_crl, signed_by
+from sros_tool.pki.requests import key_digest
 from sros_tool.validity import BACKDATE, Window, iso
-from sros_tool.xml import read_bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,46 +100,165 @@ def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> li
     return [each for each in old.revoked if expiries.get(each.serial, issued) >= issued]
 
 
-def put_away(root: Path, known: Container[str] = ()) -> Iterator[x509.Certificate]:
+def _put_away(keystore: Keystore, known: Container[str] = ()) -> Iterator[x509.Certificate]:
     """Yield the certificates in ``revoked`` that a trusted identity CA issued.
 
     Those whose serial number in hexadecimal is in ``known`` are not read.
     """
-    file = identity_file(root)
-    trusted = certificates_of(root, file) if file else ()
-    for path in revoked_certificates(root):
+    file = keystore.identity_file
+    trusted = keystore.certificates_of(file) if file else ()
+    for path in revoked_certificates(keystore.root):
         if path.parent.name not in known:
             with suppress(SrosError):  # a file that is no certificate
-                found = read_certificate(path)
-                if any(issued_by(found, each) for each in trusted):
-                    yield found
+                certificate = keystore.certificate(path)
+                if any(issued_by(certificate, authority) for authority in trusted):
+                    yield certificate
+
+
+@dataclass(frozen=True, slots=True)
+class Superseded:
+    """A certificate that was replaced, and the digest of the key of the new certificate."""
+
+    name: str
+    old: Entry
+    not_after: datetime
+    new_key: str
+
+    @classmethod
+    def by(
+        cls, name: str, old: x509.Certificate, new: x509.Certificate, now: datetime
+    ) -> Superseded:
+        """Return the record that ``new`` replaced ``old`` at ``now``."""
+        entry = certificate_entry(now, "certificate", old, name)
+        key = key_digest(new.public_key())  # type: ignore[arg-type]
+        return cls(name, entry, validity_of(old).not_after, key)
 
 
 class RevocationListSigner:
     """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
     ``present`` is the list before the change, or None if there is none, or if no trusted identity
-    CA signed it.  ``remarks`` are sentences about lists that could not be signed or used.
+    CA signed it.  ``remarks`` are sentences about lists that could not be signed or used, and about
+    certificates that nobody may know of.
     """
 
     def __init__(
         self,
         transaction: Transaction,
+        keystore: Keystore,
+        *,
         authority: Authority,
         template: Template,
         keyring: Keyring,
-        ledger: Ledger,
         now: datetime,
     ) -> None:
         self._transaction = transaction
-        self._root = transaction.root
+        self._keystore = keystore
+        self._root = keystore.root
         self._authority = authority
         self._template = template
         self._keyring = keyring
-        self._ledger = ledger
         self._now = now
+        self._last: Mapping[str, Entry] = {}
         self.remarks: list[Note] = []
-        self.present = self._authentic(read_crl(self._root))
+        self.present = self._authentic(keystore.revocation_list)
+
+    # ── what is revoked ────────────────────────────────────────────────────────────────────
+
+    def revocations(
+        self, last: Mapping[str, Entry], reason: str, *, keep: Mapping[str, str] | None = None
+    ) -> list[Entry]:
+        """Return the ledger entries for revoking all valid certificates of enclaves.
+
+        `sign` then remarks if the ledger may lack some of them.
+
+        Args:
+            last: the present certificate of each of the enclaves.
+            reason: the reason, as RFC 5280 spells it.
+            keep: the digests of the keys of enclaves that are not revoked with their certificates.
+        """
+        listed = {each.serial for each in self.present.revoked} if self.present else set()
+        revocations = []
+        moment = iso(self._now)
+        present = last
+        if keep is not None:  # an expired certificate needs no revocation to be replaced
+            present = {name: each for name, each in last.items() if each.not_after >= moment}
+        for name, valid in self._still_valid(last, present).items():
+            for serial, each in valid.items():
+                if serial not in listed:
+                    listed.add(serial)
+                    key = "" if keep and each.key == keep[name] else each.key
+                    revocations.append(
+                        Entry(
+                            iso(self._now),
+                            "revocation",
+                            each.enclave,
+                            each.subject,
+                            each.serial,
+                            reason=reason,
+                            key=key,
+                        )
+                    )
+        self._last = last
+        return revocations
+
+    def superseded(self, replaced: Iterable[Superseded]) -> list[Entry]:
+        """Return the ledger entries for revoking all certificates that enclaves had before."""
+        by_name = {each.name: each for each in replaced}
+        return self.revocations(
+            {name: each.old for name, each in by_name.items()},
+            SUPERSEDED,
+            keep={name: each.new_key for name, each in by_name.items()},
+        )
+
+    def _still_valid(
+        self, names: Iterable[str], present: Mapping[str, Entry]
+    ) -> dict[str, dict[int, Entry]]:
+        """Map each of the enclaves to its certificates that have not expired, by serial number.
+
+        They are from the ledger, from the files in ``revoked`` (a list that was lost no longer has
+        those), and the ``present`` ones, which the ledger lacks if ros2/sros2 issued them.
+        """
+        found: dict[str, dict[int, Entry]] = {name: {} for name in names}
+        moment = iso(self._now)
+        for each in self._keystore.ledger.entries:
+            expired = each.not_after and each.not_after < moment
+            if each.what == "certificate" and each.enclave in found and each.serial and not expired:
+                found[each.enclave][int(each.serial, 16)] = each
+        for certificate in _put_away(self._keystore):
+            name = common_name_of(certificate.subject)
+            if name in found and validity_of(certificate).not_after >= self._now:
+                entry = certificate_entry(self._now, "certificate", certificate, name)
+                found[name][certificate.serial_number] = entry
+        for name, each in present.items():
+            found[name][int(each.serial, 16)] = each
+        return found
+
+    def _note_lack(self) -> None:
+        """Note if the ledger may lack earlier certificates of the enclaves that are revoked."""
+        if not self._last:
+            return
+        ledger = self._keystore.ledger
+        why = list(ledger.gaps)
+        if ledger.unchained:
+            why.append(
+                f"nothing shows whether a line was removed from its first {ledger.unchained}"
+            )
+        recorded = {int(each.serial, 16) for each in ledger.entries if each.serial}
+        lacking = (
+            name for name, each in self._last.items() if int(each.serial, 16) not in recorded
+        )
+        if unknown := sorted(lacking):
+            why.append(f"it does not have the present certificate of {', '.join(unknown)}")
+        if why:
+            text = (
+                f"The ledger of '{self._root}' may lack earlier certificates: {'; '.join(why)}. "
+                "Those that it lacks stay valid until they expire or their CA is replaced: see "
+                "`sros rotate_ca`."
+            )
+            self.remarks.append(Note("ledger.may-lack-certificates", text))
+
+    # ── the lists ──────────────────────────────────────────────────────────────────────────
 
     def _authentic(self, found: RevocationList | None) -> RevocationList | None:
         """Return a list if a trusted identity CA signed it; else None, with a remark.
@@ -147,8 +266,9 @@ class RevocationListSigner:
         Whoever can write the file, but not sign, could have entries signed that revoke others, or
         that keep a certificate from being revoked.
         """
-        file = identity_file(self._root)
-        trusted = certificates_of(self._root, file) if file else (self._authority.certificate,)
+        file = self._keystore.identity_file
+        own = (self._authority.certificate,)
+        trusted = self._keystore.certificates_of(file) if file else own
         if found is None or any(signed_by(found.list, each) for each in trusted):
             return found
         text = (
@@ -159,11 +279,11 @@ class RevocationListSigner:
         return None
 
     def sign(
-        self, new_entries: Sequence[Revoked], names: Sequence[str], *, incomplete: bool
+        self, revocations: Sequence[Entry], names: Sequence[str], *, incomplete: bool
     ) -> tuple[datetime, list[Entry]]:
-        """Sign and stage the lists; return their first expiry and their ledger entries.
+        """Sign and stage the lists; return their first expiry and all ledger entries.
 
-        ``new_entries`` are the certificates to revoke, ``names`` the enclaves that get the lists.
+        ``revocations`` are the entries of what is revoked; the enclaves ``names`` get the lists.
         Each list has all serial numbers: the ledger does not say which of two CAs issued a
         certificate, and a serial number of the other CA does no harm.
 
@@ -171,6 +291,8 @@ class RevocationListSigner:
             KeystoreError: a revocation needs the key of the old CA, which is missing, and
                 ``incomplete`` is not set.
         """
+        date = self._now.replace(microsecond=0)
+        new_entries = [Revoked(int(each.serial, 16), date, each.reason) for each in revocations]
         expiries = self._expiries()
         if lost := self._lost(expiries):
             new_entries = [*new_entries, *lost]
@@ -184,7 +306,9 @@ class RevocationListSigner:
         found = [signed]
         if second := self._sign_second(new_entries, names, expiries, incomplete=incomplete):
             found.append(second)
-        return min(each.end for each in found), [each.entry for each in found]
+        _link_everywhere(self._transaction, names)
+        self._note_lack()
+        return min(each.end for each in found), [*revocations, *(each.entry for each in found)]
 
     def _sign(
         self,
@@ -199,18 +323,18 @@ class RevocationListSigner:
         kept += [each for each in new_entries if each.serial not in listed]
         # Without an earlier list that is authentic: above every number that was used, because each
         # list that is signed adds an entry to the ledger, and at most 2 to the number.
-        used = 2 * sum(each.what == "crl" for each in self._ledger.entries)
+        used = 2 * sum(each.what == "crl" for each in self._keystore.ledger.entries)
         number = max(old.number + 1 if old else used + 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
 
     def _lost(self, expiries: Mapping[int, str]) -> list[Revoked]:
         """Return the revocations in the ledger, if the present list is older than the last one."""
-        entries = self._ledger.entries
+        entries = self._keystore.ledger.entries
         count = max(
             (i for i, each in enumerate(entries, 1) if each.what == "revocation"), default=0
         )
-        path = self._root / CRL
-        present = read_bytes(path, "revocation list") if path.exists() else b""
+        keystore = self._keystore
+        present = keystore.read(CRL, "revocation list") if keystore.has(CRL) else b""
         sha256 = hashlib.sha256(present).hexdigest()
         if any(each.what == "crl" and each.sha256 == sha256 for each in entries[count:]):
             return []
@@ -232,11 +356,11 @@ class RevocationListSigner:
         """
         recorded = {
             each.serial: each.not_after
-            for each in self._ledger.certain
+            for each in self._keystore.ledger.certain
             if each.what == "certificate" and each.serial and each.not_after
         }
         expiries = {int(serial, 16): not_after for serial, not_after in recorded.items()}
-        for found in put_away(self._root, recorded):
+        for found in _put_away(self._keystore, recorded):
             expiries.setdefault(found.serial_number, iso(validity_of(found).not_after))
         return expiries
 
@@ -254,18 +378,18 @@ class RevocationListSigner:
 
         Return None if there is no second CA or its list cannot be signed.
         """
-        rotation = read_rotation(self._root)
-        file = identity_file(self._root)
+        rotation = read_rotation(self._keystore)
+        file = self._keystore.identity_file
         replaced = next((each for each in rotation.replacements if each.file == file), None)
         if not replaced or not file:
             return None
         coming = rotation.stage is RotationStage.DISTRIBUTE
-        certificates = certificates_of(self._root, file)
+        certificates = self._keystore.certificates_of(file)
         wanted = replaced.new if coming else replaced.old
         (other,) = [each for each in certificates if digest(each) == wanted]
         if coming and crls_confusable(certificates[0], other):
             return None  # in this case all processes have to be restarted together anyway
-        old = self._authentic(embedded_crl(self._root, file))
+        old = self._authentic(self._keystore.embedded_list(file))
         try:
             authority = self._open(other, replaced, coming=coming)
         except KeystoreError as error:
@@ -277,7 +401,8 @@ class RevocationListSigner:
         least = (self.present.number if self.present else 0) + 2 if coming else 0
         signed = self._sign(authority, old, () if coming else new_entries, expiries, least)
         bundle = b"".join(map(pem, certificates)) + signed.document
-        write_bundle(self._transaction, file, authority_files(self._root)[file], bundle, names)
+        roles = self._keystore.authority_files[file]
+        write_bundle(self._transaction, file, roles, bundle, names)
         return signed
 
     def _open(
@@ -286,7 +411,7 @@ class RevocationListSigner:
         place = replaced.key if coming else replaced.old_key_place(certificate)
         # The places in the environment variables are for the key of the issuing CA.
         keyring = replace(self._keyring, places={})
-        key = keyring.open(self._root, IDENTITY, replace(self._template, identity_key=place))
+        key = keyring.open(self._keystore, IDENTITY, replace(self._template, identity_key=place))
         if not same_key(certificate, key):
             name = authority_text(certificate)
             raise KeystoreError(
@@ -326,3 +451,40 @@ class RevocationListSigner:
             text += "the enclaves of that CA"
         text += f": run `sros rotate_ca {quote(str(self._root))} --to retire`."
         self.remarks.append(Note("crl.old-ca-not-signed", text))
+
+
+def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
+    """Stage the link ``crl.pem`` to the revocation list for each enclave without it."""
+
+    def link(part: Sequence[str]) -> None:
+        for name in part:
+            folder = enclave_folder(name)
+            target = "../" * folder.count("/") + f"../{CRL}"
+            # Some ways to copy a keystore replace the link by a file, which would never be updated.
+            try:
+                there = os.readlink(f"{transaction.root}/{folder}/crl.pem")  # noqa: PTH115 - fast
+            except OSError:
+                there = ""
+            if there != target:
+                transaction.link(f"{folder}/crl.pem", target)
+
+    transaction.on_all_cores(names, link)
+
+
+def another_ca(keystore: Keystore, aim: str) -> str:
+    """Return what to do where DDS refuses the lists of the identity CA, before the ``aim``."""
+    file = keystore.identity_file
+    words = ["sros rotate_ca", quote(str(keystore.root))]
+    if read_rotation(keystore).stage is not RotationStage.NONE:
+        return (
+            f"First retire the old CA: `{' '.join(words)} --finish`, restart all processes, and "
+            f"{aim} then."
+        )
+    if len(keystore.authority_files) > 1:
+        words.append("--identity")
+    if not keystore.has(f"{PRIVATE}/{file}.key.pem"):
+        words.append("--identity-key URI")
+    return (
+        f"Replace the identity CA by one that may sign revocation lists: `{' '.join(words)} "
+        f"--finish`, restart all processes, and {aim} then."
+    )

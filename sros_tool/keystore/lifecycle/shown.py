@@ -1,14 +1,14 @@
 """What ``--json`` prints of changes of a keystore: creation, renewal, revocation, update, rotation.
 
-The functions turn the result of a change into what is printed of it.
+`shown` turns the result of a change into what is printed of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Generic, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Generic, NamedTuple, TypeVar
 
 from sros_tool.errors import Note
 from sros_tool.keystore.layout import ROLES
@@ -29,17 +29,15 @@ from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words, s
 
 if TYPE_CHECKING:
     from sros_tool.keystore.comparison import SettingChange
+    from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.keystore.lifecycle.create import Creation
-    from sros_tool.keystore.lifecycle.renew import Renewal
     from sros_tool.keystore.lifecycle.revoke import Revocation
-    from sros_tool.keystore.lifecycle.rotation.stages import RotationStep
     from sros_tool.keystore.lifecycle.rotation.state import (
         AuthorityStatus,
         RotationStage,
         RotationStatus,
     )
-    from sros_tool.keystore.lifecycle.update import KeystoreUpdate, UpdateStage
-    from sros_tool.keystore.template import Template
+    from sros_tool.keystore.lifecycle.update import UpdateStage
     from sros_tool.pki.crl import RevocationList
     from sros_tool.zenoh.network import ZenohNetwork
 
@@ -52,6 +50,41 @@ TrustRevoked = Annotated[
     Sequence[str],
     "Enclaves whose processes trust the revoked certificates until they are restarted.",
 ]
+
+
+Form = TypeVar("Form", bound=tuple[Any, ...])
+
+
+def shown(result: Changed, form: type[Form], **more: Any) -> Form:
+    """Return what ``--json`` prints of a change: the keys of ``form``, from the result or ``more``.
+
+    ``notes`` among ``more`` are added to those of the result.
+    """
+    root = result.root
+    known: dict[str, Callable[[], Any]] = {
+        "keystore": lambda: root,
+        "folder": lambda: root,
+        "enclaves": lambda: enclave_results(result),
+        "restart_zenoh": lambda: result.zenoh.restart,
+        "replaced_work_until": lambda: result.works_until,
+        "changes": lambda: changes_below(root, result.changes),
+        "notes": lambda: (*result.notes, *result.remarks, *more.get("notes", ())),
+    }
+    values = {}
+    for key in form._fields:  # type: ignore[attr-defined]
+        if key in known and (key == "notes" or key not in more):
+            values[key] = known[key]()
+        else:
+            values[key] = more[key] if key in more else getattr(result, key)
+    return form(**values)
+
+
+def enclave_results(result: Changed) -> list[EnclaveResult[str]]:
+    """Return what was done with enclaves; those that a dry run would write are not there yet."""
+    return [
+        enclave_result(result.root, name, done, written=not result.dry_run or done == "kept")
+        for name, done in result.outcomes.items()
+    ]
 
 
 # ── create_keystore, create_enclave, create_permission, generate_artifacts ──────────────────
@@ -97,27 +130,6 @@ MadeEnclaves = EnclaveCreation[
 ]
 
 
-def shown_creation(
-    result: Creation, notes: Sequence[Note] = (), *, dry_run: bool
-) -> EnclaveCreation[str]:
-    """Return what is printed of new or changed enclaves, with more ``notes``."""
-    return EnclaveCreation(
-        result.root,
-        dry_run,
-        result.new_keystore,
-        enclaves=[
-            enclave_result(result.root, name, done, written=not dry_run or done == "kept")
-            for done in ("created", "changed", "completed", "kept")
-            for name in getattr(result, done)
-        ],
-        rights=result.replaced,
-        restart=result.restart,
-        restart_zenoh=result.zenoh.restart,
-        changes=changes_below(result.root, result.changes),
-        notes=(*result.notes, *result.remarks, *notes),
-    )
-
-
 @shows(spread=("facts",))
 class KeystoreAuthority(NamedTuple):
     """A CA of a new keystore."""
@@ -143,30 +155,25 @@ class NewKeystore(NamedTuple):
 
 
 def shown_keystore(
-    result: Creation,
-    template: Template,
-    imported: Mapping[str, bytes],
-    notes: Sequence[Note],
-    *,
-    dry_run: bool,
+    result: Creation, imported: Mapping[str, bytes], notes: Sequence[Note]
 ) -> NewKeystore:
     """Return what is printed of a new keystore; ``imported`` are certificates of CAs by role."""
     authorities = []
-    for roles in [(role,) for role in ROLES] if template.separate_authorities else [ROLES]:
+    separate = result.template.separate_authorities
+    for roles in [(role,) for role in ROLES] if separate else [ROLES]:
         role, certificate = roles[0], None
-        if not dry_run:
+        if not result.dry_run:
             certificate = load_ca_certificate(result.root, role)
         elif role in imported:
             certificate = load_certificate(imported[role], f"of the {role} CA")
         authorities.append(KeystoreAuthority(authority_facts(roles, certificate), role in imported))
-    return NewKeystore(
-        result.root,
-        dry_run,
-        template.name,
-        str(result.domains),
-        authorities,
-        changes_below(result.root, result.changes),
-        (*result.notes, *notes),
+    return shown(
+        result,
+        NewKeystore,
+        template=result.template.name,
+        domains=str(result.domains),
+        authorities=authorities,
+        notes=notes,
     )
 
 
@@ -218,7 +225,7 @@ class KeystoreZenoh(NamedTuple):
 
 
 def shown_zenoh(
-    result: Creation, network: ZenohNetwork | None, changed: Collection[str], *, dry_run: bool
+    result: Creation, network: ZenohNetwork | None, changed: Collection[str]
 ) -> KeystoreZenoh:
     """Return what is printed of the files of Zenoh; ``changed`` are the paths of new ones."""
     settings = None
@@ -230,19 +237,11 @@ def shown_zenoh(
             network.mode.value,
             network.domains or tuple(result.domains),
         )
-    return KeystoreZenoh(
-        result.root,
-        dry_run,
-        settings,
-        files=[
-            ZenohFileState(name, result.root / path, path not in changed)
-            for name, path in result.zenoh.files.items()
-        ],
-        created=result.created,
-        restart=result.restart,
-        changes=changes_below(result.root, result.changes),
-        notes=result.notes,
-    )
+    files = [
+        ZenohFileState(name, result.root / path, path not in changed)
+        for name, path in result.zenoh.files.items()
+    ]
+    return shown(result, KeystoreZenoh, network=settings, files=files)
 
 
 # ── renew, revoke, update_keystore ──────────────────────────────────────────────────────────
@@ -266,24 +265,6 @@ class RenewedEnclaves(NamedTuple):
     restart_zenoh: RestartZenoh
     changes: FileChanges
     notes: Notes
-
-
-def shown_renewal(result: Renewal, *, dry_run: bool) -> RenewedEnclaves:
-    """Return what is printed of a renewal."""
-    return RenewedEnclaves(
-        result.root,
-        dry_run,
-        [
-            enclave_result(result.root, name, "renewed", written=not dry_run)
-            for name in result.renewed
-        ],
-        replaced_work_until=result.works_until,
-        revoked=result.revoked,
-        restart=result.restart,
-        restart_zenoh=result.zenoh.restart,
-        changes=changes_below(result.root, result.changes),
-        notes=(*result.notes, *result.remarks),
-    )
 
 
 class RevokedEnclave(NamedTuple):
@@ -310,21 +291,6 @@ class RevokedEnclaves(NamedTuple):
     restart_zenoh: RestartZenoh
     changes: FileChanges
     notes: Notes
-
-
-def shown_revocation(result: Revocation, reason: str, *, dry_run: bool) -> RevokedEnclaves:
-    """Return what is printed of a revocation."""
-    return RevokedEnclaves(
-        result.root,
-        dry_run,
-        [RevokedEnclave(name) for name in result.revoked],
-        reason=reason,
-        next_update=result.next_update,
-        restart=result.restart,
-        restart_zenoh=result.zenoh.restart,
-        changes=changes_below(result.root, result.changes),
-        notes=result.remarks,
-    )
 
 
 class TemplateChange(NamedTuple):
@@ -373,38 +339,6 @@ class UpdatedKeystore(NamedTuple):
     restart_zenoh: RestartZenoh
     changes: FileChanges
     notes: Notes
-
-
-def shown_update(
-    update: KeystoreUpdate, undone: Sequence[str], *, dry_run: bool
-) -> UpdatedKeystore:
-    """Return what is printed of an update; ``undone`` are clauses about edits that it undoes."""
-    return UpdatedKeystore(
-        update.root,
-        dry_run,
-        needs_allow_looser=bool(update.looser()),
-        template=TemplateChange(update.before, update.after),
-        done=update.done,
-        left=update.left,
-        settings=update.settings,
-        rights=update.rights,
-        looser=update.looser(),
-        enclaves=[
-            enclave_result(update.root, name, outcome, written=not dry_run)
-            for outcome, names in (("renewed", update.renewed), ("signed", update.signed))
-            for name in names
-        ],
-        replaced_work_until=update.works_until,
-        revoked=update.revoked,
-        restart=update.restart,
-        restart_zenoh=update.zenoh.restart,
-        changes=changes_below(update.root, update.changes),
-        notes=(
-            *(Note("keystore.edit-undone", clause) for clause in undone),
-            *update.remarks,
-            *update.notes,
-        ),
-    )
 
 
 # ── crl ─────────────────────────────────────────────────────────────────────────────────────
@@ -497,7 +431,7 @@ def shown_lists(
         ],
         restart=refreshed.restart if refreshed else (),
         changes=changes_below(root, refreshed.changes) if refreshed else (),
-        notes=refreshed.remarks if refreshed else (),
+        notes=(*refreshed.notes, *refreshed.remarks) if refreshed else (),
     )
 
 
@@ -563,24 +497,3 @@ class RotationChange(NamedTuple):
     """What to do next; empty in a dry run."""
     changes: FileChanges
     notes: Notes
-
-
-def shown_step(step: RotationStep, remarks: Sequence[str], *, dry_run: bool) -> RotationChange:
-    """Return what is printed of a stage of a rotation; ``remarks`` say what to do next."""
-    reissued = any(change.path.endswith("/cert.pem") for change in step.changes)
-    outcome = "reissued" if reissued else "kept"
-    return RotationChange(
-        step.root,
-        dry_run,
-        step.stage,
-        step.files,
-        [
-            enclave_result(step.root, name, outcome, written=not (dry_run and reissued))
-            for name in step.enclaves
-        ],
-        old_keys_elsewhere=step.kept_elsewhere,
-        cut_off=step.cut_off,
-        remarks=remarks,
-        changes=changes_below(step.root, step.changes),
-        notes=step.notes,
-    )

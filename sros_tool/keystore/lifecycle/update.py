@@ -9,7 +9,8 @@ one transaction, and no state is kept: what the keystore does not have yet is wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import StrEnum
@@ -21,7 +22,6 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError, UsageError
-from sros_tool.keystore.authorities.authority import Authorities, load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.comparison import (
     Effect,
@@ -36,21 +36,17 @@ from sros_tool.keystore.expiry import (
     read_credentials,
     refuse_unreadable,
 )
-from sros_tool.keystore.fleet import EnclaveDomains, checked_fleet
-from sros_tool.keystore.issuing.acceptance import refuse_stopping
+from sros_tool.keystore.fleet import EnclaveDomains
 from sros_tool.keystore.issuing.enclave import (
-    EnclaveWriter,
     Issuance,
     NewIdentity,
     StatedRights,
     default_rights,
 )
-from sros_tool.keystore.issuing.governance import write_governance
-from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
-from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     GOVERNANCE_XML,
     PERMISSIONS,
+    PERMISSIONS_FILE,
     PRIVATE,
     PUBLIC,
     ROLES,
@@ -58,11 +54,11 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     ca_key,
     enclave_path,
-    list_enclaves,
     waits_for_answer,
 )
-from sros_tool.keystore.ledger import append, read_ledger
-from sros_tool.keystore.lifecycle.governed import exports_note, restart_note
+from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
+from sros_tool.keystore.lifecycle.governed import exports_note, restart_note, write_governance
 from sros_tool.keystore.lifecycle.renew import checked_rights
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
@@ -70,9 +66,14 @@ from sros_tool.keystore.lifecycle.replaced import (
     replaced_rights,
     rights_text,
 )
-from sros_tool.keystore.lifecycle.revoke import Superseded, another_ca, revoke_superseded
+from sros_tool.keystore.lifecycle.revocation_list import Superseded
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
-from sros_tool.keystore.reader import authority_files, governance_of, load_settings
+from sros_tool.keystore.reader import (
+    Keystore,
+    as_keystore,
+    authority_files,
+    load_settings,
+)
 from sros_tool.keystore.recorded import EarlierRights, RecordedRights
 from sros_tool.keystore.settings import (
     HandEdits,
@@ -83,13 +84,8 @@ from sros_tool.keystore.settings import (
     write_settings,
 )
 from sros_tool.keystore.template import EVERYTHING, Template, with_values
-from sros_tool.keystore.transaction.recovery import tidy
-from sros_tool.keystore.transaction.stage import Change
-from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.keystore.zenoh.wanted import ZenohChange
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import enclave_subject, has_unique_part, same_key
-from sros_tool.pki.keys import PublicKey
 from sros_tool.policy.protection import DomainProtection, Level
 from sros_tool.policy.rights import compare
 from sros_tool.translate import (
@@ -100,6 +96,7 @@ from sros_tool.translate import (
     permissions_for,
     protection_for,
 )
+from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
 
@@ -158,37 +155,24 @@ class PresentSettings:
         return self.settings
 
 
-@dataclass(frozen=True, slots=True)
-class KeystoreUpdate:
-    """The result of an update; with ``dry_run``, the result it would have.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeystoreUpdate(Changed):
+    """The result of an update.
 
-    ``done`` are the stages that it carries out, ``left`` those that remain.  ``renewed`` are the
-    enclaves with a new certificate and permissions, ``signed`` those with new permissions only.
-    ``rights`` has what enclaves gain and lose.  ``works_until`` is the latest expiry of replaced
-    certificates with their permissions, or None if none works.  ``revoked`` is the number of
-    revoked certificates.  ``restart`` are the enclaves whose processes have to be restarted,
-    ``remarks`` notes about that and other open tasks; ``zenoh`` are the configurations for Zenoh.
+    ``before`` and ``after`` are the names of the templates.  ``done`` are the stages that it
+    carries out, ``left`` those that remain.  ``outcomes`` has the enclaves that are renewed, with a
+    new certificate and permissions, and signed, with new permissions only.
     """
 
-    root: Path
     before: str
     after: str
-    done: tuple[UpdateStage, ...]
-    left: tuple[UpdateStage, ...]
-    settings: tuple[SettingChange, ...]
-    rights: tuple[ReplacedRights, ...]
-    renewed: tuple[str, ...]
-    signed: tuple[str, ...]
-    works_until: datetime | None
-    revoked: int
-    restart: tuple[str, ...]
-    remarks: tuple[Note, ...]
-    changes: Sequence[Change]
-    notes: tuple[Note, ...] = ()
-    zenoh: KeptZenoh = KeptZenoh()  # noqa: RUF009 - frozen
+    done: tuple[UpdateStage, ...] = ()
+    left: tuple[UpdateStage, ...] = ()
+    settings: tuple[SettingChange, ...] = ()
 
+    @property
     def looser(self) -> tuple[str, ...]:
-        """Return a clause for each thing that becomes possible."""
+        """Everything that becomes possible, settings and rights, as clauses."""
         gained = [
             f"{each.enclave} gains {rights_text(each.gained)}"
             for each in self.rights
@@ -200,22 +184,23 @@ class KeystoreUpdate:
 # ── what is, and what shall be ─────────────────────────────────────────────────────────────
 
 
-def present_settings(root: Path) -> PresentSettings:
+def present_settings(root: Path | Keystore) -> PresentSettings:
     """Return the settings that are in force in a keystore.
 
     Raises:
         KeystoreError: ``root`` is no keystore, or its governance cannot be used.
         DocumentError: its settings are malformed, and the ledger does not have those of before.
     """
-    list_enclaves(root)
-    governance = governance_of(root)
-    ledger = read_ledger(root, having=("what", "settings"))
+    keystore = as_keystore(root)
+    keystore.check()
+    governance = keystore.governance
+    ledger = keystore.ledger_with("what", "settings")
     recorded = recorded_settings(ledger)
-    missing = not (root / SETTINGS).exists()
+    missing = not keystore.has(SETTINGS)
     without_settings = missing and recorded is None
     written, unreadable = None, ""
     try:
-        loaded = recorded if missing and recorded else load_settings(root)
+        loaded = recorded if missing and recorded else keystore.template
         written = None if missing else loaded
         unreadable = f"there is no {SETTINGS}" if missing and recorded else ""
     except DocumentError as error:
@@ -231,7 +216,7 @@ def present_settings(root: Path) -> PresentSettings:
     settings = recorded or loaded
     if protection := protection_for(governance):
         settings = replace(settings, protection=protection)
-    edits = hand_edits(root, ledger, written, governance)
+    edits = hand_edits(keystore, ledger, written, governance)
     if unreadable:
         edits = replace(edits, settings=(unreadable,))
     return PresentSettings(settings, written, governance, edits, without_settings, recorded)
@@ -365,11 +350,11 @@ def update_keystore(
             are no longer those that were ``seen``, or vendors would refuse enclaves that they
             accept today.
     """
-    if not dry_run:
-        tidy(root)
-    list_enclaves(root)
-    with Transaction(root, dry_run=dry_run) as transaction:
-        present = present_settings(root)
+    change = KeystoreChange(
+        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
+    )
+    with change:
+        present = present_settings(change.keystore)
         if seen is not None and seen != present:
             raise KeystoreError(
                 f"the settings of keystore '{root}' have just changed",
@@ -389,8 +374,8 @@ def update_keystore(
         pending = _pending(present, goal)
         done = pending[:1] if next_stage else pending
         step = goal if done == pending else _first_step(present, goal)
-        authorities = load_authorities(root, present.settings, keyring, now)
-        updater = _Updater(transaction, present, step, authorities, now, revoke_old=revoke_old)
+        change.template, change.governance = present.settings, present.governance
+        change.open_authorities()
         if revoke_old and not pending:
             raise UsageError(
                 "nothing changes in the keystore, so no certificate is replaced",
@@ -398,24 +383,18 @@ def update_keystore(
                 f"To replace and revoke certificates, run `sros renew {quote(str(root))} NAME "
                 "--revoke-old`.",
             )
-        update = updater.update(done, pending, keyring, progress)
-        lost = _signed_payloads(present.settings.protection, goal.settings.protection)
-        update = replace(update, remarks=(*update.remarks, *lost))
-        if not dry_run and not allow_looser and (looser := update.looser()):
+        update = _Updater(change, present, step, revoke_old=revoke_old).update(
+            done, pending[len(done) :], progress
+        )
+        change.remarks += _signed_payloads(present.settings.protection, goal.settings.protection)
+        if not dry_run and not allow_looser and (looser := update().looser):
             raise UsageError(
                 f"the update would make keystore '{root}' looser: {'; '.join(looser)}",
                 "Nothing was changed.",
                 "If that is meant, add --allow-looser.",
             )
-        stopped = refuse_stopping(
-            transaction,
-            now,
-            allowed=allow_refusal,
-            remedy=another_ca(root, "update with --revoke-old") if revoke_old else "",
-        )
-        update = replace(update, remarks=(*update.remarks, *stopped))
-        transaction.commit()
-    return update
+        change.finish(aim="update with --revoke-old" if revoke_old else "")
+    return update()
 
 
 @dataclass(frozen=True, slots=True)
@@ -502,21 +481,12 @@ class _Updater:
     """Writer of one update, within a transaction."""
 
     def __init__(
-        self,
-        transaction: Transaction,
-        present: PresentSettings,
-        goal: _Goal,
-        authorities: Authorities,
-        now: datetime,
-        *,
-        revoke_old: bool,
+        self, change: KeystoreChange, present: PresentSettings, goal: _Goal, *, revoke_old: bool
     ) -> None:
-        self._transaction = transaction
-        self._root = transaction.root
+        self._change = change
+        self._root = change.root
         self._present = present
         self._goal = goal
-        self._authorities = authorities
-        self._now = now
         self._revoke_old = revoke_old
         before, after = present.settings, goal.settings
         self._certificates = revoke_old or (
@@ -531,105 +501,68 @@ class _Updater:
             or present.without_settings
         )
         self._kept_open: tuple[str, ...] = ()
-        self._recorded = RecordedRights(self._root)
-        fleet = checked_fleet(self._root)
-        self._before = EnclaveDomains(present.domains, fleet)
-        self._after = EnclaveDomains(goal.domains, fleet)
-        self._known = KnownKeys(self._root)
-        self._writer = EnclaveWriter(
-            transaction,
-            after,
-            now,
-            identity=authorities.identity,
-            permissions=authorities.permissions,
-        )
+        self._before = EnclaveDomains(present.domains, change.fleet)
+        self._after = EnclaveDomains(goal.domains, change.fleet)
+        change.template, change.domains = goal.settings, goal.domains
+        self._writer = change.writer()
 
     def update(
         self,
         done: tuple[UpdateStage, ...],
-        pending: tuple[UpdateStage, ...],
-        keyring: Keyring,
+        left: tuple[UpdateStage, ...],
         progress: Progress | None,
-    ) -> KeystoreUpdate:
-        """Stage the changes of the stages ``done``, and return what they are."""
+    ) -> Callable[[], KeystoreUpdate]:
+        """Stage the changes of the stages ``done``; return what gives the result."""
+        change, before, after = self._change, self._present.settings, self._goal.settings
         names = tuple(
-            each
-            for each in list_enclaves(self._root)
-            if not waits_for_answer(enclave_path(self._root, each))
+            name for name in change.names if not waits_for_answer(enclave_path(self._root, name))
         )
-        before, after = self._present.settings, self._goal.settings
         governance = self._goal.governance()
         reissued = self._reissue(names, progress) if done else []
-        entries = list(self._writer.entries)
+        change.entries += self._writer.entries
         if UpdateStage.GOVERNANCE in done:
-            permissions = self._authorities.permissions
-            entries.append(
-                write_governance(self._transaction, governance, permissions, names, self._now)
-            )
+            write_governance(change, governance, names=names)
         if done:
             self._part_authorities()
-            entries.append(write_settings(self._transaction, after, self._now))
-        revoked = None
+            change.entries.append(write_settings(change.transaction, after, change.now))
         superseded = [each.old for each in reissued if each.old]
-        if self._revoke_old and superseded:
-            revoked = revoke_superseded(
-                self._transaction,
-                superseded,
-                self._authorities.identity,
-                after,
-                keyring,
-                names,
-                self._now,
-            )
-            entries += revoked.entries
-        kept = KeptZenoh()
+        revoked = self._revoke_old and bool(superseded)
+        if revoked:
+            change.revoke(superseded, names=names)
+        change.notes += self._writer.notes if reissued else ()
         if done:
-            kept = self._keep_zenoh([each.name for each in superseded] if revoked else ())
-        append(self._transaction, entries, self._authorities.identity, self._now)
+            replaced = [old.name for old in superseded] if revoked else ()
+            change.keep_zenoh(self._writer.grants, replaced=replaced)
+        change.record()
         rights = tuple(each.rights.revoked() if revoked else each.rights for each in reissued)
         settings = (
             *compare_governance(self._present.governance, governance),
-            *compare_settings(before, after, self._now),
+            *compare_settings(before, after, change.now),
         )
-        restart = names if revoked or governance != self._present.governance else ()
-        restart = restart or tuple(sorted({*(each.name for each in reissued), *kept.restart}))
-        remarks = [*(revoked.remarks if revoked else ())]
-        if restart:
+        if revoked or governance != self._present.governance:
+            change.restart = names
+        else:
+            issued = (each.name for each in reissued)
+            change.restart = tuple(sorted({*issued, *change.zenoh.restart}))
+        if change.restart:
             disturbed = mismatch(self._present.governance, governance)
-            remarks.append(restart_note(disturbed, revoked=bool(revoked)))
-            remarks.append(exports_note(self._root, names))
-        remarks += self._still_open()
-        remarks += self._open_tasks(settings)
+            change.remarks.append(restart_note(disturbed, revoked=revoked))
+            change.remarks.append(exports_note(self._root, names))
+        change.remarks += self._still_open()
+        change.remarks += self._open_tasks(settings)
         ends = [each.works_until for each in rights if each.works_until]
-        return KeystoreUpdate(
-            self._root,
-            before.name,
-            after.name,
-            done,
-            pending[len(done) :],
-            settings,
-            tuple(each for each in rights if each.lost or each.gained),
-            tuple(each.name for each in reissued if each.old),
-            tuple(each.name for each in reissued if not each.old),
-            max(ends, default=None),
-            revoked.count if revoked else 0,
-            restart,
-            tuple(remarks),
-            self._transaction.changes,
-            (*(self._writer.notes if reissued else ()), *kept.notes),
-            kept,
-        )
-
-    def _keep_zenoh(self, replaced: Sequence[str]) -> KeptZenoh:
-        permissions = self._authorities.permissions
-        return keep_zenoh(
-            self._transaction,
-            self._goal.settings.zenoh,
-            self._goal.domains,
-            permissions.certificate,
-            lambda: permissions,
-            self._now,
-            ZenohChange(self._writer.grants, replaced=replaced),
+        renewed = dict.fromkeys((each.name for each in reissued if each.old), "renewed")
+        signed = dict.fromkeys((each.name for each in reissued if not each.old), "signed")
+        return lambda: change.result(
+            KeystoreUpdate,
+            before=before.name,
+            after=after.name,
+            done=done,
+            left=left,
+            settings=settings,
+            rights=tuple(each for each in rights if each.lost or each.gained),
+            outcomes=renewed | signed,
+            works_until=max(ends, default=None),
         )
 
     # ── enclaves ───────────────────────────────────────────────────────────────────────────
@@ -645,9 +578,11 @@ class _Updater:
 
         closes = before.default_permissions == EVERYTHING != after.default_permissions
 
+        keystore = self._change.keystore
+
         def work(name: str) -> _Reissued | _KeptOpen | UnreadableEnclave | None:
             try:
-                state = read_credentials(self._root, name)
+                state = read_credentials(keystore, name)
                 done = self._reissue_one(state)
                 same = done is None or not done.rights.lost
                 if closes and same and allows_everything(state.grant):
@@ -666,7 +601,8 @@ class _Updater:
 
     def _reissue_one(self, state: Credentials) -> _Reissued | None:
         name = state.name
-        earlier = checked_rights(state, self._authorities, self._recorded)
+        change = self._change
+        earlier = checked_rights(state, change.authorities, change.recorded)
         replaces_default = self._has_default_rights(state, earlier)
         certificate = self._certificates or self._expires_otherwise(name)
         if not (self._permissions or replaces_default or certificate):
@@ -683,8 +619,8 @@ class _Updater:
         present = EarlierPermissions(state.certificate, state.grant)
         old = None
         if certificate:
-            old = Superseded.by(name, state.certificate, issued.certificate, self._now)
-        return _Reissued(name, replaced_rights(name, present, grant, self._now), old)
+            old = Superseded.by(name, state.certificate, issued.certificate, change.now)
+        return _Reissued(name, replaced_rights(name, present, grant, change.now), old)
 
     def _expires_otherwise(self, name: str) -> bool:
         """Return whether an enclave becomes short-lived, or is no longer."""
@@ -693,9 +629,7 @@ class _Updater:
 
     def _new_identity(self, state: Credentials) -> NewIdentity:
         name, settings = state.name, self._goal.settings
-        public: PublicKey = state.certificate.public_key()  # type: ignore[assignment]
-        remedy = f"Give it another key with `sros renew {quote(str(self._root))} {name} --new-key`."
-        self._known.refuse_revoked(public, f"enclave {name}", remedy, state.certificate)
+        public = self._change.unrevoked_key(name, state.certificate)
         kept = settings.unique_subject == self._present.settings.unique_subject
         unique = (
             settings.unique_subject
@@ -745,10 +679,10 @@ class _Updater:
 
     def _part_authorities(self) -> None:
         """Stage a file of its own for each CA, if one file has both; DDS loads the same bytes."""
-        settings, files = self._goal.settings, authority_files(self._root)
+        settings, files = self._goal.settings, self._change.keystore.authority_files
         if not settings.separate_authorities or len(files) > 1:
             return
-        if read_rotation(self._root).stage is not RotationStage.NONE:
+        if read_rotation(self._change.keystore).stage is not RotationStage.NONE:
             raise KeystoreError(
                 f"a rotation of the CA of keystore '{self._root}' is under way",
                 "It replaces the CA in both roles.",
@@ -761,11 +695,11 @@ class _Updater:
         ):
             if not (self._root / one).is_file():
                 continue  # a key that is kept elsewhere
-            data = self._transaction.read(one)
+            data = self._change.transaction.read(one)
             for role in ROLES:
-                self._transaction.write(path_of(role), data, private=private)
+                self._change.transaction.write(path_of(role), data, private=private)
             if one not in map(path_of, ROLES):
-                self._transaction.remove(one)
+                self._change.transaction.remove(one)
 
     # ── remarks ────────────────────────────────────────────────────────────────────────────
 
@@ -782,8 +716,8 @@ class _Updater:
         return [Note("keystore.kept-open", text)]
 
     def _open_tasks(self, changes: Sequence[SettingChange]) -> list[Note]:
-        identity = self._authorities.identity.certificate
-        shared = same_key(identity, self._authorities.permissions.key)
+        identity = self._change.identity.certificate
+        shared = same_key(identity, self._change.permissions.key)
         if self._goal.settings.separate_authorities and shared:
             text = (
                 "Identity CA and permissions CA have files of their own now, and still the same "
@@ -807,6 +741,66 @@ class _Updater:
         ``role`` is the option for one of them, or "".
         """
         command = f"sros rotate_ca {quote(str(self._root))}"
-        if read_rotation(self._root).stage is RotationStage.NONE:
+        if read_rotation(self._change.keystore).stage is RotationStage.NONE:
             return f"`{command}{role} --next` begins that"
         return f"`{command} --next` goes on with the rotation that is under way"
+
+
+# ── rights that only an old ledger has ───────────────────────────────────────────────────
+
+
+def trust_records(
+    root: Path, *, now: datetime, keyring: Keyring = IN_KEYSTORE, dry_run: bool = False
+) -> KeystoreUpdate:
+    """Record the permissions of enclaves again that version 0.1 of sros recorded without a chain.
+
+    Only permissions are recorded that are the last ones of their enclave in the ledger, and that
+    the permissions CA signed.  Where others are there, nothing is written.
+
+    Raises:
+        KeystoreError: the ledger is damaged, or no enclave needs it, or permissions are not the
+            last ones that the ledger has.
+    """
+    with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
+        ledger = change.ledger
+        if ledger.gaps:
+            raise KeystoreError(
+                f"the ledger of '{root}' is damaged: {ledger.gaps[0]}",
+                "Lines that were changed or removed are not taken on trust.",
+                f"See `sros check {quote(str(root))}`.",
+            )
+        last = RecordedRights(change.keystore, ledger).unproven()
+        names = [name for name in change.names if name in last]
+        if not names:
+            raise KeystoreError(f"no enclave of '{root}' has rights to take on trust")
+        entries: list[Entry] = []
+        others: list[str] = []
+        for name in names:
+            state = change.keystore.enclave(name, now=now)
+            message = state.files.get(PERMISSIONS_FILE, b"")
+            if state.grant and hashlib.sha256(message).hexdigest() == last[name].sha256:
+                entries.append(
+                    replace(last[name], time=iso(now), reason="taken on trust", previous="")
+                )
+            else:
+                others.append(name)
+        if others:
+            raise KeystoreError(
+                f"the permissions of {', '.join(others)} are not the last ones in the ledger",
+                "Perhaps older ones were put back, with rights that were taken away since.",
+                f"State their rights with `sros create_permission {quote(str(root))} "
+                f"{' '.join(map(quote, others))} POLICY_FILE`, and try again.",
+            )
+        change.open_authorities()
+        change.entries += entries
+        change.record()
+        change.transaction.commit()
+    number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
+    text = (
+        f"taken on trust: the rights of {number}, as the ledger has them in lines "
+        "without a chain. If somebody removed one of these lines, older permissions may be in "
+        "force again: compare them with your policy (`sros diff_policy`)."
+    )
+    change.remarks.append(Note("keystore.taken-on-trust", text))
+    name = change.template.name
+    return change.result(KeystoreUpdate, before=name, after=name)

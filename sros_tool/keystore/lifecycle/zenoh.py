@@ -15,16 +15,12 @@ from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.enclave import default_rights
 from sros_tool.keystore.issuing.zenoh import remove_zenoh
-from sros_tool.keystore.layout import PERMISSIONS_FILE, SETTINGS, check_keystore, enclave_path
-from sros_tool.keystore.ledger import Entry
-from sros_tool.keystore.lifecycle.create import Creation, open_to_issue, write_enclaves
-from sros_tool.keystore.reader import governance_of, load_settings
-from sros_tool.keystore.recorded import RecordedRights
+from sros_tool.keystore.layout import PERMISSIONS_FILE, SETTINGS, enclave_path
+from sros_tool.keystore.lifecycle.change import KeystoreChange
+from sros_tool.keystore.lifecycle.create import Creation, creation
+from sros_tool.keystore.lifecycle.enclaves import write_enclaves
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import EVERYTHING, NODE_BASICS
-from sros_tool.keystore.transaction.recovery import tidy
-from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.xml import read_bytes
 from sros_tool.zenoh.network import ZenohNetwork
 
 
@@ -47,27 +43,24 @@ def set_zenoh(
         UsageError: the network is not for the domains of the keystore, or the router's enclave has
             rights of its own.
     """
-    if not dry_run:
-        tidy(root)
-    check_keystore(root)
-    with Transaction(root, dry_run=dry_run) as transaction:
-        keystore = open_to_issue(transaction, None, keyring, now)
-        _check_settings(root, edited=bool(keystore.notes))
-        template = replace(keystore.template, zenoh=network)
-        entries: tuple[Entry, ...] = ()
-        if template != keystore.template:
-            entries = (write_settings(transaction, template, now),)
-        if network and network.router in keystore.names:
-            _check_router(root, network.router)
-        removed = () if network else remove_zenoh(transaction)
-        keystore = replace(keystore, template=template, entries=entries)
-        done = write_enclaves(transaction, keystore, {}, now)
-    return replace(done, new_keystore=False, restart=removed or done.restart)
+    with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
+        change.begin_issuing(None)
+        _check_settings(change, edited=bool(change.notes))
+        template = replace(change.template, zenoh=network)
+        if network and network.router in change.names:
+            _check_router(change, network.router)
+        if template != change.template:
+            change.template = template
+            change.entries.append(write_settings(change.transaction, template, now))
+        removed = () if network else remove_zenoh(change.transaction)
+        write_enclaves(change, {})
+    change.restart = removed or change.restart
+    return creation(change, ())
 
 
-def _check_settings(root: Path, *, edited: bool) -> None:
+def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
     """Raise `KeystoreError` if the settings are missing, or files were ``edited`` by hand."""
-    where = quote(str(root))
+    root, where = change.root, quote(str(change.root))
     if not (root / SETTINGS).exists():
         raise KeystoreError(
             f"keystore '{root}' has no settings, as ros2/sros2 makes it",
@@ -76,7 +69,7 @@ def _check_settings(root: Path, *, edited: bool) -> None:
             "settings change, and then without --dry-run.",
         )
     if edited:
-        edits = found_edits(root, governance_of(root))
+        edits = found_edits(change.keystore, change.governance)
         raise KeystoreError(
             f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
             "Writing the settings would undo it, or carry it out unseen.",
@@ -84,18 +77,17 @@ def _check_settings(root: Path, *, edited: bool) -> None:
         )
 
 
-def _check_router(root: Path, router: str) -> None:
+def _check_router(change: KeystoreChange, router: str) -> None:
     """Raise `UsageError` if the enclave of the router has permissions that a policy gave it."""
-    path = enclave_path(root, router) / PERMISSIONS_FILE
+    path = enclave_path(change.root, router) / PERMISSIONS_FILE
     if not path.exists():
         return
-    digest = hashlib.sha256(read_bytes(path, "permissions document")).hexdigest()
-    template = load_settings(root)
+    digest = hashlib.sha256(change.keystore.read(path, "permissions document")).hexdigest()
     usual = {
-        default_rights(replace(template, default_permissions=each), router).digest
-        for each in (EVERYTHING, NODE_BASICS)
+        default_rights(replace(change.template, default_permissions=choice), router).digest
+        for choice in (EVERYTHING, NODE_BASICS)
     }
-    if RecordedRights(root).policy(router, digest) not in ("", *usual):
+    if change.recorded.policy(router, digest) not in ("", *usual):
         raise UsageError(
             f"the enclave {router} has rights of its own",
             "The router passes on what all others say, so it would have the rights of all there.",

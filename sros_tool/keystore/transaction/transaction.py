@@ -264,7 +264,7 @@ class Transaction:
         It is None if there will be no such file, or if it cannot be read, or if this dry run made
         too many files to keep this one.
         """
-        if not self._is_staged(place):
+        if not self.is_staged(place):
             return _content(self.root / place)
         if self.dry_run:
             kept = self._kept.get(place)
@@ -280,7 +280,7 @@ class Transaction:
 
     def _target_after(self, path: str) -> str | None:
         """Return the target of the link that will be at ``path``; None if it will be no link."""
-        if not self._is_staged(path):
+        if not self.is_staged(path):
             return _link_target(f"{self.root}/{path}")
         if self.dry_run:
             kept = self._kept.get(path)
@@ -343,7 +343,8 @@ class Transaction:
     def _note_staged(self, folder: str, names: tuple[str, ...]) -> None:
         self._staged[folder] = self._names.setdefault(names, names)
 
-    def _is_staged(self, path: str) -> bool:
+    def is_staged(self, path: str) -> bool:
+        """Return whether this transaction writes or removes ``path``."""
         folder, _, name = path.rpartition("/")
         return name in self._staged.get(folder, ())
 
@@ -466,7 +467,7 @@ class Transaction:
         """Return the paths that other users can open, except those that this change writes."""
         if self._new_root:
             return []
-        return [path for path in _open_keys(self.root) if not self._is_staged(path)]
+        return [path for path in _open_keys(self.root) if not self.is_staged(path)]
 
     def _report_commit(self) -> None:
         _LOG.info("committed %d changes to the keystore '%s'", len(self.changes), self.root)

@@ -9,28 +9,29 @@ from __future__ import annotations
 
 import secrets
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
+from typing import Any
 
 from cryptography import x509
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
+from sros_tool.fleet.enclaves import robot_of
 from sros_tool.keystore.authorities.authority import Authority, write_bundle, write_copies
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring, check_places
-from sros_tool.keystore.issuing.acceptance import refuse_stopping
+from sros_tool.keystore.fleet import checked_fleet, load_fleet
+from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
     NewIdentity,
 )
-from sros_tool.keystore.issuing.zenoh import keep_zenoh
-from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -49,18 +50,14 @@ from sros_tool.keystore.layout import (
     ca_key,
     enclave_folder,
     enclave_path,
-    list_enclaves,
 )
 from sros_tool.keystore.ledger import (
     SAME_KEY,
-    Entry,
-    append,
     certificate_entry,
     document_entry,
-    read_ledger,
 )
+from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import sign_list
-from sros_tool.keystore.lifecycle.rotation.confirmed import of_no_robot, robots_cut_off
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     Rotation,
@@ -70,25 +67,11 @@ from sros_tool.keystore.lifecycle.rotation.state import (
     render_rotation,
     retired_key,
 )
-from sros_tool.keystore.reader import (
-    authority_files,
-    certificates_of,
-    embedded_crl,
-    governance_of,
-    load_settings,
-    read_certificate,
-    read_crl,
-    read_signed_grant,
-)
-from sros_tool.keystore.recorded import EarlierRights, RecordedRights
+from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.recorded import EarlierRights
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction.recovery import tidy
-from sros_tool.keystore.transaction.stage import Change
-from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.keystore.zenoh.wanted import ZenohChange
 from sros_tool.parallel import Progress
-from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     common_name,
     digest,
@@ -101,15 +84,18 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import PublicKey, algorithm, is_weak
 from sros_tool.validity import Span, Window, span_text, window
-from sros_tool.xml import read_bytes
+from sros_tool.wording import first_few
 
 _SHOWN = 10
 """The number of robots that an error names; it counts the others."""
+_ENCLAVES_SHOWN = 5
+_ISSUED = {IDENTITY: ("certificate",), "permissions": ("permissions", "governance")}
+"""What the CA of each role issues, by the kinds of `fleet_status`."""
 
 
-@dataclass(frozen=True, slots=True)
-class RotationStep:
-    """The result of a rotation step; with ``dry_run``, the result it would have.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RotationStep(Changed):
+    """The result of a rotation step.
 
     ``stage`` is the stage of the keystore afterwards.  ``files`` are the stems of the CA files that
     are replaced ("identity_ca", "permissions_ca" or "ca").  ``kept_elsewhere`` are the places of
@@ -117,13 +103,9 @@ class RotationStep:
     not confirmed the stage before.
     """
 
-    root: Path
     stage: RotationStage
     files: tuple[str, ...]
-    enclaves: tuple[str, ...]
-    changes: Sequence[Change]
     kept_elsewhere: tuple[str, ...] = ()
-    notes: tuple[Note, ...] = ()
     cut_off: tuple[str, ...] = ()
 
 
@@ -157,38 +139,81 @@ def rotate_ca(
             cut off, or vendors would refuse enclaves that they accept today.
         UsageError: the stage ``to`` is over, or is not the next stage.
     """
-    if not dry_run:
-        tidy(root)
-    list_enclaves(root)
-    with Transaction(root, dry_run=dry_run) as transaction:
-        names = list_enclaves(root)
-        rotation = read_rotation(root)
-        stage = RotationStage.RETIRE if finish else _target_stage(root, rotation, to)
-        rotator = _Rotator(
-            transaction, rotation, names, keyring, now, delete_old_key=delete_old_key
-        )
+    change = KeystoreChange(
+        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
+    )
+    with change:
+        rotation = read_rotation(change.keystore)
+        stage = RotationStage.RETIRE if finish else _target_stage(change.keystore, rotation, to)
+        rotator = _Rotator(change, rotation, delete_old_key=delete_old_key)
         cut_off: tuple[str, ...] = ()
         if finish or stage not in (rotation.stage, RotationStage.NONE):
             if rotation.stage is not RotationStage.REISSUE:  # the last stage signs nothing
-                _refuse_edited(root)
-            cut_off = robots_cut_off(root, rotation, stage)
+                _refuse_edited(change.keystore)
+            cut_off = robots_cut_off(change.keystore, rotation, stage)
             if cut_off and not allow_unconfirmed:
                 raise _would_cut_off(root, rotation, cut_off)
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
-                rotator.notes += tuple(of_no_robot(root, names))
-            rotator.notes += refuse_stopping(transaction, now, allowed=allow_refusal)
-            transaction.commit()
-    return RotationStep(
-        root,
-        stage,
-        tuple(each.file for each in rotator.replacements),
-        names,
-        transaction.changes,
-        tuple(rotator.kept_elsewhere),
-        rotator.notes,
-        cut_off,
+                change.notes += _of_no_robot(change.keystore, change.names)
+            change.finish()
+    return _step(
+        change,
+        stage=stage,
+        files=tuple(each.file for each in rotator.replacements),
+        kept_elsewhere=tuple(rotator.kept_elsewhere),
+        cut_off=cut_off,
     )
+
+
+def _step(change: KeystoreChange, **more: Any) -> RotationStep:
+    """Return the result of a step, in which a CA issued all certificates again or none."""
+    reissued = any(
+        each.path.endswith(f"/{CERTIFICATE_FILE}") for each in change.transaction.changes
+    )
+    outcomes = dict.fromkeys(change.names, "reissued" if reissued else "kept")
+    return change.result(RotationStep, outcomes=outcomes, restart=(), **more)
+
+
+def robots_cut_off(keystore: Keystore, rotation: Rotation, to: RotationStage) -> tuple[str, ...]:
+    """Return the names of the robots that the stage ``to`` would cut off from the others; sorted.
+
+    Those are the robots that have enclaves and have not confirmed the stage before: that they trust
+    the new CA, and then that they also have what it issued.  None is cut off without a fleet, or by
+    the first stage.
+
+    Raises:
+        KeystoreError: the file of the fleet is not the one that sros wrote last.
+    """
+    if to is RotationStage.DISTRIBUTE or checked_fleet(keystore) is None:
+        return ()
+    stages = list(RotationStage)
+    robots = [each for each in fleet_status(keystore.root).robots if each.enclaves]
+    if stages.index(to) - stages.index(rotation.stage) > 1:
+        return tuple(each.robot for each in robots)  # stages that no robot was ever at
+    roles = {role for each in rotation.replacements for role in keystore.authority_files[each.file]}
+    needed = {f"{role}_ca" for role in roles}
+    if rotation.stage is RotationStage.REISSUE:
+        needed.update(kind for role in roles for kind in _ISSUED[role])
+    return tuple(
+        each.robot
+        for each in robots
+        if each.received is None
+        or any(file.kind in needed and not file.surplus for file in each.pending)
+    )
+
+
+def _of_no_robot(keystore: Keystore, names: Iterable[str]) -> Iterator[Note]:
+    """Yield a note on enclaves that belong to no robot of a fleet, so that nobody confirms them."""
+    fleet = load_fleet(keystore)
+    without = [name for name in names if robot_of(fleet, name) is None] if fleet else []
+    if without:
+        verb = "belongs" if len(without) == 1 else "belong"
+        yield Note(
+            "keystore.of-no-robot",
+            f"{first_few(without, _ENCLAVES_SHOWN)} {verb} to no robot, so nothing says whether "
+            "this stage is there: see to it before the next one.",
+        )
 
 
 def _would_cut_off(root: Path, rotation: Rotation, robots: Sequence[str]) -> KeystoreError:
@@ -202,12 +227,12 @@ def _would_cut_off(root: Path, rotation: Rotation, robots: Sequence[str]) -> Key
     )
 
 
-def _refuse_edited(root: Path) -> None:
+def _refuse_edited(keystore: Keystore) -> None:
     """Raise `KeystoreError` if settings or governance were edited: signing would undo that."""
-    governance = None
+    root, governance = keystore.root, None
     with suppress(SrosError):  # signing it again reports it
-        governance = governance_of(root)
-    if edits := found_edits(root, governance):
+        governance = keystore.governance
+    if edits := found_edits(keystore, governance):
         raise KeystoreError(
             f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
             "The new CA would sign the governance as it was before.",
@@ -215,28 +240,31 @@ def _refuse_edited(root: Path) -> None:
         )
 
 
-def _was_replaced(root: Path) -> bool:
+def _was_replaced(keystore: Keystore) -> bool:
     """Return whether the ledger has a CA that another one replaced, perhaps of the same name."""
-    names = (certificates_of(root, f"{role}_ca") for role in ROLES)
+    names = (keystore.certificates_of(f"{role}_ca") for role in ROLES)
     trusted = {subject_text(each.subject) for certificates in names for each in certificates}
     made = Counter(
         each.subject
-        for each in read_ledger(root, having=("what", "ca")).entries
+        for each in keystore.ledger_with("what", "ca").entries
         if each.what == "ca" and each.reason != SAME_KEY
     )
     return any(number > 1 or subject not in trusted for subject, number in made.items())
 
 
-def _target_stage(root: Path, rotation: Rotation, to: RotationStage | None) -> RotationStage:
+def _target_stage(
+    keystore: Keystore, rotation: Rotation, to: RotationStage | None
+) -> RotationStage:
     """Return the stage to go to; NONE if there is nothing to do.
 
     Raises:
         UsageError: the stage ``to`` is over, or is not the next stage.
     """
+    root = keystore.root
     if to is None:
         return rotation.next_stage()
     if to is RotationStage.RETIRE and rotation.stage is RotationStage.NONE:
-        if not _was_replaced(root):
+        if not _was_replaced(keystore):
             raise UsageError(
                 f"no CA of keystore '{root}' is being replaced",
                 "There is no old CA to retire.",
@@ -281,27 +309,25 @@ def renew_identity_ca(
             self-signed, or its key is weak or missing.
         UsageError: the new certificate would expire before the present one.
     """
-    if not dry_run:
-        tidy(root)
-    list_enclaves(root)
-    with Transaction(root, dry_run=dry_run) as transaction:
-        names = list_enclaves(root)
-        if len(authority_files(root)) == 1:
+    change = KeystoreChange(
+        root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
+    )
+    with change:
+        if len(change.keystore.authority_files) == 1:
             raise KeystoreError(
                 f"the CA of keystore '{root}' cannot be renewed with the same key",
                 "It is also the permissions CA, and DDS accepts permissions only with the "
                 "certificate that they embed.",
                 "Rotate it without --same-key.",
             )
-        if read_rotation(root).stage is not RotationStage.NONE:
+        if read_rotation(change.keystore).stage is not RotationStage.NONE:
             raise KeystoreError(
                 f"a rotation of the CAs of keystore '{root}' is under way",
                 "",
                 f"Finish it first with `sros rotate_ca {quote(str(root))} --next`.",
             )
-        template = load_settings(root)
-        key = keyring.open(root, IDENTITY, template)
-        old, *above = certificates_of(root, "identity_ca")
+        key = keyring.open(change.keystore, IDENTITY, change.template)
+        old, *above = change.keystore.certificates_of("identity_ca")
         if above or not same_key(old, key):
             raise KeystoreError(
                 "the identity CA cannot be renewed with the same key",
@@ -314,48 +340,35 @@ def renew_identity_ca(
                 f"The key is weak: {algorithm(old.public_key())}.",
                 "Rotate it without --same-key.",
             )
-        new = issue_ca(key, old.subject, window(now, validity or template.authority_validity))
+        new = issue_ca(
+            key, old.subject, window(now, validity or change.template.authority_validity)
+        )
         _check_later(old, new)
-        write_bundle(transaction, "identity_ca", (IDENTITY,), pem(new), names)
-        transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
-        entry = certificate_entry(now, "ca", new, reason=SAME_KEY)
-        append(transaction, [entry], Authority(new, key), now)
-        notes = refuse_stopping(transaction, now, allowed=allow_refusal)
-        transaction.commit()
-    return RotationStep(
-        root, RotationStage.NONE, ("identity_ca",), names, transaction.changes, notes=notes
-    )
+        write_bundle(change.transaction, "identity_ca", (IDENTITY,), pem(new), change.names)
+        change.transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
+        change.entries.append(certificate_entry(now, "ca", new, reason=SAME_KEY))
+        change.record(Authority(new, key))
+        change.finish()
+    return _step(change, stage=RotationStage.NONE, files=("identity_ca",))
 
 
 class _Rotator:
-    """Writer of one rotation step, within a transaction.
+    """Writer of one rotation step.
 
     ``replacements`` are the CAs that are replaced, ``kept_elsewhere`` the places of old keys
-    outside of the keystore, and ``notes`` remarks on the issued documents.
+    outside of the keystore.
     """
 
-    def __init__(
-        self,
-        transaction: Transaction,
-        rotation: Rotation,
-        names: Sequence[str],
-        keyring: Keyring,
-        now: datetime,
-        *,
-        delete_old_key: bool,
-    ) -> None:
-        self._transaction = transaction
-        self._root = transaction.root
+    def __init__(self, change: KeystoreChange, rotation: Rotation, *, delete_old_key: bool) -> None:
+        self._change = change
+        self._transaction = change.transaction
+        self._keystore = change.keystore
+        self._root = change.root
         self._rotation = rotation
-        self._names = names
-        self._keyring = keyring
-        self._now = now
         self._delete = delete_old_key
-        self._template = load_settings(self._root)
-        self._entries: list[Entry] = []
+        self._template = change.template
         self.replacements = list(rotation.replacements)
         self.kept_elsewhere: list[str] = []
-        self.notes: tuple[Note, ...] = ()
 
     def go_to(
         self,
@@ -383,13 +396,13 @@ class _Rotator:
             else:
                 self._reissue(successors, stage, progress)
         else:
-            successors = _distributed(self._root, self._rotation, self._keyring, self._template)
+            successors = _distributed(self._change, self._rotation)
             if stage is RotationStage.REISSUE and self._lacks_crl(successors):
                 stage = RotationStage.DISTRIBUTE
                 self._distribute(successors)
             else:
                 self._reissue(successors, stage, progress)
-        append(self._transaction, self._entries, successors[0].new, self._now)
+        self._change.record(successors[0].new)
         return stage
 
     # ── the stages ─────────────────────────────────────────────────────────────────────────
@@ -398,18 +411,18 @@ class _Rotator:
         self, roles: Sequence[str], new_keys: Keyring, validity: Span | None, *, next_to: bool
     ) -> list[_Successor]:
         successors = _make_successors(
-            self._transaction,
+            self._change,
             roles,
             new_keys,
-            self._keyring,
-            self._template,
-            window(self._now, validity or self._template.authority_validity),
+            window(self._change.now, validity or self._template.authority_validity),
             next_to=next_to,
         )
         for each in successors:
             if validity is None:
                 self._note_earlier(each.old[0], each.new.certificate)
-            self._entries.append(certificate_entry(self._now, "ca", each.new.certificate))
+            self._change.entries.append(
+                certificate_entry(self._change.now, "ca", each.new.certificate)
+            )
         self.replacements = [each.replacement() for each in successors]
         return successors
 
@@ -429,22 +442,24 @@ class _Rotator:
                 "another one."
             )
             # Both CAs usually have the same dates, and one note is enough then.
-            self.notes = tuple(
-                dict.fromkeys((*self.notes, Note("keystore.ca-expires-earlier", text)))
-            )
+            note = Note("keystore.ca-expires-earlier", text)
+            if note not in self._change.notes:
+                self._change.notes.append(note)
 
     def _distribute(self, successors: list[_Successor]) -> None:
         for each in successors:
             bundle = b"".join(map(pem, (*each.old, each.new.certificate)))
-            if self._takes_crl(each) and (old := read_crl(self._root)):
+            if self._takes_crl(each) and (old := self._keystore.revocation_list):
                 bundle += self._empty_crl(each.new, old.number + 1)
-            write_bundle(self._transaction, each.file, each.roles, bundle, self._names)
+            write_bundle(self._transaction, each.file, each.roles, bundle, self._change.names)
         self._write_state(RotationStage.DISTRIBUTE)
 
     def _empty_crl(self, authority: Authority, number: int) -> bytes:
         """Return an empty revocation list of a new CA, as PEM."""
-        signed = sign_list(authority, (), number=number, template=self._template, now=self._now)
-        self._entries.append(signed.entry)
+        signed = sign_list(
+            authority, (), number=number, template=self._template, now=self._change.now
+        )
+        self._change.entries.append(signed.entry)
         return signed.document
 
     def _lacks_crl(self, successors: list[_Successor]) -> bool:
@@ -453,7 +468,8 @@ class _Rotator:
         This happens after the first revocation, if that was during the stage DISTRIBUTE.
         """
         return (self._root / CRL).exists() and any(
-            self._takes_crl(each) and not embedded_crl(self._root, each.file) for each in successors
+            self._takes_crl(each) and not self._keystore.embedded_list(each.file)
+            for each in successors
         )
 
     def _takes_crl(self, each: _Successor) -> bool:
@@ -469,13 +485,13 @@ class _Rotator:
         for each in successors:
             trusted = (each.new.certificate, *(each.old if stage is RotationStage.REISSUE else ()))
             bundle = b"".join(map(pem, trusted))
-            if IDENTITY in each.roles and (old := read_crl(self._root)):
+            if IDENTITY in each.roles and (old := self._keystore.revocation_list):
                 if stage is RotationStage.REISSUE:
-                    bundle += read_bytes(self._root / CRL, "revocation list")
+                    bundle += self._keystore.read(CRL, "revocation list")
                 crl = self._empty_crl(each.new, old.number + 2)
                 self._transaction.write(CRL, crl)
-                write_copies(self._transaction, self._names, CRL_FILE, crl)
-            write_bundle(self._transaction, each.file, each.roles, bundle, self._names)
+                write_copies(self._transaction, self._change.names, CRL_FILE, crl)
+            write_bundle(self._transaction, each.file, each.roles, bundle, self._change.names)
             old_key = self._install_key(each)
             self.replacements.append(replace(each.replacement(), old_key=old_key))
             if stage is RotationStage.RETIRE:
@@ -499,18 +515,18 @@ class _Rotator:
         """
         if permissions:
             self._sign_governance(permissions)
+        change = self._change
         writer = EnclaveWriter(
-            self._transaction,
-            self._template,
-            self._now,
+            change.transaction,
+            change.template,
+            change.now,
             identity=identity.new if identity else None,
             permissions=permissions.new if permissions else None,
         )
-        recorded, known = RecordedRights(self._root), KnownKeys(self._root)
 
         def reissue(name: str) -> None:
             try:
-                if issuance := _issuance(self._root, name, identity, permissions, recorded, known):
+                if issuance := _issuance(change, name, identity, permissions):
                     writer.write(issuance)
             except SrosError as error:
                 folder = enclave_path(self._root, name)
@@ -521,46 +537,41 @@ class _Rotator:
                     or f"Run `sros inspect {quote(str(folder))}`. Nothing was changed.",
                 ) from error
 
-        writer.for_each(self._names, reissue, progress)
-        self._entries += writer.entries
-        self.notes += writer.notes
+        writer.for_each(change.names, reissue, progress)
+        change.entries += writer.entries
+        change.notes += writer.notes
         if permissions:
-            signer = permissions.new
-            kept = keep_zenoh(
-                self._transaction,
-                self._template.zenoh,
-                governance_of(self._root).domains().closed(),
-                signer.certificate,
-                lambda: signer,
-                self._now,
-                ZenohChange(writer.grants),
-            )
-            self.notes += kept.notes
+            change.permissions = permissions.new
+            change.keep_zenoh(writer.grants)
         if identity:
-            self.notes += tuple(known.shared_notes(self._names))
+            change.notes += change.known.shared_notes(change.names)
 
     def _sign_governance(self, permissions: _Successor) -> None:
         """Sign the governance of the keystore and its copies in enclaves again, unchanged."""
         copies = [
-            f"{enclave_folder(each)}/{GOVERNANCE_FILE}" for each in self._names if each != "/"
+            f"{enclave_folder(each)}/{GOVERNANCE_FILE}"
+            for each in self._change.names
+            if each != "/"
         ]
         for path in (GOVERNANCE_P7S, *copies):
             real = self._root / path
             if not real.is_file() or real.is_symlink():
                 continue
-            signed = smime.parse(read_bytes(real, "governance document"))
+            signed = self._keystore.files.signed(self._keystore.read(real, "governance document"))
             signed.verify(permissions.old[0])
             parse_governance(signed.document)  # raises if it is malformed
             message = permissions.new.sign(signed.document, "the governance document")
             self._transaction.write(path, message)
-            self._entries.append(document_entry(self._now, "governance", message))
+            self._change.entries.append(document_entry(self._change.now, "governance", message))
 
     def _retire(self) -> None:
-        files = authority_files(self._root)
+        files = self._keystore.authority_files
         for each in self._rotation.replacements:
-            new, *others = certificates_of(self._root, each.file)
+            new, *others = self._keystore.certificates_of(each.file)
             (old,) = [one for one in others if digest(one) == each.old]
-            write_bundle(self._transaction, each.file, files[each.file], pem(new), self._names)
+            write_bundle(
+                self._transaction, each.file, files[each.file], pem(new), self._change.names
+            )
             self._keep_certificate(old)
             key = retired_key(old)
             if self._delete and (self._root / key).exists():
@@ -589,7 +600,7 @@ class _Rotator:
                 key = transaction.read(place)
                 transaction.write(retired_key(each.old[0]), key, private=True)
         else:
-            old_key = self._keyring.place(each.roles[0], self._template)
+            old_key = self._change.keyring.place(each.roles[0], self._template)
             self.kept_elsewhere.append(old_key)
         if each.key == f"{PRIVATE}/next_{each.file}.key.pem":
             transaction.write(place, transaction.read(each.key), private=True)
@@ -614,19 +625,19 @@ class _Rotator:
             permissions_key=places.get(PERMISSIONS, self._template.permissions_key),
         )
         if template != self._template:
-            self._entries.append(write_settings(self._transaction, template, self._now))
+            self._change.entries.append(
+                write_settings(self._transaction, template, self._change.now)
+            )
 
 
 # ── files of one enclave ───────────────────────────────────────────────────────────────────
 
 
 def _issuance(
-    root: Path,
+    change: KeystoreChange,
     name: str,
     identity: _Successor | None,
     permissions: _Successor | None,
-    recorded: RecordedRights,
-    known: KnownKeys,
 ) -> Issuance | None:
     """Return the `Issuance` of the new CAs for an enclave; None if it has no certificate yet.
 
@@ -634,11 +645,12 @@ def _issuance(
         KeystoreError: the old CA did not issue its certificate or sign its permissions, or its key
             was revoked.
     """
+    root = change.root
     folder = enclave_path(root, name)
     path = folder / CERTIFICATE_FILE
     if not path.exists():
         return None  # the new CA issues its first certificate
-    kept = read_certificate(path)
+    kept = change.keystore.certificate(path)
     certificate: NewIdentity | x509.Certificate = kept
     if identity:
         if not issued_by(kept, identity.old[0]):
@@ -648,18 +660,19 @@ def _issuance(
             )
         key: PublicKey = kept.public_key()  # type: ignore[assignment]
         remedy = f"Renew it with `sros renew {quote(str(root))} {name} --new-key`, or revoke it."
-        known.refuse_revoked(key, f"enclave {name}", remedy, kept)
+        change.known.refuse_revoked(key, f"enclave {name}", remedy, kept)
         certificate = NewIdentity(kept.subject, key)
     rights = None
     if permissions and (folder / PERMISSIONS_FILE).exists():
-        rights = _verified_rights(root, name, subject_text(kept.subject), permissions, recorded)
+        rights = _verified_rights(change, name, subject_text(kept.subject), permissions)
     return Issuance(name, certificate, rights)
 
 
 def _verified_rights(
-    root: Path, name: str, subject: str, permissions: _Successor, recorded: RecordedRights
+    change: KeystoreChange, name: str, subject: str, permissions: _Successor
 ) -> EarlierRights:
-    old = read_signed_grant(enclave_path(root, name) / PERMISSIONS_FILE, subject)
+    root = change.root
+    old = change.keystore.signed_grant(name, subject)
     old.signed.verify(permissions.old[0])
     if old.grant is None:
         raise KeystoreError(
@@ -667,7 +680,7 @@ def _verified_rights(
             "They belong to another certificate.",
             f"Sign them again with `sros create_permission {quote(str(root))} {name} POLICY_FILE`.",
         )
-    return recorded.of(name, old.digest, old.grant)
+    return change.recorded.of(name, old.digest, old.grant)
 
 
 # ── new CAs ────────────────────────────────────────────────────────────────────────────────
@@ -694,11 +707,9 @@ class _Successor:
 
 
 def _make_successors(
-    transaction: Transaction,
+    change: KeystoreChange,
     roles: Sequence[str],
     new_keys: Keyring,
-    keyring: Keyring,
-    template: Template,
     validity: Window,
     *,
     next_to: bool,
@@ -708,8 +719,8 @@ def _make_successors(
     New keys in the keystore get names next to the present keys if ``next_to``; otherwise they
     replace them.
     """
-    root = transaction.root
-    files = authority_files(root)
+    template = change.template
+    files = change.keystore.authority_files
     wanted = set(roles or ROLES)
     for file, serves in files.items():
         if wanted & set(serves) and not set(serves) <= wanted:
@@ -722,38 +733,34 @@ def _make_successors(
     found = []
     for file, serves in files.items():
         if wanted & set(serves):
-            _check_place(root, file, serves[0], new_keys, keyring, template)
+            _check_place(change, file, serves[0], new_keys)
             at = f"{PRIVATE}/{'next_' if next_to else ''}{file}.key.pem"
-            found.append(
-                _make_successor(transaction, file, serves, at, new_keys, template, validity)
-            )
+            found.append(_make_successor(change, file, serves, at, new_keys, validity))
     return found
 
 
-def _check_place(
-    root: Path, file: str, role: str, new_keys: Keyring, keyring: Keyring, template: Template
-) -> None:
-    if not new_keys.places.get(role) and not (root / f"{PRIVATE}/{file}.key.pem").is_file():
+def _check_place(change: KeystoreChange, file: str, role: str, new_keys: Keyring) -> None:
+    if not new_keys.places.get(role) and not (change.root / f"{PRIVATE}/{file}.key.pem").is_file():
         raise KeystoreError(
             f"the key of the {role} CA is not in the keystore, so the key of the new CA should not "
             "be there either",
-            f"The present key is at '{keyring.place(role, template)}'.",
+            f"The present key is at '{change.keyring.place(role, change.template)}'.",
             f"Name a place for the new key with --{role}-key.",
         )
 
 
 def _make_successor(
-    transaction: Transaction,
+    change: KeystoreChange,
     file: str,
     roles: tuple[str, ...],
     at: str,
     new_keys: Keyring,
-    template: Template,
     validity: Window,
 ) -> _Successor:
-    old = certificates_of(transaction.root, file)
+    transaction, template = change.transaction, change.template
+    old = change.keystore.certificates_of(file)
     present = transaction.root / f"{PRIVATE}/{file}.key.pem"
-    encrypted = present.is_file() and b"ENCRYPTED" in read_bytes(present, "CA key")
+    encrypted = present.is_file() and b"ENCRYPTED" in change.keystore.read(present, "CA key")
     new_keys = replace(new_keys, encrypt=new_keys.encrypt or encrypted)
     place = new_keys.places.get(roles[0], "")
     elsewhere = replace(template, identity_key="", permissions_key="")
@@ -772,18 +779,16 @@ def _make_successor(
     return _Successor(file, roles, old, Authority(certificate, key), place or at)
 
 
-def _distributed(
-    root: Path, rotation: Rotation, keyring: Keyring, template: Template
-) -> list[_Successor]:
+def _distributed(change: KeystoreChange, rotation: Rotation) -> list[_Successor]:
     """Return the new CAs of a rotation at the stage DISTRIBUTE, with their keys."""
     found = []
-    files = authority_files(root)
+    files = change.keystore.authority_files
     for each in rotation.replacements:
         roles = files[each.file]
-        certificates = certificates_of(root, each.file)
+        certificates = change.keystore.certificates_of(each.file)
         (new,) = [one for one in certificates if digest(one) == each.new]
-        moved = replace(template, identity_key=each.key, permissions_key=each.key)
-        key = replace(keyring, places={}).open(root, roles[0], moved)
+        moved = replace(change.template, identity_key=each.key, permissions_key=each.key)
+        key = replace(change.keyring, places={}).open(change.keystore, roles[0], moved)
         if not same_key(new, key):
             raise KeystoreError(
                 f"the key at '{each.key}' does not belong to the new {roles[0]} CA",

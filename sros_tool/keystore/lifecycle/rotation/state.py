@@ -22,19 +22,12 @@ from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.layout import (
     IDENTITY,
     PERMISSIONS,
+    PERMISSIONS_FILE,
     RETIRED,
     ROLES,
     ROTATION,
-    enclave_folder,
-    list_enclaves,
 )
-from sros_tool.keystore.reader import (
-    authority_files,
-    certificates_of,
-    load_settings,
-    read_certificate,
-)
-from sros_tool.pki import smime
+from sros_tool.keystore.reader import Keystore, open_keystore
 from sros_tool.pki.certificates import (
     digest,
     issued_by,
@@ -43,7 +36,6 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.validity import Window, iso
 from sros_tool.values import Words, as_plain, parse_json, shows
-from sros_tool.xml import read_bytes
 
 _SOON = timedelta(days=90)
 """The remaining validity at which a remark advises to replace a CA."""
@@ -134,27 +126,28 @@ def retired_key(certificate: x509.Certificate) -> str:
     return f"{RETIRED}/{certificate.serial_number:x}.key.pem"
 
 
-def read_rotation(root: Path) -> Rotation:
+def read_rotation(root: Path | Keystore) -> Rotation:
     """Return the rotation that is under way, or an empty `Rotation`.
 
     Raises:
         KeystoreError: the file of the rotation is damaged, or does not fit the CA certificates.
     """
-    path = root / ROTATION
+    keystore = root if isinstance(root, Keystore) else Keystore(root)
+    path = keystore.root / ROTATION
     if not path.exists():
         return Rotation()
     try:
-        read = parse_json(read_bytes(path, "file of the rotation"))
+        read = parse_json(keystore.read(path, "file of the rotation"))
         replacements = tuple(_replacement(each) for each in read["replacements"])
         rotation = Rotation(RotationStage(read["stage"]), replacements)
         for each in replacements:
             issuing = each.old if rotation.stage is RotationStage.DISTRIBUTE else each.new
-            there = [digest(found) for found in certificates_of(root, each.file)]
+            there = [digest(found) for found in keystore.certificates_of(each.file)]
             if there[0] != issuing or not {each.old, each.new} <= set(there):
                 raise ValueError
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise KeystoreError(
-            f"the rotation of keystore '{root}' cannot be continued",
+            f"the rotation of keystore '{keystore.root}' cannot be continued",
             f"'{path}' does not fit the CA certificates, or is damaged.",
             "Restore the folders 'public' and 'private' and this file from one backup.",
         ) from error
@@ -179,13 +172,14 @@ def render_rotation(rotation: Rotation) -> bytes:
 
 def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
     """Return the stage of a keystore, its trusted CAs with their validity, and remarks."""
-    names = list_enclaves(root)
-    rotation = read_rotation(root)
+    keystore = open_keystore(root)
+    names = keystore.names
+    rotation = read_rotation(keystore)
     by_file = {each.file: each for each in rotation.replacements}
     states = []
-    for file, roles in authority_files(root).items():
-        found = certificates_of(root, file)
-        counts = _count(root, names, roles[0], found)
+    for file, roles in keystore.authority_files.items():
+        found = keystore.certificates_of(file)
+        counts = _count(keystore, roles[0], found)
         for index, certificate in enumerate(found):
             replaced = by_file.get(file)
             state = "issuing" if index == 0 else "old"
@@ -206,26 +200,24 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
     remarks = (
         _expiry_remarks(states, now)
         if rotation.stage is RotationStage.NONE
-        else _restart_remarks(root, rotation)
+        else _restart_remarks(keystore, rotation)
     )
     return RotationStatus(root, rotation, tuple(states), len(names), tuple(remarks))
 
 
 def _count(
-    root: Path, names: Sequence[str], role: str, authorities: tuple[x509.Certificate, ...]
+    keystore: Keystore, role: str, authorities: tuple[x509.Certificate, ...]
 ) -> Counter[int]:
     """Count the enclaves of each CA, by index: for identity CAs by certificate, else by signer."""
     counts: Counter[int] = Counter()
-    for name in names:
-        folder = root / enclave_folder(name)
+    for name in keystore.names:
         try:
             if role == IDENTITY:
-                path = folder / "cert.pem"
-                own = read_certificate(path)
+                own = keystore.certificate_of(name)
                 fits = [issued_by(own, each) for each in authorities]
             else:
-                signed = smime.parse(read_bytes(folder / "permissions.p7s", "permissions"))
-                signer = signed.signer()
+                message = keystore.read(keystore.folder(name) / PERMISSIONS_FILE, "permissions")
+                signer = keystore.files.signed(message).signer()
                 fits = [signer == each for each in authorities]
         except SrosError:  # `sros inspect` reports the error
             continue
@@ -266,7 +258,7 @@ def _expiry_remarks(states: Sequence[AuthorityStatus], now: datetime) -> list[st
 EXPORT_FIRST = "Where they run from an export, export the enclaves again first."
 
 
-def _restart_remarks(root: Path, rotation: Rotation) -> list[str]:
+def _restart_remarks(keystore: Keystore, rotation: Rotation) -> list[str]:
     """Return remarks on the processes to restart at the stage DISTRIBUTE or REISSUE, by vendor."""
     files = [each.file for each in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
@@ -275,7 +267,7 @@ def _restart_remarks(root: Path, rotation: Rotation) -> list[str]:
             "after the restart communicate. Continue when all have been restarted.",
             EXPORT_FIRST,
         ]
-    hindrance = _fast_dds_hindrance(root, files)
+    hindrance = _fast_dds_hindrance(keystore, files)
     remarks = [
         f"Fast DDS: {hindrance} Restart all processes together."
         if hindrance
@@ -285,7 +277,7 @@ def _restart_remarks(root: Path, rotation: Rotation) -> list[str]:
         "before and after the restart do not communicate.",
     ]
     with suppress(SrosError):  # `check` finds settings that cannot be read
-        if load_settings(root).zenoh:
+        if keystore.template.zenoh:
             remarks.append(
                 "Zenoh: restart the processes one by one, at any time; processes before and after "
                 "the restart communicate. Continue when all have been restarted."
@@ -315,7 +307,7 @@ def _has_identifier(certificate: x509.Certificate) -> bool:
     return True
 
 
-def _fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
+def _fast_dds_hindrance(keystore: Keystore, files: Sequence[str]) -> str:
     """Return why Fast DDS cannot trust the old and the new CA at once, as a sentence, or "".
 
     Fast DDS 2.9.1 (measured) distinguishes two CAs of the same name by their key identifiers, and
@@ -324,7 +316,7 @@ def _fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
     for file in files:
         if file == "identity_ca":
             continue
-        for certificate in certificates_of(root, file):
+        for certificate in keystore.certificates_of(file):
             if not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
                 return "the old permissions CA has another key algorithm than the new CA."
             if not _has_identifier(certificate):

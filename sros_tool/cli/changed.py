@@ -1,0 +1,152 @@
+"""What verbs print that change a keystore: the change, what of the past still works, what is left.
+
+The change itself goes to standard output, or what ``--json`` prints; all else to standard error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from shlex import quote
+from typing import TYPE_CHECKING
+
+from sros_tool.cli.common import print_json, print_notes
+from sros_tool.terminal import echo
+from sros_tool.wording import counted, first_few
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.issuing.zenoh import KeptZenoh
+    from sros_tool.keystore.lifecycle.change import Changed
+    from sros_tool.keystore.lifecycle.replaced import ReplacedRights
+    from sros_tool.keystore.transaction.stage import Change
+
+_NAMES_SHOWN = 5
+_MAX_NAMES = 20
+"""Number of enclaves that a message names."""
+_CLOSED_SHOWN = 3
+
+
+def print_changed(
+    result: Changed,
+    form: tuple[object, ...] | None = None,
+    lines: Iterable[str] = (),
+    *,
+    told: Iterable[str] = (),
+    after: Iterable[str] = (),
+    rights: bool = True,
+    exported: bool = True,
+    restart: bool = True,
+) -> None:
+    """Print a change of a keystore.
+
+    Args:
+        result: the change.
+        form: what ``--json`` prints of it; None without ``--json``.
+        lines: what was done; in place of it, a dry run prints the files that it would change.
+        told: what to say of it at once, on standard error.
+        after: what to say after the rights that change.
+        rights: say what enclaves lose and gain.
+        exported: also say that exports are out of date.
+        restart: say which processes have to be restarted.
+    """
+    if form is not None:
+        print_json(form)
+    elif result.dry_run:
+        print_plan(result.root, result.changes)
+    else:
+        for line in lines:
+            echo(line)
+    _tell(told)
+    print_follow_up(result, after, rights=rights, exported=exported, restart=restart)
+
+
+def print_follow_up(
+    result: Changed,
+    after: Iterable[str] = (),
+    *,
+    rights: bool = True,
+    exported: bool = True,
+    restart: bool = True,
+) -> None:
+    """Print on standard error what follows from a change; arguments as of `print_changed`."""
+    if not result.dry_run:
+        _print_closed(result.root, result.changes)
+    if rights:  # on stderr, because stdout is that of ros2/sros2
+        _tell(rights_lines(result.rights, dry_run=result.dry_run))
+    _tell(after)
+    if restart:
+        _print_restart(result.restart, result.zenoh, exported=exported)
+    _tell(remark.text for remark in result.remarks)
+    print_notes(result.notes)
+
+
+def _tell(lines: Iterable[str]) -> None:
+    for line in lines:
+        echo(line, err=True)
+
+
+def print_plan(root: Path, changes: Sequence[Change]) -> None:
+    """Print the changes that a dry run did not make."""
+    for change in changes:
+        echo(f"would {change.action} {root / change.path}")
+    if not changes:
+        echo("nothing would change")
+
+
+def _print_closed(root: Path, changes: Sequence[Change]) -> None:
+    """Say on stderr what a first write did: keys closed to others, what was taken over on trust."""
+    if any(change.action == "adopt" for change in changes):
+        echo(
+            f"took over '{root}', which ros2/sros2 made: it has settings and a ledger from now on. "
+            "The certificates and permissions that were there, signed by its CA, are taken on "
+            "trust: nothing shows whether one of them was replaced or taken back before, and put "
+            "in again.",
+            err=True,
+        )
+    closed = [str(root / change.path) for change in changes if change.action == "close"]
+    if closed:
+        where = quote(str(root))
+        echo(
+            "closed to other users, who could open them until now: "
+            f"{first_few(closed, _CLOSED_SHOWN)}. "
+            "Run the nodes as the owner of the keystore, or from an export of that user (`sros "
+            "distribute_key`). Replace keys that somebody may have copied: `sros renew "
+            f"{where} NAME --new-key --revoke-old` those of enclaves, `sros rotate_ca {where} "
+            "--next` those of CAs.",
+            err=True,
+        )
+
+
+def rights_lines(replaced: Sequence[ReplacedRights], *, dry_run: bool) -> Iterable[str]:
+    """Yield what enclaves lose and gain."""
+    together: dict[tuple[str, str], list[str]] = {}
+    for rights in replaced:
+        for verb, text in (("lose", rights.loses()), ("gain", rights.gains())):
+            if text:
+                together.setdefault((verb, text), []).append(rights.enclave)
+    for (verb, text), names in together.items():
+        word = f"would {verb}" if dry_run else verb if len(names) > 1 else f"{verb}s"
+        yield f"{shown_names(names)} {word}: {text}"
+
+
+def shown_names(names: Sequence[str]) -> str:
+    """Return the first names, and the number of the others."""
+    return first_few(names, _NAMES_SHOWN)
+
+
+def _print_restart(
+    names: Sequence[str], zenoh: KeptZenoh | None = None, *, exported: bool = True
+) -> None:
+    """Print on stderr that the processes of the enclaves ``names`` have to be restarted.
+
+    ``zenoh`` says which of them on Zenoh.  With ``exported`` also that exports are out of date.
+    """
+    if not names:
+        return
+    number = counted(len(names), "enclave")
+    text = f"restart the processes of {number} for it to take effect: "
+    text += first_few(names, _MAX_NAMES)
+    if zenoh and zenoh.files and set(zenoh.restart) != set(names):
+        text += f"; of those on Zenoh: {first_few(zenoh.restart, _MAX_NAMES) or 'none'}"
+    again = "; where they run from an export, export them again first" if exported else ""
+    echo(text + again, err=True)

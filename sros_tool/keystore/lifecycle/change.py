@@ -1,0 +1,390 @@
+"""The frame of every change of a keystore, and the result that each of them returns.
+
+The order is the same for every verb: lock and recover, open the keystore once, note what was edited
+by hand, say what is to be, prove and sign it, stage it, keep Zenoh in step, write the ledger, ask
+the vendors, and put everything in place at once.  A verb says what is to be; the rest is here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from shlex import quote
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from cryptography import x509
+
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import Governance
+from sros_tool.dds.permissions import Grant
+from sros_tool.errors import Note
+from sros_tool.fleet.robots import Fleet
+from sros_tool.keystore.authorities.authority import Authorities, Authority, load_authority
+from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.fleet import checked_fleet, write_fleet
+from sros_tool.keystore.issuing.acceptance import refuse_stopping
+from sros_tool.keystore.issuing.enclave import EnclaveWriter
+from sros_tool.keystore.issuing.tokens import EnclaveTokens
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
+from sros_tool.keystore.known_keys import KnownKeys
+from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, check_keystore
+from sros_tool.keystore.ledger import Entry, Ledger, append
+from sros_tool.keystore.lifecycle.replaced import ReplacedRights
+from sros_tool.keystore.lifecycle.revocation_list import (
+    RevocationListSigner,
+    Superseded,
+    another_ca,
+)
+from sros_tool.keystore.of_ros2 import take_over
+from sros_tool.keystore.reader import Keystore, check_domain
+from sros_tool.keystore.recorded import RecordedRights
+from sros_tool.keystore.settings import edit_notes
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction.recovery import tidy
+from sros_tool.keystore.transaction.stage import Change
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.zenoh.wanted import ZenohChange
+from sros_tool.pki.keys import PublicKey
+from sros_tool.pki.token import TokenUri
+from sros_tool.policy.model import Enclave
+
+Result = TypeVar("Result", bound="Changed")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Changed:
+    """What a change did to a keystore; of a dry run, what it would do.
+
+    ``outcomes`` maps enclaves to what was done with them, such as ``created`` or ``renewed``.
+    ``rights`` has what enclaves gain and lose.  ``works_until`` is the latest expiry of what was
+    replaced, or None if nothing of it works any more.  ``revoked`` is the number of revoked
+    certificates.  ``restart`` are the enclaves whose processes have to be restarted, ``zenoh`` are
+    the configurations for Zenoh.  ``remarks`` are notes on open tasks.
+    """
+
+    root: Path
+    dry_run: bool = False
+    outcomes: Mapping[str, str] = field(default_factory=dict)
+    changes: Sequence[Change] = ()
+    rights: tuple[ReplacedRights, ...] = ()
+    works_until: datetime | None = None
+    revoked: int = 0
+    restart: tuple[str, ...] = ()
+    zenoh: KeptZenoh = KeptZenoh()  # noqa: RUF009 - frozen
+    remarks: tuple[Note, ...] = ()
+    notes: tuple[Note, ...] = ()
+
+    def names(self, outcome: str) -> tuple[str, ...]:
+        """Return the enclaves with which this was done."""
+        return tuple(name for name, done in self.outcomes.items() if done == outcome)
+
+
+class KeystoreChange:
+    """A keystore that is being changed: a context, from the lock to the flip.
+
+    What is read of the keystore is read once, when it is first asked for.  A verb may set
+    ``template``, ``domains``, ``fleet`` and the CAs to what is to be; what it issues is signed and
+    recorded with those.  Without `finish`, nothing changes.
+
+    ``entries`` are for the ledger.  ``notes`` and ``remarks`` are for the result, and so are
+    ``revoked``, the number of revoked certificates, and ``restart``, the enclaves whose processes
+    have to be restarted.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        *,
+        now: datetime,
+        keyring: Keyring = IN_KEYSTORE,
+        allow_refusal: Sequence[Vendor] = (),
+        dry_run: bool = False,
+        fresh: bool = False,
+    ) -> None:
+        """Take what every verb is given.
+
+        Args:
+            root: the keystore.
+            now: the time of the change.
+            keyring: opens the keys of the CAs.
+            allow_refusal: vendors on which nodes may stop.
+            dry_run: change nothing.
+            fresh: the keystore does not exist yet.
+        """
+        self.root = root
+        self.now = now
+        self.keyring = keyring
+        self.dry_run = dry_run
+        self.is_new = fresh
+        self.transaction = Transaction(root, fresh=fresh, dry_run=dry_run)
+        self.keystore = Keystore(root)
+        self.entries: list[Entry] = []
+        self.notes: list[Note] = []
+        self.remarks: list[Note] = []
+        self.outcomes: Mapping[str, str] = {}
+        self.revoked = 0
+        self.restart: tuple[str, ...] = ()
+        self.zenoh = KeptZenoh()
+        self._allowed = allow_refusal
+
+    def __enter__(self) -> Self:
+        """Recover and lock the keystore.
+
+        Raises:
+            KeystoreError: it is no keystore, is busy, or cannot be read.
+        """
+        if not self.dry_run:
+            tidy(self.root)
+        if not self.is_new:
+            check_keystore(self.root)
+        self.transaction.__enter__()
+        self.keystore = Keystore(self.root, locked=not self.dry_run)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.transaction.__exit__(kind, error, trace)
+
+    # ── what is there, and what is to be ───────────────────────────────────────────────────
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The enclaves before the change, sorted."""
+        return self.transaction.enclaves
+
+    @cached_property
+    def template(self) -> Template:
+        """The settings."""
+        return self.keystore.template
+
+    @cached_property
+    def identity(self) -> Authority:
+        """The identity CA, with its key."""
+        return self._authority(IDENTITY)
+
+    @cached_property
+    def permissions(self) -> Authority:
+        """The permissions CA, with its key."""
+        return self._authority(PERMISSIONS)
+
+    @cached_property
+    def authorities(self) -> Authorities:
+        """Both CAs, with their keys."""
+        return Authorities(self.identity, self.permissions)
+
+    def open_authorities(self) -> None:
+        """Open both CAs with the present settings, which say where their keys are."""
+        self.authorities  # noqa: B018 - read once
+
+    def _authority(self, role: str) -> Authority:
+        return load_authority(self.keystore, role, self.template, self.keyring, self.now)
+
+    @cached_property
+    def governance(self) -> Governance:
+        """The signed governance before the change."""
+        return self.keystore.governance
+
+    @cached_property
+    def domains(self) -> DomainSet:
+        """The ROS domains of the keystore."""
+        return self.governance.domains().closed()
+
+    @cached_property
+    def fleet(self) -> Fleet | None:
+        """The fleet of the keystore, which nobody edited by hand."""
+        return checked_fleet(self.keystore)
+
+    @cached_property
+    def ledger(self) -> Ledger:
+        """The ledger before the change."""
+        return self.keystore.ledger
+
+    @cached_property
+    def known(self) -> KnownKeys:
+        """The keys that enclaves have or had."""
+        return KnownKeys(self.keystore)
+
+    @cached_property
+    def recorded(self) -> RecordedRights:
+        """The rights that the ledger has."""
+        return RecordedRights(self.keystore)
+
+    def begin_issuing(self, domain: int | None) -> None:
+        """Open the CAs and the governance, and note edits by hand, before enclaves are issued.
+
+        Raises:
+            KeystoreError: one of them cannot be used, or ``domain`` is given and not among those of
+                the governance.
+        """
+        self.open_authorities()
+        self.check_domain(domain)
+        self.notes += self.edit_notes()
+
+    def check_domain(self, domain: int | None) -> None:
+        """Raise `KeystoreError` if ``domain`` is given and not among those of the governance."""
+        check_domain(self.domains, domain, self.root)
+
+    def write_fleet(self, fleet: Fleet, patterns: Collection[str]) -> Fleet:
+        """Stage ``fleet``, with more ``patterns`` of paths, as that of the keystore; return it."""
+        fleet, entries = write_fleet(self.transaction, self.keystore, fleet, patterns, self.now)
+        self.fleet = fleet
+        self.entries += entries
+        return fleet
+
+    def edit_notes(self) -> tuple[Note, ...]:
+        """Return a note on files that were edited by hand, which this change does not carry out."""
+        return edit_notes(self.keystore, self.governance)
+
+    def unrevoked_key(self, name: str, certificate: x509.Certificate) -> PublicKey:
+        """Return the key of an enclave's ``certificate``, to certify it again.
+
+        Raises:
+            KeystoreError: it was revoked.
+        """
+        public: PublicKey = certificate.public_key()  # type: ignore[assignment]
+        remedy = f"Give it another key with `sros renew {quote(str(self.root))} {name} --new-key`."
+        self.known.refuse_revoked(public, f"enclave {name}", remedy, certificate)
+        return public
+
+    def tokens(self, places: Mapping[str, TokenUri]) -> EnclaveTokens:
+        """Return the keys of enclaves on tokens, at ``places`` by enclave."""
+        return EnclaveTokens(
+            places, self.keyring.secrets, self.known, self.authorities, self.dry_run
+        )
+
+    def writer(self, *, keys_on_token: bool = False) -> EnclaveWriter:
+        """Return a writer of enclaves with the settings and the CAs that are to be."""
+        return EnclaveWriter(
+            self.transaction,
+            self.template,
+            self.now,
+            identity=self.identity,
+            permissions=self.permissions,
+            keys_on_token=keys_on_token,
+        )
+
+    # ── what follows from it ───────────────────────────────────────────────────────────────
+
+    def revocation_lists(self) -> RevocationListSigner:
+        """Return the signer of the revocation lists."""
+        return RevocationListSigner(
+            self.transaction,
+            self.keystore,
+            authority=self.identity,
+            template=self.template,
+            keyring=self.keyring,
+            now=self.now,
+        )
+
+    def revoke(self, replaced: Sequence[Superseded], *, names: Sequence[str] | None = None) -> None:
+        """Revoke all earlier certificates of enclaves whose certificates are ``replaced``.
+
+        The enclaves ``names`` (default: all) get the list, and have to be restarted.
+        """
+        if not replaced:
+            return
+        lists = self.revocation_lists()
+        revocations = lists.superseded(replaced)
+        self.restart = self.names if names is None else tuple(names)
+        self.entries += lists.sign(revocations, self.restart, incomplete=False)[1]
+        self.remarks += lists.remarks
+        self.revoked = len(revocations)
+
+    def keep_zenoh(
+        self,
+        issued: Mapping[str, Grant],
+        *,
+        gone: frozenset[str] = frozenset(),
+        replaced: Sequence[str] = (),
+        stated: Mapping[str, Enclave | None] | None = None,
+        created: Sequence[str] = (),
+    ) -> None:
+        """Stage the configurations of Zenoh as they have to be, if there is a Zenoh network.
+
+        Args:
+            issued: the new permissions of enclaves.
+            gone: the enclaves that are revoked.
+            replaced: those whose earlier certificates are.
+            stated: the policies of enclaves, by whose lines errors are told.
+            created: new enclaves, of which no process runs yet.
+        """
+        if self.template.zenoh is None:
+            return
+        self.zenoh = keep_zenoh(
+            self.transaction,
+            keystore=self.keystore,
+            network=self.template.zenoh,
+            domains=self.domains,
+            authority=self._permissions_certificate(),
+            signer=lambda: self.permissions,
+            now=self.now,
+            change=ZenohChange(issued, gone=gone, replaced=replaced, stated=stated or {}),
+        ).without(created)
+        self.notes += self.zenoh.notes
+
+    def _permissions_certificate(self) -> x509.Certificate:
+        """Return the certificate of the permissions CA, without its key if nothing needs it."""
+        if "permissions" in self.__dict__:
+            return self.permissions.certificate
+        return self.keystore.ca_certificate(PERMISSIONS)
+
+    # ── the flip ───────────────────────────────────────────────────────────────────────────
+
+    def record(self, signer: Authority | None = None) -> None:
+        """Write the ledger, signed by the identity CA or another ``signer``.
+
+        Before the first entry in a keystore of ros2/sros2 stands what is there already.
+        """
+        if not self.entries:
+            return
+        self.entries = take_over(self.transaction, self.keystore, self.now, self.entries)
+        append(
+            self.transaction,
+            self.entries,
+            (signer or self.identity).sign,
+            self.now,
+            self.keystore.ledger_file,
+        )
+
+    def finish(self, *, remedy: str = "", aim: str = "") -> None:
+        """Put everything in place, unless vendors would refuse enclaves that they accept today.
+
+        Args:
+            remedy: what to do where they would, as sentences.
+            aim: what the user wants, if it needs a revocation list, such as ``revoke``.
+
+        Raises:
+            KeystoreError: nodes of a vendor would stop.
+        """
+        self.notes += refuse_stopping(
+            self.transaction,
+            self.now,
+            keystore=self.keystore,
+            allowed=self._allowed,
+            remedy=(lambda: another_ca(self.keystore, aim)) if aim else lambda: remedy,
+        )
+        self.transaction.commit()
+
+    def result(self, kind: Callable[..., Result], **more: Any) -> Result:
+        """Return the result of the change, with ``more`` that the verb says of it."""
+        shared: dict[str, Any] = {
+            "root": self.root,
+            "dry_run": self.dry_run,
+            "outcomes": self.outcomes,
+            "changes": self.transaction.changes,
+            "revoked": self.revoked,
+            "restart": self.restart or self.zenoh.restart,
+            "zenoh": self.zenoh,
+            "remarks": tuple(self.remarks),
+            "notes": tuple(self.notes),
+        }
+        return kind(**shared | more)
