@@ -100,6 +100,14 @@ def test_a_denied_action_is_denied_by_its_parts() -> None:
     assert not rules.allow("/b", "call", "/other")
 
 
+def test_what_is_denied_in_part_is_not_allowed() -> None:
+    stated = ((ALLOW, "/arm/*"), (DENY, "/arm/stop"))
+    rules = Rules([Right("/a", word, "publish", name) for word, name in stated])
+    assert not rules.allow("/a", "publish", "/arm/*")
+    assert not rules.allow("/a", "publish", "/arm/st*")
+    assert rules.allow("/a", "publish", "/arm/move*")
+
+
 def test_a_right_reads_as_people_say_it() -> None:
     assert str(Right("/a", ALLOW, "publish", "/x")) == "/a ALLOW publish topic /x"
     assert str(Right("/a", DENY, "call", "/x")) == "/a DENY call action /x"
