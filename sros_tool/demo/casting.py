@@ -12,10 +12,11 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from itertools import permutations
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
@@ -87,8 +88,7 @@ _MOST_FAULTY = 8
 """The largest number of enclaves with faulty or revoked files that get a row."""
 
 
-@dataclass(frozen=True)
-class CastMember:
+class CastMember(NamedTuple):
     """An enclave of the user's keystore with its part, and the names of its ROS nodes on rclpy.
 
     ``why`` is why this enclave was chosen, or "".
@@ -100,8 +100,7 @@ class CastMember:
     why: str = ""
 
 
-@dataclass(frozen=True)
-class UserKeystore:
+class UserKeystore(NamedTuple):
     """A user's keystore to attack, with its template, domains, and cast.
 
     ``topic`` is the attacked ROS topic, ``service`` the attacked ROS service ("": none).
@@ -235,8 +234,7 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
     )
 
 
-@dataclass(frozen=True)
-class _Enclaves:
+class _Enclaves(NamedTuple):
     """The enclaves of a keystore, by what their files allow the demo to do with them.
 
     ``rights`` are the grants of sound enclaves.  ``faulty`` has the first fault of each enclave

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
@@ -28,8 +29,7 @@ _TEMPLATE = "production"
 
 
 @shows("enforces", "ros_enforces", "stacks", "advice")
-@dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(NamedTuple):
     """The stacks of this machine, and advice if none enforces security."""
 
     stacks: tuple[Stack, ...]

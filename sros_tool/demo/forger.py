@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple
 
 from cryptography import x509
 
@@ -199,8 +200,7 @@ def _same_template(template: Template) -> Template:
     return template
 
 
-@dataclass(frozen=True)
-class Undefended:
+class Undefended(NamedTuple):
     """A new keystore without a defence: made from a changed template, and then forged."""
 
     forge: Forge = _unchanged

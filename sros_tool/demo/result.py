@@ -36,7 +36,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.casting import CastMember
@@ -48,8 +48,7 @@ from sros_tool.validity import iso
 from sros_tool.values import as_plain
 
 
-@dataclass(frozen=True)
-class KeystoreSummary:
+class KeystoreSummary(NamedTuple):
     """The enclaves of a user's keystore, and those that cannot be tried; as in `UserKeystore`."""
 
     enclaves: int

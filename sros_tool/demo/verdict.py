@@ -10,7 +10,7 @@ import re
 import signal
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from sros_tool.demo.scenarios.model import (
     STATUS_OF,
@@ -147,8 +147,7 @@ class RowResult:
         }
 
 
-@dataclass(frozen=True)
-class _Finding:
+class _Finding(NamedTuple):
     """The observed status of one claim, with the evidence."""
 
     status: RowStatus

@@ -15,7 +15,6 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -340,8 +339,7 @@ class Wiretap:
         self._capture = self._injector = None
 
 
-@dataclass(frozen=True)
-class WireCount:
+class WireCount(NamedTuple):
     """The numbers of packets that show a talker's text, and of protected packets of its row.
 
     ``topics`` and ``certificates`` count the packets of the row that show the topic name, and a
@@ -354,8 +352,7 @@ class WireCount:
     certificates: int = 0
 
 
-@dataclass(frozen=True)
-class Injection:
+class Injection(NamedTuple):
     """The number of packets sent again or changed, and when sending began (CLOCK_MONOTONIC, s)."""
 
     packets: int

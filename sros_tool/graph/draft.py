@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -91,8 +91,7 @@ class LearnedPolicy(NamedTuple):
     notes: Notes
 
 
-@dataclass(frozen=True, slots=True)
-class Draft:
+class Draft(NamedTuple):
     """A change of the policy at ``path`` that is not written yet.
 
     ``before`` is the present content of the policy, None if there is no file; ``document`` is the

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Rule
@@ -43,8 +44,7 @@ from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes, tag_of
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class NodeRight:
+class NodeRight(NamedTuple):
     """A right (publish, subscribe, request, reply, call, execute) on an absolute ROS name."""
 
     right: str
@@ -208,8 +208,7 @@ def _is_place(ns: str, name: str) -> bool:
     return plain and name.replace("_", "a").isalnum() and name.isascii() and not name[0].isdigit()
 
 
-@dataclass(frozen=True, slots=True)
-class Folded:
+class Folded(NamedTuple):
     """The rights behind a set of endpoints.
 
     ``halves`` are service endpoints without the matching request or reply endpoint; ``foreign``
@@ -523,8 +522,7 @@ UNSHOWN = ("/",)
 _CONTAINER = "~/_container/load_node"
 
 
-@dataclass(frozen=True, slots=True)
-class NamedEnclaves:
+class NamedEnclaves(NamedTuple):
     """An observation in which every process has an enclave, and notes on the chosen names."""
 
     observation: Observation

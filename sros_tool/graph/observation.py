@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from sros_tool.values import Words, shows
 
 PUBLISH, SUBSCRIBE = "publish", "subscribe"
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Endpoint:
+class Endpoint(NamedTuple):
     """A DDS topic (its raw name), and whether it is written (publish) or read (subscribe)."""
 
     topic: str
@@ -66,8 +65,7 @@ class ObservedNode:
 
 
 @shows("nodes")
-@dataclass(frozen=True, slots=True)
-class Observation:
+class Observation(NamedTuple):
     """The nodes of a graph, sorted, and the endpoints that belong to none of them.
 
     ``silent`` are nodes (enclave, namespace, name) that were announced but had no endpoint.

@@ -29,7 +29,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 from sros_tool.errors import UnavailableError
 from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
@@ -198,8 +198,7 @@ Clock = Callable[[], float]
 _TICK = 0.2
 
 
-@dataclass(frozen=True, slots=True)
-class Settling:
+class Settling(NamedTuple):
     """The times after which an observed graph counts as complete, in seconds.
 
     It is complete once ``least`` has passed and it has not changed for ``still``, but at the latest
@@ -308,8 +307,7 @@ _Name = tuple[str, str]
 NOBODY = "_NODE_NAME_UNKNOWN_"
 
 
-@dataclass(frozen=True, slots=True)
-class Sighting:
+class Sighting(NamedTuple):
     """One look at the graph: the announced nodes, in their order, and all endpoints.
 
     Each endpoint comes with its participant, and the namespace and name of its node.  ``ordered``

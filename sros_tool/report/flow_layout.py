@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import accumulate
+from typing import NamedTuple
 
 from sros_tool.policy.model import ALLOW, Qualifier
 from sros_tool.report.focus import ENCLAVE, FocusFlow
@@ -91,8 +92,7 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, placed: bool = True) -> Sc
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Stage:
+class _Stage(NamedTuple):
     """Bundles of names in ``column``, with the ties of each to the left and to the right."""
 
     column: int

@@ -25,6 +25,7 @@ from collections.abc import (
 )
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import NamedTuple
 
 from sros_tool.fleet.robots import Robot
 from sros_tool.policy.model import ALLOW
@@ -54,8 +55,7 @@ _TITLE_LETTERS = 30
 _ENCLAVE = "enclave"
 
 
-@dataclass(frozen=True, slots=True)
-class Folding:
+class Folding(NamedTuple):
     """A picture in which equal units are one, and what its enclaves and names stand for."""
 
     picture: Picture
@@ -109,8 +109,7 @@ class Folding:
         return replace(frame, title=whole if len(whole) <= _TITLE_LETTERS else short)
 
 
-@dataclass(frozen=True, slots=True)
-class _Unit:
+class _Unit(NamedTuple):
     """A robot, a namespace or an enclave that can be equal to others of its ``family``.
 
     ``values`` are the words by which names name it: its name, and its namespace if that differs.

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from sros_tool.policy.model import ALLOW, Qualifier
 from sros_tool.report.picture import (
@@ -79,8 +80,7 @@ SENDERS, LISTENERS = "may send", "may receive"
 _NAMES = "topics, services, actions"
 
 
-@dataclass(frozen=True, slots=True)
-class Head:
+class Head(NamedTuple):
     """What a column has; ``anchor`` is where ``x`` is in the text: start, middle or end."""
 
     x: int
@@ -160,8 +160,7 @@ class Link:
     differs: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Onlooker:
+class Onlooker(NamedTuple):
     """An enclave with so many names that their cards show its letter (``tag``) instead of lines."""
 
     tag: str
@@ -635,8 +634,7 @@ def frames_of(cards: Iterable[Card]) -> Iterable[Frame]:
             yield Frame(title, found[0].x - 6, top, found[0].width + 12, bottom - top)
 
 
-@dataclass(frozen=True, slots=True)
-class ColumnItem:
+class ColumnItem(NamedTuple):
     """An item of a column, with a height; the items of a ``group`` stay together."""
 
     id: str

@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.names import READING_SERVICES
 from sros_tool.policy.model import ALLOW, RIGHTS, Qualifier
@@ -168,8 +168,7 @@ def asks(name: Name | Edge) -> bool:
     return name.kind == "services" and name.name.endswith(_ASKED)
 
 
-@dataclass(frozen=True, slots=True)
-class Statement:
+class Statement(NamedTuple):
     """A right as written in the source, and the number of known names that it matches."""
 
     qualifier: Qualifier
@@ -257,8 +256,7 @@ class PicturedFinding:
     """The enclave, or another subject."""
 
 
-@dataclass(frozen=True, slots=True)
-class SourceTitle:
+class SourceTitle(NamedTuple):
     """The title of a source in the picture: its base name, and its kind."""
 
     title: str
@@ -267,8 +265,7 @@ class SourceTitle:
     """What it is, such as ``policy``."""
 
 
-@dataclass(frozen=True, slots=True)
-class Overlay:
+class Overlay(NamedTuple):
     """The kind of an overlay of two sources.
 
     ``kind`` is use (allowed and observed), change (before and after), drift (policy and keystore)
@@ -284,8 +281,7 @@ class Overlay:
     """What only the second side has, in words."""
 
 
-@dataclass(frozen=True, slots=True)
-class OverlayDifference:
+class OverlayDifference(NamedTuple):
     """A right that only one side has, with ``notes``.
 
     For a change, the notes are the wildcards of the other side that cover the right; for use, the
@@ -337,8 +333,7 @@ class Focus:
     """Enclaves that the enclave influences; with 1 hop directly."""
 
 
-@dataclass(frozen=True, slots=True)
-class PicturedUse:
+class PicturedUse(NamedTuple):
     """A use of a name that breaks a requirement; ``by`` is the wildcard that allows it, or ""."""
 
     enclave: str
@@ -353,8 +348,7 @@ class PicturedUse:
     """The wildcard that allows it, or an empty string."""
 
 
-@dataclass(frozen=True, slots=True)
-class PicturedViolation:
+class PicturedViolation(NamedTuple):
     """A requirement that does not hold, in words, and the uses that break it."""
 
     text: str
@@ -367,8 +361,7 @@ _SAID = 5  # violations, and units that differ, that the headlines say; JSON has
 _SHOWN = 2  # rights that they say of one unit
 
 
-@dataclass(frozen=True, slots=True)
-class Requirements:
+class Requirements(NamedTuple):
     """The number of requirements that hold, and those that do not.
 
     ``assumed`` are those that hold by an assumption, in words.
@@ -394,8 +387,7 @@ class Requirements:
         return (*said, *more, *((holds,) if self.hold else ()))
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class EqualUnits:
+class EqualUnits(NamedTuple):
     """Robots, namespaces or enclaves (``what``) that are equal but for their names.
 
     ``label`` stands for each of them in the paths and names that are drawn, like ``{r01…r50}``.
@@ -415,8 +407,7 @@ class EqualUnits:
         return f"{first} … {last}: {len(self.members)} equal {self.what}s"
 
 
-@dataclass(frozen=True, slots=True)
-class DifferentUnit:
+class DifferentUnit(NamedTuple):
     """A unit, or the label of several, that is nearly equal to those of the label ``usual``.
 
     ``more`` and ``fewer`` are the enclaves and rights that it has and lacks, in words.

@@ -17,10 +17,9 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.files import unpacked_dds_dir
@@ -85,8 +84,7 @@ class SecurityRefusedError(DdsError):
     """A refusal by DDS Security of a participant, a topic, a writer or a reader."""
 
 
-@dataclass(frozen=True, order=True)
-class Publication:
+class Publication(NamedTuple):
     """A discovered writer: its DDS topic name and DDS type name."""
 
     topic: str
@@ -341,8 +339,7 @@ def _text(raw: bytes | None) -> str:
 # ── the library ────────────────────────────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True)
-class CycloneLibrary:
+class CycloneLibrary(NamedTuple):
     """A loaded libddsc: its functions, its file, and its log.
 
     ``version`` is as in its file name ("0.10.2"); ``plugins`` is the folder of its security

@@ -22,10 +22,9 @@ import socket
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from sros_tool.errors import SrosError
 
@@ -67,8 +66,7 @@ class _RouteEntry(ctypes.Structure):
     ]
 
 
-@dataclass(frozen=True)
-class Isolation:
+class Isolation(NamedTuple):
     """Whether a process can get a separate network, with the reason if it cannot."""
 
     isolated: bool

@@ -126,8 +126,7 @@ _RMW_OF = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class UnseenProcess:
+class UnseenProcess(NamedTuple):
     """A process that could not be looked at, and ``why``, as a clause.
 
     ``speaks`` is whether its command shows that it speaks ROS 2; of others that is not known.

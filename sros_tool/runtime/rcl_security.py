@@ -7,16 +7,15 @@ ROS_SECURITY_STRATEGY than ``Enforce``, a process without an enclave runs unsecu
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.errors import SrosError
 from sros_tool.runtime.cyclone import ENCLAVE_FILES
 from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
 
 
-@dataclass(frozen=True)
-class SecurityChoice:
+class SecurityChoice(NamedTuple):
     """The enclave directory that rcl chooses (None: no security), and the reason."""
 
     enclave: Path | None

@@ -21,7 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
 from sros_tool.runtime.events import Event, EventKind, ProcessStage, read_events
@@ -46,8 +46,7 @@ ROS_ADVICE = (
 _EXIT_SECONDS = 5.0
 
 
-@dataclass(frozen=True)
-class ProbeEnclave:
+class ProbeEnclave(NamedTuple):
     """The secured environment of a probe, with one allowed and one denied ROS topic.
 
     ``environment`` holds the ROS_SECURITY_* variables and ROS_DOMAIN_ID of an enclave that may
@@ -207,8 +206,7 @@ def _package_version(name: str) -> str:
 # ── trying one ──────────────────────────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True)
-class ProbeRun:
+class ProbeRun(NamedTuple):
     """The reports, the output and the exit status of one probe process.
 
     ``status`` is negative for a signal, and None if the process had to be stopped.
@@ -261,8 +259,7 @@ def _wait(process: subprocess.Popen[bytes]) -> int | None:
 # ── judging what was seen ───────────────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True)
-class ProbeVerdict:
+class ProbeVerdict(NamedTuple):
     """Whether a DDS enforces security (None: could not be tried), with the evidence."""
 
     enforces: bool | None

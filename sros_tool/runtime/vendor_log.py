@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from enum import Enum, auto
+from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.faults import Fault
@@ -38,8 +38,7 @@ _ROS = None
 """The vendor of texts that rcl or an RMW prints with every DDS."""
 
 
-@dataclass(frozen=True, slots=True)
-class LogText:
+class LogText(NamedTuple):
     """A text of a log and its meaning.
 
     ``pattern`` is searched in a line without colours; its groups are fields such as ``path``,
@@ -988,8 +987,7 @@ def zenoh_text(line: str) -> tuple[LogText, re.Match[str]] | None:
 # ── denied messages ────────────────────────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True, slots=True)
-class DroppedMessage:
+class DroppedMessage(NamedTuple):
     """A message that access control dropped, as the log of the enforcing process says.
 
     ``line`` counts from 1; ``name`` is the common name of the remote process, "" if the log does
