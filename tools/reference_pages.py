@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 
 import click
 
-from sros_tool.checks.registry import KINDS
+from sros_tool.checks.registry import all_kinds
 from sros_tool.keystore.template import load_template, settings_values, template_names
 from sros_tool.policy.protection import Level
 from sros_tool.runtime.vendor_log import LOG_TEXTS
@@ -87,7 +87,7 @@ def _row(option: click.Option, context: click.Context) -> tuple[str, str]:
 
 def _findings() -> str:
     families: dict[str, list[str]] = {}
-    for kind in KINDS.values():
+    for kind in all_kinds().values():
         family = kind.id.partition(".")[0]
         text = (
             f"### {kind.id}\n\n**{kind.severity}**: {_cell(kind.title)}.\n\n{_cell(kind.why)}\n\n"

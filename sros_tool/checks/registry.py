@@ -5,30 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import cache
+from importlib import import_module
 from types import ModuleType
 from typing import NamedTuple
 
-from sros_tool.checks import (
-    environment,
-    policies,
-    process_files,
-    processes,
-    requirements,
-    runtime,
-    zenoh,
-    zenoh_environment,
-)
-from sros_tool.checks.keystores import (
-    authorities,
-    documents,
-    enclaves,
-    files,
-    issued,
-    starting,
-    topic_names,
-    vendors,
-    zenoh_files,
-)
 from sros_tool.checks.kind import (
     ERROR,
     NOTE,
@@ -42,19 +23,12 @@ from sros_tool.checks.kind import (
 from sros_tool.errors import UsageError
 
 _MODULES = (
-    *(policies, requirements, files, authorities, enclaves, starting, vendors, documents),
-    *(
-        topic_names,
-        issued,
-        zenoh_files,
-        zenoh,
-        zenoh_environment,
-        environment,
-        runtime,
-        processes,
-        process_files,
-    ),
+    *("policies", "requirements", "keystores.files", "keystores.authorities"),
+    *("keystores.enclaves", "keystores.starting", "keystores.vendors", "keystores.documents"),
+    *("keystores.topic_names", "keystores.issued", "keystores.zenoh_files", "zenoh"),
+    *("zenoh_environment", "environment", "runtime", "processes", "process_files"),
 )
+"""The modules of checks, in the order in which their kinds are listed."""
 
 
 def _declared(module: ModuleType) -> Iterator[FindingKind]:
@@ -65,12 +39,17 @@ def _declared(module: ModuleType) -> Iterator[FindingKind]:
                 yield each
 
 
-KINDS: Mapping[str, FindingKind] = by_id(
-    *dict.fromkeys(
-        kind for module in _MODULES for kind in sorted(_declared(module), key=lambda kind: kind.id)
+@cache
+def all_kinds() -> Mapping[str, FindingKind]:
+    """Return every kind by its id; this imports all checks."""
+    modules = [import_module(f"sros_tool.checks.{name}") for name in _MODULES]
+    return by_id(
+        *dict.fromkeys(
+            kind
+            for module in modules
+            for kind in sorted(_declared(module), key=lambda kind: kind.id)
+        )
     )
-)
-"""Every kind by its id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +75,7 @@ class FindingFilter:
 
     def __post_init__(self) -> None:
         for pattern in (*self.include, *self.exclude):
-            if not any(_matches(kind, pattern) for kind in KINDS.values()):
+            if not any(_matches(kind, pattern) for kind in all_kinds().values()):
                 raise UsageError(
                     f"no finding has the id {pattern!r}",
                     "",
@@ -108,7 +87,7 @@ class FindingFilter:
         included = not self.include or any(_matches(kind, each) for each in self.include)
         if self.vendor and kind.vendors and self.vendor not in kind.vendors:
             return False
-        if self.vendor and kind is vendors.DIFFER:
+        if self.vendor and kind.id == _DIFFERENCES:
             return False
         return included and not any(_matches(kind, each) for each in self.exclude)
 
@@ -208,8 +187,12 @@ class AllKinds(NamedTuple):
 
 
 def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:
-    """Return the selected kinds, in the order of `KINDS`."""
-    return [kind for kind in KINDS.values() if selection.wants(kind)]
+    """Return the selected kinds, in the order of `all_kinds`."""
+    return [kind for kind in all_kinds().values() if selection.wants(kind)]
+
+
+_DIFFERENCES = "portable.vendors-differ"
+"""The kind of finding that is about several vendors."""
 
 
 def _matches(kind: FindingKind, pattern: str) -> bool:

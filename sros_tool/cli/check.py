@@ -59,9 +59,9 @@ _LEVELS = click.Choice(["note", "warning", "error"])
 
 def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
     """Complete the ids of findings."""
-    from sros_tool.checks.registry import KINDS
+    from sros_tool.checks.registry import all_kinds
 
-    return [each for each in KINDS if each.startswith(incomplete)]
+    return [each for each in all_kinds() if each.startswith(incomplete)]
 
 
 @click.command(
@@ -225,9 +225,6 @@ def check(
     """
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
-    from sros_tool.proof.dropped import dropped_findings
-    from sros_tool.proof.findings import requirement_findings
-    from sros_tool.proof.requirements import read_all_requirements
 
     check_one_format()
     family, paths = _family(targets)
@@ -277,16 +274,13 @@ def check(
         return 0
     if template and not requirements:
         raise UsageError("--template is for --requirements and --suggest", "", "Leave it out.")
-    read = read_all_requirements(requirements)
     if earlier and not requirements:
         raise UsageError("--requirements-before needs --requirements", "", "Name the new file.")
-    one = _one_path(family, paths, "--requirements") if read else None
+    decide = _requirements(family, paths, requirements, earlier)
     with progress("checking"):
         every = _findings(family, paths, at)
-        if one:
-            every += requirement_findings(read, _system(one, at, vendor, template))
-        if earlier:
-            every += dropped_findings(read_all_requirements(earlier), read, str(requirements[0]))
+        if decide:
+            every += decide(lambda path: _system(path, at, vendor, template))
         found = [_shown(each) for each in every]
     chosen = selection.choose(found)
     if form == "text" and at.fleet:
@@ -294,6 +288,34 @@ def check(
     else:
         _SHOW[form](chosen, selection)
     return _status(chosen, fail_on)
+
+
+def _requirements(
+    family: str,
+    paths: tuple[Path, ...],
+    files: tuple[Path, ...],
+    earlier: tuple[Path, ...],
+) -> Callable[[Callable[[Path], System]], list[Finding]] | None:
+    """Return the decision of the requirements in some files, or None without any.
+
+    It gets a function that reads the policy or keystore at a path.
+    """
+    if not files:
+        return None
+    from sros_tool.proof.dropped import dropped_findings
+    from sros_tool.proof.findings import requirement_findings
+    from sros_tool.proof.requirements import read_all_requirements
+
+    read = read_all_requirements(files)
+    path = _one_path(family, paths, "--requirements") if read else None
+
+    def decide(load: Callable[[Path], System]) -> list[Finding]:
+        findings = list(requirement_findings(read, load(path))) if path else []
+        if earlier:
+            findings += dropped_findings(read_all_requirements(earlier), read, str(files[0]))
+        return findings
+
+    return decide
 
 
 def _status(chosen: ChosenFindings, fail_on: str) -> int:

@@ -20,7 +20,7 @@ from sros_tool import cli
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import policy_file_findings
-from sros_tool.checks.registry import KINDS
+from sros_tool.checks.registry import all_kinds
 from sros_tool.checks.runtime import RuntimeState, runtime_findings
 from sros_tool.keystore.reader import Keystore
 from tests.checks import policy_cases, runtime_cases
@@ -86,7 +86,7 @@ def at(moment: datetime, monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.setattr(module, "now", lambda: moment)
 
 
-NAMED = [each for each in CASES if "`sros " in KINDS[each].remedy and each not in ELSEWHERE]
+NAMED = [each for each in CASES if "`sros " in all_kinds()[each].remedy and each not in ELSEWHERE]
 
 
 @pytest.mark.parametrize("kind", some(NAMED, 20))
@@ -118,7 +118,7 @@ def test_no_remedy_names_a_command_that_refuses(
         assert ended.status < 2, (words, ended.err)
 
 
-POLICIES = [each for each in policy_cases.CASES if "`sros " in KINDS[each.id].remedy]
+POLICIES = [each for each in policy_cases.CASES if "`sros " in all_kinds()[each.id].remedy]
 SHOWN_ONLY = {"portable.document-size"}
 """The findings whose commands show what a person may change, and write nothing."""
 
@@ -164,8 +164,9 @@ STARTED, OTHERS = (
     [
         name
         for name, (kind, _) in RUNTIME.items()
-        if "sros " in KINDS[kind].remedy and kind not in NOT_HERE
-        if bool(re.search("sros (env|run) (?!.*update_keystore)", KINDS[kind].remedy)) is starts
+        if "sros " in all_kinds()[kind].remedy and kind not in NOT_HERE
+        if bool(re.search("sros (env|run) (?!.*update_keystore)", all_kinds()[kind].remedy))
+        is starts
     ]
     for starts in (True, False)
 )
