@@ -272,7 +272,7 @@ def _check_token_used(place: TokenUri, name: str, rmw: str) -> None:
 
 def _check_pin(place: TokenUri, name: str) -> None:
     """Raise `KeystoreError` if others can read the PIN of a token, or this user cannot."""
-    from sros_tool.keystore.issuing.tokens import pin_file_problem
+    from sros_tool.pki.token import pin_file_problem
 
     if problem := pin_file_problem(place):
         raise KeystoreError(

@@ -8,8 +8,6 @@ from pathlib import Path
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
-from sros_tool.checks.policies import policy_file_findings
-from sros_tool.checks.zenoh import configuration_findings
 from sros_tool.errors import DocumentError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (
@@ -22,7 +20,6 @@ from sros_tool.keystore.layout import (
     refuse_earlier,
 )
 from sros_tool.keystore.reader import Keystore
-from sros_tool.policy.document import policy_files
 from sros_tool.policy.model import Policy
 from sros_tool.xml import read_bytes
 
@@ -60,6 +57,8 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     other path.
     """
     if path.suffix in (".json5", ".json") and not path.is_dir():
+        from sros_tool.checks.zenoh import configuration_findings
+
         return list(configuration_findings(path))
     if is_keystore(path):
         return _keystore(path, at, None)
@@ -77,6 +76,9 @@ def policy_findings(path: Path, at: Circumstances) -> list[Finding]:
 
     Raises `DocumentError` if there is no file to read, or one in the folder is perhaps a policy.
     """
+    from sros_tool.checks.policies import policy_file_findings
+    from sros_tool.policy.document import policy_files
+
     if not path.is_dir():
         read_bytes(path, "file")
         return list(policy_file_findings(path, at.distribution, at.fleet))

@@ -321,12 +321,11 @@ def _requirements(
 def _status(chosen: ChosenFindings, fail_on: str) -> int:
     """Return the exit status: 1 for findings, and `NOT_DONE` if some processes were not seen."""
     from sros_tool.checks.kind import Severity
-    from sros_tool.checks.process_files import PROCESS_NOT_SEEN
 
     if fail_on == "never":
         return 0
     failing = [each for each in chosen.shown if each.severity >= Severity[fail_on.upper()]]
-    if failing and all(each.kind is PROCESS_NOT_SEEN for each in failing):
+    if failing and all(each.id == "runtime.process-not-seen" for each in failing):
         return NOT_DONE
     return 1 if failing else 0
 
@@ -395,13 +394,18 @@ def _circumstances(
 ) -> Circumstances:
     from sros_tool.checks.targets import Circumstances
     from sros_tool.cli.common import local_zone
-    from sros_tool.fleet.expansion import read_policy_for
-    from sros_tool.fleet.fleet_file import read_fleet
 
-    fleet = read_fleet(fleet_file) if fleet_file else None
-    read = tuple(read_policy_for(each, fleet) for each in policies)
+    fleet, read = None, []
+    if fleet_file:
+        from sros_tool.fleet.fleet_file import read_fleet
+
+        fleet = read_fleet(fleet_file)
+    for policy in policies:
+        from sros_tool.fleet.expansion import read_policy_for
+
+        read.append(read_policy_for(policy, fleet))
     zone, wanted = local_zone(os.environ), domain_of(domain)
-    return Circumstances(moment_of(moment), zone, wanted, read, fleet=fleet)
+    return Circumstances(moment_of(moment), zone, wanted, tuple(read), fleet=fleet)
 
 
 def _distribution(named: str | None) -> str:

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note
 from sros_tool.fleet.enclaves import enclaves_of, robot_of, size_problem
-from sros_tool.fleet.fleet_file import MAX_BYTES, parse_fleet, render_fleet
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.layout import FLEET, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger
@@ -92,10 +91,14 @@ def _read(keystore: Keystore) -> bytes | None:
     path = keystore.root / FLEET
     if not os.path.lexists(path):
         return None
+    from sros_tool.fleet.fleet_file import MAX_BYTES  # most keystores have no fleet
+
     return keystore.files.read(path, "fleet file", most=MAX_BYTES)
 
 
 def _parse(root: Path, data: bytes) -> Fleet:
+    from sros_tool.fleet.fleet_file import parse_fleet  # most keystores have no fleet
+
     return parse_fleet(data, f"the fleet file '{root / FLEET}'")
 
 
@@ -170,6 +173,8 @@ def write_fleet(
 
     It gets the paths of enclaves that it names itself, that the keystore had, and ``patterns``.
     """
+    from sros_tool.fleet.fleet_file import render_fleet
+
     before = load_fleet(keystore)
     known = (before.enclaves if before else (), fleet.enclaves, patterns)
     paths = dict.fromkeys(sorted(each for paths in known for each in paths))

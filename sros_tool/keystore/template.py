@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, SrosError, UsageError
@@ -22,8 +22,9 @@ from sros_tool.policy.patterns import covers, matches
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.validity import Span, duration_text, parse_duration, parse_span, span_text
 from sros_tool.xml import read_bytes
-from sros_tool.zenoh.configuration import Mode, is_endpoint
-from sros_tool.zenoh.network import ZenohNetwork
+
+if TYPE_CHECKING:
+    from sros_tool.zenoh.network import ZenohNetwork
 
 DEFAULT_TEMPLATE = "development"
 EVERYTHING, NODE_BASICS = "everything", "node_basics"
@@ -216,6 +217,9 @@ def _short_lived(table: _Table) -> Iterator[ShortLived]:
 
 
 def _zenoh(table: _Table) -> ZenohNetwork:
+    from sros_tool.zenoh.configuration import Mode, is_endpoint  # most keystores have none
+    from sros_tool.zenoh.network import ZenohNetwork
+
     usual = ZenohNetwork()
     network = ZenohNetwork(
         table.text("router", usual.router),

@@ -5,9 +5,11 @@ from __future__ import annotations
 import importlib.util
 import os
 import secrets as random
+import stat
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote as shell_quote
 from typing import Any
 from urllib.parse import quote, unquote
 
@@ -17,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_dss_signature
 from cryptography.hazmat.primitives.serialization import load_der_public_key
 
-from sros_tool.errors import PkiError, UnavailableError, UsageError
+from sros_tool.errors import DocumentError, PkiError, UnavailableError, UsageError
 from sros_tool.owners import file_of_root
 from sros_tool.xml import read_bytes
 
@@ -497,3 +499,40 @@ def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
             )
         found[name] = unquote(value)
     return found
+
+
+# ── the file with a PIN ────────────────────────────────────────────────────────────────────
+
+_LONGEST_PIN = 256  # bytes; CK_TOKEN_INFO of PKCS#11 says which lengths a token takes
+
+
+def pin_file_problem(place: TokenUri) -> str:
+    """Return why the file with the PIN of a token cannot be used, as a clause; "" if it can."""
+    if not place.pin_source:
+        return ""
+    path = Path(place.pin_source)
+    try:
+        read_bytes(path, "file with the PIN", most=_LONGEST_PIN)
+        mode = stat.S_IMODE(path.stat().st_mode)
+    except (DocumentError, OSError) as error:
+        return str(error).rstrip(".")
+    if mode & 0o077:
+        return (
+            f"others can use the file with the PIN, '{path}' (mode {mode:04o}): run `chmod 600 "
+            f"{shell_quote(str(path))}`"
+        )
+    return ""
+
+
+def pin_line_break(place: TokenUri) -> str:
+    """Return what a line break after the PIN does, as a clause; "" if there is none."""
+    try:
+        pin = read_bytes(Path(place.pin_source), "file with the PIN", most=_LONGEST_PIN)
+    except DocumentError:
+        return ""
+    if not pin.endswith((b"\n", b"\r")):
+        return ""
+    return (
+        f"the file with the PIN, '{place.pin_source}', ends with a line break, which libp11 before "
+        "0.4.17 takes for a part of the PIN, so that no node starts: write it with `printf %s PIN`"
+    )

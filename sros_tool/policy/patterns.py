@@ -15,12 +15,15 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import translate
-from functools import cached_property, lru_cache, reduce
+from functools import cache, cached_property, lru_cache, reduce
 from operator import and_
+from typing import TYPE_CHECKING
 
-from sros_tool.automata import Automaton, Letters, NameSet
 from sros_tool.errors import DocumentError
 from sros_tool.names import is_expression
+
+if TYPE_CHECKING:
+    from sros_tool.automata import Letters, NameSet
 
 _MANY = 4096
 _WILDCARD = re.compile(r"[*?\[]")
@@ -384,21 +387,23 @@ def _grams(run: str) -> Iterator[str]:
 # ── names that expressions have in common ──────────────────────────────────────────────────
 
 
-_WORD = Letters.between([("A", "Z"), ("a", "z"), ("_", "_")])
-_SLASH = Letters.of("/")
-_DIGITS = Letters.between([("0", "9")])
-_PARTS = ((1, _WORD, 2), (2, _WORD | _DIGITS, 2))
-_ABSOLUTE_NAMES = NameSet(
-    (), [Automaton(((0, _SLASH, 1), *_PARTS, (2, _SLASH, 1)), frozenset((2,)))]
-)
-_RELATIVE_NAMES = NameSet(
-    (), [Automaton(((0, _WORD, 2), *_PARTS, (2, _SLASH, 1)), frozenset((2,)))]
-)
+# Most questions need no automata, which take long to import.
+@cache
+def _ros_names(absolute: bool) -> NameSet:
+    """Return all names that the grammar of ROS allows, with or without a leading "/"."""
+    from sros_tool.automata import Automaton, Letters, NameSet
+
+    word, slash = Letters.between([("A", "Z"), ("a", "z"), ("_", "_")]), Letters.of("/")
+    parts = ((1, word, 2), (2, word | Letters.between([("0", "9")]), 2), (2, slash, 1))
+    begin = (0, slash, 1) if absolute else (0, word, 2)
+    return NameSet((), [Automaton((begin, *parts), frozenset((2,)))])
 
 
 @lru_cache(maxsize=_MANY)
 def _names_of(expression: str) -> NameSet:
     """Return the names that an expression matches."""
+    from sros_tool.automata import Automaton, NameSet
+
     if not is_expression(expression):
         return NameSet([expression])
     pieces = _pieces(expression)
@@ -409,6 +414,8 @@ def _names_of(expression: str) -> NameSet:
 
 @lru_cache(maxsize=_MANY)
 def _as_letters(piece: frozenset[str]) -> Letters:
+    from sros_tool.automata import Letters
+
     return Letters.of("".join(piece))
 
 
@@ -434,6 +441,7 @@ def common_name(
 
 @lru_cache(maxsize=4096)
 def _search(wanted: tuple[str, ...], unwanted: tuple[str, ...], absolute: bool) -> str | None:
-    valid = _ABSOLUTE_NAMES if absolute else _RELATIVE_NAMES
-    both = reduce(and_, map(_names_of, wanted), valid)
+    from sros_tool.automata import NameSet
+
+    both = reduce(and_, map(_names_of, wanted), _ros_names(absolute))
     return (both - NameSet.union(map(_names_of, unwanted))).example()

@@ -17,7 +17,6 @@ from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
-from sros_tool.fleet.enclaves import left_robot_of
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import FLEET_REMEDY
 from sros_tool.keystore.layout import (
@@ -31,7 +30,6 @@ from sros_tool.keystore.layout import (
     ca_key,
     key_path,
 )
-from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.keystore.recorded import RecordedRights
 from sros_tool.keystore.settings import edit_remedy
@@ -364,6 +362,8 @@ _SHOWN, _MOST_LEFT = 5, 20
 
 
 def _left_enclaves(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
+    from sros_tool.fleet.enclaves import left_robot_of
+
     robots: dict[str, list[str]] = {}
     for name in keystore.names:
         if robot := left_robot_of(fleet, name):
@@ -494,6 +494,8 @@ def shared_ca_findings(
 
 def _separation(keystore: CheckedKeystore) -> str:
     """Return what is left to do until identity CA and permissions CA have keys of their own."""
+    from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+
     try:
         stage = read_rotation(keystore.root).stage
         files = keystore.opened.authority_files

@@ -18,12 +18,12 @@ from sros_tool.checks.keystores.enclaves import grant_of, plain
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import check_topic_names
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
-from sros_tool.checks.policies import outside_findings
 from sros_tool.dds.decision.moments import read_moment
 from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, Moments, Vendor
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Rule
+from sros_tool.dds.portable import outside
 from sros_tool.errors import SrosError
 from sros_tool.keystore.fleet import EnclaveDomains
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_XML
@@ -217,7 +217,11 @@ def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
     if permissions is None:
         return
     name, file = enclave.name, enclave.file("permissions.p7s")
-    yield from outside_findings(permissions, enclave.state.permissions_bytes, name, file)
+    size = enclave.state.permissions_bytes
+    if any(outside(permissions, size, lambda names: Names(names).meets)):
+        from sros_tool.checks.policies import outside_findings
+
+        yield from outside_findings(permissions, size, name, file)
     if len(permissions.grants) > 1:
         yield SEVERAL_GRANTS.found(name, f"it has {len(permissions.grants)} grants", file)
     for grant in permissions.grants:

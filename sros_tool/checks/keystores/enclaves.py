@@ -26,7 +26,6 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
 from sros_tool.faults import VENDOR_FAULTS, Fault
-from sros_tool.keystore.issuing.tokens import pin_file_problem, pin_line_break
 from sros_tool.keystore.layout import (
     IDENTITY,
     IDENTITY_CA_FILE,
@@ -40,7 +39,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import weaknesses
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
-from sros_tool.pki.token import TokenUri
+from sros_tool.pki.token import TokenUri, pin_file_problem, pin_line_break
 from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 

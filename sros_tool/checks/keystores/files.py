@@ -13,7 +13,6 @@ from shlex import quote
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.errors import KeystoreError, SrosError
-from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
     CONFIRMED,
     ENCLAVES,
@@ -40,7 +39,6 @@ from sros_tool.keystore.layout import (
     enclave_path,
     hidden_enclaves,
 )
-from sros_tool.keystore.transaction.stage import check_interrupted
 from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
 from sros_tool.pki.keys import holds_private_key
 
@@ -352,6 +350,9 @@ def _unread(error: OSError, root: str) -> Finding:
 
 
 def _interrupted(parent: Path, root: str) -> Finding:
+    from sros_tool.folders import Folder
+    from sros_tool.keystore.transaction.stage import check_interrupted
+
     try:
         with Folder(parent) as folder:
             check_interrupted(folder)

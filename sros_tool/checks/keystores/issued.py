@@ -15,7 +15,6 @@ from sros_tool.checks.keystores.documents import DIFFERS as GOVERNANCE_DIFFERS
 from sros_tool.checks.keystores.enclaves import grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
-from sros_tool.checks.policies import ENCLAVE_NAMES, only_basic, within_root
 from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.dds.portable import mistaken_names, some_pairs
@@ -29,7 +28,6 @@ from sros_tool.keystore.layout import (
     enclave_path,
 )
 from sros_tool.keystore.protection import less_protected
-from sros_tool.keystore.rights import load_rights
 from sros_tool.pki.certificates import fingerprints, load_certificates
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy.model import stated_protections
@@ -237,10 +235,16 @@ def check_issued(
     names = [each.name for each in summaries]
     pairs = [(inner, outer) for inner, outer in mistaken_names(names) if inner in plain]
     if pairs:
+        from sros_tool.checks.policies import ENCLAVE_NAMES
+
         text = f"Cyclone DDS mistakes {some_pairs(pairs)}"
         yield ENCLAVE_NAMES.found(pairs[0][0], text, str(keystore.root))
-    if "/" in keystore.names and (text := within_root(load_rights(keystore.opened).rights)):
-        yield ROOT_ENCLAVE.found("/", text, str(enclave_path(keystore.root, "/")))
+    if "/" in keystore.names:
+        from sros_tool.checks.policies import within_root
+        from sros_tool.keystore.rights import load_rights
+
+        if text := within_root(load_rights(keystore.opened).rights):
+            yield ROOT_ENCLAVE.found("/", text, str(keystore.opened.folder("/")))
     yield from _trust(keystore, summaries)
     yield from _exported_governance(keystore, summaries)
     yield from _lists(keystore, summaries)
@@ -379,6 +383,8 @@ def _is_plain_router(enclave: CheckedEnclave, grant: Grant | None) -> bool:
     settings = enclave.keystore.settings
     if not (settings and settings.zenoh and settings.zenoh.router == enclave.name and grant):
         return False
+    from sros_tool.checks.policies import only_basic
+
     return only_basic(grant_rights(enclave.name, grant))
 
 

@@ -45,7 +45,6 @@ from sros_tool.checks.keystores.vendors import (
 )
 from sros_tool.checks.keystores.zenoh_files import check_network, check_own_zenoh
 from sros_tool.checks.kind import Finding
-from sros_tool.checks.policies import findings_in
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
@@ -149,6 +148,8 @@ def keystore_findings(
     found += check_capitals(topics)
     found += check_network(keystore, only)
     for policy in policies:
+        from sros_tool.checks.policies import findings_in
+
         chosen = tuple(each for each in policy.enclaves if only is None or each.path in only)
         found += findings_in(replace(policy, enclaves=chosen), distribution)
     real_root = os.path.realpath(root)

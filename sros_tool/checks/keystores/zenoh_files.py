@@ -6,15 +6,19 @@ permissions of the enclave that has them.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterator
+from typing import TYPE_CHECKING
 
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import SrosError
 from sros_tool.faults import Fault
-from sros_tool.keystore.layout import PERMISSIONS, SETTINGS, enclave_path
-from sros_tool.keystore.zenoh.opened import OpenedZenoh, ZenohFault, open_zenoh
-from sros_tool.keystore.zenoh.wanted import Drift, Drifted, zenoh_drift
+from sros_tool.keystore.layout import PERMISSIONS, SETTINGS, ZENOH_FILES
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.zenoh.opened import OpenedZenoh
+    from sros_tool.keystore.zenoh.wanted import Drifted
 
 _AGAIN = "Run `sros zenoh ROOT`, and restart the processes that it names."
 _SOURCE = "sros (docs/zenoh.md); Zenoh 1.10 verifies no signature of its configuration."
@@ -82,15 +86,15 @@ CANNOT_BE_MADE = FindingKind(
 )
 
 _KINDS = {
-    ZenohFault.MISSING: MISSING,
-    ZenohFault.UNREADABLE: UNSIGNED,
-    ZenohFault.UNSIGNED: UNSIGNED,
-    ZenohFault.SIGNATURE: UNSIGNED,
-    ZenohFault.OTHER_DOCUMENT: OTHER_DOCUMENT,
-    ZenohFault.MALFORMED: OUT_OF_DATE,
-    ZenohFault.OUT_OF_DATE: OUT_OF_DATE,
+    "missing": MISSING,
+    "unreadable": UNSIGNED,
+    "unsigned": UNSIGNED,
+    "signature": UNSIGNED,
+    "other-document": OTHER_DOCUMENT,
+    "malformed": OUT_OF_DATE,
+    "out-of-date": OUT_OF_DATE,
 }
-"""The kind of each fault; that of another name is ``enclave.name-mismatch``."""
+"""The kind of each fault, by its id; that of another name is ``enclave.name-mismatch``."""
 
 
 def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
@@ -101,14 +105,16 @@ def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
     settings = enclave.keystore.settings
     if settings and settings.zenoh:
         return
-    opened = open_zenoh(enclave.folder, enclave.name, enclave.state)
-    if opened.files:
-        yield from _of_opened(enclave, opened)
+    if not any(os.path.lexists(enclave.folder / file) for file in ZENOH_FILES):
+        return
+    from sros_tool.keystore.zenoh.opened import open_zenoh  # most keystores have no such files
+
+    yield from _of_opened(enclave, open_zenoh(enclave.folder, enclave.name, enclave.state))
 
 
 def _of_opened(enclave: CheckedEnclave, opened: OpenedZenoh) -> Iterator[Finding]:
     for problem in opened.problems:
-        if kind := _KINDS.get(problem.fault):
+        if kind := _KINDS.get(problem.fault.value):
             text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
             remedy = kind.remedy
             if not enclave.keystore.is_home:
@@ -127,6 +133,8 @@ def check_network(
     authorities = keystore.authorities.get(PERMISSIONS)
     if network is None or not authorities:
         return
+    from sros_tool.keystore.zenoh.wanted import zenoh_drift
+
     try:
         domains = keystore.opened.domains
     except SrosError:  # a finding of each enclave
@@ -143,14 +151,18 @@ def check_network(
             yield from _of_drift(keystore, each)
     for name, why in left_out.items():
         if only is None or name in only:
-            folder = enclave_path(keystore.root, name)
             faults = {e.fault for e in keystore.enclave(name).problems_at_home}
             remedy = _RENEW if faults and faults <= _EXPIRED else ""
-            yield LEFT_OUT.found(name, why.rstrip("."), str(folder), remedy=remedy)
+            yield LEFT_OUT.found(
+                name, why.rstrip("."), str(keystore.opened.folder(name)), remedy=remedy
+            )
 
 
 def _of_drift(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
     """Yield findings about a configuration that is not as it should be, with what is wrong."""
+    from sros_tool.keystore.zenoh.opened import open_zenoh
+    from sros_tool.keystore.zenoh.wanted import Drift
+
     file = keystore.shown(drift.path)
     if drift.kind is Drift.STALE:
         yield LEFT_OVER.found(drift.enclave, "the keystore has none for it", file)

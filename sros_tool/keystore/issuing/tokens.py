@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
-from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, UsageError
+from sros_tool.errors import KeystoreError, Note, PkiError, UsageError
 from sros_tool.keystore.authorities.authority import Authorities
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path
@@ -19,13 +18,13 @@ from sros_tool.pki.token import (
     is_token_uri,
     make_enclave_key,
     parse_enclave_uri,
+    pin_file_problem,
+    pin_line_break,
     planned_key,
     read_token_file,
     token_file,
 )
 from sros_tool.xml import read_bytes
-
-_LONGEST_PIN = 256  # bytes; CK_TOKEN_INFO of PKCS#11 says which lengths a token takes
 
 
 def token_places(uri: str, names: Sequence[str]) -> Mapping[str, TokenUri]:
@@ -125,35 +124,3 @@ def pin_notes(place: TokenUri) -> Iterator[Note]:
     """Yield why Fast DDS may not use the file that has the PIN of a token, or others may."""
     for problem in filter(None, (pin_file_problem(place), pin_line_break(place))):
         yield Note("token.pin-file", f"{problem}.")
-
-
-def pin_file_problem(place: TokenUri) -> str:
-    """Return why the file with the PIN of a token cannot be used, as a clause; "" if it can."""
-    if not place.pin_source:
-        return ""
-    path = Path(place.pin_source)
-    try:
-        read_bytes(path, "file with the PIN", most=_LONGEST_PIN)
-        mode = stat.S_IMODE(path.stat().st_mode)
-    except (DocumentError, OSError) as error:
-        return str(error).rstrip(".")
-    if mode & 0o077:
-        return (
-            f"others can use the file with the PIN, '{path}' (mode {mode:04o}): run `chmod 600 "
-            f"{quote(str(path))}`"
-        )
-    return ""
-
-
-def pin_line_break(place: TokenUri) -> str:
-    """Return what a line break after the PIN does, as a clause; "" if there is none."""
-    try:
-        pin = read_bytes(Path(place.pin_source), "file with the PIN", most=_LONGEST_PIN)
-    except DocumentError:
-        return ""
-    if not pin.endswith((b"\n", b"\r")):
-        return ""
-    return (
-        f"the file with the PIN, '{place.pin_source}', ends with a line break, which libp11 before "
-        "0.4.17 takes for a part of the PIN, so that no node starts: write it with `printf %s PIN`"
-    )
