@@ -20,7 +20,6 @@ from tools.json_schemas import object_schema, schemas, text_of
 
 BY_HAND = {
     "confirmation.json",
-    "demo.json",
     "inspect.json",
 }
 """The schemas that no type makes: the confirmation, which robots write, and verbs not done yet."""

@@ -66,6 +66,13 @@ VERBS: Mapping[str, str | Shapes] = {
             "--watch": "sros_tool.checks.news:FindingChange",
         },
     ),
+    "demo": Shapes(
+        "What was shown on a real DDS, or on Zenoh.",
+        {
+            "the result": "sros_tool.demo.result:DemoResult",
+            "--list": "sros_tool.demo.result:ScenarioList",
+        },
+    ),
     "doctor": "sros_tool.cli.check:MachineReport",
     "review": "sros_tool.proof.review:ReviewResult",
     "verify": "sros_tool.checks.keystores.arrival:VerifiedFolder",

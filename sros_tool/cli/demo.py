@@ -207,13 +207,15 @@ def demo(
     moment = now()
     result = run_demo(options, moment, _progress)
     if report is not None:
-        _write_report(report, result.as_json(), keep)
+        from sros_tool.values import as_plain
+
+        _write_report(report, as_plain(result), keep)
     if summary is not None:
         from sros_tool.demo.result import summary_page
 
         replace_file(summary, summary_page(result, moment).encode())
     if as_json:
-        print_json(result.as_json())
+        print_json(result)
     else:
         echo_lines(demo_table(result))
     sys.exit(result.exit_status)
@@ -246,12 +248,14 @@ def _list(backend: str, as_json: bool) -> None:
     on_dds = () if backend == "zenoh" else SCENARIOS
     on_zenoh = ZENOH_SCENARIOS if backend in ("auto", "zenoh") else ()
     if as_json:
+        from sros_tool.demo.result import ListedScenario, ScenarioList
+
         listed = [
-            {"name": each.name, "title": each.title, "rows": len(each.rows), "zenoh": zenoh}
+            ListedScenario(scenario.name, scenario.title, len(scenario.rows), zenoh)
             for scenarios, zenoh in ((on_dds, False), (on_zenoh, True))
-            for each in scenarios
+            for scenario in scenarios
         ]
-        print_json({"scenarios": listed})
+        print_json(ScenarioList(listed))
         return
     _echo_scenarios(on_dds)
     if on_dds and on_zenoh:

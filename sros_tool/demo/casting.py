@@ -89,15 +89,16 @@ _MOST_FAULTY = 8
 
 
 class CastMember(NamedTuple):
-    """An enclave of the user's keystore with its part, and the names of its ROS nodes on rclpy.
-
-    ``why`` is why this enclave was chosen, or "".
-    """
+    """A part."""
 
     part: str
+    """The part."""
     enclave: str
+    """The enclave."""
     nodes: tuple[str, ...] = ()
+    """Its ROS nodes."""
     why: str = ""
+    """Why this enclave was chosen, or empty."""
 
 
 class UserKeystore(NamedTuple):

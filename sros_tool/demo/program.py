@@ -9,7 +9,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -28,7 +28,7 @@ from sros_tool.demo.backend import (
     conditions,
     zenoh_backend,
 )
-from sros_tool.demo.casting import UserKeystore, open_user_keystore
+from sros_tool.demo.casting import CastMember, UserKeystore, open_user_keystore
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.result import DemoResult, KeystoreSummary, ScenarioResult
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
@@ -153,24 +153,42 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             summary = (
                 KeystoreSummary(user.enclaves, user.elsewhere, user.not_tried) if user else None
             )
-            results.append(
-                ScenarioResult(scenario.name, scenario.title, tuple(row_results), cast, summary)
-            )
+            results.append(_result_of(scenario, row_results, cast, summary))
         left_out = sum(len(each.rows) for each in options.scenarios)
         left_out -= sum(len(each.rows) for each in results)
-        result = DemoResult(backend, topic, isolation, template.name, tuple(results), left_out)
+        result = DemoResult(
+            backend=backend.name,
+            dds=backend.dds,
+            why=backend.why,
+            template=template.name,
+            topic=topic,
+            own_network=isolation.isolated,
+            network_reason=isolation.reason,
+            scenarios=tuple(results),
+            left_out=left_out,
+        )
         if options.keep is not None:
-            text = json.dumps(versioned(result.as_json()), indent=2) + "\n"
+            text = json.dumps(versioned(result), indent=2) + "\n"
             (folder / "result.json").write_text(text, encoding="utf-8")
     return result
+
+
+def _result_of(
+    scenario: Scenario,
+    rows: Iterable[RowResult],
+    cast: tuple[CastMember, ...] = (),
+    attacked: KeystoreSummary | None = None,
+) -> ScenarioResult:
+    rows = tuple(replace(row, scenario=scenario.name) for row in rows)
+    return ScenarioResult(scenario.name, scenario.title, rows, cast, attacked)
 
 
 def _parted(scenarios: Sequence[Scenario], rows: Sequence[RowResult]) -> Iterator[ScenarioResult]:
     """Yield the results of scenarios whose rows ran together, in order."""
     left = iter(rows)
     for scenario in scenarios:
-        own = tuple(itertools.islice(left, len(scenario.rows)))
-        yield ScenarioResult(scenario.name, scenario.title, own)
+        own = itertools.islice(left, len(scenario.rows))
+        yield _result_of(scenario, own)
 
 
 def _expected(row: Row, backend: Backend, template: Template, topic: str) -> Row:

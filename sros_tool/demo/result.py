@@ -1,70 +1,46 @@
-"""The result of a demo, and its JSON.
-
-`DemoResult.as_json` is what ``sros demo --json`` prints and ``--keep`` leaves as ``result.json``:
-
-- ``backend``, ``dds``, ``why``: the backend, its DDS and version, the reason for the choice;
-- ``template``: the keystore template on which the expected statuses depend;
-- ``topic``: the topic of the demo;
-- ``own_network``, ``network_reason``: whether it ran in a network namespace, and if not, why;
-- ``as_expected``: whether the exit status is 0;
-- ``left_out``: the number of rows that ``--only`` did not choose;
-- ``scenarios``: a list of ``{"name", "title", "as_expected", "cast", "keystore", "rows", "cost"}``;
-- ``rows``: the rows of all scenarios, in order, each with its ``scenario``.
-
-A row has ``name``, ``expected`` and ``observed`` (values of `RowStatus`), ``as_expected``,
-``mechanism`` (the reason for the expected status), ``detail`` (the observation, with counts),
-``domain``, ``seconds`` (the length of the window), ``attack`` (the name of the attack; "" if the
-row is not an attack), ``defence_removed`` ("" for the attack itself; otherwise the row shows that
-the attack works without the named defence), ``open_because`` (why an attack is known to succeed,
-or ""), ``remedy``, ``accepted`` (the user accepts that the attack succeeds) and ``open_here`` (it
-succeeds because of the user's keystore, and was not accepted: the row is not as expected), and
-``applies`` (false: the keystore has nobody for a part of the row, which was skipped).
-
-``cast`` has the enclave of each part in a user's keystore (empty without ``--keystore``): a list
-of ``{"part", "enclave", "nodes", "why"}``; ``nodes`` are the absolute names of the ROS nodes that
-ran in the enclave, ``why`` is why it was chosen, or "".
-
-``keystore`` is null without ``--keystore``; otherwise ``{"enclaves", "elsewhere", "not_tried"}``:
-the number of enclaves, how many have their key elsewhere, and what would have to be tried for a
-proof, and was not: attacks that were skipped, and peculiar enclaves that got no part.
-
-``cost`` is null: readers of earlier versions expect the key.
-"""
+"""The result of a demo: what ``sros demo --json`` prints, a table, and a summary in Markdown."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
-from sros_tool.demo.backend import Backend
+from sros_tool.demo.backend import CYCLONE, RCLPY, ZENOH
 from sros_tool.demo.casting import CastMember
 from sros_tool.demo.scenarios.model import RowStatus
 from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import NOT_DONE
-from sros_tool.runtime.netns import Isolation
 from sros_tool.validity import iso
-from sros_tool.values import as_plain
+from sros_tool.values import Words, shows
 
 
 class KeystoreSummary(NamedTuple):
-    """The enclaves of a user's keystore, and those that cannot be tried; as in `UserKeystore`."""
+    """What of a keystore was tried."""
 
     enclaves: int
+    """Number of its enclaves."""
     elsewhere: int = 0
+    """Number of enclaves whose key is elsewhere: they were not tried."""
     not_tried: tuple[str, ...] = ()
+    """What would have to be tried for a proof, and was not: then the exit status is not 0."""
 
 
+@shows("name", "title", "as_expected", "cast", "keystore", "rows", "cost")
 @dataclass(frozen=True)
 class ScenarioResult:
-    """The result of one scenario; ``keystore`` describes a keystore of the user."""
+    """A scenario."""
 
     name: str
+    """Its name."""
     title: str
+    """Its title."""
     rows: tuple[RowResult, ...]
+    """Its rows."""
     cast: tuple[CastMember, ...] = ()
-    keystore: KeystoreSummary | None = None
+    """With `--keystore`: the enclaves that played a part."""
+    attacked: KeystoreSummary | None = None
 
     @property
     def wrong(self) -> tuple[RowResult, ...]:
@@ -72,48 +48,56 @@ class ScenarioResult:
         return tuple(row for row in self.rows if not row.as_expected)
 
     @property
+    def keystore(self) -> KeystoreSummary | None:
+        """With `--keystore`: what of it was tried."""
+        return self.attacked and self.attacked._replace(not_tried=self.not_tried)
+
+    @property
     def not_tried(self) -> tuple[str, ...]:
         """What would have to be tried to prove a user's keystore sound, and was not.
 
         The demo's own keystores are to show what works, and prove nothing of other ones.
         """
-        if self.keystore is None:
+        if self.attacked is None:
             return ()
-        return (*(row.name for row in self.rows if row.untried), *self.keystore.not_tried)
+        return (*(row.name for row in self.rows if row.untried), *self.attacked.not_tried)
 
     @property
     def as_expected(self) -> bool:
-        """Whether every row is as expected or skipped with a reason, and a keystore is proved."""
+        """Whether its rows are as expected."""
         return not self.wrong and not self.not_tried
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the scenario as `sros demo --json` shows it."""
-        return {
-            "name": self.name,
-            "title": self.title,
-            "as_expected": self.as_expected,
-            "cast": as_plain(self.cast),
-            "keystore": self._keystore_as_json(),
-            "rows": [{**row.as_json(), "scenario": self.name} for row in self.rows],
-            "cost": None,
-        }
-
-    def _keystore_as_json(self) -> dict[str, Any] | None:
-        if self.keystore is None:
-            return None
-        return {**as_plain(self.keystore), "not_tried": list(self.not_tried)}
+    @property
+    def cost(self) -> None:
+        """Always null: `./dev bench --protection` measures what protection costs."""
 
 
+@shows(
+    *("backend", "dds", "why", "template", "topic", "own_network", "network_reason"),
+    *("as_expected", "left_out", "scenarios", "rows"),
+)
 @dataclass(frozen=True)
 class DemoResult:
-    """The result of the demo; ``left_out`` is the number of rows that --only did not choose."""
+    """The result."""
 
-    backend: Backend
-    topic: str
-    isolation: Isolation
+    backend: Annotated[str, Words((RCLPY, CYCLONE, ZENOH))]
+    """What the nodes ran on."""
+    dds: str
+    """The DDS, or Zenoh, and its version."""
+    why: str
+    """Why this backend was chosen."""
     template: str
+    """The template of the keystores."""
+    topic: str
+    """The topic."""
+    own_network: bool
+    """Whether it ran in a network namespace."""
+    network_reason: str
+    """If not, why."""
     scenarios: tuple[ScenarioResult, ...]
+    """The scenarios."""
     left_out: int = 0
+    """Number of rows that `--only` did not choose."""
 
     @property
     def rows(self) -> tuple[RowResult, ...]:
@@ -122,7 +106,9 @@ class DemoResult:
 
     @property
     def as_expected(self) -> bool:
-        """Whether every row is as expected or skipped with a reason, and a keystore is proved."""
+        """Whether every row is as expected, and a keystore of yours proved: the exit status is
+        0.
+        """
         return all(scenario.as_expected for scenario in self.scenarios)
 
     @property
@@ -132,22 +118,25 @@ class DemoResult:
             return 1
         return 0 if self.as_expected else NOT_DONE
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the result as JSON, described at the top of this module."""
-        scenarios = [scenario.as_json() for scenario in self.scenarios]
-        return {
-            "backend": self.backend.name,
-            "dds": self.backend.dds,
-            "why": self.backend.why,
-            "template": self.template,
-            "topic": self.topic,
-            "own_network": self.isolation.isolated,
-            "network_reason": self.isolation.reason,
-            "as_expected": self.as_expected,
-            "left_out": self.left_out,
-            "scenarios": scenarios,
-            "rows": [row for scenario in scenarios for row in scenario["rows"]],
-        }
+
+class ListedScenario(NamedTuple):
+    """A scenario."""
+
+    name: str
+    """Its name."""
+    title: str
+    """Its title."""
+    rows: int
+    """Number of its rows."""
+    zenoh: bool
+    """Whether it runs with `--backend zenoh`, and else on a DDS."""
+
+
+class ScenarioList(NamedTuple):
+    """The scenarios."""
+
+    scenarios: Sequence[ListedScenario]
+    """The scenarios."""
 
 
 # ── as text ──────────────────────────────────────────────────────────────────────────────────────
@@ -159,12 +148,12 @@ def demo_table(result: DemoResult) -> str:
     """Return the result as a table, with the backend above and a summary line below."""
     network = (
         "a separate network namespace"
-        if result.isolation.isolated
-        else f"the network of this machine ({result.isolation.reason})"
+        if result.own_network
+        else f"the network of this machine ({result.network_reason})"
     )
     lines = [
-        f"{result.backend.dds}, topic {result.topic}, in {network}",
-        f"backend {result.backend.name}: {result.backend.why}",
+        f"{result.dds}, topic {result.topic}, in {network}",
+        f"backend {result.backend}: {result.why}",
     ]
     for scenario in result.scenarios:
         lines.append("")
@@ -274,7 +263,7 @@ def summary_page(result: DemoResult, now: datetime) -> str:
     lines = [
         "# Security demo: expected and observed",
         "",
-        f"Run {iso(now)} with `sros demo` on {result.backend.dds}; expected statuses are those of"
+        f"Run {iso(now)} with `sros demo` on {result.dds}; expected statuses are those of"
         f" the keystore template `{result.template}`: **{_verdict(result, wrong)}**",
         "",
     ]

@@ -10,7 +10,7 @@ import re
 import signal
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sros_tool.demo.scenarios.model import (
     STATUS_OF,
@@ -31,6 +31,7 @@ from sros_tool.runtime.vendor_log import (
     participant_refusal,
     plain_refusal,
 )
+from sros_tool.values import shows
 
 
 @dataclass(frozen=True)
@@ -78,28 +79,52 @@ class RowRecord:
         return self.window[1] - self.window[0] if self.window else 0.0
 
 
+@shows(
+    *("name", "expected", "observed", "as_expected", "mechanism", "detail", "domain", "seconds"),
+    *("attack", "defence_removed", "open_because", "remedy", "accepted", "open_here", "applies"),
+    "scenario",
+)
 @dataclass(frozen=True)
 class RowResult:
-    """The result of a row: one line of the table."""
+    """A row of the result."""
 
     name: str
+    """What was tried."""
     expected: RowStatus
+    """The expected outcome."""
     observed: RowStatus
+    """The observed outcome."""
     mechanism: str
+    """Why that is expected."""
     detail: str
+    """What was observed, with counts."""
     domain: int
+    """The ROS domain."""
     seconds: float = 0.0
+    """How long it was observed."""
     attack: str = ""
+    """The attack, or an empty string."""
     removed: str = ""
     open_because: str = ""
+    """Why the attack is known to succeed, or an empty string."""
     remedy: str = ""
+    """What helps against it, or an empty string."""
     accepted: bool = False
+    """Whether `--accept-open` names it."""
     unaccepted: bool = False
     applies: bool = True
+    """Whether the keystore has an enclave for each part; if not, it was skipped."""
+    scenario: str = ""
+    """The scenario."""
+
+    @property
+    def defence_removed(self) -> str:
+        """The defence that is missing in this row, or an empty string."""
+        return self.removed
 
     @property
     def as_expected(self) -> bool:
-        """Whether the row was skipped, has the expected status, or is open and was accepted."""
+        """Whether they are the same, or it was skipped or accepted."""
         expected = self.observed in (self.expected, RowStatus.SKIPPED) and not self.open_here
         return expected or self.known_open
 
@@ -112,7 +137,7 @@ class RowResult:
 
     @property
     def open_here(self) -> bool:
-        """Whether the attack succeeds because of the user's keystore, and was not accepted."""
+        """Whether it succeeds because of the keystore, and was not accepted."""
         return self.unaccepted and self.observed is self.expected
 
     @property
@@ -125,26 +150,6 @@ class RowResult:
         if self.observed is not RowStatus.SKIPPED or not self.applies or self.removed:
             return False
         return not self.accepted and (self.unaccepted or not self.open_because)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the row as `sros demo --json` shows it."""
-        return {
-            "name": self.name,
-            "expected": self.expected.value,
-            "observed": self.observed.value,
-            "as_expected": self.as_expected,
-            "mechanism": self.mechanism,
-            "detail": self.detail,
-            "domain": self.domain,
-            "seconds": round(self.seconds, 1),
-            "attack": self.attack,
-            "defence_removed": self.removed,
-            "open_because": self.open_because,
-            "remedy": self.remedy,
-            "accepted": self.accepted,
-            "open_here": self.open_here,
-            "applies": self.applies,
-        }
 
 
 class _Finding(NamedTuple):
@@ -169,7 +174,7 @@ def judge_row(record: RowRecord) -> RowResult:
         row.mechanism,
         finding.detail,
         record.domain,
-        record.seconds,
+        round(record.seconds, 1),
         row.attack,
         row.removed,
         row.open_because,

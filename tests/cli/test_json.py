@@ -290,7 +290,7 @@ def test_what_demo_prints(
     shown = result(CLOSED, TWIN, OPEN)
     cast = (CastMember("listener", "/a", ("/n",)),)
     keystore = KeystoreSummary(3, not_tried=("/b with a governance of its own",))
-    scenario = replace(shown.scenarios[0], cast=cast, keystore=keystore)
+    scenario = replace(shown.scenarios[0], cast=cast, attacked=keystore)
     unproved = replace(shown, scenarios=(scenario,))
     opened = result(replace(OPEN, unaccepted=True))
     for each, status in ((shown, 0), (opened, 1), (unproved, 2)):

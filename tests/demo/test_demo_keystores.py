@@ -200,7 +200,7 @@ SKIPPED = replace(CLOSED, observed=RowStatus.SKIPPED, detail="no key")
 def test_a_keystore_is_not_proved_by_what_was_not_tried(row: object, proved: bool) -> None:
     played = result(row, CLOSED)  # type: ignore[arg-type]
     assert played.exit_status == 0, "the demo's own keystores prove nothing of others"
-    scenario = replace(played.scenarios[0], keystore=KeystoreSummary(7, elsewhere=2))
+    scenario = replace(played.scenarios[0], attacked=KeystoreSummary(7, elsewhere=2))
     shown = replace(played, scenarios=(scenario,), left_out=3)
     assert shown.exit_status == (0 if proved else 2)
     assert shown.as_expected is proved

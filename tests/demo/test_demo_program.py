@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.demo import backend as backends
-from sros_tool.demo.backend import Backend, choose_backend
+from sros_tool.demo.backend import choose_backend
 from sros_tool.demo.nodes import split_ros_args
 from sros_tool.demo.program import DemoOptions, run_demo
 from sros_tool.demo.result import DemoResult, ScenarioResult, demo_table
@@ -20,8 +20,8 @@ from sros_tool.demo.scenarios.policies import check_topic, talking_policy
 from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import load_template
-from sros_tool.runtime.netns import Isolation
 from sros_tool.runtime.stacks import ProbeEnclave, Stack
+from sros_tool.values import as_plain
 from tests.support.harness import sros
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -172,11 +172,14 @@ def test_the_table_shows_reasons_and_a_summary() -> None:
         RowResult("c", RowStatus.READABLE, RowStatus.SKIPPED, "m", "not permitted", 3),
     )
     result = DemoResult(
-        Backend("cyclone", "C 1", "w"),
-        "/t",
-        Isolation(False, "no right"),
-        "production",
-        (ScenarioResult("s", "title", rows),),
+        backend="cyclone",
+        dds="C 1",
+        why="w",
+        template="production",
+        topic="/t",
+        own_network=False,
+        network_reason="no right",
+        scenarios=(ScenarioResult("s", "title", rows),),
     )
     text = demo_table(result)
     assert "no right" in text
@@ -184,7 +187,7 @@ def test_the_table_shows_reasons_and_a_summary() -> None:
     assert "not permitted" in text
     assert text.endswith("1 of 3 rows as expected, 1 not as expected, 1 skipped.")
     assert not result.as_expected
-    assert result.as_json()["rows"][1]["as_expected"] is False
+    assert as_plain(result)["rows"][1]["as_expected"] is False
 
 
 def test_rows_that_nobody_has_are_refused() -> None:

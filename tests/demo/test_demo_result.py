@@ -8,12 +8,11 @@ from datetime import UTC, datetime
 
 import pytest
 
-from sros_tool.demo.backend import Backend
 from sros_tool.demo.result import DemoResult, ScenarioResult, demo_table, summary_page
 from sros_tool.demo.scenarios.model import RowStatus
 from sros_tool.demo.verdict import RowResult
 from sros_tool.report.pages import render_demo_page
-from sros_tool.runtime.netns import Isolation
+from sros_tool.values import as_plain
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 CLOSED = RowResult(
@@ -43,13 +42,21 @@ OPEN = RowResult(
 
 
 def result(*rows: RowResult) -> DemoResult:
-    scenario = ScenarioResult("attacks", "every way in", rows)
-    backend = Backend("cyclone", "Cyclone DDS 0.10.2", "a test")
-    return DemoResult(backend, "/chatter", Isolation(True), "production", (scenario,))
+    named = tuple(replace(row, scenario="attacks") for row in rows)
+    return DemoResult(
+        backend="cyclone",
+        dds="Cyclone DDS 0.10.2",
+        why="a test",
+        template="production",
+        topic="/chatter",
+        own_network=True,
+        network_reason="",
+        scenarios=(ScenarioResult("attacks", "every way in", named),),
+    )
 
 
 def test_json_says_what_the_module_describes() -> None:
-    shown = json.loads(json.dumps(result(CLOSED, TWIN, OPEN).as_json()))
+    shown = json.loads(json.dumps(as_plain(result(CLOSED, TWIN, OPEN))))
     assert shown["as_expected"] is True
     assert shown["scenarios"][0]["rows"] == shown["rows"]
     closed, twin, open_ = shown["rows"]
@@ -73,9 +80,9 @@ def test_a_door_that_only_this_keystore_opens_is_a_failure_until_it_is_accepted(
     assert not shown.as_expected
     assert "OPEN  put back" in text and "nothing revokes it; to do: renew" in text
     assert "1 of 2 rows as expected, 1 open in this keystore (accept each with" in text
-    assert [row["open_here"] for row in shown.as_json()["rows"]] == [True, False]
+    assert [row["open_here"] for row in as_plain(shown)["rows"]] == [True, False]
     assert "- **put back**: open in this keystore: nothing" in summary_page(shown, NOW)
-    page = render_demo_page(shown.as_json())
+    page = render_demo_page(as_plain(shown))
     assert "<b>1</b> open in this keystore" in page and "known to be open" not in page
     skipped = replace(OPEN, unaccepted=True, observed=RowStatus.SKIPPED)
     assert result(skipped).as_expected

@@ -11,6 +11,7 @@ from sros_tool.demo.scenarios.model import Row, RowStatus
 from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, judge_row
 from sros_tool.demo.wire import WireCount
 from sros_tool.runtime.events import Event, EventKind, ProcessStage
+from sros_tool.values import as_plain
 
 WINDOW = (100.0, 105.0)
 FAST_DDS_DENIAL = (
@@ -270,4 +271,4 @@ def test_wire(plain: int, protected: int, observed: RowStatus) -> None:
 def test_a_skipped_row_is_shown_with_its_reason() -> None:
     result = judge_row(RowRecord(row(POSITIVE), 100, skipped="not permitted"))
     assert (result.observed, result.detail) == (RowStatus.SKIPPED, "not permitted")
-    assert set(result.as_json()) >= {"name", "expected", "observed", "as_expected", "mechanism"}
+    assert set(as_plain(result)) >= {"name", "expected", "observed", "as_expected", "mechanism"}
