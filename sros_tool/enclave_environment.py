@@ -363,7 +363,7 @@ def _refuse_outdated(root: Path, name: str, now: datetime) -> None:
 
     def drifted(moment: datetime | None) -> bool:
         drifts, _ = zenoh_drift(root, network, keystore.domains, authority, moment)
-        return any(each.enclave == name for each in drifts)
+        return any(drift.enclave == name for drift in drifts)
 
     # The router starts although the permissions of another enclave have expired since.
     if drifted(now) and drifted(None):
@@ -387,7 +387,7 @@ def _zenoh_domain(
     if not own:
         return wanted
     if wanted is None:
-        return next((each for each in own if each in domains), own[0])
+        return next((own_domain for own_domain in own if own_domain in domains), own[0])
     if wanted not in own:
         raise KeystoreError(
             f"the Zenoh configuration is for domain {', '.join(map(str, own))}, not for {wanted}",

@@ -26,8 +26,10 @@ class SrosError(Exception):
         self.remedy = remedy
 
     def __str__(self) -> str:
-        sentences = [each.strip().removesuffix(".") for each in (self.what, self.why, self.remedy)]
-        text = ". ".join(each for each in sentences if each)
+        sentences = [
+            sentence.strip().removesuffix(".") for sentence in (self.what, self.why, self.remedy)
+        ]
+        text = ". ".join(sentence for sentence in sentences if sentence)
         return " ".join(text.split()) + ("." if self.why or self.remedy else "")
 
     @property

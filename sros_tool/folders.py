@@ -75,7 +75,7 @@ class Folder:
 
     def forget(self) -> None:
         """Close the folders below it that were kept open, since their paths have changed."""
-        for path in [each for each in self._handles if each]:
+        for path in [handle for handle in self._handles if handle]:
             os.close(self._handles.pop(path))
 
     # ── looking ────────────────────────────────────────────────────────────────────────────
@@ -382,9 +382,9 @@ def make_folders(path: Path) -> list[Path]:
 
 def remove_folders(paths: list[Path]) -> None:
     """Remove each folder that is empty, in this order."""
-    for each in paths:
+    for path in paths:
         with contextlib.suppress(OSError):
-            each.rmdir()
+            path.rmdir()
 
 
 def write_all(handle: int, data: bytes) -> None:

@@ -65,7 +65,9 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
             RuntimeError: a path is empty, a filter would keep the prefix from some processes, or
                 no process can run in ``enclave``.
         """
-        keystore, policy, enclave = (perform_substitutions(context, each) for each in self._given)
+        keystore, policy, enclave = (
+            perform_substitutions(context, substitutions) for substitutions in self._given
+        )
         if not keystore or not policy:
             raise RuntimeError("secured_nodes needs a keystore and a policy: one of them is empty.")
         if context.launch_configurations.get(_FILTER):

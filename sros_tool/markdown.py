@@ -42,12 +42,12 @@ def bounded(items: Iterable[str], most: int, rest: str) -> str:
     """
     lines: list[str] = []
     left, out = most, 0
-    for each in items:
-        left -= len(each) + 3
+    for item in items:
+        left -= len(item) + 3
         if left < 0:
             out += 1
         else:
-            lines.append(f"- {each}")
+            lines.append(f"- {item}")
     if out:
         lines.append(f"- and {out} more, {rest}")
     return "\n".join(lines)
@@ -64,7 +64,9 @@ _BLANK = "\u115f\u1160\u2800\u3164\uffa0\U0001d159"
 
 def _shown(text: str) -> str:
     """Return ``text`` without line ends, and what is not printable or not seen by itself."""
-    return "".join(each if _is_seen(each) else f"\\x{ord(each):02x}" for each in text)
+    return "".join(
+        character if _is_seen(character) else f"\\x{ord(character):02x}" for character in text
+    )
 
 
 def _is_seen(character: str) -> bool:

@@ -94,15 +94,15 @@ def _way(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
 def _is_private(group: int, trusted: frozenset[int]) -> bool:
     """Return whether a group is the private group of a trusted user, without other members."""
     users = []
-    for each in trusted:
+    for user in trusted:
         with suppress(KeyError):
-            users.append(pwd.getpwuid(each))
+            users.append(pwd.getpwuid(user))
     try:
         name, _, _, members = grp.getgrgid(group)
     except KeyError:
         return False
-    own = any(each.pw_gid == group and each.pw_name == name for each in users)
-    return own and {each.pw_name for each in users}.issuperset(members)
+    own = any(user.pw_gid == group and user.pw_name == name for user in users)
+    return own and {user.pw_name for user in users}.issuperset(members)
 
 
 def user_name(user: int) -> str:

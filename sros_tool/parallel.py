@@ -81,8 +81,8 @@ def tallied() -> Iterator[Tally]:
 
 def tick() -> None:
     """Report that the work on one item of `map_slices` is done."""
-    for each in _tallies:
-        each.add()
+    for tally in _tallies:
+        tally.add()
 
 
 _SMALLEST_SLICE = 100
@@ -137,8 +137,8 @@ def _on_slices(
     slices = [items[begin:end] for begin, end in pairwise(bounds)]
     workers: list[tuple[int, int]] = []
     try:
-        for each in slices[1:]:
-            _fork(each, work, workers)
+        for part in slices[1:]:
+            _fork(part, work, workers)
         results = [work(slices[0])]
         while workers:
             results.append(_collect(*workers[0]))

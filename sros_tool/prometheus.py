@@ -41,7 +41,7 @@ class Metric:
     """Its values."""
 
     def __post_init__(self) -> None:
-        for name in (self.name, *(label for each in self.samples for label in each.labels)):
+        for name in (self.name, *(label for sample in self.samples for label in sample.labels)):
             if not _NAME.match(name) or name.startswith("__"):
                 raise ValueError(f"{name!r} is not a name of Prometheus")
 
@@ -68,8 +68,8 @@ def render_metrics(metrics: Iterable[Metric]) -> str:
     lines: list[str] = []
     for metric in metrics:
         series: dict[str, int | float] = {}
-        for each in metric.samples:
-            series.setdefault(_series(metric.name, each.labels), each.value)
+        for sample in metric.samples:
+            series.setdefault(_series(metric.name, sample.labels), sample.value)
         if not series:
             continue
         lines += [f"# HELP {metric.name} {_escaped(metric.help)}", f"# TYPE {metric.name} gauge"]
@@ -87,7 +87,9 @@ def _quoted(value: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    shown = "".join(each if each.isprintable() else _visible(each) for each in text)
+    shown = "".join(
+        character if character.isprintable() else _visible(character) for character in text
+    )
     return shown.replace("\\", "\\\\")
 
 

@@ -63,8 +63,8 @@ def _yaml_lines(value: object) -> Iterator[str]:
             else:
                 yield f"{_yaml_string(key)}: {next(lines)}"
     elif isinstance(value, list) and value:
-        for each in value:
-            lines = _yaml_lines(each)
+        for item in value:
+            lines = _yaml_lines(item)
             yield f"- {next(lines)}"
             yield from (f"  {line}" for line in lines)
     elif isinstance(value, bool):
@@ -83,7 +83,9 @@ def _yaml_string(text: str) -> str:
     if _PLAIN_YAML.match(text) and text.lower() not in _YAML_WORDS:
         return text
     quoted = json.dumps(text, ensure_ascii=False)
-    return "".join(each if each.isprintable() else _yaml_escape(each) for each in quoted)
+    return "".join(
+        character if character.isprintable() else _yaml_escape(character) for character in quoted
+    )
 
 
 def _yaml_escape(character: str) -> str:
@@ -110,9 +112,9 @@ def as_plain(value: object) -> Any:
     if isinstance(value, Mapping):
         return {as_plain(key): as_plain(each) for key, each in value.items()}
     if isinstance(value, (set, frozenset)):
-        return [as_plain(each) for each in sorted(value)]
+        return [as_plain(item) for item in sorted(value)]
     if isinstance(value, Sequence) and not isinstance(value, (str, bytes)):
-        return [as_plain(each) for each in value]
+        return [as_plain(item) for item in value]
     if isinstance(value, datetime):
         return iso(value)
     if isinstance(value, PurePath):
@@ -171,7 +173,7 @@ def key_of(name: str) -> str:
 def _public_fields(kind: type) -> tuple[str, ...]:
     names: tuple[str, ...] = getattr(kind, "_fields", ())
     if is_dataclass(kind):
-        names = tuple(each.name for each in fields(kind))
+        names = tuple(field.name for field in fields(kind))
     return tuple(name for name in names if not name.startswith("_"))
 
 

@@ -255,7 +255,7 @@ def _denied(found: Audit) -> list[str]:
 
 def _show(found: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None:
     """Print what is denied and unseen; the verdict names everything that it does not cover."""
-    for line in (*_denied(found), *(f"not seen: {each}" for each in found.unseen)):
+    for line in (*_denied(found), *(f"not seen: {node}" for node in found.unseen)):
         echo(line)
     what = [counted(len(found.denied), "right")] if found.denied else []
     what += [counted(len(found.refused), "whole enclave")] if found.refused else []
@@ -273,5 +273,5 @@ def _show(found: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None
     if kept_changing:
         verdict += f"; the ROS graph kept changing for {kept_changing:.0f} s"
     echo(verdict, err=True)
-    if any(each.by_rule for each in found.denied):
+    if any(denied_right.by_rule for denied_right in found.denied):
         echo("a DENY denies some of it; no right that is added changes that", err=True)

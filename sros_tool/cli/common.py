@@ -317,7 +317,7 @@ def complete_keystore_and_enclave(
 
 def _completions(names: Iterable[str], incomplete: str) -> list[str]:
     """Return the names that begin so, and that a shell can show on its line."""
-    return [each for each in names if each.startswith(incomplete) and visible_line(each) == each]
+    return [name for name in names if name.startswith(incomplete) and visible_line(name) == name]
 
 
 def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
@@ -754,7 +754,7 @@ def echo_findings(findings: Sequence[Finding], *, err: bool = False) -> None:
     first = findings[0]
     if first.cause and len(findings) > 1:
         place = first.cause.place or first.place
-        ids = ", ".join(dict.fromkeys(each.id for each in findings))
+        ids = ", ".join(dict.fromkeys(finding.id for finding in findings))
         lines = [f"{place}: {first.severity.word}: {first.cause.title}"]
         for text in (f"[{ids}]", first.cause.text, first.cause.remedy):
             lines += _wrapped(text, "    ")
@@ -772,7 +772,7 @@ def _finding_lines(finding: Finding) -> list[str]:
     head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
     subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
     by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
-    related = [f"      {each}: {each.text}" for each in finding.related]
+    related = [f"      {place}: {place.text}" for place in finding.related]
     return [head, f"    {subject}{finding.text}{by}", *related, f"    {finding.remedy}"]
 
 
@@ -789,7 +789,7 @@ def _wrapped(text: str, indent: str) -> list[str]:
         break_long_words=False,
         break_on_hyphens=False,
     )
-    return [each.replace("\0", " ") for each in lines]
+    return [line.replace("\0", " ") for line in lines]
 
 
 def print_signed(groups: Sequence[Sequence[Finding]], files: Iterable[str]) -> None:
@@ -798,7 +798,7 @@ def print_signed(groups: Sequence[Sequence[Finding]], files: Iterable[str]) -> N
 
     for group in groups[:_MOST_SHOWN]:
         echo_findings(group, err=True)
-    hidden = Counter(each.severity for group in groups[_MOST_SHOWN:] for each in group)
+    hidden = Counter(finding.severity for group in groups[_MOST_SHOWN:] for finding in group)
     more = [
         counted(hidden[severity], severity.word)
         for severity in sorted(Severity, reverse=True)

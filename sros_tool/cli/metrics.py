@@ -91,7 +91,7 @@ def metrics(
         check_output(output, force=True)
     if fleet_file and not policies:
         raise UsageError("--fleet is for the placeholders of a policy: add --policy FILE")
-    wanted = tuple(policy_for(each, fleet_file) for each in policies)
+    wanted = tuple(policy_for(policy, fleet_file) for policy in policies)
     with progress("examining"):
         keystore = Keystore(root)
         findings = keystore_findings(

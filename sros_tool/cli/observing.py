@@ -507,7 +507,7 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
     from_log = learned.source is RightsFound.LOG
     would = "" if written else "would have "
     if plan.before is None:
-        enclaves = {each.enclave for each in learned.profiles}
+        enclaves = {profile.enclave for profile in learned.profiles}
         echo(
             f"{would}{'wrote' if written else 'written'} '{plan.path}': "
             f"{counted(len(enclaves), 'enclave')}, {counted(len(learned.profiles), 'node')}, "
@@ -519,8 +519,8 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
         known = "denied" if from_log else "observed"
         echo(f"nothing to add: '{plan.path}' already covers everything that was {known}")
     if plan.before is not None or from_log:
-        for each in plan.added:
-            echo(f"  {each}")
+        for right in plan.added:
+            echo(f"  {right}")
     if plan.copies:
         echo(f"{would}copied {', '.join(sorted(plan.copies))} next to it")
     print_notes((*merge_notes(plan.contradictions), *learned.notes))

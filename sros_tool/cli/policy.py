@@ -290,7 +290,7 @@ def _difference_markdown(
         if found:
             parts.append(f"**{len(found)} {title}**")
             parts.append(bounded(map(code, found), _MOST_LINES, rest))
-    notes = [f"{each.id}: {each.text}" for each in (*first.notes, *second.notes)]
+    notes = [f"{note.id}: {note.text}" for note in (*first.notes, *second.notes)]
     if notes:
         parts += ["**Notes**", bounded(map(code, notes), 4000, rest)]
     differ = "1 difference" if len(lines) == 1 else f"{len(lines)} differences"
@@ -338,8 +338,8 @@ def _protection_differences(
     if first.protections is None or second.protections is None:
         return []
     one, other = set(first.protections), set(second.protections)
-    found = [("-", each) for each in first.protections if each not in other]
-    found += [("+", each) for each in second.protections if each not in one]
+    found = [("-", protection) for protection in first.protections if protection not in other]
+    found += [("+", protection) for protection in second.protections if protection not in one]
     return sorted(found, key=lambda line: (line[1].enclave, line[1].name, line[0] == "+"))
 
 
@@ -488,7 +488,9 @@ def _node_basics() -> Sequence[Group]:
     from sros_tool.policy.document import read_policy
 
     basics = read_policy(policies_dir() / "defaults" / "node_basics.xml")
-    return [group for each in basics.enclaves for p in each.all_profiles() for group in p.groups]
+    return [
+        group for enclave in basics.enclaves for p in enclave.all_profiles() for group in p.groups
+    ]
 
 
 def _robot_notes(unobserved: dict[str, list[str]]) -> Iterator[Note]:
@@ -505,7 +507,9 @@ def _scope_notes(given: Policy, result: MinimizedPolicy, seen: frozenset[Right])
     if unseen:
         text = f"never observed, and therefore not changed: {', '.join(unseen)}."
         yield Note("minimize.enclave-never-observed", text)
-    unknown = sorted({right.enclave for right in seen} - {each.path for each in given.enclaves})
+    unknown = sorted(
+        {right.enclave for right in seen} - {enclave.path for enclave in given.enclaves}
+    )
     if unknown:
         text = f"observed, but not in the policy: {', '.join(unknown)}."
         yield Note("minimize.enclave-not-in-policy", text)
@@ -739,7 +743,7 @@ def _convert(
             PrintedConversion(
                 earlier,
                 [enclave.path for enclave in policy.enclaves],
-                [each.text for each in converted.left_out],
+                [note.text for note in converted.left_out],
                 output=output if saved else None,
                 dry_run=dry_run,
                 document=None if output or dry_run else document.decode(),
@@ -758,8 +762,8 @@ def _convert(
     elif not dry_run:
         echo(f"converted {what}", err=True)
     print_notes(converted.notes)
-    for each in converted.left_out:
-        echo(f"left out: {each.text}", err=True)
+    for note in converted.left_out:
+        echo(f"left out: {note.text}", err=True)
     if saved:
         echo(saved, err=True)
         if not complete:
@@ -814,14 +818,15 @@ def _show_new_access(
 def _added_lines(head: AccessSource, growth: Growth) -> list[str]:
     return [
         *_folded(head, "+", growth.added, growth),
-        *(f"+ less protection: {each}" for each in growth.lost),
+        *(f"+ less protection: {change}" for change in growth.lost),
         *_reach_lines(head, growth.reach),
     ]
 
 
 def _removed_lines(base: AccessSource, growth: Growth) -> list[str]:
     more = (
-        f"- more protection: {each.key} {each.after} -> {each.before}" for each in growth.gained
+        f"- more protection: {change.key} {change.after} -> {change.before}"
+        for change in growth.gained
     )
     return [*_folded(base, "-", growth.removed, growth), *more]
 
@@ -862,8 +867,11 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
     from sros_tool.reach import path_text
 
     found = [
-        (each.source, f"+ {each.source} can influence {each.target}: {path_text(each.path)}")
-        for each in reach
+        (
+            new_reach.source,
+            f"+ {new_reach.source} can influence {new_reach.target}: {path_text(new_reach.path)}",
+        )
+        for new_reach in reach
     ]
     lines = list(folded(head.fleet, found))
     more = len(lines) - _MOST_NEW_LINES
@@ -915,5 +923,5 @@ def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> s
     for title, lines in lists:
         if lines:
             parts.append(f"**{len(lines)} {title}**")
-            parts.append(bounded((code(each[2:]) for each in lines), _MOST_CHARACTERS, rest))
+            parts.append(bounded((code(line[2:]) for line in lines), _MOST_CHARACTERS, rest))
     return "\n\n".join(parts) + "\n"

@@ -325,9 +325,9 @@ def _outdated_dependency() -> str:
     from importlib.metadata import PackageNotFoundError, requires, version
 
     with suppress(PackageNotFoundError):
-        for each in requires("sros_tool") or ():
-            name, mark, least = each.partition(">=")
-            if not mark or ";" in each:  # of an extra
+        for requirement in requires("sros_tool") or ():
+            name, mark, least = requirement.partition(">=")
+            if not mark or ";" in requirement:  # of an extra
                 continue
             try:
                 found = version(name)
@@ -343,7 +343,7 @@ def _outdated_dependency() -> str:
 
 
 def _numbers(version: str) -> list[int]:
-    return [int(each) for each in re.findall(r"\d+", version)[:2]]
+    return [int(digits) for digits in re.findall(r"\d+", version)[:2]]
 
 
 def _defect(error: BaseException, arguments: Sequence[str]) -> int:

@@ -66,7 +66,7 @@ _DOMAIN = click.option(
 
 def _complete_rmw(_ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
     """Complete the RMWs that sros knows to secure."""
-    return [each for each in RMWS if each.startswith(incomplete)]
+    return [rmw for rmw in RMWS if rmw.startswith(incomplete)]
 
 
 _RMW = click.option(
@@ -135,7 +135,7 @@ def _form_of(arguments: Sequence[str]) -> str:
         for each, before in zip(arguments, ["", *arguments], strict=False)
         if each.startswith("--format=") or before == "--format"
     )
-    return next((each for each in named if each in _FORMS), _FORMS[0])
+    return next((form for form in named if form in _FORMS), _FORMS[0])
 
 
 @click.command(
@@ -413,7 +413,7 @@ def _enclave_of_node(file: Path, command: Sequence[str]) -> str:
     full = f"/{ns.strip('/')}/{name}".replace("//", "/")
     found = read_policy(file).enclaves_of_node(ns, name)
     if len(found) != 1:
-        names = ", ".join(each.path for each in found[:3])
+        names = ", ".join(enclave.path for enclave in found[:3])
         what = f"in {len(found)} enclaves, such as {names}" if found else "in no enclave"
         raise UsageError(
             f"the policy '{file}' has the node {full} {what}",

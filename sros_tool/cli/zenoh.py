@@ -146,7 +146,9 @@ def zenoh(
         result = work(root, network, now=now(), keyring=keyring(), dry_run=dry_run or only_check)
     # A document and the signed one next to it are written together.
     actions = {
-        each.path: each.action for each in result.changes if Path(each.path).name in ZENOH_FILES
+        change.path: change.action
+        for change in result.changes
+        if Path(change.path).name in ZENOH_FILES
     }
     changed = dict.fromkeys(map(_document, actions))
     if as_json:
@@ -225,9 +227,10 @@ def _show_from(
     document = parse_configuration(read_bytes(file, "Zenoh configuration"), str(file))
     rights = rights_behind(document)
     findings = sorted(
-        document_findings(document), key=lambda each: (-each.severity.weight, each.line or 0)
+        document_findings(document),
+        key=lambda finding: (-finding.severity.weight, finding.line or 0),
     )
-    shown = [each for each in findings if each.severity >= WARNING]
+    shown = [finding for finding in findings if finding.severity >= WARNING]
     notes: tuple[Note, ...] = ()
     saved = ""
     changes: Sequence[FileChange] = ()
@@ -267,26 +270,26 @@ def _show_from(
     print_notes(notes)
     if saved:
         echo(saved, err=True)
-    return 1 if any(each.severity >= ERROR for each in findings) else 0
+    return 1 if any(finding.severity >= ERROR for finding in findings) else 0
 
 
 def _lines(document: ConfigurationDocument, found: Sequence[RightsBehindRules]) -> Iterator[str]:
     from sros_tool.checks.zenoh import VERBS
 
     yield f"{document.name}: the configuration of a {_kind(document)}"
-    for each in found:
-        if not (each.rights or each.unsaid or each.denied):
+    for rights in found:
+        if not (rights.rights or rights.unsaid or rights.denied):
             continue
-        obeys = ", by rules that bind only itself" if each.own else ""
-        yield f"{_who(each)}{obeys}"
+        obeys = ", by rules that bind only itself" if rights.own else ""
+        yield f"{_who(rights)}{obeys}"
         for right in VERBS:
-            stated = [one for one in each.rights if one.right == right]
+            stated = [one for one in rights.rights if one.right == right]
             for one in stated:
                 domain = "" if one.domain == "0" else f" (domain {one.domain})"
                 lacks = f" (of no use without {', '.join(one.lacks)})" if one.lacks else ""
                 yield f"  may {VERBS[right]} {one.name}{domain}{lacks}"
-        yield from _keys("may also", each.unsaid)
-        yield from _keys("is denied, if no wildcard is used,", each.denied)
+        yield from _keys("may also", rights.unsaid)
+        yield from _keys("is denied, if no wildcard is used,", rights.denied)
 
 
 def _keys(what: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
@@ -313,7 +316,7 @@ def _who(found: RightsBehindRules) -> str:
 
 def _why_no_policy(found: Sequence[RightsBehindRules]) -> str:
     """Say which subjects have rights, but are no enclaves."""
-    strangers = [_who(each) for each in found if each.rights]
+    strangers = [_who(rights) for rights in found if rights.rights]
     if not strangers:
         return "They allow no ROS name that anybody may publish, subscribe, call or serve."
     return (
@@ -326,17 +329,19 @@ def _left_out(found: Sequence[RightsBehindRules]) -> Iterator[Note]:
     """Yield notes about what the rules allow or deny, and the policy does not state."""
     from sros_tool.translate_from_zenoh import enclave_of
 
-    for each in found:
-        if (each.rights or each.unsaid) and not enclave_of(each):
-            yield Note("zenoh.no-enclave", f"{_who(each)}: no enclave, so not in the policy")
-        elif each.unsaid:
-            keys = ", ".join(key for _, key in each.unsaid[:_MOST_KEYS])
+    for rights in found:
+        if (rights.rights or rights.unsaid) and not enclave_of(rights):
+            yield Note("zenoh.no-enclave", f"{_who(rights)}: no enclave, so not in the policy")
+        elif rights.unsaid:
+            keys = ", ".join(key for _, key in rights.unsaid[:_MOST_KEYS])
             yield Note(
                 "zenoh.unsaid",
-                f"{_who(each)}: the policy lacks {len(each.unsaid)} rights that no ROS name "
+                f"{_who(rights)}: the policy lacks {len(rights.unsaid)} rights that no ROS name "
                 f"states exactly: {keys}",
             )
-    domains = sorted({one.domain for each in found for one in each.rights} - {"0", "*"}, key=int)
+    domains = sorted(
+        {one.domain for rights in found for one in rights.rights} - {"0", "*"}, key=int
+    )
     if domains:
         yield Note(
             "zenoh.domains",

@@ -73,7 +73,7 @@ def size_problem(fleet: Fleet) -> str:
         return f"It has {len(fleet.enclaves)} paths with a placeholder, more than {MAX_PATTERNS}."
     members = {name: len(robots) for name, robots in fleet.groups.items()}
     members[""] = len(fleet.robots)
-    count = sum(members.get(group_of(parts_of(each)), 0) for each in fleet.enclaves)
+    count = sum(members.get(group_of(parts_of(pattern)), 0) for pattern in fleet.enclaves)
     return f"Its robots have {count} enclaves, more than {MAX_ENCLAVES}." * (count > MAX_ENCLAVES)
 
 
@@ -125,7 +125,7 @@ def unrecorded_enclaves(
     below: dict[str, list[str]] = {robot: [] for robot in robots}
     naming: dict[str, list[str]] = {robot: [] for robot in robots}
     for name in names:
-        owners = next((folders[each] for each in _upwards(name) if each in folders), frozenset())
+        owners = next((folders[path] for path in _upwards(name) if path in folders), frozenset())
         named = owners | set(name.split("/")[1:])
         if named.isdisjoint(below) or robot_of(fleet, name):
             continue
@@ -200,14 +200,14 @@ def _patterns(paths: tuple[str, ...]) -> Mapping[str, list[_Pattern]]:
 
 def _expression(parts: Parts) -> re.Pattern[str]:
     text, seen = "", set()
-    for each in parts:
-        if isinstance(each, str):
-            text += re.escape(each)
-        elif each.value in seen:
-            text += f"(?P={each.value})"
+    for part in parts:
+        if isinstance(part, str):
+            text += re.escape(part)
+        elif part.value in seen:
+            text += f"(?P={part.value})"
         else:
-            seen.add(each.value)
-            text += f"(?P<{each.value}>{_VALUES[each.value]})"
+            seen.add(part.value)
+            text += f"(?P<{part.value}>{_VALUES[part.value]})"
     return re.compile(text, re.ASCII)
 
 

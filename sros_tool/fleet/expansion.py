@@ -124,27 +124,27 @@ class FleetPolicy(Mapping[str, Enclave]):
     def _expanded(self, path: str, enclave: Enclave, robot: Robot | None) -> Enclave:
         count = 0
 
-        def profile(each: Profile) -> Profile:
+        def changed_profile(profile: Profile) -> Profile:
             nonlocal count
-            ns, node = (self._one(text, robot) for text in (each.ns, each.node))
-            if has_placeholder(each.ns):
+            ns, node = (self._one(text, robot) for text in (profile.ns, profile.node))
+            if has_placeholder(profile.ns):
                 ns = check_namespace(ns)  # in the root namespace it can be empty
             groups = []
-            for one in each.groups:
+            for one in profile.groups:
                 group = self._group(one, robot, _MOST_NAMES - count)
                 count += len(group.names)
                 if count > _MOST_NAMES:
                     raise PolicyError(
-                        f"{each.source}: the enclave {path} has more than {_MOST_NAMES} names",
+                        f"{profile.source}: the enclave {path} has more than {_MOST_NAMES} names",
                         "",
                         "Divide it, or name fewer robots, such as a group.",
                     )
                 if group.names:
                     groups.append(group)
-            return replace(each, ns=ns, node=node, groups=tuple(groups))
+            return replace(profile, ns=ns, node=node, groups=tuple(groups))
 
         blocks = tuple(
-            replace(block, profiles=tuple(map(profile, block.profiles)))
+            replace(block, profiles=tuple(map(changed_profile, block.profiles)))
             for block in enclave.profiles
         )
         return replace(enclave, path=path, profiles=blocks)
@@ -246,15 +246,18 @@ def written(policy: Policy) -> Policy:
 
 
 def _renamed(policy: Policy, change: Callable[[str], str]) -> Policy:
-    def profile(each: Profile) -> Profile:
-        groups = (replace(one, names=tuple(map(change, one.names))) for one in each.groups)
-        return replace(each, ns=change(each.ns), groups=tuple(groups))
+    def changed_profile(profile: Profile) -> Profile:
+        groups = (replace(one, names=tuple(map(change, one.names))) for one in profile.groups)
+        return replace(profile, ns=change(profile.ns), groups=tuple(groups))
 
-    def enclave(each: Enclave) -> Enclave:
-        blocks = (replace(one, profiles=tuple(map(profile, one.profiles))) for one in each.profiles)
-        return replace(each, profiles=tuple(blocks))
+    def changed_enclave(enclave: Enclave) -> Enclave:
+        blocks = (
+            replace(one, profiles=tuple(map(changed_profile, one.profiles)))
+            for one in enclave.profiles
+        )
+        return replace(enclave, profiles=tuple(blocks))
 
-    return replace(policy, enclaves=tuple(map(enclave, policy.enclaves)))
+    return replace(policy, enclaves=tuple(map(changed_enclave, policy.enclaves)))
 
 
 def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozenset[Right]:
@@ -296,11 +299,11 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
     for path in policy:
         if path not in seen and policy.stated(path)[0].path not in replaced:
             continue
-        allowed, rest = (policy_rights(Policy((each[path],))) for each in (policy, after))
+        allowed, rest = (policy_rights(Policy((side[path],))) for side in (policy, after))
         before, now = Rules(allowed), Rules(rest)
-        wrong = [each for each in rest if each.qualifier is ALLOW and not before.cover(each)]
+        wrong = [right for right in rest if right.qualifier is ALLOW and not before.cover(right)]
         used = (e for e in unfolded(seen.get(path, ())) if before.allow(path, e.right, e.name))
-        wrong += (each for each in used if not now.cover(each))
+        wrong += (right for right in used if not now.cover(right))
         if wrong:
             raise PolicyError(
                 "the policy cannot be narrowed for all robots at once",
@@ -311,9 +314,9 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
 
 def _by_enclave(observed: Iterable[Right]) -> dict[str, list[Right]]:
     found: dict[str, list[Right]] = defaultdict(list)
-    for each in observed:
-        if each.qualifier is ALLOW:
-            found[each.enclave].append(each)
+    for right in observed:
+        if right.qualifier is ALLOW:
+            found[right.enclave].append(right)
     return found
 
 
@@ -360,8 +363,8 @@ def _names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]
     if not several:
         return ("".join(map(str, found)),)
     return [
-        "".join(map(str, fill(found, each.name, each.namespace, plural=True)))
-        for each in policy.fleet.members(several[0].group)
+        "".join(map(str, fill(found, member.name, member.namespace, plural=True)))
+        for member in policy.fleet.members(several[0].group)
     ]
 
 
@@ -370,7 +373,7 @@ def _likely(name: str, robot: Robot | None) -> Iterator[str]:
     if robot:
 
         def named(text: str) -> str:
-            return "/".join("{robot}" if each == robot.name else each for each in text.split("/"))
+            return "/".join("{robot}" if part == robot.name else part for part in text.split("/"))
 
         inside = f"/{_NAMESPACE}}}{named(name.removeprefix(robot.namespace.rstrip('/')))}"
         if robot.namespace != "/" and name.startswith(f"{robot.namespace}/"):

@@ -201,7 +201,7 @@ class _Reader:
     def _texts(self, table: Mapping[str, Any], key: str, at: str, most: int) -> tuple[str, ...]:
         values = table.get(key, [])
         where = f"{at}.{key}" if at else key
-        if not isinstance(values, list) or not all(isinstance(each, str) for each in values):
+        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
             raise self._error(f"{where} is not a list of names", "", f'Write {key} = ["NAME"].')
         if len(values) > most:
             raise self._error(f"{where} has more than {most} names")
@@ -241,7 +241,7 @@ def render_fleet(fleet: Fleet) -> str:
 def _lines(fleet: Fleet) -> Iterator[str]:
     if fleet.enclaves:
         yield "enclaves = ["
-        yield from (f"  {json.dumps(each)}," for each in fleet.enclaves)
+        yield from (f"  {json.dumps(pattern)}," for pattern in fleet.enclaves)
         yield "]"
     for group in fleet.groups:
         yield f"[groups.{group}]"

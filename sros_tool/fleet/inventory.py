@@ -153,8 +153,8 @@ class _Inventory:
     def _names(self, groups: Mapping[str, Any]) -> Iterator[str]:
         """Yield the groups that are read from the top: those in no other one, if all are there."""
         inside: set[str] = set()
-        for each in groups.values():
-            children = each.get("children") if isinstance(each, dict) else None
+        for group in groups.values():
+            children = group.get("children") if isinstance(group, dict) else None
             inside |= set(map(str, children)) if isinstance(children, (dict, list)) else set()
         for name in groups:
             if not isinstance(name, str):
@@ -274,18 +274,19 @@ class _Inventory:
 
 def inventory(fleet: Fleet) -> dict[str, Any]:
     """Return a static inventory of the robots: Ansible reads it from a file in YAML or JSON."""
-    hosts = {each.name: _variables(each) for each in fleet.robots.values()}
+    hosts = {robot.name: _variables(robot) for robot in fleet.robots.values()}
     groups: dict[str, Any] = {
-        name: {"hosts": {each: {} for each in members}} for name, members in fleet.groups.items()
+        name: {"hosts": {member: {} for member in members}}
+        for name, members in fleet.groups.items()
     }
     return {"all": {"hosts": hosts, **({"children": groups} if groups else {})}}
 
 
 def script_inventory(fleet: Fleet) -> dict[str, Any]:
     """Return the inventory as a program prints it that Ansible runs with ``--list``."""
-    ungrouped = [each.name for each in fleet.robots.values() if not each.groups]
+    ungrouped = [robot.name for robot in fleet.robots.values() if not robot.groups]
     return {
-        "_meta": {"hostvars": {each.name: _variables(each) for each in fleet.robots.values()}},
+        "_meta": {"hostvars": {robot.name: _variables(robot) for robot in fleet.robots.values()}},
         "all": {"children": [*fleet.groups, "ungrouped"]},
         **{name: {"hosts": list(members)} for name, members in fleet.groups.items()},
         "ungrouped": {"hosts": ungrouped},

@@ -109,7 +109,7 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
 
 def has_unique_part(subject: x509.Name) -> bool:
     """Return whether an enclave's subject has a part besides its common name."""
-    return len(subject.rdns) > 1 or any(len(each) > 1 for each in subject.rdns)
+    return len(subject.rdns) > 1 or any(len(rdn) > 1 for rdn in subject.rdns)
 
 
 def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certificate:
@@ -428,9 +428,9 @@ def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) ->
         return True
     own = extension(authority, x509.SubjectKeyIdentifier)
     issuers = [
-        each.value
-        for each in named.authority_cert_issuer or ()
-        if isinstance(each, x509.DirectoryName)
+        name.value
+        for name in named.authority_cert_issuer or ()
+        if isinstance(name, x509.DirectoryName)
     ]
     return (
         (not own or named.key_identifier in (None, own.digest))
@@ -554,7 +554,9 @@ def subject_text(name: x509.Name) -> str:
         return _name_text(name.public_bytes())
     # In DER, the attributes within an RDN are in the order of DER.
     return ",".join(
-        "+".join(_name_text(x509.Name([each]).public_bytes()) for each in reversed(list(rdn)))
+        "+".join(
+            _name_text(x509.Name([attribute]).public_bytes()) for attribute in reversed(list(rdn))
+        )
         for rdn in reversed(name.rdns)
     )
 
@@ -664,8 +666,8 @@ def read_form(data: bytes) -> CertificateForm | None:
     """Return the form of the first certificate in a PEM file; None if it is an unusual one."""
     with suppress(PkiError, ValueError, IndexError, StopIteration):
         blocks = list(pem_file.blocks(data))
-        first = next(each for each in blocks if each.label in pem_file.CERTIFICATES)
-        around = tuple((each.label, each.headers) for each in blocks)
+        first = next(block for block in blocks if block.label in pem_file.CERTIFICATES)
+        around = tuple((block.label, block.headers) for block in blocks)
         form = _form(first.content)
         return form._replace(common=(*around, *form.common))
     return None

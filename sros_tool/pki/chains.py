@@ -128,8 +128,8 @@ class _Chain:
     def _faults(self, checks: Checks, *, new: bool) -> Iterator[str]:
         chain = self._certificates
         if new:
-            for each in chain:
-                yield from _extension_faults(each)
+            for certificate in chain:
+                yield from _extension_faults(certificate)
             yield from _network_faults(chain)
         if new or Checks.STRICT in checks:
             yield from _authority_faults(chain, checks)
@@ -156,7 +156,9 @@ def _chain_of(
 ) -> _Chain:
     certificates, missing = build_chain(start, authorities, others, at)
     if missing:
-        unread = (fault for each in (start, *authorities) for fault in _unread_faults(each))
+        unread = (
+            fault for certificate in (start, *authorities) for fault in _unread_faults(certificate)
+        )
         missing = next(unread, missing)
     return _Chain(certificates, missing, at)
 
@@ -213,8 +215,10 @@ def _issuer(
 ) -> x509.Certificate | None:
     """Return the first possible issuer that is valid now; else the one that expires last."""
     found = [each for each in among if likely_issued(certificate, each) and each not in chain]
-    valid = (each for each in found if validity_of(each).contains(at))
-    return next(valid, max(found, key=lambda each: each.not_valid_after_utc, default=None))
+    valid = (issuer for issuer in found if validity_of(issuer).contains(at))
+    return next(
+        valid, max(found, key=lambda certificate: certificate.not_valid_after_utc, default=None)
+    )
 
 
 def _may_sign_certificates(certificate: x509.Certificate) -> bool:
@@ -263,8 +267,8 @@ def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     """
     for oid, title in _NETWORKS.items():
         values = [
-            [part.value.public_bytes() for part in each.extensions if part.oid == oid]
-            for each in chain
+            [part.value.public_bytes() for part in certificate.extensions if part.oid == oid]
+            for certificate in chain
         ]
         for each, networks in zip(chain, values, strict=True):
             if len(networks) > 1 or not set(networks) <= set(_INHERITED):
@@ -315,8 +319,8 @@ def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
     if strict and _Authority.OLD in _authority(chain[0]):
         yield f"{subject_text(chain[0].subject)} has no basicConstraints, so it is not a CA"
     if len(chain) > 1:
-        for each in filter(has_explicit_curve, chain):
-            yield f"the curve of the key of {subject_text(each.subject)} has no name"
+        for certificate in filter(has_explicit_curve, chain):
+            yield f"the curve of the key of {subject_text(certificate.subject)} has no name"
     below = 0
     for place, each in enumerate(chain):
         constraints = extension(each, x509.BasicConstraints)
@@ -352,52 +356,57 @@ def purpose_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
             f"the keyUsage of {subject_text(chain[0].subject)} lacks digitalSignature, which "
             "signed documents need"
         )
-    for each in chain:
-        name = subject_text(each.subject)
-        purposes = extension(each, x509.ExtendedKeyUsage)
+    for certificate in chain:
+        name = subject_text(certificate.subject)
+        purposes = extension(certificate, x509.ExtendedKeyUsage)
         if purposes is not None and ExtendedKeyUsageOID.EMAIL_PROTECTION not in purposes:
             yield (
                 f"the extendedKeyUsage of {name} lacks emailProtection, which signed documents need"
             )
-        kinds = _netscape_type(each)
+        kinds = _netscape_type(certificate)
         if kinds is None:
             continue
-        needed = _SMIME_CA if each is not chain[0] else _SMIME | _SSL_CLIENT
-        if not kinds & needed and (each is chain[0] or _Authority.NETSCAPE in _authority(each)):
+        needed = _SMIME_CA if certificate is not chain[0] else _SMIME | _SSL_CLIENT
+        if not kinds & needed and (
+            certificate is chain[0] or _Authority.NETSCAPE in _authority(certificate)
+        ):
             yield f"the nsCertType of {name} has no S/MIME, which signed documents need"
 
 
 def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     if len(chain) == 1:
         return
-    for each in chain:
-        name = subject_text(each.subject)
-        usage = extension(each, x509.KeyUsage)
-        constraints = extension(each, x509.BasicConstraints)
-        version = tolerant.version_of(each)
-        if version < _WITH_EXTENSIONS and list(each.extensions):
+    for certificate in chain:
+        name = subject_text(certificate.subject)
+        usage = extension(certificate, x509.KeyUsage)
+        constraints = extension(certificate, x509.BasicConstraints)
+        version = tolerant.version_of(certificate)
+        if version < _WITH_EXTENSIONS and list(certificate.extensions):
             yield f"{name} has extensions, which its version has not"
         if constraints and constraints.ca:
-            if ExtensionOID.BASIC_CONSTRAINTS not in _critical(each):
+            if ExtensionOID.BASIC_CONSTRAINTS not in _critical(certificate):
                 yield f"the basicConstraints of {name} are not critical"
             if usage is None:
                 yield f"{name} is a CA without keyUsage"
-            if version >= _WITH_EXTENSIONS and extension(each, x509.SubjectKeyIdentifier) is None:
+            if (
+                version >= _WITH_EXTENSIONS
+                and extension(certificate, x509.SubjectKeyIdentifier) is None
+            ):
                 yield f"{name} is a CA without subjectKeyIdentifier"
         elif usage and usage.key_cert_sign:
             yield f"{name} has keyCertSign but is not a CA"
         may_issue = constraints and constraints.ca and usage and usage.key_cert_sign
         if constraints and constraints.path_length is not None and not may_issue:
             yield f"{name} has a pathlen but may not issue certificates"
-        if not (name and subject_text(each.issuer)):
+        if not (name and subject_text(certificate.issuer)):
             yield "a certificate has an empty subject or issuer"
-        names = extension(each, x509.SubjectAlternativeName)
+        names = extension(certificate, x509.SubjectAlternativeName)
         if names is not None and not list(names):
             yield f"the subjectAltName of {name} is empty"
-        if _IDENTIFIERS & _critical(each):
+        if _IDENTIFIERS & _critical(certificate):
             yield f"a key identifier of {name} is critical"
-        if version >= _WITH_EXTENSIONS and each is not chain[-1]:
-            authority = extension(each, x509.AuthorityKeyIdentifier)
+        if version >= _WITH_EXTENSIONS and certificate is not chain[-1]:
+            authority = extension(certificate, x509.AuthorityKeyIdentifier)
             if authority is None or authority.key_identifier is None:
                 yield f"{name} lacks an authorityKeyIdentifier"
 
@@ -410,14 +419,15 @@ def _critical(certificate: x509.Certificate) -> set[ObjectIdentifier]:
 
 
 def _time_faults(chain: Sequence[x509.Certificate], at: datetime) -> Iterator[str]:
-    for each in chain:
-        if date := tolerant.unread_date(each):
-            yield f"the {date} of {subject_text(each.subject)} cannot be read"
-        validity = validity_of(each)
+    for certificate in chain:
+        name = subject_text(certificate.subject)
+        if date := tolerant.unread_date(certificate):
+            yield f"the {date} of {name} cannot be read"
+        validity = validity_of(certificate)
         if at > validity.not_after:
-            yield f"{subject_text(each.subject)} expired at {iso(validity.not_after)}"
+            yield f"{name} expired at {iso(validity.not_after)}"
         elif at < validity.not_before:
-            yield f"{subject_text(each.subject)} is not valid before {iso(validity.not_before)}"
+            yield f"{name} is not valid before {iso(validity.not_before)}"
 
 
 def _signature_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iterator[str]:
@@ -447,26 +457,26 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         return
     demanded = len(chain)
     valid: set[ObjectIdentifier] = {_ANY_POLICY}
-    for each in reversed(chain[:-1]):
-        name = subject_text(each.subject)
-        found = extension(each, x509.CertificatePolicies)
+    for certificate in reversed(chain[:-1]):
+        name = subject_text(certificate.subject)
+        found = extension(certificate, x509.CertificatePolicies)
         named = [policy.policy_identifier for policy in found or ()]
         if len(named) != len(set(named)):
             yield f"{name} has a certificate policy twice"
-        maps = any(other.oid == ExtensionOID.POLICY_MAPPINGS for other in each.extensions)
+        maps = any(other.oid == ExtensionOID.POLICY_MAPPINGS for other in certificate.extensions)
         if maps and found is not None:
             yield f"{name} has policyMappings, not known to sros"
         asked = _ALWAYS_ASKED if found is None else _OF_POLICIES
-        if any(other.oid in asked and is_unread(other) for other in each.extensions):
+        if any(other.oid in asked and is_unread(other) for other in certificate.extensions):
             yield f"the policies of {name} cannot be read"
-        constraints = extension(each, x509.PolicyConstraints)
+        constraints = extension(certificate, x509.PolicyConstraints)
         after = constraints.require_explicit_policy if constraints else None
         if demanded:
-            demanded -= not is_self_issued(each)
+            demanded -= not is_self_issued(certificate)
             demanded = min(demanded, demanded if after is None else after)
         kept = valid if _ANY_POLICY in named else set()
         valid = kept | (set(named) if _ANY_POLICY in valid else valid & set(named))
-        if extension(each, x509.InhibitAnyPolicy) is not None:
+        if extension(certificate, x509.InhibitAnyPolicy) is not None:
             valid -= {_ANY_POLICY}
     if not demanded and not valid:
         yield "a certificate demands a policy that the others do not have"
@@ -518,16 +528,20 @@ def _is_allowed(name: x509.GeneralName | None, constraints: x509.NameConstraints
     if name is None:
         return False
     permitted = [
-        each for each in constraints.permitted_subtrees or () if isinstance(each, type(name))
+        subtree
+        for subtree in constraints.permitted_subtrees or ()
+        if isinstance(subtree, type(name))
     ]
     excluded = [
-        each for each in constraints.excluded_subtrees or () if isinstance(each, type(name))
+        subtree
+        for subtree in constraints.excluded_subtrees or ()
+        if isinstance(subtree, type(name))
     ]
     if not (permitted or excluded):
         return True
     try:
-        return (not permitted or any(_within(name, each) for each in permitted)) and not any(
-            _within(name, each) for each in excluded
+        return (not permitted or any(_within(name, base) for base in permitted)) and not any(
+            _within(name, base) for base in excluded
         )
     except ValueError:
         return False

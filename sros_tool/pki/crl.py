@@ -79,7 +79,7 @@ class RevocationList:
 
     def revokes(self, serial: int) -> bool:
         """Return whether the list revokes the certificate with the serial number ``serial``."""
-        return any(each.serial == serial for each in self.revoked)
+        return any(entry.serial == serial for entry in self.revoked)
 
 
 def sign_crl(
@@ -132,7 +132,7 @@ def load_crl(data: bytes, name: str) -> RevocationList:
     next_update = crl.next_update_utc
     if next_update is None:
         raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)
-    revoked = tuple(each for each in map(_revoked, crl) if each.reason in REASONS)
+    revoked = tuple(entry for entry in map(_revoked, crl) if entry.reason in REASONS)
     return RevocationList(_number(crl), crl.last_update_utc, next_update, revoked, crl)
 
 
@@ -144,7 +144,7 @@ def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
     """
     with _reading(name, data):
         blocks = pem.blocks(data)
-        return _read_block(next(each for each in blocks if each.label == _LABEL))
+        return _read_block(next(block for block in blocks if block.label == _LABEL))
 
 
 def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, ...]:
@@ -155,7 +155,7 @@ def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, 
     """
     with _reading(name, data):
         blocks = pem.blocks(data)
-        return tuple(_read_block(each) for each in blocks if each.label == _LABEL)
+        return tuple(_read_block(block) for block in blocks if block.label == _LABEL)
 
 
 def _reading(name: str, data: bytes) -> AbstractContextManager[None]:
@@ -198,7 +198,7 @@ def embedded_lists(data: bytes) -> list[bytes]:
 
     OpenSSL reads all of them, and nothing that does not begin a line (pem_lib.c).
     """
-    return [CRL_MARK + each for each in (b"\n" + data).split(b"\n" + CRL_MARK)[1:]]
+    return [CRL_MARK + text for text in (b"\n" + data).split(b"\n" + CRL_MARK)[1:]]
 
 
 def names_issuers(crl: x509.CertificateRevocationList) -> bool:
@@ -374,7 +374,7 @@ def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate)
             if isinstance(each.value, x509.CertificateIssuer):
                 issuers = each.value.get_values_for_type(x509.DirectoryName)
         if entry.serial_number == certificate.serial_number and (
-            issuers is None or any(same_name(each, certificate.issuer) for each in issuers)
+            issuers is None or any(same_name(name, certificate.issuer) for name in issuers)
         ):
             return not any(
                 isinstance(each.value, x509.CRLReason)
@@ -433,9 +433,9 @@ def _identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certifi
     if identifier.authority_cert_serial_number not in (None, authority.serial_number):
         return False
     names = [
-        each.value
-        for each in identifier.authority_cert_issuer or ()
-        if isinstance(each, x509.DirectoryName)
+        name.value
+        for name in identifier.authority_cert_issuer or ()
+        if isinstance(name, x509.DirectoryName)
     ]
     return not names or same_name(names[0], authority.issuer)
 
@@ -503,16 +503,16 @@ def _is_in_scope(
 def _is_of(place: x509.DistributionPoint, crl: x509.CertificateRevocationList) -> bool:
     if place.crl_issuer is None:
         return True
-    names = [each.value for each in place.crl_issuer if isinstance(each, x509.DirectoryName)]
-    return any(same_name(each, crl.issuer) for each in names)
+    names = [name.value for name in place.crl_issuer if isinstance(name, x509.DirectoryName)]
+    return any(same_name(name, crl.issuer) for name in names)
 
 
 def _same_place(place: x509.DistributionPoint, point: x509.IssuingDistributionPoint) -> bool:
     if place.full_name is None and place.relative_name is None:
         return True
     if place.full_name is not None and point.full_name is not None:
-        ours = [_general_name(each) for each in place.full_name]
-        return any(_general_name(each) in ours for each in point.full_name)
+        ours = [_general_name(name) for name in place.full_name]
+        return any(_general_name(name) in ours for name in point.full_name)
     return False  # names relative to the issuer: not decided here, and seldom used
 
 

@@ -50,7 +50,8 @@ def canonical_der(name: bytes) -> tuple[bytes, ...]:
     """Return the parts of a name in DER, as `canonical` does."""
     parts = der.children(der.first(name).content)
     return tuple(
-        b"".join(sorted(_attribute(each) for each in der.children(part.content))) for part in parts
+        b"".join(sorted(_attribute(attribute) for attribute in der.children(part.content)))
+        for part in parts
     )
 
 

@@ -106,7 +106,7 @@ def _kind_of_der(data: bytes) -> str:
     try:
         whole, _ = der.split(data)
         parts = der.children(der.first(der.normalized(whole)).content)
-        tags = tuple(each.tag for each in parts)
+        tags = tuple(part.tag for part in parts)
         if tags[:1] == (der.OID,):
             return _OID_OF_MESSAGE.get(parts[0].content, "a message in DER")
         if tags == (der.SEQUENCE, der.SEQUENCE, der.BIT_STRING):
@@ -124,7 +124,7 @@ def _kind_of_der(data: bytes) -> str:
 
 def _kind_of_signed(parts: list[der.Value]) -> str:
     """Return what is signed: a certificate, a request or a revocation list, by its parts."""
-    tags = [each.tag for each in parts]
+    tags = [part.tag for part in parts]
     if der.UTC_TIME in tags or der.GENERALIZED_TIME in tags:
         return _LIST_IN_DER
     if tags[:3] == [der.INTEGER, der.SEQUENCE, der.SEQUENCE] and tags[3:] in ([], [der.CONTEXT_0]):

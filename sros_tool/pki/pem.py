@@ -120,7 +120,7 @@ def _block(label: bytes, pieces: Iterator[bytes]) -> Block:
         raise PkiError(f"the block {name} in it is cut short")
     if line != _END + label + b"-----":
         raise PkiError(f"the block {name} in it does not end with '-----END {name}-----'")
-    if len(parts) == 1 and any(b":" in each for each in parts[0]):
+    if len(parts) == 1 and any(b":" in part for part in parts[0]):
         parts.append([])  # headers alone
     headers = b"\n".join(parts.pop(0)) if len(parts) == 2 else b""
     return Block(label.decode("utf-8", "replace"), headers, _decoded(b"\n".join(parts[0]), name))

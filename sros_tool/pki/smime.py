@@ -129,9 +129,9 @@ class Signature:
     def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
         """Return the first certificate with the signer's issuer and serial number, or None."""
         issuer, serial = self._issuer_and_serial
-        for each in certificates:
-            if each.serial_number == serial and canonical_issuer(each) == issuer:
-                return each
+        for certificate in certificates:
+            if certificate.serial_number == serial and canonical_issuer(certificate) == issuer:
+                return certificate
         return None
 
     def digest_matches(self, content: bytes) -> bool:
@@ -195,7 +195,7 @@ class SignedDocument:
     @property
     def digest(self) -> str:
         """The name of the weakest hash algorithm of its signatures."""
-        return min((each.digest for each in self.signatures), key=_bits).name
+        return min((signature.digest for signature in self.signatures), key=_bits).name
 
     def signer(self) -> x509.Certificate | None:
         """Return the certificate of the first signer, or None if it is not embedded."""
@@ -225,12 +225,14 @@ class SignedDocument:
 
     def weakness(self) -> str:
         """Return the weak hash of a signature as a clause, or ""."""
-        weak = any(_bits(each.digest) < _bits(hashes.SHA256()) for each in self.signatures)
+        weak = any(
+            _bits(signature.digest) < _bits(hashes.SHA256()) for signature in self.signatures
+        )
         return f"it has a weak signature, with {self.digest.upper()}" if weak else ""
 
     def digest_matches(self) -> bool:
         """Return whether every messageDigest attribute is the digest of the content."""
-        return all(each.digest_matches(self.content) for each in self.signatures)
+        return all(signature.digest_matches(self.content) for signature in self.signatures)
 
 
 def _other_signer(signer: x509.Certificate | None, authority: x509.Certificate) -> str:
@@ -459,13 +461,13 @@ def _signature(signer: der.Value) -> Signature:
     if named is None:
         raise ValueError("unknown digest")
     _digest_of(algorithm)
-    for each in unsigned:
-        _attributes(each.content)
-    found = [_attributes(each.content) for each in attributes]
+    for attribute in unsigned:
+        _attributes(attribute.content)
+    found = [_attributes(attribute.content) for attribute in attributes]
     return Signature(
         named,
         # The signature covers the attributes with the tag SET, not with their tag in SignerInfo.
-        b"".join(b"\x31" + each.whole[1:] for each in attributes if each.content),
+        b"".join(b"\x31" + attribute.whole[1:] for attribute in attributes if attribute.content),
         b"".join(map(_message_digest, found)),
         value.content,
         _issuer_and_serial(identifier),
@@ -481,11 +483,11 @@ def _issuer_and_serial(identifier: der.Value) -> tuple[tuple[bytes, ...], int]:
 
 def _check_values(*values: der.Value) -> None:
     """Raise `ValueError` for a value that OpenSSL may read in another way, or not at all."""
-    for each in values:
+    for value in values:
         if (
-            each.tag not in _ANY_VALUES
-            or (each.tag == der.OID and not _OID.fullmatch(each.content))
-            or (each.tag == _NULL and each.content)
+            value.tag not in _ANY_VALUES
+            or (value.tag == der.OID and not _OID.fullmatch(value.content))
+            or (value.tag == _NULL and value.content)
         ):
             raise ValueError("not a value of an attribute or parameter")
 

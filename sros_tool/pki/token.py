@@ -67,8 +67,8 @@ def _proxy() -> str:
 
     libp11 loads it, too, where no other is named (Debian and Ubuntu, libengine-pkcs11-openssl).
     """
-    found = sorted(each for folder in _PROXIES for each in Path("/").glob(folder))
-    return next((str(real) for each in found if (real := file_of_root(each))), "")
+    found = sorted(path for folder in _PROXIES for path in Path("/").glob(folder))
+    return next((str(real) for path in found if (real := file_of_root(path))), "")
 
 
 _PROXIES = ("usr/lib/*/p11-kit-proxy.so", "usr/lib64/p11-kit-proxy.so", "usr/lib/p11-kit-proxy.so")

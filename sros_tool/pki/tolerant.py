@@ -463,7 +463,7 @@ def _read(
     parts: Iterable[der.Value], strict: _Strict, loose: Mapping[ObjectIdentifier, _Loose]
 ) -> x509.Extensions:
     """Return extensions, given in DER; raise `PkiError` if a part is not one."""
-    known = [_parts(each) for each in parts]
+    known = [_parts(part) for part in parts]
     count = [oid for oid, _, _ in known]
     extensions = []
     for oid, critical, content in known:
@@ -478,16 +478,16 @@ def _read(
 def _parts(extension: der.Value) -> tuple[ObjectIdentifier, bool, bytes]:
     """Return the identifier of an extension, whether it is critical, and its content."""
     identifier, *flag, content = der.children(extension.content)
-    tags = (extension.tag, identifier.tag, content.tag, [each.tag for each in flag])
+    tags = (extension.tag, identifier.tag, content.tag, [value.tag for value in flag])
     if tags not in (
         (der.SEQUENCE, der.OID, der.OCTET_STRING, []),
         (der.SEQUENCE, der.OID, der.OCTET_STRING, [der.BOOLEAN]),
     ):
         raise PkiError("an extension has another structure")
-    if any(len(each.content) != 1 for each in flag):
+    if any(len(value.content) != 1 for value in flag):
         raise PkiError("an extension has a flag that is none")
     oid = ObjectIdentifier(der.decode_oid(identifier.content))
-    return oid, any(each.content != b"\0" for each in flag), content.content
+    return oid, any(value.content != b"\0" for value in flag), content.content
 
 
 def _value(
@@ -616,7 +616,7 @@ def _extended_key_usage(content: bytes) -> x509.ExtendedKeyUsage:
 
 
 def _name_constraints(content: bytes) -> None:
-    if any(each.content for each in _inside(content)):
+    if any(part.content for part in _inside(content)):
         raise ValueError("not empty")
 
 

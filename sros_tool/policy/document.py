@@ -157,7 +157,7 @@ class Includer:
         path = unquote(href, errors="surrogateescape")
         if "\0" in path or len(href) > _MAX_LENGTH:
             raise PolicyError(f"{where}: the include of {_short(href)} is not a valid path")
-        if any(each.get(_XML_BASE) is not None for each in (element, *element.iterancestors())):
+        if any(child.get(_XML_BASE) is not None for child in (element, *element.iterancestors())):
             raise PolicyError(
                 f"{where}: the include of {_short(href)} is below an xml:base",
                 "sros resolves includes from the file in which they stand.",
@@ -192,16 +192,16 @@ class Includer:
     def _expanded(
         self, elements: Iterable[etree._Element], place: IncludedFile
     ) -> Iterator[tuple[etree._Element, IncludedFile]]:
-        for each in elements:
-            if isinstance(each, etree._ProcessingInstruction):
+        for child in elements:
+            if isinstance(child, etree._ProcessingInstruction):
                 continue
-            if each.tag in INCLUDES:
-                yield from self._included(each, place)
+            if child.tag in INCLUDES:
+                yield from self._included(child, place)
                 continue
             self._elements += 1
             if self._elements > _MAX_ELEMENTS:
-                raise _too_large(_line(each, place), f"{_MAX_ELEMENTS} elements")
-            yield each, place
+                raise _too_large(_line(child, place), f"{_MAX_ELEMENTS} elements")
+            yield child, place
 
     def _included(
         self, element: etree._Element, place: IncludedFile
@@ -220,7 +220,7 @@ class Includer:
                 "It would put any readable file into a signed document.",
                 "Include policy XML, without parse=.",
             )
-        inside = [each for each in element if isinstance(each.tag, str)]
+        inside = [child for child in element if isinstance(child.tag, str)]
         if len(inside) > 1 or (inside and inside[0].tag not in FALLBACKS):
             raise PolicyError(
                 f"{where}: an include can contain only one <fallback>", "", "Remove the rest."
@@ -270,8 +270,8 @@ class Includer:
         found: Iterable[tuple[etree._Element, IncludedFile]] = roots
         for depth, step in enumerate(steps):
             if depth:
-                found = (each for parent in found for each in self.children(*parent))
-            found = [each for each in found if _fits(each[0], step)]
+                found = (child for parent in found for child in self.children(*parent))
+            found = [child for child in found if _fits(child[0], step)]
         if not found:
             raise PolicyError(
                 f"{where}: the xpointer {_short(pointer)} selects nothing",
@@ -308,14 +308,14 @@ _PROTECT = re.compile(r"""protect\s*=\s*(?:"(?P<one>[^"]*)"|'(?P<other>[^']*)')\
 def _check_instructions(root: etree._Element, file: Path) -> None:
     """Raise `PolicyError` if a processing instruction for sros stands in no name."""
     around = (*root.itersiblings(preceding=True), *root.itersiblings())
-    for each in (*around, *root.iter(etree.PI)):
-        if not isinstance(each, etree._ProcessingInstruction):
+    for instruction in (*around, *root.iter(etree.PI)):
+        if not isinstance(instruction, etree._ProcessingInstruction):
             continue
-        parent = each.getparent()
+        parent = instruction.getparent()
         named = parent is not None and tag_of(parent) in _ITEMS
-        if not named and (each.target or "").lower() == _INSTRUCTION:
+        if not named and (instruction.target or "").lower() == _INSTRUCTION:
             raise PolicyError(
-                f"{file}:{each.sourceline}: <?{_INSTRUCTION} ...?> is not in a name",
+                f"{file}:{instruction.sourceline}: <?{_INSTRUCTION} ...?> is not in a name",
                 "Protection is said for a topic, service or action, in its element.",
                 _EXAMPLE,
             )
@@ -543,7 +543,7 @@ class _Reader:
         if kind not in RIGHTS:
             raise PolicyError(
                 f"{self._where(element, place)}: <profile> cannot contain <{kind}>",
-                f"It can contain only {', '.join(f'<{each}>' for each in RIGHTS)}.",
+                f"It can contain only {', '.join(f'<{word}>' for word in RIGHTS)}.",
             )
         self._attributes(element, place, optional=RIGHTS[kind])
         rights = []
@@ -715,7 +715,7 @@ class _Reader:
                 and not name.startswith(_XML_ATTRIBUTES)
             ):
                 where = self._where(element, place)
-                known = ", ".join(f"{each}=" for each in (*required, *optional))
+                known = ", ".join(f"{word}=" for word in (*required, *optional))
                 raise PolicyError(
                     f"{where}: <{tag_of(element)}> has no attribute {_short(name)}",
                     "",

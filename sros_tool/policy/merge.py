@@ -175,8 +175,10 @@ def _entry_order(entry: AddedName) -> tuple[int, GroupRights, str]:
 def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
     """Return a note for each denial that limits a merge."""
     by_denial: dict[tuple[Right, bool], list[Right]] = {}
-    for each in contradictions:
-        by_denial.setdefault((each.denied, each.new), []).append(each.allowed)
+    for contradiction in contradictions:
+        by_denial.setdefault((contradiction.denied, contradiction.new), []).append(
+            contradiction.allowed
+        )
     notes = []
     for (denied, new), allowed in by_denial.items():
         shown = [right.describe() for right in dict.fromkeys(sorted(allowed, key=order))]
@@ -421,12 +423,13 @@ def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
     author's choice.
     """
     present = {(e.kind, e.name): e for e in stated_protections(merged.enclaves)}
-    for each in stated_protections(additions.enclaves):
-        own = present.get((each.kind, each.name))
-        if own is None or own.level is not each.level:
+    for protection in stated_protections(additions.enclaves):
+        own = present.get((protection.kind, protection.name))
+        if own is None or own.level is not protection.level:
             says = f'says protect="{own.word}" at {own.source}' if own else "does not say it"
             raise PolicyError(
-                f"{each.source}: {each} has protect=\"{each.word}\", and '{path}' {says}",
+                f'{protection.source}: {protection} has protect="{protection.word}", and '
+                f"'{path}' {says}",
                 "A merge adds rights, and changes no name that is there.",
                 "Say the same of the name in both files, and merge again.",
             )
@@ -457,7 +460,7 @@ def _groups(entries: Sequence[AddedName]) -> list[_New]:
     """Return the groups for names that come sorted by kind and rights."""
     return [
         _group(kind, rights, same)
-        for (kind, rights), same in groupby(entries, key=lambda each: (each.kind, each.rights))
+        for (kind, rights), same in groupby(entries, key=lambda entry: (entry.kind, entry.rights))
     ]
 
 
@@ -477,7 +480,9 @@ class _Editor:
     def add(self, entries: dict[ProfileKey, tuple[AddedName, ...]]) -> bytes:
         """Return the document with ``entries``."""
         blocks = list(self._text.root.named("enclaves"))
-        own = {each.get("path"): each for block in blocks for each in block.named("enclave")}
+        own = {
+            element.get("path"): element for block in blocks for element in block.named("enclave")
+        }
         for path, found in groupby(entries.items(), key=lambda item: item[0].enclave):
             places = dict(found)
             if path in own:
@@ -492,7 +497,7 @@ class _Editor:
                     else "Its <enclaves> are included from another file.",
                     "Merge into the file that contains this part.",
                 )
-            profiles = _New("profiles", children=[_profile(*each) for each in places.items()])
+            profiles = _New("profiles", children=[_profile(*profile) for profile in places.items()])
             self._append(blocks[0], _New(f'enclave path="{path}"', children=[profiles]))
         return self._text.document()
 
@@ -523,9 +528,11 @@ class _Editor:
             for child in profile.children:
                 if child.tag in RIGHTS:
                     groups.setdefault((child.tag, _rights_of(child)), child)
-        for new in _groups([each for each in entries if (each.kind, each.rights) not in groups]):
+        for new in _groups(
+            [entry for entry in entries if (entry.kind, entry.rights) not in groups]
+        ):
             self._append(profiles[0], new)
-        for (kind, rights), same in groupby(entries, key=lambda each: (each.kind, each.rights)):
+        for (kind, rights), same in groupby(entries, key=lambda entry: (entry.kind, entry.rights)):
             if group := groups.get((kind, rights)):
                 self._add_names(group, kind, list(same))
 
@@ -547,7 +554,7 @@ class _Editor:
 
     def _append(self, parent: PlacedElement, new: _New) -> None:
         """Write an element after the last child of ``parent``, but before its metadata."""
-        last = next((each for each in reversed(parent.children) if each.tag != "metadata"), None)
+        last = next((child for child in reversed(parent.children) if child.tag != "metadata"), None)
         if last:
             self._put_after(last, new)
         else:

@@ -227,15 +227,15 @@ class _Narrowing:
             return self._enclave, self._use_of({*self._stated}, ())
         kept = {right for right in self._stated if self._stays(right)}
         wide = self._narrowed(kept)
-        self._prove([*kept, *(right for each in wide for right in each.replacement)])
-        replacements = {each.rule: each.replacement for each in wide}
+        self._prove([*kept, *(right for wildcard in wide for right in wildcard.replacement)])
+        replacements = {wildcard.rule: wildcard.replacement for wildcard in wide}
         return _narrowed_enclave(self._enclave, kept, replacements), self._use_of(kept, wide)
 
     def _use_of(self, kept: set[Right], wide: Sequence[WideRule]) -> EnclaveUse:
         seen = bool(self._observed)
         unused = [right for right in self._stated if not self._is_observed(right)]
-        rewritten = {each.rule for each in wide}
-        remaining = [*kept, *(right for each in wide for right in each.replacement)]
+        rewritten = {wildcard.rule for wildcard in wide}
+        remaining = [*kept, *(right for wildcard in wide for right in wildcard.replacement)]
         in_use = self._pairs(self._in_use)
         return EnclaveUse(
             enclave=self._enclave.path,
@@ -466,7 +466,8 @@ def propose_wildcards(
             names = tuple(sorted(found, key=order))
             candidates[frozenset(found)] = WildcardProposal(rule, names, adds, saves)
     best = sorted(
-        candidates.values(), key=lambda each: (len(each.adds), -each.saves, order(each.rule))
+        candidates.values(),
+        key=lambda proposal: (len(proposal.adds), -proposal.saves, order(proposal.rule)),
     )
     chosen: list[WildcardProposal] = []
     replaced: set[Right] = set()

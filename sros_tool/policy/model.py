@@ -126,7 +126,7 @@ class Policy:
 
     def enclave(self, path: str) -> Enclave | None:
         """Return the enclave with this path, or None."""
-        return next((each for each in self.enclaves if each.path == path), None)
+        return next((enclave for enclave in self.enclaves if enclave.path == path), None)
 
     def enclaves_of_node(self, ns: str, node: str) -> tuple[Enclave, ...]:
         """Return the enclaves with a profile for the node ``node`` in the namespace ``ns``."""
@@ -134,22 +134,27 @@ class Policy:
         return tuple(
             enclave
             for enclave in self.enclaves
-            if any((each.ns.strip("/"), each.node) == wanted for each in enclave.all_profiles())
+            if any(
+                (profile.ns.strip("/"), profile.node) == wanted
+                for profile in enclave.all_profiles()
+            )
         )
 
 
 def with_groups(policy: Policy, change: Callable[[Group, Profile], Iterable[Group]]) -> Policy:
     """Return the policy with every group replaced by those that ``change`` returns for it."""
 
-    def profile(each: Profile) -> Profile:
-        groups = tuple(new for group in each.groups for new in change(group, each))
-        return replace(each, groups=groups)
+    def changed_profile(profile: Profile) -> Profile:
+        groups = tuple(new for group in profile.groups for new in change(group, profile))
+        return replace(profile, groups=groups)
 
-    def enclave(each: Enclave) -> Enclave:
-        blocks = (replace(b, profiles=tuple(map(profile, b.profiles))) for b in each.profiles)
-        return replace(each, profiles=tuple(blocks))
+    def changed_enclave(enclave: Enclave) -> Enclave:
+        blocks = (
+            replace(b, profiles=tuple(map(changed_profile, b.profiles))) for b in enclave.profiles
+        )
+        return replace(enclave, profiles=tuple(blocks))
 
-    return replace(policy, enclaves=tuple(map(enclave, policy.enclaves)))
+    return replace(policy, enclaves=tuple(map(changed_enclave, policy.enclaves)))
 
 
 # ── stated protection ─────────────────────────────────────────────────────────────────────────

@@ -256,7 +256,7 @@ class Names:
 
     def __init__(self, names: Iterable[str], limit: ComparisonLimit | None = None) -> None:
         self._names = tuple(dict.fromkeys(names))
-        self._wild = tuple(each for each in self._names if is_expression(each))
+        self._wild = tuple(expression for expression in self._names if is_expression(expression))
         self._every = frozenset(self._names)
         self._exact = self._every.difference(self._wild)
         self._limit = limit or ComparisonLimit()
@@ -281,9 +281,9 @@ class Names:
     def meeting(self, name: str) -> Iterator[str]:
         """Yield the names of this set that overlap with ``name``, in their order."""
         if is_expression(name):
-            for each in map(self._names.__getitem__, sorted(self._that_may_meet(name))):
-                if self._tried(overlap(each, name), each, name):
-                    yield each
+            for expression in map(self._names.__getitem__, sorted(self._that_may_meet(name))):
+                if self._tried(overlap(expression, name), expression, name):
+                    yield expression
             return
         if name in self._exact:
             yield name
@@ -301,8 +301,10 @@ class Names:
         keys = {
             text[i : i + size] for size in range(_GRAM + 1) for i in range(len(text) - size + 1)
         }
-        found = [each for key in keys & self._by_letters.keys() for each in self._by_letters[key]]
-        return [self._wild[each] for each in sorted(found)]
+        found = [
+            number for key in keys & self._by_letters.keys() for number in self._by_letters[key]
+        ]
+        return [self._wild[number] for number in sorted(found)]
 
     @cached_property
     def _by_letters(self) -> dict[str, list[int]]:
@@ -311,8 +313,8 @@ class Names:
         Of the letters of an expression, those are taken that the fewest others have.
         """
         grams = [
-            {gram for run in _RUN.findall(_letters_of(each)) for gram in _grams(run)}
-            for each in self._wild
+            {gram for run in _RUN.findall(_letters_of(expression)) for gram in _grams(run)}
+            for expression in self._wild
         ]
         count = Counter(gram for each in grams for gram in each)
 
@@ -334,14 +336,18 @@ class Names:
 
     @cached_property
     def _by_begin(self) -> _Beginnings:
-        return _Beginnings([(literal_prefix(each), is_expression(each)) for each in self._names])
+        return _Beginnings(
+            [(literal_prefix(expression), is_expression(expression)) for expression in self._names]
+        )
 
     @cached_property
     def _by_end(self) -> _Beginnings:
         return _Beginnings(
             [
-                (_END.sub("", each)[::-1], True) if is_expression(each) else (each[::-1], False)
-                for each in self._names
+                (_END.sub("", expression)[::-1], True)
+                if is_expression(expression)
+                else (expression[::-1], False)
+                for expression in self._names
             ]
         )
 
@@ -375,7 +381,9 @@ def _letters_of(expression: str) -> str:
     if "[" not in expression:
         return expression.replace("*", _BETWEEN).replace("?", _BETWEEN)
     pieces = _form(expression).pieces
-    return "".join(next(iter(each)) or _BETWEEN if len(each) == 1 else _BETWEEN for each in pieces)
+    return "".join(
+        next(iter(piece)) or _BETWEEN if len(piece) == 1 else _BETWEEN for piece in pieces
+    )
 
 
 def _grams(run: str) -> Iterator[str]:
@@ -408,7 +416,7 @@ def _names_of(expression: str) -> NameSet:
         return NameSet([expression])
     pieces = _pieces(expression)
     return NameSet(
-        (), [Automaton.sequence(None if each is _ANY else _as_letters(each) for each in pieces)]
+        (), [Automaton.sequence(None if piece is _ANY else _as_letters(piece) for piece in pieces)]
     )
 
 
@@ -433,9 +441,13 @@ def common_name(
     inner, outer = tuple(dict.fromkeys(wanted)), tuple(dict.fromkeys(unwanted))
     for name in inner:
         if not is_expression(name):
-            others = (each for each in inner if each != name)
-            fits = all(matches(each, name) for each in others)
-            return name if fits and not any(matches(each, name) for each in outer) else None
+            others = (expression for expression in inner if expression != name)
+            fits = all(matches(expression, name) for expression in others)
+            return (
+                name
+                if fits and not any(matches(expression, name) for expression in outer)
+                else None
+            )
     return _search(inner, outer, absolute)
 
 

@@ -64,8 +64,8 @@ def parts_of(text: str) -> Parts:
         parts += [text[end : found.start()], placeholder]
         end = found.end()
     parts.append(text[end:])
-    kept = tuple(each for each in parts if each != "")
-    if any(isinstance(each, str) and has_placeholder(each) for each in kept):
+    kept = tuple(part for part in parts if part != "")
+    if any(isinstance(part, str) and has_placeholder(part) for part in kept):
         raise ValueError("It has a brace that is not of a placeholder such as {robot}.")
     if len({each.group for each in placeholders_of(kept) if each.plural}) > 1:
         raise ValueError("It has the robots of several groups, so it is unclear which go together.")
@@ -91,12 +91,12 @@ def _place_problem(placeholder: Placeholder, before: str, after: str) -> str:
 
 def placeholders_of(parts: Parts) -> tuple[Placeholder, ...]:
     """Return the placeholders of a name, in order."""
-    return tuple(each for each in parts if isinstance(each, Placeholder))
+    return tuple(part for part in parts if isinstance(part, Placeholder))
 
 
 def sample(parts: Parts) -> str:
     """Return the name that the shortest values give, for checks of its grammar."""
-    return "".join(each if isinstance(each, str) else _SAMPLES[each.value] for each in parts)
+    return "".join(part if isinstance(part, str) else _SAMPLES[part.value] for part in parts)
 
 
 def check_path(path: Parts) -> None:
@@ -106,10 +106,10 @@ def check_path(path: Parts) -> None:
         ValueError: it is not; the message is a sentence.
     """
     found = placeholders_of(path)
-    if plural := next((each for each in found if each.plural), None):
+    if plural := next((part for part in found if part.plural), None):
         one = replace(plural, plural=False)
         raise ValueError(f"{plural} is all robots, and a path is of one enclave: write {one}.")
-    if len({each.group for each in found}) > 1:
+    if len({part.group for part in found}) > 1:
         raise ValueError("Its placeholders are of different groups.")
 
 
@@ -125,18 +125,18 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
         ValueError: it has another placeholder; the message is a sentence.
     """
     owner = placeholders_of(path)
-    for each in placeholders_of(name):
-        if each.plural:
+    for placeholder in placeholders_of(name):
+        if placeholder.plural:
             if not several:
-                raise ValueError(f"{each} is a name for each robot, and here is only one.")
+                raise ValueError(f"{placeholder} is a name for each robot, and here is only one.")
         elif not owner:
-            instead = f" For a name for each robot write {replace(each, plural=True)}."
+            instead = f" For a name for each robot write {replace(placeholder, plural=True)}."
             raise ValueError(
-                f"{each} is one robot, and the path of the enclave does not say which one."
+                f"{placeholder} is one robot, and the path of the enclave does not say which one."
                 f"{instead if several else ''}"
             )
-        elif each.group not in ("", owner[0].group):
-            raise ValueError(f"{each} is not the robot of the enclave: leave out the group.")
+        elif placeholder.group not in ("", owner[0].group):
+            raise ValueError(f"{placeholder} is not the robot of the enclave: leave out the group.")
 
 
 def fill(parts: Parts, robot: str, namespace: str, *, plural: bool = False) -> Parts:
@@ -145,6 +145,6 @@ def fill(parts: Parts, robot: str, namespace: str, *, plural: bool = False) -> P
     if namespace == "/" and len(parts) > 1:
         values["namespace"] = ""  # in the root namespace, {namespace}/scan is /scan
     return tuple(
-        values[each.value] if isinstance(each, Placeholder) and each.plural is plural else each
-        for each in parts
+        values[part.value] if isinstance(part, Placeholder) and part.plural is plural else part
+        for part in parts
     )

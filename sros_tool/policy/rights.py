@@ -73,7 +73,7 @@ GroupRights = tuple[tuple[str, Qualifier], ...]
 
 def groupable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
     """Yield the groups for ``rights`` to a name: two if a right is both allowed and denied."""
-    ordered = sorted(rights, key=lambda each: (RIGHT_ORDER[each[0]], each[1]))
+    ordered = sorted(rights, key=lambda right: (RIGHT_ORDER[right[0]], right[1]))
     if len({right for right, _ in ordered}) == len(ordered):
         yield tuple(ordered)
         return
@@ -123,13 +123,13 @@ def folded(rights: Iterable[Right]) -> frozenset[Right]:
     """Return the normal form: the five parts of an action are replaced by the action."""
     remaining = set(unfolded(rights))
     actions = [
-        Right(each.enclave, each.qualifier, WHOLE[each.right], each.name.removesuffix(GOAL))
-        for each in remaining
-        if each.right in WHOLE and each.name.endswith(GOAL) and each.name.startswith("/")
+        Right(right.enclave, right.qualifier, WHOLE[right.right], right.name.removesuffix(GOAL))
+        for right in remaining
+        if right.right in WHOLE and right.name.endswith(GOAL) and right.name.startswith("/")
     ]
-    whole = [each for each in actions if each.name and remaining.issuperset(parts(each))]
-    for each in whole:
-        remaining.difference_update(parts(each))
+    whole = [right for right in actions if right.name and remaining.issuperset(parts(right))]
+    for right in whole:
+        remaining.difference_update(parts(right))
     return frozenset(remaining.union(whole))
 
 
@@ -209,7 +209,7 @@ class RightsDifference:
 
     def lines(self) -> list[tuple[str, Right]]:
         """Return each different right with "-" (first side only) or "+" (second), by `order`."""
-        found = [("-", each) for each in self.only_first] + [("+", e) for e in self.only_second]
+        found = [("-", right) for right in self.only_first] + [("+", e) for e in self.only_second]
         return sorted(found, key=lambda line: (*order(line[1]), line[0] == "+"))
 
 

@@ -47,12 +47,12 @@ def listed(expression: str, most: int) -> list[str]:
     """
     if "?" not in expression and "[" not in expression:
         return [_STARS.sub("*", expression)]
-    pieces = [_choices(*each.groups()) for each in _PIECE.finditer(expression)]
+    pieces = [_choices(*match.groups()) for match in _PIECE.finditer(expression)]
     if prod(map(len, pieces)) > most:
         raise CannotSubtract
-    names = ("".join(each) for each in product(*pieces))
+    names = ("".join(choice) for choice in product(*pieces))
     # "/" next to another one or at the end is in no name.
-    found = (_STARS.sub("*", each) for each in names if "//" not in each and each[-1:] != "/")
+    found = (_STARS.sub("*", name) for name in names if "//" not in name and name[-1:] != "/")
     return list(dict.fromkeys(found))
 
 
@@ -64,7 +64,7 @@ def _choices(negated: str, members: str, one: str, text: str) -> Sequence[str]:
     chosen: set[str] = set()
     for low, high, single in _RANGE.findall(members):
         chosen.update([single] if single else map(chr, range(ord(low), ord(high) + 1)))
-    return [each for each in _LETTERS + "/" if (each in chosen) is not bool(negated)]
+    return [letter for letter in _LETTERS + "/" if (letter in chosen) is not bool(negated)]
 
 
 @dataclass
@@ -94,7 +94,7 @@ def subtract(
         )
     except CannotSubtract as error:
         if error.denied:  # what is left of it after some letters
-            error.denied = next(each for each in without if error.denied in each)
+            error.denied = next(expression for expression in without if error.denied in expression)
         raise
     return list(search.found)
 
@@ -139,16 +139,16 @@ class _Difference:
         self.effort.left -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
         if self.effort.left < 0:
             raise CannotSubtract
-        denied = tuple(each for each in denied if overlap(each, wide))
+        denied = tuple(expression for expression in denied if overlap(expression, wide))
         if not denied:
             self._keep(read + wide)
             return ()
-        if any(covers(each, wide) for each in denied):
+        if any(covers(expression, wide) for expression in denied):
             return ()
         if not wide.startswith("*"):
             return (_Place(read + wide[0], wide[1:], _after(wide[0], denied), _LETTERS),)
-        starred = [each for each in denied if each.startswith("*")]
-        if starred and all(each in starred or "*" not in each for each in denied):
+        starred = [expression for expression in denied if expression.startswith("*")]
+        if starred and all(expression in starred or "*" not in expression for expression in denied):
             self._keep_backwards(read, wide, denied)
             return ()
         return self._by_next_letter(place._replace(denied=denied))
@@ -157,10 +157,10 @@ class _Difference:
         """Divide the names of a place; ``wide`` begins with a star."""
         read, wide, denied, letters = place
         rest = wide[1:]
-        parts = [each.partition("/")[0] for each in denied]
-        if rest[:1] in ("", "/") and not any("*" in each for each in parts):
+        parts = [expression.partition("/")[0] for expression in denied]
+        if rest[:1] in ("", "/") and not any("*" in part for part in parts):
             # A part with a letter that no denied part has is allowed, whatever its other letters.
-            needed = {letter for each in parts for letter in each}
+            needed = {letter for part in parts for letter in part}
             for letter in letters:
                 if letter not in needed:
                     self._keep(f"{read}{IN_PART}{letter}{wide}")
@@ -175,11 +175,15 @@ class _Difference:
 
     def _keep_backwards(self, read: str, wide: str, denied: tuple[str, ...]) -> None:
         if self.backwards:
-            raise CannotSubtract(next(each for each in denied if each.startswith("*"))[::-1])
+            raise CannotSubtract(
+                next(expression for expression in denied if expression.startswith("*"))[::-1]
+            )
         ends = _Difference(self.most, self.effort, backwards=True)
-        ends.run([_Place("", wide[::-1], tuple(each[::-1] for each in denied), _LETTERS)])
-        for each in ends.found:
-            self._keep(read + each[::-1])
+        ends.run(
+            [_Place("", wide[::-1], tuple(expression[::-1] for expression in denied), _LETTERS)]
+        )
+        for expression in ends.found:
+            self._keep(read + expression[::-1])
 
     def _keep(self, expression: str) -> None:
         """Keep an expression unless it matches no name: with an empty part."""
@@ -192,11 +196,11 @@ class _Difference:
 def _after(letter: str, expressions: Iterable[str]) -> tuple[str, ...]:
     """Return what has to follow for the expressions to match, after a letter was read."""
     found = []
-    for each in expressions:
-        if each.startswith("*"):
-            found.append(each)
-            if each[1:2] == letter:
-                found.append(each[2:])
-        elif each.startswith(letter):
-            found.append(each[1:])
+    for expression in expressions:
+        if expression.startswith("*"):
+            found.append(expression)
+            if expression[1:2] == letter:
+                found.append(expression[2:])
+        elif expression.startswith(letter):
+            found.append(expression[1:])
     return tuple(dict.fromkeys(found))
