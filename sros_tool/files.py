@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from sros_tool.errors import DocumentError
 from sros_tool.folders import Folder, make_folders, remove_folders, write_all
 
 _LOG = logging.getLogger(__name__)
@@ -234,6 +235,21 @@ def _is_shared(folder: Path) -> bool:
 
 _LONGEST_LINE = 4000  # characters: the parser takes quadratic time for a key with many dots
 _LONGEST_DOCUMENT = 256 * 1024  # characters
+
+
+def read_toml(data: bytes, what: str, remedy: str = "", *, longest: int = _LONGEST_DOCUMENT) -> Any:
+    """Return the tables of a TOML document in a file; ``what`` names the file in errors.
+
+    Raises:
+        DocumentError: it is not TOML in UTF-8, too long, or nested too deeply.
+    """
+    try:
+        return parse_toml(data.decode(), longest)
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        why = str(error)
+        raise DocumentError(
+            f"{what} is not valid TOML", f"{why[:1].upper()}{why[1:]}.", remedy
+        ) from error
 
 
 def parse_toml(text: str, longest: int = _LONGEST_DOCUMENT) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import check_enclave_name, check_namespace, expression_problem, is_expression
 from sros_tool.policy.document import PolicyFiles, read_policy
 from sros_tool.policy.minimize import MinimizedPolicy
-from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Source
+from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Source, with_profiles
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.placeholders import Parts, fill, has_placeholder, parts_of, placeholders_of
 from sros_tool.policy.rights import Right, Rules, parts, policy_rights, unfolded
@@ -124,7 +124,7 @@ class FleetPolicy(Mapping[str, Enclave]):
     def _expanded(self, path: str, enclave: Enclave, robot: Robot | None) -> Enclave:
         count = 0
 
-        def changed_profile(profile: Profile) -> Profile:
+        def filled(profile: Profile) -> Profile:
             nonlocal count
             ns, node = (self._one(text, robot) for text in (profile.ns, profile.node))
             if has_placeholder(profile.ns):
@@ -143,11 +143,7 @@ class FleetPolicy(Mapping[str, Enclave]):
                     groups.append(group)
             return replace(profile, ns=ns, node=node, groups=tuple(groups))
 
-        blocks = tuple(
-            replace(block, profiles=tuple(map(changed_profile, block.profiles)))
-            for block in enclave.profiles
-        )
-        return replace(enclave, path=path, profiles=blocks)
+        return replace(enclave.with_profiles(filled), path=path)
 
     def _one(self, text: str, robot: Robot | None) -> str:
         if robot is None or not has_placeholder(text):
@@ -246,18 +242,11 @@ def written(policy: Policy) -> Policy:
 
 
 def _renamed(policy: Policy, change: Callable[[str], str]) -> Policy:
-    def changed_profile(profile: Profile) -> Profile:
-        groups = (replace(one, names=tuple(map(change, one.names))) for one in profile.groups)
+    def renamed(profile: Profile) -> Profile:
+        groups = (replace(group, names=tuple(map(change, group.names))) for group in profile.groups)
         return replace(profile, ns=change(profile.ns), groups=tuple(groups))
 
-    def changed_enclave(enclave: Enclave) -> Enclave:
-        blocks = (
-            replace(one, profiles=tuple(map(changed_profile, one.profiles)))
-            for one in enclave.profiles
-        )
-        return replace(enclave, profiles=tuple(blocks))
-
-    return replace(policy, enclaves=tuple(map(changed_enclave, policy.enclaves)))
+    return with_profiles(policy, renamed)
 
 
 def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozenset[Right]:

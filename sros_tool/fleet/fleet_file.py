@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from shlex import quote
@@ -13,7 +12,7 @@ from typing import Any
 
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError
-from sros_tool.files import parse_toml
+from sros_tool.files import read_toml
 from sros_tool.fleet.enclaves import MAX_PATTERNS, pattern_problem, size_problem
 from sros_tool.fleet.inventory import SHOWN, connections, fleet_table, is_json
 from sros_tool.fleet.robots import (
@@ -39,10 +38,6 @@ _OF_ROBOT = "{robot}"
 """Stands for the name of a robot in the values of a group."""
 
 
-class FleetError(DocumentError):
-    """A value of a fleet file that is not valid."""
-
-
 def read_fleet(path: Path) -> Fleet:
     """Return the fleet in a TOML file, or in an inventory of Ansible in YAML or JSON.
 
@@ -60,10 +55,10 @@ def read_fleet(path: Path) -> Fleet:
         return _Reader(what, SHOWN).fleet(table)
     try:
         return parse_fleet(data, f"the fleet file '{path}'")
-    except FleetError as error:
+    except DocumentError as error:
         if ending == ".toml" or not _INI_HOST.search(data):
             raise
-        raise FleetError(
+        raise DocumentError(
             f"'{path}' is not a fleet file in TOML",
             "It looks like an inventory of Ansible in INI.",
             f"Convert it with `ansible-inventory -i {quote(str(path))} --list > hosts.json`, and "
@@ -94,12 +89,7 @@ def parse_fleet(data: bytes, what: str) -> Fleet:
     Raises:
         DocumentError: it is not TOML, or a value in it is not valid.
     """
-    try:
-        table = parse_toml(data.decode(), longest=MAX_BYTES)
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        why = str(error)
-        raise FleetError(f"{what} is not valid TOML", f"{why[:1].upper()}{why[1:]}.") from error
-    return _Reader(what).fleet(table)
+    return _Reader(what).fleet(read_toml(data, what, longest=MAX_BYTES))
 
 
 class _Reader:
@@ -214,11 +204,11 @@ class _Reader:
                 where = f"{at}.{_key(key)}" if at else _key(key)
                 raise self._error(f"{where} is not a known key", f"There are {', '.join(known)}.")
 
-    def _refused(self, at: str, value: object, problem: str) -> FleetError:
+    def _refused(self, at: str, value: object, problem: str) -> DocumentError:
         return self._error(f"{at} has {_short(value)}, which is not valid", problem)
 
-    def _error(self, what: str, why: str = "", remedy: str = "") -> FleetError:
-        return FleetError(f"{self._what}: {what}", why, remedy)
+    def _error(self, what: str, why: str = "", remedy: str = "") -> DocumentError:
+        return DocumentError(f"{self._what}: {what}", why, remedy)
 
 
 def _short(value: object) -> str:

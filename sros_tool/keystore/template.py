@@ -6,7 +6,6 @@ A keystore keeps a copy of its settings (``sros.toml``), which apply to enclaves
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import timedelta
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, SrosError, UsageError
-from sros_tool.files import parse_toml, templates_dir
+from sros_tool.files import parse_toml, read_toml, templates_dir
 from sros_tool.names import check_enclave_name, expand, expression_problem
 from sros_tool.pki.token import refuse_pin
 from sros_tool.policy.patterns import covers, matches
@@ -109,13 +108,9 @@ def read_template(path: Path, what: str = "template", remedy: str = "") -> Templ
 
 def decode_template(data: bytes, path: Path, what: str, remedy: str) -> Template:
     """Return the template in the content of a file, as `read_template` does."""
+    table = read_toml(data, f"the {what} '{path}'", remedy)
     try:
-        return parse_template(data.decode(), path.stem)
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        why = str(error)
-        raise DocumentError(
-            f"the {what} '{path}' is not valid TOML", f"{why[:1].upper()}{why[1:]}.", remedy
-        ) from error
+        return _template(table, path.stem)
     except _TemplateError as error:
         raise DocumentError(f"the {what} '{path}' is not valid", f"{error}.", remedy) from error
 

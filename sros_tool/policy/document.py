@@ -44,6 +44,7 @@ from sros_tool.policy.model import (
     Profiles,
     Qualifier,
     Source,
+    with_profiles,
 )
 from sros_tool.policy.placeholders import (
     Parts,
@@ -859,19 +860,7 @@ def with_node_rights(policy: Policy, folder: Path) -> Policy:
                 added.append(Group(group.kind, group.rights, lacking, group.protect))
         return replace(profile, groups=(*profile.groups, *added))
 
-    return replace(
-        policy,
-        enclaves=tuple(
-            replace(
-                enclave,
-                profiles=tuple(
-                    replace(block, profiles=tuple(map(completed, block.profiles)))
-                    for block in enclave.profiles
-                ),
-            )
-            for enclave in policy.enclaves
-        ),
-    )
+    return with_profiles(policy, completed)
 
 
 class _EarlierReader(_Reader):

@@ -368,13 +368,7 @@ def _narrowed_enclave(
     relative, private or absolute.  Profiles without a rule stay.
     """
     pending = dict(replacements)
-    blocks = []
-    for block in enclave.profiles:
-        profiles = tuple(
-            _profile(enclave.path, profile, kept, pending) for profile in block.profiles
-        )
-        blocks.append(replace(block, profiles=profiles))
-    return replace(enclave, profiles=tuple(blocks))
+    return enclave.with_profiles(lambda profile: _profile(enclave.path, profile, kept, pending))
 
 
 def _profile(

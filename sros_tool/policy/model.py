@@ -111,6 +111,13 @@ class Enclave:
         """Return every profile of the enclave, in order."""
         return tuple(profile for block in self.profiles for profile in block.profiles)
 
+    def with_profiles(self, change: Callable[[Profile], Profile]) -> Enclave:
+        """Return the enclave with every profile replaced by what ``change`` returns for it."""
+        blocks = (
+            replace(block, profiles=tuple(map(change, block.profiles))) for block in self.profiles
+        )
+        return replace(self, profiles=tuple(blocks))
+
 
 @dataclass(frozen=True, slots=True)
 class Policy:
@@ -141,20 +148,21 @@ class Policy:
         )
 
 
+def with_profiles(policy: Policy, change: Callable[[Profile], Profile]) -> Policy:
+    """Return the policy with every profile replaced by what ``change`` returns for it."""
+    return replace(
+        policy, enclaves=tuple(enclave.with_profiles(change) for enclave in policy.enclaves)
+    )
+
+
 def with_groups(policy: Policy, change: Callable[[Group, Profile], Iterable[Group]]) -> Policy:
     """Return the policy with every group replaced by those that ``change`` returns for it."""
 
-    def changed_profile(profile: Profile) -> Profile:
+    def with_new_groups(profile: Profile) -> Profile:
         groups = tuple(new for group in profile.groups for new in change(group, profile))
         return replace(profile, groups=groups)
 
-    def changed_enclave(enclave: Enclave) -> Enclave:
-        blocks = (
-            replace(b, profiles=tuple(map(changed_profile, b.profiles))) for b in enclave.profiles
-        )
-        return replace(enclave, profiles=tuple(blocks))
-
-    return replace(policy, enclaves=tuple(map(changed_enclave, policy.enclaves)))
+    return with_profiles(policy, with_new_groups)
 
 
 # ── stated protection ─────────────────────────────────────────────────────────────────────────

@@ -15,14 +15,13 @@ by its class.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 from sros_tool.errors import DocumentError
-from sros_tool.files import parse_toml
+from sros_tool.files import read_toml
 from sros_tool.names import expression_problem, is_expression
 from sros_tool.policy.model import RIGHTS, Source
 from sros_tool.policy.protection import Level
@@ -224,14 +223,8 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
     Raises:
         DocumentError: a part of it is not valid.
     """
-    try:
-        text = data.decode()
-        document = parse_toml(text)
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        why = str(error)
-        raise DocumentError(
-            f"the requirements file '{file}' is not valid TOML", f"{why[:1].upper()}{why[1:]}."
-        ) from error
+    document = read_toml(data, f"the requirements file '{file}'")
+    text = data.decode()
     places = _places(text)
     tables: list[tuple[int, _Table]] = []
     for kind, found in document.items():

@@ -41,7 +41,6 @@ from __future__ import annotations
 
 import difflib
 import re
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -62,7 +61,7 @@ from sros_tool.demo.scenarios.model import (
 )
 from sros_tool.demo.scenarios.policies import check_topic
 from sros_tool.errors import DocumentError, SrosError
-from sros_tool.files import parse_toml
+from sros_tool.files import read_toml
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
@@ -123,14 +122,9 @@ def read_scenario(path: Path) -> Scenario:
     Raises:
         DocumentError: the file is not a valid scenario; the message has the line.
     """
-    try:
-        text = read_bytes(path, "scenario").decode()
-        data = parse_toml(text)
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise DocumentError(
-            f"the scenario '{path}' is not valid TOML", f"{error}.", "Correct the file."
-        ) from error
-    return _scenario(_Table(path, text.splitlines(), "", 0, data))
+    content = read_bytes(path, "scenario")
+    data = read_toml(content, f"the scenario '{path}'", "Correct the file.")
+    return _scenario(_Table(path, content.decode().splitlines(), "", 0, data))
 
 
 class _Table(NamedTuple):

@@ -133,8 +133,4 @@ def _with_topic(enclave: Enclave, topic: str | None, before: str = _POLICY_TOPIC
         groups = (of_group(group) for group in profile.groups)
         return replace(profile, groups=tuple(group for group in groups if group is not None))
 
-    blocks = (
-        replace(block, profiles=tuple(of_profile(profile) for profile in block.profiles))
-        for block in enclave.profiles
-    )
-    return replace(enclave, profiles=tuple(blocks))
+    return enclave.with_profiles(of_profile)
