@@ -146,9 +146,9 @@ class UserKeystore(NamedTuple):
         """Return the enclave of a row whose attacker is the very enclave that it competes with."""
         attackers, others = (
             {
-                (each.role, self.cast.get(each.identity.enclave, ""))
-                for each in row.parties
-                if each.identity.keystore is OWN and each.intruder is intruder
+                (party.role, self.cast.get(party.identity.enclave, ""))
+                for party in row.parties
+                if party.identity.keystore is OWN and party.intruder is intruder
             }
             for intruder in (True, False)
         )
@@ -160,7 +160,7 @@ class UserKeystore(NamedTuple):
         ``topic`` is the attacked ROS topic.  Nobody else takes part then: the success proves
         itself, and a second server would answer in the attacker's place.
         """
-        attacker = next((each for each in row.parties if each.intruder), None)
+        attacker = next((party for party in row.parties if party.intruder), None)
         if row.expected is not RowStatus.REFUSED or attacker is None:
             return row
         enclave = self.cast.get(attacker.identity.enclave, "")
@@ -172,7 +172,7 @@ class UserKeystore(NamedTuple):
         expressions = expressions_of(self.grants[enclave], right, name)
         if not all(expressions):
             return row
-        wild = next((f" by {each}" for each in expressions if is_wild(each)), "")
+        wild = next((f" by {expression}" for expression in expressions if is_wild(expression)), "")
         claim = row.claims[0]
         success = STATUS_OF[claim.relation, True]
         return replace(
@@ -180,7 +180,7 @@ class UserKeystore(NamedTuple):
             expected=success,
             mechanism="its signed permissions allow it",
             parties=tuple(
-                each for each in row.parties if each.name in (claim.subject, claim.talker)
+                party for party in row.parties if party.name in (claim.subject, claim.talker)
             ),
             claims=(claim.expecting(success),),
             controls=(),
@@ -296,9 +296,9 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
     newest = _content(keystore.root / CRL)
     for name in keystore.names:
         state = keystore.enclave(name, now=now, domain=domain)
-        faults = [each for each in state.problems if each.fault is not Fault.REVOKED]
+        faults = [problem for problem in state.problems if problem.fault is not Fault.REVOKED]
         own = len(faults) < len(state.problems)
-        if any(each.fault in (Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE) for each in faults):
+        if any(fault.fault in (Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE) for fault in faults):
             unreadable.append(name)
         elif KEY_FILE not in state.files and (state.key_on_robot or state.token):
             elsewhere.append(name)
@@ -327,9 +327,9 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
 
 def _revoked_serials(keystore: Keystore) -> frozenset[int]:
     """Return the serial numbers that the ledger or the revocation list names as revoked."""
-    entries = (each for each in keystore.ledger.entries if each.what == "revocation")
+    entries = (entry for entry in keystore.ledger.entries if entry.what == "revocation")
     listed = keystore.revocation_list.revoked if keystore.revocation_list else ()
-    return frozenset({*(int(each.serial, 16) for each in entries), *(e.serial for e in listed)})
+    return frozenset({*(int(entry.serial, 16) for entry in entries), *(e.serial for e in listed)})
 
 
 def _content(path: Path) -> bytes:

@@ -43,7 +43,7 @@ class Diagnosis(NamedTuple):
     @property
     def ros(self) -> Stack | None:
         """The RMW that ROS nodes use here, or None if no RMW is installed."""
-        return next((each for each in self.stacks if each.kind == "rmw" and each.present), None)
+        return next((stack for stack in self.stacks if stack.kind == "rmw" and stack.present), None)
 
     @property
     def ros_enforces(self) -> bool | None:
@@ -62,7 +62,7 @@ class Diagnosis(NamedTuple):
         """What enforces security here and what does not, as sentences."""
         if not self.enforces:
             return f"Nothing here enforces DDS Security. {self.advice}"
-        named = " and ".join(each.name for each in self.stacks if each.enforces)
+        named = " and ".join(stack.name for stack in self.stacks if stack.enforces)
         able = f"DDS Security can be enforced here, by {named}"
         ros = self.ros
         if ros is None:
@@ -168,7 +168,7 @@ def security_provider(environment: Mapping[str, str]) -> SecurityProvider | None
         )
         names = [str(each) for each in json.loads(ended.stdout)]
         if names:
-            hidden = {each for each in names if each != names[-1] and each not in _OURS}
+            hidden = {name for name in names if name != names[-1] and name not in _OURS}
             return SecurityProvider(names[-1], tuple(sorted(hidden)))
     return None
 

@@ -471,7 +471,7 @@ def _outdated_lists(copy: KeystoreCopy) -> dict[Path, bytes]:
     Who did not get the last list will not get the next one, either.
     """
     newest = copy.root / CRL
-    revoked = any(each.what == "revocation" for each in read_ledger(copy.root).entries)
+    revoked = any(entry.what == "revocation" for entry in read_ledger(copy.root).entries)
     if not revoked and not newest.exists():
         return {}
     paths = [copy.folder(part) / CRL_FILE for part in copy.cast]

@@ -41,7 +41,9 @@ def _allowing(grant: Grant, verb: str, topic: str) -> str:
     own name comes first.  A topic that no rule names is denied.
     """
     for rule in grant.rules:
-        fitting = [each for each in _expressions(rule, verb) if matches(each, topic)]
+        fitting = [
+            expression for expression in _expressions(rule, verb) if matches(expression, topic)
+        ]
         if fitting:
             return (topic if topic in fitting else fitting[0]) if rule.allow else ""
     return ""
@@ -61,15 +63,16 @@ def expressions_of(grant: Grant, right: str, name: str) -> tuple[str, ...]:
     """Return the expression of `_allowing` for each DDS topic that a right on a ROS name needs."""
     topics = dds_names(right, name)
     return (
-        *(_allowing(grant, "publish", each) for each in topics.publish),
-        *(_allowing(grant, "subscribe", each) for each in topics.subscribe),
+        *(_allowing(grant, "publish", topic) for topic in topics.publish),
+        *(_allowing(grant, "subscribe", topic) for topic in topics.subscribe),
     )
 
 
 def may(grant: Grant, right: str, name: str, *, named: bool = False) -> bool:
     """Return whether a grant allows a right on a ROS name; with ``named``, without wildcards."""
     return all(
-        each and not (named and is_wild(each)) for each in expressions_of(grant, right, name)
+        expression and not (named and is_wild(expression))
+        for expression in expressions_of(grant, right, name)
     )
 
 
@@ -111,9 +114,9 @@ def is_node_allowed(grant: Grant, node: str) -> bool:
     """Return whether a grant allows all standard services of the node ``node`` (absolute)."""
     names = (dds_names("reply", f"{node}/{service}") for service in NODE_SERVICES)
     return all(
-        all(allows(grant, "publish", topic) for topic in each.publish)
-        and all(allows(grant, "subscribe", topic) for topic in each.subscribe)
-        for each in names
+        all(allows(grant, "publish", topic) for topic in name.publish)
+        and all(allows(grant, "subscribe", topic) for topic in name.subscribe)
+        for name in names
     )
 
 

@@ -295,8 +295,8 @@ def _summary_cast(members: Sequence[CastMember]) -> list[str]:
         "| --- | --- | --- | --- |",
     ]
     lines += [
-        f"| {each.part} | {each.enclave} | {', '.join(each.nodes)} | {each.why} |"
-        for each in members
+        f"| {member.part} | {member.enclave} | {', '.join(member.nodes)} | {member.why} |"
+        for member in members
     ]
     return [*lines, ""]
 

@@ -318,7 +318,7 @@ def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Findi
         return finding
     if claim.evidence in finding.detail:
         return finding
-    outputs = [(each.name, record.parties[each.name].output) for each in record.row.parties]
+    outputs = [(party.name, record.parties[party.name].output) for party in record.row.parties]
     lines = ((name, line) for name, output in outputs for line in output.splitlines())
     found = next(((name, line) for name, line in lines if claim.evidence in line), None)
     if found is None:

@@ -182,7 +182,7 @@ def mapped_segments(process: int) -> frozenset[Path]:
     except OSError:
         return frozenset()
     names = (line.split(maxsplit=5)[5:] for line in lines)
-    return frozenset(Path(each[0]) for each in names if each and each[0].startswith(_SHARED_MEMORY))
+    return frozenset(Path(name[0]) for name in names if name and name[0].startswith(_SHARED_MEMORY))
 
 
 def shared_memory(texts: Mapping[str, str], segments: Collection[Path]) -> dict[str, int]:

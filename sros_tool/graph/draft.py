@@ -258,7 +258,7 @@ def _with_includes(
             continue
         if place in known:
             text.put(element.inner, _in_front(profile, element, text))
-        elif all(rules.allow(profile.enclave, each.right, each.name) for each in profile.rights):
+        elif all(rules.allow(profile.enclave, right.right, right.name) for right in profile.rights):
             text.put(element.inner, _inside(profile, element, text), element.close)
         else:
             continue

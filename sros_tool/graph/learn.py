@@ -94,17 +94,21 @@ class Learned:
     def flat(self) -> Learned:
         """Return the same rights without includes."""
         profiles = (
-            replace(each, includes=(), groups=groups_of(each.rights, each.ns, each.node))
-            for each in self.profiles
+            replace(
+                profile, includes=(), groups=groups_of(profile.rights, profile.ns, profile.node)
+            )
+            for profile in self.profiles
         )
         return replace(self, profiles=tuple(profiles))
 
     def policy(self) -> Policy:
         """Return the learned rights as a policy without includes."""
         enclaves: dict[str, list[Profile]] = {}
-        for each in self.profiles:
-            groups = groups_of(each.rights, each.ns, each.node)
-            enclaves.setdefault(each.enclave, []).append(Profile(each.ns, each.node, groups))
+        for profile in self.profiles:
+            groups = groups_of(profile.rights, profile.ns, profile.node)
+            enclaves.setdefault(profile.enclave, []).append(
+                Profile(profile.ns, profile.node, groups)
+            )
         return Policy(
             tuple(Enclave(path, (Profiles(tuple(found)),)) for path, found in enclaves.items())
         )
@@ -161,17 +165,17 @@ def _rights_of(node: ObservedNode, notes: _Notes) -> list[tuple[_Place, frozense
         notes.add("changing-name", f"{node.fqn} as {name}")
     if len(enclaves) > 1:
         notes.add("ambiguous", f"{node.fqn} in {' or '.join(enclaves)}")
-    folded = fold(each for each in node.endpoints if _is_plain(each, node, notes))
+    folded = fold(endpoint for endpoint in node.endpoints if _is_plain(endpoint, node, notes))
     for half in folded.halves:
         notes.add("half-service", f"{node.fqn} {half.topic}")
     for foreign in folded.foreign:
         notes.add("no-ros-name", f"{node.fqn} {foreign.topic}")
     own, stable = expand("~/", node.ns, node.name), expand("~/", node.ns, name)
     rights = set()
-    for each in folded.rights:
-        _note_about(each, node, notes)
-        renamed = stable + each.name[len(own) :] if each.name.startswith(own) else each.name
-        rights.add(NodeRight(each.right, renamed))
+    for right in folded.rights:
+        _note_about(right, node, notes)
+        renamed = stable + right.name[len(own) :] if right.name.startswith(own) else right.name
+        rights.add(NodeRight(right.right, renamed))
     return [((enclave, node.ns, name), frozenset(rights)) for enclave in enclaves]
 
 
@@ -239,7 +243,9 @@ def fold(endpoints: Iterable[Endpoint]) -> Folded:
 
 
 def _criteria(endpoints: Iterable[Endpoint], direction: str) -> tuple[Criteria, ...]:
-    topics = tuple(sorted(each.topic for each in endpoints if each.direction == direction))
+    topics = tuple(
+        sorted(endpoint.topic for endpoint in endpoints if endpoint.direction == direction)
+    )
     return (Criteria(topics),) if topics else ()
 
 
@@ -384,7 +390,7 @@ def common_parts(folder: Path, shipped: Path) -> CommonParts:
 
 
 def _expanded(rights: Iterable[NodeRight], ns: str, node: str) -> frozenset[NodeRight]:
-    return frozenset(NodeRight(each.right, expand(each.name, ns, node)) for each in rights)
+    return frozenset(NodeRight(right.right, expand(right.name, ns, node)) for right in rights)
 
 
 def _differs(folder: Path, path: str, needed: Mapping[str, bytes]) -> bool:
@@ -502,17 +508,17 @@ class News:
     def lines(self, observation: Observation) -> list[str]:
         """Return a line for each node and each right that was not reported before."""
         lines = []
-        for each in learn(observation).profiles:
-            place = each.enclave, each.ns, each.node
-            name = f"{each.ns.rstrip('/')}/{each.node}"
+        for profile in learn(observation).profiles:
+            place = profile.enclave, profile.ns, profile.node
+            name = f"{profile.ns.rstrip('/')}/{profile.node}"
             if place not in self._nodes:
                 self._nodes.add(place)
-                lines.append(f"new: {name} ({each.enclave})")
-            for right in sorted(each.rights):
-                plain = NodeRight(right.right, written(right.name, each.ns, each.node))
+                lines.append(f"new: {name} ({profile.enclave})")
+            for right in sorted(profile.rights):
+                plain = NodeRight(right.right, written(right.name, profile.ns, profile.node))
                 if plain not in self._ordinary and (*place, right) not in self._rights:
                     self._rights.add((*place, right))
-                    lines.append(f"new: {name} ({each.enclave}) {right.right} {right.name}")
+                    lines.append(f"new: {name} ({profile.enclave}) {right.right} {right.name}")
         return lines
 
 
@@ -585,9 +591,9 @@ def _notes(
             f"name of one of them: {listed(sorted(several), '; ')}",
         )
     users: dict[str, set[str]] = {}
-    for each in nodes:
-        for enclave in each.enclaves:
-            users.setdefault(enclave, set()).add(each.participant)
+    for node in nodes:
+        for enclave in node.enclaves:
+            users.setdefault(enclave, set()).add(node.participant)
     shared = [
         f"{name} ({len(users[name])} processes)"
         for name in sorted(set(names.values()))

@@ -144,4 +144,4 @@ def _text(value: object) -> str:
 
 
 def _topics(node: ObservedNode, direction: str) -> list[str]:
-    return sorted(each.topic for each in node.endpoints if each.direction == direction)
+    return sorted(endpoint.topic for endpoint in node.endpoints if endpoint.direction == direction)

@@ -231,9 +231,9 @@ class Snapshot:
     @property
     def gone(self) -> frozenset[str]:
         """The full names of the nodes that were seen and are no longer there."""
-        stayed = {(each.participant, each.fqn) for each in self.observation.nodes}
+        stayed = {(node.participant, node.fqn) for node in self.observation.nodes}
         return frozenset(
-            each.fqn for each in self.everything.nodes if (each.participant, each.fqn) not in stayed
+            node.fqn for node in self.everything.nodes if (node.participant, node.fqn) not in stayed
         )
 
 

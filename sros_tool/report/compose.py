@@ -143,8 +143,8 @@ def with_requirements(
     """
     broken = {
         (use.enclave, use.kind, use.name, use.right): use
-        for each in requirements.violations
-        for use in each.uses
+        for violation in requirements.violations
+        for use in violation.uses
     }
     edges, found = [], set()
     for edge in picture.edges:
@@ -162,7 +162,7 @@ def with_requirements(
         Name(kind, name, namespace_of(name), protection_of(governance, kind, name))
         for kind, name in new
     ]
-    paths = {each.path for each in picture.enclaves}
+    paths = {enclave.path for enclave in picture.enclaves}
     return replace(
         picture,
         requirements=requirements,
@@ -182,7 +182,7 @@ def union(sources: Sequence[PictureSource]) -> PictureSource:
         SourceTitle(title, "observation"),
         frozenset(right for source in sources for right in source.rights),
         {path: tuple(sorted(found)) for path, found in nodes.items()},
-        findings=tuple(each for source in sources for each in source.findings),
+        findings=tuple(finding for source in sources for finding in source.findings),
     )
 
 
@@ -216,8 +216,10 @@ def _picture(
             for kind, name in names
         ),
         edges=edges,
-        validities=tuple(sorted({each for source in sources for each in source.validities})),
-        findings=tuple(dict.fromkeys(each for source in sources for each in source.findings)),
+        validities=tuple(
+            sorted({validity for source in sources for validity in source.validities})
+        ),
+        findings=tuple(dict.fromkeys(finding for source in sources for finding in source.findings)),
     )
 
 
@@ -253,7 +255,7 @@ def _enclaves(
     known: Known,
     context: Context,
 ) -> tuple[PicturedEnclave, ...]:
-    described = {each.path: each for source in sources for each in source.enclaves}
+    described = {enclave.path: enclave for source in sources for enclave in source.enclaves}
     statements: dict[str, list[Statement]] = defaultdict(list)
     for right in sorted(stated, key=order):
         reaches = len(known.reached(right.kind, right.name))
@@ -411,7 +413,7 @@ class Known:
 
     def _matching(self, kind: str, expression: str) -> Iterable[str]:
         if kind == "actions":
-            return sorted(each for each in self.actions if matches(expression, each))
+            return sorted(action for action in self.actions if matches(expression, action))
         names, prefix = self._names.get(kind, ()), literal_prefix(expression)
         found = []
         for name in names[bisect_left(names, prefix) :]:
@@ -502,7 +504,7 @@ def _action_edges(
     remaining = dict(members)
     for right, needed in _WHOLE.items():
         if needed <= members.keys():
-            whole = {each for part in needed for each in members[part]}
+            whole = {member for part in needed for member in members[part]}
             yield Edge(enclave, "actions", action, right, qualifier, _by(whole, action=True))
             for part in needed:
                 remaining.pop(part, None)
@@ -519,7 +521,7 @@ def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
     if "" in names:
         return ()
     return tuple(
-        sorted({each.rpartition(ACTION_SEPARATOR)[0] or each if action else each for each in names})
+        sorted({name.rpartition(ACTION_SEPARATOR)[0] or name if action else name for name in names})
     )
 
 
@@ -566,8 +568,9 @@ class _Demanded:
 
     def __init__(self, stated: Iterable[StatedProtection]) -> None:
         found: dict[WireLevel, list[str]] = defaultdict(list)
-        for each in stated:
-            found[WireLevel(each.word)] += protected_topics(each.kind, each.name)
+        for protection in stated:
+            topics = protected_topics(protection.kind, protection.name)
+            found[WireLevel(protection.word)] += topics
         self._names = {level: Names(topics) for level, topics in found.items()}
 
     def protection(self, kind: str, name: str) -> Protection | None:

@@ -129,9 +129,10 @@ def _texts(scene: Scene, card: Card) -> Iterable[str]:
         yield KIND_NAMES[card.kind] + _protected(card)
     yield from card.members if len(card.members) <= len(card.lines) else card.lines
     yield from card.notes
-    for each in scene.onlookers:
-        if each.tag in card.tags:
-            yield f"{each.tag}: {ONLOOKERS[each.right]} {each.enclave.removeprefix(':')}"
+    for onlooker in scene.onlookers:
+        if onlooker.tag in card.tags:
+            enclave = onlooker.enclave.removeprefix(":")
+            yield f"{onlooker.tag}: {ONLOOKERS[onlooker.right]} {enclave}"
 
 
 def _protected(card: Card) -> str:

@@ -104,7 +104,7 @@ class _Draft:
 
     def __init__(self, picture: Picture, flow: FocusFlow, hops: int) -> None:
         self._picture, self._flow, self._hops = picture, flow, hops
-        self._groups = {each.path: each.group for each in picture.enclaves}
+        self._groups = {enclave.path: enclave.group for enclave in picture.enclaves}
         self._further = tuple(
             tuple(sorted(path for path, far in side.items() if far > hops))
             for side in (flow.before, flow.after)

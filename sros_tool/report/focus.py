@@ -64,7 +64,7 @@ def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[
     names = {(edge.kind, edge.name) for edge in edges}
     return replace(
         picture,
-        enclaves=tuple(each for each in picture.enclaves if each.path in enclaves),
+        enclaves=tuple(enclave for enclave in picture.enclaves if enclave.path in enclaves),
         names=tuple(each for each in picture.names if (each.kind, each.name) in names),
         edges=edges,
         findings=tuple(e for e in picture.findings if not e.enclave or e.enclave in enclaves),
@@ -184,7 +184,7 @@ class _System:
 
     def __init__(self, picture: Picture, sources: Sequence[PictureSource]) -> None:
         self._picture = picture
-        enclaves = {each.path for each in picture.enclaves}
+        enclaves = {enclave.path for enclave in picture.enclaves}
         self._rights = [
             right for source in sources for right in source.rights if right.enclave in enclaves
         ]
@@ -202,7 +202,7 @@ class _System:
             unguarded=opened,
             everybody=everybody,
         )
-        self._known = {(each.kind, each.name) for each in picture.names}
+        self._known = {(name.kind, name.name) for name in picture.names}
         self._paths: list[HopPath] = []
 
     def meant(self, word: str) -> Iterator[tuple[str, str]]:
@@ -210,15 +210,15 @@ class _System:
 
         An exact name that no right states can be meant if a wildcard matches it.
         """
-        enclaves = [each.path for each in self._picture.enclaves]
+        enclaves = [enclave.path for enclave in self._picture.enclaves]
         found = [ENCLAVE] * (word in enclaves)
-        found += [each.kind for each in self._picture.names if each.name == word]
+        found += [name.kind for name in self._picture.names if name.name == word]
         if not found:
             found = [
                 kind for kind in _VERBS if any(_meets(each, kind, word) for each in self._rights)
             ]
         if not found:
-            known = (*enclaves, *(each.name for each in self._picture.names))
+            known = (*enclaves, *(name.name for name in self._picture.names))
             meant = likely_names(word, known)
             raise UsageError(
                 f"no name and no enclave in '{self._picture.title}' is called {word!r}",
@@ -340,7 +340,7 @@ def _sentence(
     if open_to_all or not senders:
         return text
     them = f"the {sender}" if len(senders) == 1 else f"these {sender}s"
-    near = sum(each.hops == 2 for each in influencing)
+    near = sum(influence.hops == 2 for influence in influencing)
     if not influencing:
         return f"{text}; no other enclave influences {them}"
     s = "s" if near == 1 else ""

@@ -90,9 +90,9 @@ class Folding(NamedTuple):
         cards = []
         for card in scene.cards:
             if card.kind:
-                found = [self.names.get((card.kind, each), (each,)) for each in card.members]
+                found = [self.names.get((card.kind, member), (member,)) for member in card.members]
             else:
-                found = [self.enclaves.get(each, (each,)) for each in card.members]
+                found = [self.enclaves.get(member, (member,)) for member in card.members]
             members = tuple(dict.fromkeys(each for one in found for each in one))
             cards.append(replace(card, members=members))
         return replace(
@@ -102,7 +102,7 @@ class Folding(NamedTuple):
         )
 
     def _titled(self, frame: Frame) -> Frame:
-        equal = next((each for each in self.equal if each.label in frame.title), None)
+        equal = next((units for units in self.equal if units.label in frame.title), None)
         if equal is None:
             return frame
         whole, short = equal.title, f"{len(equal.members)} equal {equal.what}s"
@@ -168,7 +168,7 @@ class _Draft:
     def __init__(self, picture: Picture, robots: Mapping[str, Robot]) -> None:
         self._picture = picture
         self._units = list(_robots(picture, robots) if robots else _guessed(picture))
-        self._names_of = {(each.kind, each.name): each for each in picture.names}
+        self._names_of = {(name.kind, name.name): name for name in picture.names}
         self._find_words()
 
     def _find_words(self) -> None:
@@ -219,9 +219,9 @@ class _Draft:
 
     def _has_marks(self) -> bool:
         texts = (
-            *(each.path for each in self._picture.enclaves),
-            *(each.group for each in self._picture.enclaves),
-            *(each.name for each in self._picture.names),
+            *(enclave.path for enclave in self._picture.enclaves),
+            *(enclave.group for enclave in self._picture.enclaves),
+            *(name.name for name in self._picture.names),
         )
         return any(mark in text for text in texts for mark in _MARKS)
 
@@ -274,9 +274,9 @@ class _Draft:
 
         Two that have the same kind are the same but for the units.
         """
-        alarming = {each.enclave for each in self._picture.findings if each.severity == "error"} | {
-            each.path for each in self._picture.enclaves if each.problems
-        }
+        alarming = {
+            finding.enclave for finding in self._picture.findings if finding.severity == "error"
+        } | {each.path for each in self._picture.enclaves if each.problems}
         roles = _roles(self._picture)
         targets = {(each.kind, each.name) for each in self._picture.focus}
         owners = {each.path: self._owner(each.path) for each in self._picture.enclaves}
@@ -361,13 +361,13 @@ class _Draft:
     def _named_by(self, families: Container[int]) -> Counter[int]:
         """Return how many other units of its family name a unit."""
         pairs = {
-            (each, owner)
+            (unit, owner)
             for _kind, units, what in self._seen
             if isinstance(what, Edge) and (owner := self._of.get(what.enclave)) is not None
-            for each in units
-            if each != owner
-            and self._units[each].family == self._units[owner].family
-            and self._units[each].family in families
+            for unit in units
+            if unit != owner
+            and self._units[unit].family == self._units[owner].family
+            and self._units[unit].family in families
         }
         return Counter(each for each, _ in pairs)
 
@@ -503,10 +503,10 @@ class _Draft:
         return self._alike[kind, self._form(name)]
 
     def _form(self, text: _Text) -> object:
-        return text.form, tuple(self._symbols[each] for each in text.units)
+        return text.form, tuple(self._symbols[unit] for unit in text.units)
 
     def _folded_names(self, edges: Sequence[Edge]) -> Iterator[Name]:
-        for kind, shown in sorted({(each.kind, each.name) for each in edges}):
+        for kind, shown in sorted({(edge.kind, edge.name) for edge in edges}):
             real = self._names.get((kind, shown), (shown,))[0]
             if found := self._names_of.get((kind, real)):
                 yield replace(found, name=shown, namespace=namespace_of(shown))
@@ -619,10 +619,10 @@ def _robots(picture: Picture, robots: Mapping[str, Robot]) -> Iterator[_Unit]:
     """Yield the robots of a fleet, with those of their enclaves that are in the picture."""
     enclaves: dict[str, list[str]] = defaultdict(list)
     named = {}
-    for each in picture.enclaves:
-        if robot := robots.get(each.path):
+    for enclave in picture.enclaves:
+        if robot := robots.get(enclave.path):
             named[robot.name] = robot
-            enclaves[robot.name].append(each.path)
+            enclaves[robot.name].append(enclave.path)
     for name, robot in named.items():
         space = robot.namespace.rpartition("/")[2]
         values = (name, space) if space not in ("", name) else (name,)
@@ -631,7 +631,7 @@ def _robots(picture: Picture, robots: Mapping[str, Robot]) -> Iterator[_Unit]:
 
 def _guessed(picture: Picture) -> Iterator[_Unit]:
     """Yield namespaces or enclaves next to each other that hold the same enclaves, or nearly."""
-    waiting = [_by_first((each.path[1:], each.path) for each in picture.enclaves)]
+    waiting = [_by_first((enclave.path[1:], enclave.path) for enclave in picture.enclaves)]
     family = 0
     while waiting:
         children = waiting.pop()

@@ -194,7 +194,7 @@ def scenes_of(
     y and no frames, for formats that place cards themselves.  ``drawn_as`` are names to count in
     place of those that are drawn.
     """
-    groups = {each.path: each.group for each in picture.enclaves}
+    groups = {enclave.path: enclave.group for enclave in picture.enclaves}
     titles = sorted(set(groups.values()))
     essential = [edge for edge in picture.edges if not edge.common]
     if len(groups) <= _MOST_ENCLAVES or len(titles) < 2 or len(titles) > len(groups) // 2:
@@ -271,7 +271,7 @@ class _Draft:
     ) -> None:
         self._members = members
         self._everybody = everybody
-        self._groups = {each.path: each.group for each in picture.enclaves}
+        self._groups = {enclave.path: enclave.group for enclave in picture.enclaves}
         self._notes = enclave_notes(picture)
         bundles = fold(picture.names, edges, owner)
         self._looking = _onlookers(bundles)
@@ -465,7 +465,7 @@ def _own_text(own: Iterable[Bundle]) -> list[str]:
     lines = [f"{OWN} {', '.join(found[:2])}"]
     lines += [", ".join(found[2:])] if found[2:] else []
     sides = (Lack.SENDER, Lack.RECEIVER)
-    return [*lines, *(f"{lacks[each]} without a {each}" for each in sides if lacks[each])]
+    return [*lines, *(f"{lacks[side]} without a {side}" for side in sides if lacks[side])]
 
 
 def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -486,8 +486,9 @@ def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def enclave_notes(picture: Picture) -> Mapping[str, tuple[str, ...]]:
     """Map enclaves to what is noted on their cards."""
     return {
-        each.path: (each.note,) * bool(each.note) + ("never observed",) * (not each.observed)
-        for each in picture.enclaves
+        enclave.path: (enclave.note,) * bool(enclave.note)
+        + ("never observed",) * (not enclave.observed)
+        for enclave in picture.enclaves
     }
 
 

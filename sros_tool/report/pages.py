@@ -41,7 +41,7 @@ def render_page(
     ``now`` is the date of its findings, ``drawn`` the picture in which equal units are one.
     """
     script, style = _asset("view.js"), _asset("view.css")
-    origins = ", ".join(f"{each.kind} {each.title}" for each in picture.origins)
+    origins = ", ".join(f"{origin.kind} {origin.title}" for origin in picture.origins)
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
     return _document(
         f"{picture.title}: who may do what",
@@ -111,7 +111,7 @@ def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[s
         "headlines": picture.headlines,
         "overlay": as_plain(picture.overlay),
         "of_every_node": OF_EVERY_NODE,
-        "enclaves": [_enclave(each) for each in picture.enclaves],
+        "enclaves": [_enclave(enclave) for enclave in picture.enclaves],
         "bundles": [_bundle(each) for each in fold(picture.names, picture.edges, apart=True)],
         "scenes": [_scene(each) for each in scenes],
         "equal": as_plain(picture.equal),
@@ -124,7 +124,11 @@ def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[s
 
 def _enclave(enclave: PicturedEnclave) -> dict[str, Any]:
     """Return an enclave as JSON, with only those statements that have wildcards."""
-    wild = [_with_deny(as_plain(each)) for each in enclave.statements if is_expression(each.name)]
+    wild = [
+        _with_deny(as_plain(statement))
+        for statement in enclave.statements
+        if is_expression(statement.name)
+    ]
     return {**as_plain(enclave), "statements": wild}
 
 

@@ -383,7 +383,7 @@ class Requirements(NamedTuple):
             return (holds,)
         number = len(self.violations)
         more = (f"{number - _SAID} more do not hold",) if number > _SAID else ()
-        said = (f"Violated: {each.text}" for each in self.violations[:_SAID])
+        said = (f"Violated: {violation.text}" for violation in self.violations[:_SAID])
         return (*said, *more, *((holds,) if self.hold else ()))
 
 
@@ -469,9 +469,9 @@ class Picture:
     def headlines(self) -> tuple[str, ...]:
         """The answers that the picture gives, as sentences without a full stop."""
         found = self.requirements.sentences() if self.requirements else ()
-        equal = (f"{each.title} are drawn as one" for each in self.equal)
+        equal = (f"{units.title} are drawn as one" for units in self.equal)
         more = len(self.different) - _SAID
-        different = [each.sentence() for each in self.different[:_SAID]]
+        different = [unit.sentence() for unit in self.different[:_SAID]]
         different += [f"{more} more differ"] if more > 0 else []
         return (*(each.sentence for each in self.focus), *found, *equal, *different)
 

@@ -83,8 +83,10 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
     return replace(
         with_findings(replace(source, findings=()), path, source.findings),
         enclaves=tuple(
-            replace(each, problems=tuple(_without_path(text, places) for text in each.problems))
-            for each in source.enclaves
+            replace(
+                enclave, problems=tuple(_without_path(text, places) for text in enclave.problems)
+            )
+            for enclave in source.enclaves
         ),
     )
 
@@ -96,9 +98,11 @@ def with_findings(
 
     A finding keeps its enclave only if the source has an enclave of that name.
     """
-    known = {each.path for each in source.enclaves} | {each.enclave for each in source.rights}
+    known = {enclave.path for enclave in source.enclaves} | {
+        right.enclave for right in source.rights
+    }
     places = _places(path)
-    found = tuple(_without_paths(_placed(each, known), places) for each in findings)
+    found = tuple(_without_paths(_placed(finding, known), places) for finding in findings)
     return replace(source, findings=tuple(dict.fromkeys((*source.findings, *found))))
 
 

@@ -99,7 +99,7 @@ def render_svg(picture: Picture, scene: Scene) -> str:
     """Return the scene as an SVG document; the same scene gives the same bytes."""
     legend = list(_legend(picture, scene))
     used = _USE if picture.overlay and picture.overlay.kind == "use" else ""
-    said = [line for each in picture.headlines for line in _lines(f"{each}.", scene.width)]
+    said = [line for headline in picture.headlines for line in _lines(f"{headline}.", scene.width)]
     top = _HEAD + _SAID * len(said) + (8 if said else 0)
     height = scene.height + top + 16 + 20 * len(legend)
     lines = [
@@ -268,10 +268,10 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
     if scene.onlookers:
         yield _row(
             (
-                f'<text class="tag" x="4" y="0">{each.tag}</text>',
-                f"{ONLOOKERS[each.right]} {each.enclave.removeprefix(':')}",
+                f'<text class="tag" x="4" y="0">{onlooker.tag}</text>',
+                f"{ONLOOKERS[onlooker.right]} {onlooker.enclave.removeprefix(':')}",
             )
-            for each in scene.onlookers
+            for onlooker in scene.onlookers
         )
 
 
@@ -284,9 +284,9 @@ def _card_legend(picture: Picture, scene: Scene) -> Iterable[str]:
         rows.append((_BOX.format("lacking"), "nobody may send, or nobody may receive"))
     if rows:
         yield _row(rows)
-    for each in picture.equal[:_MOST_LABELS]:
-        of_each = f"each of {len(each.members)} {each.what}s, which are equal but for their names"
-        yield _row([("", f"{each.label}: {of_each}")])
+    for units in picture.equal[:_MOST_LABELS]:
+        of_each = f"each of {len(units.members)} {units.what}s, which are equal but for their names"
+        yield _row([("", f"{units.label}: {of_each}")])
     if any(word in line for word in OTHERS for card in scene.cards for line in card.lines):
         yield _row([("", f"{{1 {OTHERS[0]} …}}: such a name of another one of them")])
 

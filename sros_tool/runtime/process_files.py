@@ -73,12 +73,12 @@ class ProcessEnclave:
 
     def file(self, name: str) -> LoadedFile:
         """Return a file of the enclave by its name."""
-        return next((each for each in self.files if each.name == name), LoadedFile(name))
+        return next((file for file in self.files if file.name == name), LoadedFile(name))
 
     @property
     def lacking(self) -> tuple[str, ...]:
         """The names of the required files that are not there."""
-        there = {each.name for each in self.files if each.changed or each.problem}
+        there = {file.name for file in self.files if file.changed or file.problem}
         there |= {_KEY} if _KEY_ON_TOKEN in there else set()
         return tuple(each for each in ENCLAVE_FILES if each not in there)
 

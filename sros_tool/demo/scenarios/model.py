@@ -388,9 +388,11 @@ def joined(scenarios: Sequence[Scenario]) -> Scenario:
         ValueError: their enclaves or policies differ.
     """
     first = scenarios[0]
-    if any((each.cast, each.policy) != (first.cast, first.policy) for each in scenarios):
+    if any(
+        (scenario.cast, scenario.policy) != (first.cast, first.policy) for scenario in scenarios
+    ):
         raise ValueError("scenarios with other enclaves cannot run together")
-    return replace(first, rows=tuple(row for each in scenarios for row in each.rows))
+    return replace(first, rows=tuple(row for scenario in scenarios for row in scenario.rows))
 
 
 # ── words in which scenarios are written ───────────────────────────────────────────────────
@@ -426,8 +428,10 @@ def tries(attack: str, *rows: Row) -> tuple[Row, ...]:
             row,
             attack=attack,
             variants=tuple(
-                replace(each, instead=each.instead and replace(each.instead, attack=attack))
-                for each in row.variants
+                replace(
+                    variant, instead=variant.instead and replace(variant.instead, attack=attack)
+                )
+                for variant in row.variants
             ),
         )
         for row in rows

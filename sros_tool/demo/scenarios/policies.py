@@ -80,11 +80,13 @@ def attacked_policy(topic: str) -> Policy:
     enclave name contains the guest's.
     """
     talking = talking_policy(topic)
-    talker = next(each for each in _shipped_policy(_POLICY_FILE).enclaves if each.path == _TALKER)
+    talker = next(
+        enclave for enclave in _shipped_policy(_POLICY_FILE).enclaves if enclave.path == _TALKER
+    )
     guest = replace(_with_topic(talker, _GUEST_TOPIC), path=GUEST)
     guests = (guest, replace(_with_topic(talker, topic), path=f"{GUEST}/admin"))
     service = _shipped_policy("add_two_ints.xml").enclaves
-    allowed = tuple(each for each in talking.enclaves if not each.path.endswith(_WITHOUT))
+    allowed = tuple(enclave for enclave in talking.enclaves if not enclave.path.endswith(_WITHOUT))
     return replace(talking, enclaves=(*allowed, *guests, *service))
 
 
@@ -95,7 +97,7 @@ def zenoh_policy(topic: str, *, guest_talks: bool = False, silent: str = "") -> 
     ``silent`` may not use it.
     """
     attacked = attacked_policy(topic)
-    of = {each.path: each for each in attacked.enclaves}
+    of = {enclave.path: enclave for enclave in attacked.enclaves}
     if guest_talks:
         of[GUEST] = replace(of[GUEST], profiles=(*of[_TALKER].profiles, *of[_LISTENER].profiles))
     if silent:
@@ -116,7 +118,9 @@ def shipped_action_policy(_topic: str) -> Policy:
 def composed_policy(topic: str) -> Policy:
     """Return the shipped policies of a container, and of the nodes outside that it talks to."""
     talking = talking_policy(topic)
-    container = (_with_topic(each, topic) for each in _shipped_policy("composition.xml").enclaves)
+    container = (
+        _with_topic(enclave, topic) for enclave in _shipped_policy("composition.xml").enclaves
+    )
     service = shipped_service_policy(topic).enclaves
     return replace(talking, enclaves=(*talking.enclaves, *container, *service))
 

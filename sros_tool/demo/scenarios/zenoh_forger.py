@@ -314,7 +314,9 @@ def in_the_clear(copy: KeystoreCopy) -> None:
         del document["transport"]["link"]
         for side in ("listen", "connect"):
             endpoints = document[side]["endpoints"]
-            document[side]["endpoints"] = [each.replace("tls/", "tcp/") for each in endpoints]
+            document[side]["endpoints"] = [
+                endpoint.replace("tls/", "tcp/") for endpoint in endpoints
+            ]
 
     _edit_all(copy, change)
 
