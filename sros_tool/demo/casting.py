@@ -76,6 +76,7 @@ from sros_tool.keystore.template import Template
 from sros_tool.names import ACTION_SEPARATOR
 from sros_tool.pki.certificates import digest, fingerprints
 from sros_tool.topics import dds_names, service_of
+from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
 _RIGHTS = {
@@ -220,18 +221,18 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
     widest = dict(_widest(rights, cast, attacked, service))
     cast |= {part: enclave for part, (enclave, _) in widest.items()}
     return UserKeystore(
-        root,
-        template,
-        domains,
-        cast,
-        attacked,
-        service,
-        {name: rights[name] for name in cast.values()},
-        {part: why for part, (_, why) in widest.items()},
-        (*(row for part, row in WIDEST.items() if part in widest), *read.rows()),
-        len(keystore.names),
-        len(read.elsewhere),
-        tuple(read.not_tried(cast)),
+        root=root,
+        template=template,
+        domains=domains,
+        cast=cast,
+        topic=attacked,
+        service=service,
+        grants={name: rights[name] for name in cast.values()},
+        why={part: why for part, (_, why) in widest.items()},
+        rows=(*(row for part, row in WIDEST.items() if part in widest), *read.rows()),
+        enclaves=len(keystore.names),
+        elsewhere=len(read.elsewhere),
+        not_tried=tuple(read.not_tried(cast)),
     )
 
 
@@ -265,22 +266,17 @@ class _Enclaves(NamedTuple):
         if more > 0:
             yield f"{more} more enclaves with faulty or revoked files"
         if self.unreadable:
-            yield f"{_listed(self.unreadable)} with files that cannot be read"
+            yield f"{first_few(sorted(self.unreadable), 1)} with files that cannot be read"
         if self.without_list and cast["listener"] not in self.without_list:
-            yield f"{_listed(self.without_list)} without the newest revocation list"
+            yield f"{first_few(sorted(self.without_list), 1)} without the newest revocation list"
         if self.other_governance:
-            yield f"{_listed(self.other_governance)} with a governance of its own"
+            yield f"{first_few(sorted(self.other_governance), 1)} with a governance of its own"
 
     def faults_text(self) -> str:
         """Return a sentence on the first enclave that is left out for its files, or ""."""
         for name, why in self.faulty.items():
             return f" {name} is left out: {why}."
         return ""
-
-
-def _listed(names: frozenset[str] | tuple[str, ...]) -> str:
-    first, *others = sorted(names)
-    return f"{first} and {len(others)} more" if others else first
 
 
 def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
@@ -315,13 +311,15 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
                 without_list += [name] if not found or found != (newest or found) else []
     usual = Counter(governances.values()).most_common(1)
     return _Enclaves(
-        rights,
-        faulty,
-        revoked,
-        tuple(unreadable),
-        tuple(elsewhere),
-        frozenset(without_list),
-        tuple(name for name, found in governances.items() if found != usual[0][0]),
+        rights=rights,
+        faulty=faulty,
+        revoked=revoked,
+        unreadable=tuple(unreadable),
+        elsewhere=tuple(elsewhere),
+        without_list=frozenset(without_list),
+        other_governance=tuple(
+            name for name, governance in governances.items() if governance != usual[0][0]
+        ),
     )
 
 

@@ -168,20 +168,20 @@ def judge_row(record: RowRecord) -> RowResult:
     finding = _observe(record)
     row = record.row
     return RowResult(
-        row.name,
-        row.expected,
-        finding.status,
-        row.mechanism,
-        finding.detail,
-        record.domain,
-        round(record.seconds, 1),
-        row.attack,
-        row.removed,
-        row.open_because,
-        row.remedy,
-        row.accepted,
-        row.unaccepted,
-        record.applies,
+        name=row.name,
+        expected=row.expected,
+        observed=finding.status,
+        mechanism=row.mechanism,
+        detail=finding.detail,
+        domain=record.domain,
+        seconds=round(record.seconds, 1),
+        attack=row.attack,
+        removed=row.removed,
+        open_because=row.open_because,
+        remedy=row.remedy,
+        accepted=row.accepted,
+        unaccepted=row.unaccepted,
+        applies=record.applies,
     )
 
 

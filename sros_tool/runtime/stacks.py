@@ -18,7 +18,6 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, NamedTuple
@@ -58,8 +57,7 @@ class ProbeEnclave(NamedTuple):
     denied: str
 
 
-@dataclass(frozen=True)
-class Stack:
+class Stack(NamedTuple):
     """A DDS or RMW."""
 
     name: str
@@ -68,15 +66,15 @@ class Stack:
     """What it is: libddsc, an RMW of rclpy, or the Python package."""
     dds: str
     """The DDS."""
-    version: str
+    version: str = ""
     """Its version, or an empty string."""
-    where: str
+    where: str = ""
     """Its library, or an empty string."""
-    present: bool
+    present: bool = True
     """Whether it is installed."""
-    enforces: bool | None
+    enforces: bool | None = None
     """Whether it enforces security; null if it could not be tried."""
-    evidence: str
+    evidence: str = ""
     """What was tried and observed."""
     advice: str = ""
     """What to do, or an empty string."""
@@ -103,49 +101,31 @@ def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
 
 def cyclone_stack(probe: ProbeEnclave) -> Stack:
     """Try the libddsc that sros uses (`sros_tool.runtime.cyclone`), and return the result."""
-    run = _run_probe("cyclone", probe, {})
-    verdict = judge(run, probe.allowed, probe.denied)
-    dds, version, where = _identity(run)
-    absent = not version and any("cannot find Cyclone DDS" in event.text for event in run.events)
-    if absent:
-        verdict = ProbeVerdict(None, verdict.evidence.removeprefix("could not be tried: "))
-    return Stack(
-        "Cyclone DDS (libddsc)",
-        "cyclone",
-        dds or "Cyclone DDS",
-        version,
-        where,
-        not absent,
-        verdict.enforces,
-        verdict.evidence,
-        "" if verdict.enforces else INSTALL_ADVICE,
-    )
+    stack = _probed(Stack("Cyclone DDS (libddsc)", "cyclone", "Cyclone DDS"), "cyclone", probe)
+    if not stack.version and "cannot find Cyclone DDS" in stack.evidence:
+        evidence = stack.evidence.removeprefix(_UNTRIED)
+        stack = stack._replace(present=False, enforces=None, evidence=evidence)
+    return stack._replace(advice="" if stack.enforces else INSTALL_ADVICE)
 
 
 def _cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
     """Try the Python package ``cyclonedds``, which contains a libddsc, and return the result."""
+    stack = Stack("cyclonedds (Python package)", "cyclonedds", "Cyclone DDS")
     spec = importlib.util.find_spec("cyclonedds")
     if spec is None:
-        return _absent("cyclonedds (Python package)", "cyclonedds", "Cyclone DDS")
-    run = _run_probe("cyclonedds", probe, {})
-    verdict = judge(run, probe.allowed, probe.denied)
-    dds, version, where = _identity(run)
-    if verdict.enforces is None and where and not _has_plugins(Path(where)):
-        verdict = ProbeVerdict(
-            False,
+        return stack._replace(present=False)
+    stack = _probed(stack, "cyclonedds", probe)
+    if stack.enforces is None and stack.where and not _has_plugins(Path(stack.where)):
+        evidence = (
             "a secured participant fails, and the package has no libdds_security_*.so."
-            f" {verdict.evidence.partition(': ')[2]}",
+            f" {stack.evidence.partition(': ')[2]}"
         )
-    return Stack(
-        "cyclonedds (Python package)",
-        "cyclonedds",
-        dds or "Cyclone DDS",
-        version or _package_version("cyclonedds"),
-        where or str(spec.origin or ""),
-        True,
-        verdict.enforces,
-        verdict.evidence,
-        "" if verdict.enforces else "sros does not need this package: it uses libddsc directly.",
+        stack = stack._replace(enforces=False, evidence=evidence)
+    needless = "sros does not need this package: it uses libddsc directly."
+    return stack._replace(
+        version=stack.version or _package_version("cyclonedds"),
+        where=stack.where or str(spec.origin or ""),
+        advice="" if stack.enforces else needless,
     )
 
 
@@ -155,34 +135,32 @@ def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
         variables[RMW] = rmw
     if below := middleware_of(rmw):
         variables |= below.explains
-    run = _run_probe("rclpy", probe, variables)
-    verdict = judge(run, probe.allowed, probe.denied)
-    dds, version, where = _identity(run)
-    return Stack(
-        f"rclpy with {rmw or 'its default RMW'}",
-        "rmw",
-        dds,
-        version,
-        where,
-        True,
-        verdict.enforces,
-        verdict.evidence,
-        "" if verdict.enforces else ROS_ADVICE,
-        rmw,
-    )
+    stack = Stack(f"rclpy with {rmw or 'its default RMW'}", "rmw", "", rmw=rmw)
+    stack = _probed(stack, "rclpy", probe, variables)
+    return stack._replace(advice="" if stack.enforces else ROS_ADVICE)
 
 
 def _without_rclpy() -> Stack:
-    installed = sorted(Path("/opt/ros").glob("*/setup.sh"))
-    stack = _absent("rclpy", "rmw", "")
-    if not installed:
-        return stack
-    advice = f"ROS 2 is installed but not set up in this shell: run `. {installed[-1]}` first."
-    return Stack(**{**vars(stack), "advice": advice})
+    advice = ""
+    if installed := sorted(Path("/opt/ros").glob("*/setup.sh")):
+        advice = f"ROS 2 is installed but not set up in this shell: run `. {installed[-1]}` first."
+    return Stack("rclpy", "rmw", "", present=False, advice=advice)
 
 
-def _absent(name: str, kind: str, dds: str) -> Stack:
-    return Stack(name, kind, dds, "", "", False, None, "")
+def _probed(
+    stack: Stack, kind: str, probe: ProbeEnclave, variables: Mapping[str, str] | None = None
+) -> Stack:
+    """Return a stack with what a probe of a kind observed of it."""
+    run = _run_probe(kind, probe, variables or {})
+    verdict = judge(run, probe.allowed, probe.denied)
+    dds, version, where = _identity(run)
+    return stack._replace(
+        dds=dds or stack.dds,
+        version=version,
+        where=where,
+        enforces=verdict.enforces,
+        evidence=verdict.evidence,
+    )
 
 
 def _identity(run: ProbeRun) -> tuple[str, str, str]:
@@ -346,5 +324,8 @@ def _first(events: Sequence[Event], kind: EventKind) -> Event | None:
     return next((event for event in events if event.kind is kind), None)
 
 
+_UNTRIED = "could not be tried: "
+
+
 def _untried(why: str) -> ProbeVerdict:
-    return ProbeVerdict(None, f"could not be tried: {why}")
+    return ProbeVerdict(None, f"{_UNTRIED}{why}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import pytest
 
@@ -48,9 +47,9 @@ def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) 
     assert "enclave.file-empty" in broken
 
 
-SECURE = replace(RMW, name="rclpy with rmw_s", enforces=True, rmw="rmw_s")
-ABSENT = replace(RMW, present=False, enforces=None, rmw="")
-UNTRIED = replace(RMW, enforces=None)
+SECURE = RMW._replace(name="rclpy with rmw_s", enforces=True, rmw="rmw_s")
+ABSENT = RMW._replace(present=False, enforces=None, rmw="")
+UNTRIED = RMW._replace(enforces=None)
 BY = "DDS Security can be enforced here, by "
 
 

@@ -7,7 +7,6 @@ import os
 import pwd
 import socket
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -59,7 +58,7 @@ ENVIRONMENT = {
 
 
 def test_nothing_secret_is_in_the_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    planted = replace(STACK, name=TEXT, version=TEXT, evidence=TEXT, where=TEXT)
+    planted = STACK._replace(name=TEXT, version=TEXT, evidence=TEXT, where=TEXT)
     monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis((planted,)))
     monkeypatch.setattr(socket, "gethostname", lambda: "heartofgold.example.org")
     user = pwd.struct_passwd(("zaphod", "x", 1, 1, "", "/home/zaphod", ""))

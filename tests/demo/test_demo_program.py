@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -108,14 +107,14 @@ def test_the_policy_follows_the_topic_and_leaves_two_enclaves_without_it() -> No
     ("wish", "ros", "cyclone", "name", "why"),
     [
         ("auto", ENFORCING, CYCLONE, "rclpy", "enforces security here"),
-        ("auto", replace(ENFORCING, enforces=False), CYCLONE, "cyclone", "does not enforce"),
-        ("auto", replace(ENFORCING, enforces=None), CYCLONE, "cyclone", "does not enforce"),
+        ("auto", ENFORCING._replace(enforces=False), CYCLONE, "cyclone", "does not enforce"),
+        ("auto", ENFORCING._replace(enforces=None), CYCLONE, "cyclone", "does not enforce"),
         ("auto", ABSENT, CYCLONE, "cyclone", "rclpy is not installed here"),
         ("cyclone", ENFORCING, CYCLONE, "cyclone", "chosen with --backend"),
         ("rclpy", ENFORCING, CYCLONE, "rclpy", "chosen with --backend"),
         ("rclpy", ABSENT, CYCLONE, None, "rclpy is not installed here"),
-        ("auto", ABSENT, replace(CYCLONE, enforces=False), None, "no DDS here"),
-        ("cyclone", ENFORCING, replace(CYCLONE, enforces=None), None, "no DDS here"),
+        ("auto", ABSENT, CYCLONE._replace(enforces=False), None, "no DDS here"),
+        ("cyclone", ENFORCING, CYCLONE._replace(enforces=None), None, "no DDS here"),
     ],
 )
 def test_backends(
