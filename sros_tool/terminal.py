@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -18,10 +19,6 @@ _CONTROLS = [
     *(0x2028, 0x2029),  # ends of lines
 ]
 _BYTES = range(0xDC80, 0xDD00)  # bytes of names that are not UTF-8; 0x9B is CSI to some terminals
-_SHOWN = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROLS}
-_SHOWN |= {code: f"\\u{code:04x}" for code in (*range(0xD800, 0xE000), 0xFFFE, 0xFFFF)}
-_SHOWN |= {code: f"\\x{code - 0xDC00:02x}" for code in _BYTES}
-_SHOWN_ON_A_LINE = {**_SHOWN, 0x0A: "\\x0a"}
 _COLOURS = {
     "error": "red",
     "warning": "yellow",
@@ -43,12 +40,20 @@ def visible(text: str) -> str:
 
     Newline and tab stay.
     """
-    return text.translate(_SHOWN)
+    # A text that Python calls printable has none of these characters, and most texts are.
+    return text if text.isprintable() else text.translate(_escapes())
 
 
 def visible_line(text: str) -> str:
     """Return ``text`` as `visible` does, on one line: a line feed could forge the next one."""
-    return text.translate(_SHOWN_ON_A_LINE)
+    return visible(text).replace("\n", "\\x0a")
+
+
+@cache
+def _escapes() -> dict[int, str]:
+    escapes = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROLS}
+    escapes |= {code: f"\\u{code:04x}" for code in (*range(0xD800, 0xE000), 0xFFFE, 0xFFFF)}
+    return escapes | {code: f"\\x{code - 0xDC00:02x}" for code in _BYTES}
 
 
 @cache
@@ -63,12 +68,12 @@ def visible_json(document: str) -> str:
 
 def echo(*parts: str | Coloured, err: bool = False) -> None:
     """Print one line, on standard error with ``err``."""
-    _print(parts, _SHOWN_ON_A_LINE, err=err)
+    _print(parts, visible_line, err=err)
 
 
 def echo_lines(*parts: str | Coloured, err: bool = False) -> None:
     """Print lines of which sros made the ends, on standard error with ``err``."""
-    _print(parts, _SHOWN, err=err)
+    _print(parts, visible, err=err)
 
 
 def echo_document(document: str | bytes) -> None:
@@ -105,13 +110,13 @@ def ask_secret(what: str, *, confirm: bool) -> str:
     return str(answer)
 
 
-def _print(parts: tuple[str | Coloured, ...], shown: dict[int, str], *, err: bool) -> None:
+def _print(parts: tuple[str | Coloured, ...], shown: Callable[[str], str], *, err: bool) -> None:
     import click
 
     texts = (
         click.style(part.word, fg=_COLOURS[part.word], bold=True)
         if isinstance(part, Coloured)
-        else part.translate(shown)
+        else shown(part)
         for part in parts
     )
     click.echo("".join(texts), err=err)

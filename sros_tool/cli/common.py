@@ -12,7 +12,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -26,6 +25,8 @@ from sros_tool.terminal import Coloured, ask_secret, echo, echo_lines, visible_j
 from sros_tool.wording import counted
 
 if TYPE_CHECKING:
+    from datetime import datetime, tzinfo
+
     from click.shell_completion import CompletionItem
 
     from sros_tool.checks.kind import Finding
@@ -406,6 +407,12 @@ def save(output: Path, document: bytes) -> str:
 
 def now() -> datetime:
     """Return the current time in UTC; verbs pass it to the functions that they call."""
+    return _clock()
+
+
+def _clock() -> datetime:
+    from datetime import UTC, datetime
+
     return datetime.now(UTC)
 
 
@@ -445,6 +452,7 @@ def named_zone(name: str) -> tzinfo:
 
     Raises `UsageError`.
     """
+    from datetime import timedelta, timezone
     from zoneinfo import ZoneInfo
 
     if match := _OFFSET.match(name):
@@ -461,6 +469,7 @@ def named_zone(name: str) -> tzinfo:
 
 def local_zone(environment: Mapping[str, str]) -> tzinfo:
     """Return the time zone of $TZ or /etc/localtime, or the current UTC offset as a fixed zone."""
+    from datetime import UTC, datetime
     from zoneinfo import ZoneInfo
 
     name = environment.get("TZ", "").removeprefix(":")

@@ -9,7 +9,7 @@ import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC, datetime
 from pathlib import Path
 from unittest import mock
 
@@ -116,12 +116,7 @@ _NAMES = ("new\nline", "‮abc", "\udcff", "-x", "x" * 255, "a b", "$(x)", "é",
 def at(moment: datetime) -> Iterator[None]:
     """Set the clock of the command line."""
 
-    class Clock(datetime):
-        @classmethod
-        def now(cls, tz: tzinfo | None = None) -> datetime:  # type: ignore[override]
-            return moment.astimezone(tz) if moment.year > 1 else moment
-
-    with mock.patch("sros_tool.cli.common.datetime", Clock):
+    with mock.patch("sros_tool.cli.common._clock", lambda: moment):
         yield
 
 
