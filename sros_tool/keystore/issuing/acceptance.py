@@ -66,7 +66,6 @@ from sros_tool.pki.keys import generate_key
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
 from sros_tool.wording import enumerated, first_few
-from sros_tool.xml import read_bytes
 
 _LOADED = (
     IDENTITY_CA_FILE,
@@ -379,19 +378,17 @@ class _FilesOfChange:
         places = self.places_after(name)
         return _complete({file: self.content_after(place) for file, place in places.items()})
 
-    def content(self, path: str, *, kept: bool = True) -> bytes:
-        """Return the content of a file as it is, or nothing; only if ``kept`` it is remembered."""
+    def content(self, path: str) -> bytes:
+        """Return the content of a file as it is, or nothing."""
         try:
-            if kept:
-                return self._keystore.read(path, "file")
-            return read_bytes(self._keystore.root / path, "file")
+            return self._keystore.read(path, "file")
         except SrosError:
             return b""
 
-    def content_after(self, place: str, *, kept: bool = True) -> bytes:
+    def content_after(self, place: str) -> bytes:
         """Return the content that a file, not a link, will have, or nothing."""
         if not self.transaction.is_staged(place):
-            return self.content(place, kept=kept)
+            return self.content(place)
         if place not in self._after:
             self._after[place] = self.transaction.content_after(place) or b""
         return self._after[place]
@@ -419,8 +416,7 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
         shared_places = tuple(place.removeprefix(f"{folder}/") for place in places.values())
         looks: tuple[object, ...] = ()
         if name in present:  # otherwise this transaction issues it, as all others that are new
-            # What the change has not read is not kept: a large keystore has many certificates.
-            data = files.content_after(places[CERTIFICATE_FILE], kept=bool(own))
+            data = files.content_after(places[CERTIFICATE_FILE])
             if not data:
                 continue  # it is revoked, or its request is not answered yet
             crl = places[CRL_FILE]

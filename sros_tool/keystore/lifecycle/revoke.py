@@ -23,7 +23,6 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import read_certificate
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import issued_by
 from sros_tool.pki.crl import REASONS
@@ -141,8 +140,7 @@ def _check_names(change: KeystoreChange, names: Sequence[str]) -> None:
 def _move_away(change: KeystoreChange, name: str) -> Entry:
     """Stage the move of an enclave's files to ``revoked``; return the entry of its certificate."""
     transaction, folder = change.transaction, enclave_folder(name)
-    path = transaction.root / folder / CERTIFICATE_FILE
-    certificate = read_certificate(path)
+    certificate = change.keystore.certificate_of(name)
     if not issued_by(certificate, change.identity.certificate):
         raise KeystoreError(
             f"the certificate of enclave {name} was not issued by the identity CA of this keystore",
@@ -151,13 +149,15 @@ def _move_away(change: KeystoreChange, name: str) -> Entry:
         )
     target = f"{REVOKED}/{certificate.serial_number:x}"
     for file in _FILES:
-        source = transaction.root / folder / file
+        path = f"{folder}/{file}"
+        source = transaction.root / path
         if name == "/" and file == "governance.p7s":
             continue  # the governance of the keystore is in the folder of the enclave /
         if not source.is_symlink() and not source.exists():
             continue
         if not source.is_symlink():
-            data = transaction.read(f"{folder}/{file}")
+            known = file == CERTIFICATE_FILE
+            data = change.keystore.read(source, file) if known else transaction.read(path)
             transaction.write(f"{target}/{file}", data, private=file == _PRIVATE)
-        transaction.remove(f"{folder}/{file}")
+        transaction.remove(path)
     return certificate_entry(change.now, "certificate", certificate, name)
