@@ -411,8 +411,11 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
     kinds: dict[_Kind, list[str]] = {}
     for name in sorted(names):
         folder = enclave_folder(name)
-        places = files.places_after(name)
         own = frozenset(changed.get(folder, ())).intersection(_LOADED)
+        if name not in present and own.issuperset(_NEEDED):
+            kinds.setdefault(((), own, ()), []).append(name)  # all of it is made alike, and now
+            continue
+        places = files.places_after(name)
         shared_places = tuple(place.removeprefix(f"{folder}/") for place in places.values())
         looks: tuple[object, ...] = ()
         if name in present:  # otherwise this transaction issues it, as all others that are new
