@@ -15,9 +15,9 @@ from sros_tool.terminal import echo
 from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.issuing.zenoh import KeptZenoh
     from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.keystore.lifecycle.replaced import ReplacedRights
+    from sros_tool.keystore.outcomes import KeptZenoh
     from sros_tool.keystore.transaction.stage import Change
 
 _NAMES_SHOWN = 5

@@ -40,6 +40,7 @@ from sros_tool.terminal import echo
 from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
+    from sros_tool.checks.kind import Finding
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.lifecycle.update import KeystoreUpdate
@@ -294,17 +295,22 @@ def _show(
     as_json: bool,
     policies: Sequence[Policy | FleetPolicy] = (),
 ) -> None:
-    from sros_tool.checks.signed import as_note, signed_findings
     from sros_tool.keystore.lifecycle.replaced import lasting_text
 
-    signed = {*result.created, *result.changed, *result.kept}
-    found = signed_findings(policies, signed, os.environ.get("ROS_DISTRO", ""))
+    findings: list[tuple[Finding, ...]] = []
+    if policies:
+        from sros_tool.checks.signed import signed_findings
+
+        signed = {*result.created, *result.changed, *result.kept}
+        findings = signed_findings(policies, signed, os.environ.get("ROS_DISTRO", ""))
     shown = None
     if as_json:
+        from sros_tool.checks.signed import as_note
         from sros_tool.keystore.lifecycle.shown import EnclaveCreation
         from sros_tool.keystore.lifecycle.shown import shown as json_form
 
-        shown = json_form(result, EnclaveCreation, notes=[as_note(each) for each in found])
+        notes = [as_note(finding) for finding in findings]
+        shown = json_form(result, EnclaveCreation, notes=notes)
     lasting = (lasting_text(result.root, rights) for rights in result.rights)
     print_changed(
         result,
@@ -314,7 +320,7 @@ def _show(
         after=filter(None, lasting),
     )
     if not as_json:
-        print_signed(found, [policy.file for policy in policies])
+        print_signed(findings, [policy.file for policy in policies])
 
 
 def _created_lines(result: Creation) -> Iterator[str]:

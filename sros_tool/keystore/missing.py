@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from shlex import quote
@@ -104,5 +103,7 @@ def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
 
 def _alike(text: str, texts: Mapping[str, str], least: float) -> list[str]:
     """Return the enclaves whose text (the value) is spelled almost as ``text``."""
+    import difflib
+
     alike = difflib.get_close_matches(text, set(texts.values()), n=3, cutoff=least)
     return [each for each, written in texts.items() if written in alike]

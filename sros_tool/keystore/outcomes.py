@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Generic, NamedTuple, TypeVar
 
 from cryptography import x509
 
-from sros_tool.errors import SrosError
+from sros_tool.errors import Note, SrosError
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.layout import ROLES, enclave_path
 from sros_tool.keystore.transaction.stage import Change
@@ -25,6 +26,25 @@ Restart = Annotated[
 RestartZenoh = Annotated[
     Sequence[str], "The enclaves whose processes on Zenoh have to be restarted."
 ]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptZenoh:
+    """What a change of a keystore meant for its Zenoh configurations.
+
+    ``files`` maps the enclaves to their files in the keystore, ``written`` the paths that were
+    staged to their content.  ``restart`` are the enclaves whose
+    processes have to be restarted, because their configurations changed.
+    """
+
+    files: Mapping[str, str] = field(default_factory=dict)
+    written: Mapping[str, bytes] = field(default_factory=dict)
+    restart: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
+
+    def without(self, names: Collection[str]) -> KeptZenoh:
+        """Return the same without restarting the enclaves ``names``."""
+        return replace(self, restart=tuple(each for each in self.restart if each not in names))
 
 
 class EnclaveResult(NamedTuple, Generic[Outcome]):

@@ -38,7 +38,6 @@ from sros_tool.keystore.issuing.enclave import (
     shared_files,
     stated_enclave,
 )
-from sros_tool.keystore.issuing.zenoh import KeptZenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -61,6 +60,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     lasting_text,
     replaced_rights,
 )
+from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.recorded import EarlierRights
 from sros_tool.names import check_enclave_name

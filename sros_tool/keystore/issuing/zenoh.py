@@ -7,7 +7,6 @@ and Zenoh enforce the same rights at any moment.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from datetime import datetime
 
 from cryptography import x509
@@ -16,6 +15,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import Note
 from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.ledger import Ledger
+from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh.wanted import (
@@ -30,25 +30,6 @@ from sros_tool.keystore.zenoh.wanted import (
 )
 from sros_tool.validity import iso
 from sros_tool.zenoh.network import ZenohNetwork
-
-
-@dataclass(frozen=True, slots=True)
-class KeptZenoh:
-    """What a change of a keystore meant for its Zenoh configurations.
-
-    ``files`` maps the enclaves to their files in the keystore, ``written`` the paths that were
-    staged to their content.  ``restart`` are the enclaves whose
-    processes have to be restarted, because their configurations changed.
-    """
-
-    files: Mapping[str, str] = field(default_factory=dict)
-    written: Mapping[str, bytes] = field(default_factory=dict)
-    restart: tuple[str, ...] = ()
-    notes: tuple[Note, ...] = ()
-
-    def without(self, names: Collection[str]) -> KeptZenoh:
-        """Return the same without restarting the enclaves ``names``."""
-        return replace(self, restart=tuple(each for each in self.restart if each not in names))
 
 
 def keep_zenoh(

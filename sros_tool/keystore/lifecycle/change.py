@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from shlex import quote
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from cryptography import x509
 
@@ -30,17 +30,12 @@ from sros_tool.keystore.fleet import checked_fleet, write_fleet
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.enclave import EnclaveWriter
 from sros_tool.keystore.issuing.tokens import EnclaveTokens
-from sros_tool.keystore.issuing.zenoh import KeptZenoh, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, check_keystore
 from sros_tool.keystore.ledger import Entry, Ledger, append
-from sros_tool.keystore.lifecycle.replaced import ReplacedRights
-from sros_tool.keystore.lifecycle.revocation_list import (
-    RevocationListSigner,
-    Superseded,
-    another_ca,
-)
+from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
 from sros_tool.keystore.of_ros2 import take_over
+from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore, check_domain
 from sros_tool.keystore.recorded import RecordedRights
 from sros_tool.keystore.settings import edit_notes
@@ -48,10 +43,12 @@ from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.keystore.zenoh.wanted import ZenohChange
 from sros_tool.pki.keys import PublicKey
 from sros_tool.pki.token import TokenUri
 from sros_tool.policy.model import Enclave
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
 
 Result = TypeVar("Result", bound="Changed")
 
@@ -276,6 +273,8 @@ class KeystoreChange:
 
     def revocation_lists(self) -> RevocationListSigner:
         """Return the signer of the revocation lists."""
+        from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
+
         return RevocationListSigner(
             self.transaction,
             self.keystore,
@@ -319,6 +318,9 @@ class KeystoreChange:
         """
         if self.template.zenoh is None:
             return
+        from sros_tool.keystore.issuing.zenoh import keep_zenoh
+        from sros_tool.keystore.zenoh.wanted import ZenohChange
+
         self.zenoh = keep_zenoh(
             self.transaction,
             keystore=self.keystore,
@@ -370,9 +372,14 @@ class KeystoreChange:
             self.now,
             keystore=self.keystore,
             allowed=self._allowed,
-            remedy=(lambda: another_ca(self.keystore, aim)) if aim else lambda: remedy,
+            remedy=lambda: self._another_ca(aim) if aim else remedy,
         )
         self.transaction.commit()
+
+    def _another_ca(self, aim: str) -> str:
+        from sros_tool.keystore.lifecycle.revocation_list import another_ca
+
+        return another_ca(self.keystore, aim)
 
     def result(self, kind: Callable[..., Result], **more: Any) -> Result:
         """Return the result of the change, with ``more`` that the verb says of it."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +30,6 @@ from sros_tool.keystore.layout import ENCLAVES, PRIVATE, PUBLIC, is_keystore, re
 from sros_tool.keystore.ledger import certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.enclaves import write_enclaves
-from sros_tool.keystore.lifecycle.governed import raise_protection, write_governance
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.protection import with_stated
@@ -403,6 +401,8 @@ def _begin(
         refuse_stale_domains(root, EnclaveDomains(change.domains, before), recorded, stated)
         change.notes += left_enclaves(root, before, recorded) if before else ()
     if protections:
+        from sros_tool.keystore.lifecycle.governed import raise_protection
+
         raise_protection(change, protections)
 
 
@@ -410,6 +410,8 @@ def _write_keystore(
     change: KeystoreChange, template: Template, domains: DomainSet, imported: Mapping[str, bytes]
 ) -> None:
     """Stage a new keystore: its CAs, its governance and its settings."""
+    from sros_tool.keystore.lifecycle.governed import write_governance
+
     _check_free(change.root)  # another process may have created it meanwhile
     for span in (template.certificate_validity, template.permissions_validity):
         window(change.now, span)  # raises if the CAs could not issue anything
@@ -484,6 +486,8 @@ def _check_typo(root: Path) -> None:
         siblings = [p.name for p in root.absolute().parent.iterdir() if p.is_dir()]
     except OSError:
         return
+    import difflib
+
     close = difflib.get_close_matches(root.name, siblings, n=3, cutoff=0.5)
     for name in close:
         if _without_digits(name) == _without_digits(root.name):

@@ -38,10 +38,10 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import (
     ReplacedRights,
+    Superseded,
     earlier_permissions,
     replaced_rights,
 )
-from sros_tool.keystore.lifecycle.revocation_list import Superseded
 from sros_tool.keystore.template import NODE_BASICS, Template
 from sros_tool.parallel import Progress
 from sros_tool.pki import smime

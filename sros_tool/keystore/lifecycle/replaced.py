@@ -18,8 +18,10 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
+from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import subject_text, validity_of
+from sros_tool.pki.requests import key_digest
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, compare
 from sros_tool.translate import grant_rights
@@ -112,6 +114,25 @@ def replaced_rights(
             for one, other in ((before, after), (after, before))
         ),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Superseded:
+    """A certificate that was replaced, and the digest of the key of the new certificate."""
+
+    name: str
+    old: Entry
+    not_after: datetime
+    new_key: str
+
+    @classmethod
+    def by(
+        cls, name: str, old: x509.Certificate, new: x509.Certificate, now: datetime
+    ) -> Superseded:
+        """Return the record that ``new`` replaced ``old`` at ``now``."""
+        entry = certificate_entry(now, "certificate", old, name)
+        key = key_digest(new.public_key())  # type: ignore[arg-type]
+        return cls(name, entry, validity_of(old).not_after, key)
 
 
 _RIGHTS_SHOWN = 6

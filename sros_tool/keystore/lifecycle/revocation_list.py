@@ -29,6 +29,7 @@ from sros_tool.keystore.layout import (
     revoked_certificates,
 )
 from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
+from sros_tool.keystore.lifecycle.replaced import Superseded
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     RotationStage,
@@ -48,7 +49,6 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.crl import REASONS, SUPERSEDED, RevocationList, Revoked, sign_crl, signed_by
-from sros_tool.pki.requests import key_digest
 from sros_tool.validity import BACKDATE, Window, iso
 
 
@@ -113,25 +113,6 @@ def _put_away(keystore: Keystore, known: Container[str] = ()) -> Iterator[x509.C
                 certificate = keystore.certificate(path)
                 if any(issued_by(certificate, authority) for authority in trusted):
                     yield certificate
-
-
-@dataclass(frozen=True, slots=True)
-class Superseded:
-    """A certificate that was replaced, and the digest of the key of the new certificate."""
-
-    name: str
-    old: Entry
-    not_after: datetime
-    new_key: str
-
-    @classmethod
-    def by(
-        cls, name: str, old: x509.Certificate, new: x509.Certificate, now: datetime
-    ) -> Superseded:
-        """Return the record that ``new`` replaced ``old`` at ``now``."""
-        entry = certificate_entry(now, "certificate", old, name)
-        key = key_digest(new.public_key())  # type: ignore[arg-type]
-        return cls(name, entry, validity_of(old).not_after, key)
 
 
 class RevocationListSigner:

@@ -63,10 +63,10 @@ from sros_tool.keystore.lifecycle.renew import checked_rights
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
     ReplacedRights,
+    Superseded,
     replaced_rights,
     rights_text,
 )
-from sros_tool.keystore.lifecycle.revocation_list import Superseded
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.reader import (
     Keystore,
