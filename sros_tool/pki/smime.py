@@ -278,6 +278,11 @@ def _remembered(read: Callable[[_Part], _Read]) -> Callable[[_Part], _Read]:
 @lru_cache(maxsize=8)  # several callers parse the same document in a row
 def parse(message: bytes) -> SignedDocument:
     """Parse a ``.p7s`` without verifying it; raise `PkiError` if it is not a signed message."""
+    return parse_new(message)
+
+
+def parse_new(message: bytes) -> SignedDocument:
+    """Parse a message as `parse` does, and remember nothing: it was just signed."""
     content, signature = _split(message)
     try:
         return _parse_cms(signature, content)

@@ -83,7 +83,7 @@ class Authority:
         messages: list[bytes] = []
         for some in _in_a_row(documents):
             signed = [smime.sign(each, self.certificate, self.key) for each in some]
-            parsed = [smime.parse(each) for each in signed]
+            parsed = [smime.parse_new(each) for each in signed]
             for document, found in zip(some, parsed, strict=True):
                 meant = document.replace(b"\r\n", b"\n")
                 check_meaning((found.digest_matches(), found.text), (True, meant), what)
