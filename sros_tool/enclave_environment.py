@@ -349,7 +349,7 @@ def _refuse_outdated(root: Path, name: str, now: datetime) -> None:
     validly signed, it would enforce those of before.  An export does not have them.
     """
     from sros_tool.keystore.layout import PERMISSIONS, SETTINGS
-    from sros_tool.keystore.reader import load_ca_certificate, open_keystore
+    from sros_tool.keystore.reader import Keystore, open_keystore
     from sros_tool.keystore.zenoh.wanted import zenoh_drift
     from sros_tool.zenoh.configuration import Mode
 
@@ -359,7 +359,7 @@ def _refuse_outdated(root: Path, name: str, now: datetime) -> None:
     network = keystore.settings.zenoh if keystore.settings else None
     if network is None or (network.router != name and network.mode is Mode.CLIENT):
         return
-    authority = load_ca_certificate(root, PERMISSIONS)
+    authority = Keystore(root).ca_certificate(PERMISSIONS)
 
     def drifted(moment: datetime | None) -> bool:
         drifts, _ = zenoh_drift(root, network, keystore.domains, authority, moment)

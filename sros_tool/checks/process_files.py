@@ -28,7 +28,8 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
 )
-from sros_tool.keystore.ledger import Entry, read_ledger
+from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificates, subject_text, validity_of
 from sros_tool.pki.crl import SUPERSEDED, load_crl
@@ -258,7 +259,7 @@ def _entries(enclave: ProcessEnclave) -> tuple[Sequence[Entry], str]:
     if size > _MOST_LEDGER:
         return (), f"the ledger of its keystore has more than {_MOST_LEDGER // 1024**2} MiB"
     try:
-        entries = read_ledger(enclave.here, having=("enclave", enclave.name)).entries
+        entries = Keystore(enclave.here).ledger_with("enclave", enclave.name).entries
     except SrosError as error:
         return (), f"the ledger of its keystore cannot be read: {error.what}"
     return [each for each in entries if each.enclave == enclave.name], ""

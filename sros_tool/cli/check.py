@@ -515,10 +515,11 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
         expiring_enclaves,
         parse_threshold,
     )
-    from sros_tool.keystore.reader import load_settings
+    from sros_tool.keystore.reader import Keystore
 
     threshold = parse_threshold(text)
-    due, unreadable, count = due_enclaves(root, threshold, moment, load_settings(root))
+    keystore = Keystore(root)
+    due, unreadable, count = due_enclaves(keystore, threshold, moment, keystore.template)
     if form == "json":
         print_json(expiring_enclaves(due, unreadable))
     else:

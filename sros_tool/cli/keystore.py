@@ -556,7 +556,7 @@ def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
 def _new_keystore_lines(result: Creation, imported: frozenset[str] = frozenset()) -> Iterator[str]:
     """Yield the new keystore's domains, template, CAs, validity and CA fingerprints."""
     from sros_tool.keystore.layout import ROLES
-    from sros_tool.keystore.reader import load_ca_certificate
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.pki.certificates import digest, validity_of
     from sros_tool.validity import iso, span_text
 
@@ -580,7 +580,7 @@ def _new_keystore_lines(result: Creation, imported: frozenset[str] = frozenset()
     # A robot's operator compares them with the CAs of an answer: see `sros import --ca`.
     for role in roles:
         name = f"{role} CA" if template.separate_authorities else "CA"
-        certificate = load_ca_certificate(root, role)
+        certificate = Keystore(root).ca_certificate(role)
         yield f"  {name} SHA-256 {digest(certificate)}"
         if role in imported:
             yield f"    imported, valid until {iso(validity_of(certificate).not_after)}"

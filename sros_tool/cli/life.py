@@ -268,7 +268,7 @@ def crl(
 
     from sros_tool.keystore.layout import list_enclaves
     from sros_tool.keystore.lifecycle.revoke import refresh_crl
-    from sros_tool.keystore.reader import read_lists
+    from sros_tool.keystore.reader import Keystore
 
     root = root or keystore_from_environment()
     list_enclaves(root)
@@ -281,15 +281,16 @@ def crl(
             print_plan(root, result.changes)
             return 0
         print_follow_up(result, restart=not dry_run)
-    lists = read_lists(root)
+    keystore = Keystore(root)
+    lists = keystore.revocation_lists
     soon = bool(lists) and min(each.next_update for each in lists) - now() < timedelta(days=30)
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_lists
 
-        enclaves = _names(root)
+        enclaves = _names(keystore)
         print_json(shown_lists(root, lists, result, enclaves, expires_soon=soon, dry_run=dry_run))
     elif lists:
-        for line in _list_lines(lists, _names(root)):
+        for line in _list_lines(lists, _names(keystore)):
             echo(line)
     else:
         echo("nothing was ever revoked", err=True)
@@ -304,11 +305,9 @@ def crl(
     return 1 if soon else 0
 
 
-def _names(root: Path) -> dict[str, str]:
+def _names(keystore: Keystore) -> dict[str, str]:
     """Map the serial numbers of certificates to their enclaves, as the ledger has them."""
-    from sros_tool.keystore.ledger import read_ledger
-
-    return {each.serial: each.enclave for each in read_ledger(root).entries if each.serial}
+    return {entry.serial: entry.enclave for entry in keystore.ledger.entries if entry.serial}
 
 
 def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> Iterator[str]:
@@ -332,6 +331,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.authorities.keyring import Keyring
     from sros_tool.keystore.lifecycle.rotation.stages import RotationStep
     from sros_tool.keystore.lifecycle.rotation.state import RotationStatus
+    from sros_tool.keystore.reader import Keystore
 
 _DONE = {
     "distribute": "distributed the new CA next to the old one",

@@ -117,7 +117,7 @@ def zenoh(
     """
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
     from sros_tool.keystore.lifecycle.zenoh import set_zenoh
-    from sros_tool.keystore.reader import load_settings
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.unchanged import of_one_state
 
     if existing:
@@ -129,7 +129,7 @@ def zenoh(
         raise UsageError("--output and --force are for --from only", "", "Leave them out.")
     root = root or keystore_from_environment()
     check_keystore(root)
-    settings = load_settings(root)
+    settings = Keystore(root).template
     chosen = {
         "router": router,
         "endpoints": ",".join(endpoints),

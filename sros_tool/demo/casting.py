@@ -65,13 +65,7 @@ from sros_tool.keystore.layout import (
     ca_key,
     enclave_path,
 )
-from sros_tool.keystore.reader import (
-    Keystore,
-    OpenedEnclave,
-    governance_of,
-    load_settings,
-    open_keystore,
-)
+from sros_tool.keystore.reader import Keystore, OpenedEnclave, open_keystore
 from sros_tool.keystore.template import Template
 from sros_tool.names import ACTION_SEPARATOR
 from sros_tool.pki.certificates import digest, fingerprints
@@ -197,9 +191,9 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
         KeystoreError: ``root`` is not a keystore, or no two enclaves may talk to each other.
     """
     keystore = open_keystore(root)
-    domains = governance_of(root).domains()
+    domains = keystore.governance.domains()
     read = _read_enclaves(keystore, now, next(iter(domains)))
-    template = load_settings(root)
+    template = keystore.template
     # A keystore created from this template gets new CA keys, not the user's.
     template = replace(template, identity_key="", permissions_key="")
     wanted = f"rt{topic}" if topic else ""

@@ -49,10 +49,9 @@ from sros_tool.keystore.layout import (
     REQUIRED_FILES,
     enclave_path,
 )
-from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.reader import Keystore, load_settings
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, pem, validity_of
@@ -116,7 +115,8 @@ class KeystoreCopy:
         """
         keyring = IN_KEYSTORE if root else self.keyring
         root = root or self.root
-        return load_authorities(Keystore(root), load_settings(root), keyring, self.now)
+        keystore = Keystore(root)
+        return load_authorities(keystore, keystore.template, keyring, self.now)
 
     def put(self, part: str, name: str, data: bytes) -> None:
         """Replace a file of an enclave; a link is replaced, not followed."""
@@ -471,7 +471,7 @@ def _outdated_lists(copy: KeystoreCopy) -> dict[Path, bytes]:
     Who did not get the last list will not get the next one, either.
     """
     newest = copy.root / CRL
-    revoked = any(entry.what == "revocation" for entry in read_ledger(copy.root).entries)
+    revoked = any(entry.what == "revocation" for entry in Keystore(copy.root).ledger.entries)
     if not revoked and not newest.exists():
         return {}
     paths = [copy.folder(part) / CRL_FILE for part in copy.cast]

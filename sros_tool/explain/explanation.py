@@ -210,11 +210,11 @@ def _is_rotating(keystore: Path) -> bool:
 
 def _is_latest(keystore: Path, enclave: str) -> bool:
     """Return whether an enclave has the permissions that the ledger says were signed last."""
-    from sros_tool.keystore.ledger import read_ledger
+    from sros_tool.keystore.reader import Keystore
 
     try:
         signed = (enclave_path(keystore, enclave) / PERMISSIONS_FILE).read_bytes()
-        entries = reversed(read_ledger(keystore, having=("enclave", enclave)).entries)
+        entries = reversed(Keystore(keystore).ledger_with("enclave", enclave).entries)
     except (SrosError, OSError):
         return True
     last = (each for each in entries if (each.what, each.enclave) == ("permissions", enclave))

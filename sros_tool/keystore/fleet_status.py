@@ -41,9 +41,9 @@ from sros_tool.keystore.layout import (
     enclave_names,
     has_enclave,
 )
-from sros_tool.keystore.ledger import Entry, read_ledger
+from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
-from sros_tool.keystore.reader import authority_files, certificates_of
+from sros_tool.keystore.reader import Keystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import digest
 from sros_tool.pki.crl import SUPERSEDED
@@ -409,7 +409,8 @@ class _Known:
         different = [each for robot in compared for each in robot.different if each.confirmed]
         wanted = {each.confirmed for each in different}
         wanted.update(one for each in different for one in each.certificates)
-        ledger = read_ledger(root) if wanted else read_ledger(root, having=("what", "revocation"))
+        keystore = Keystore(root)
+        ledger = keystore.ledger if wanted else keystore.ledger_with("what", "revocation")
         for entry in ledger.entries:
             if entry.sha256 in wanted:
                 self._issued.setdefault(entry.sha256, entry)
@@ -521,8 +522,9 @@ class _Stages:
         self.at_home = self.COMPLETE if is_complete else rotation.stage.value
         self._new: dict[str, str] = {}
         self._at_home: dict[str, tuple[tuple[str, ...], str]] = {}
-        for file, roles in authority_files(root).items():
-            certificates = tuple(digest(each) for each in certificates_of(root, file))
+        keystore = Keystore(root)
+        for file, roles in keystore.authority_files.items():
+            certificates = tuple(map(digest, keystore.certificates_of(file)))
             new = [each.new for each in rotation.replacements if each.file == file]
             for kind in (f"{role}_ca" for role in roles):
                 self._new[kind] = new[0] if new else certificates[0]

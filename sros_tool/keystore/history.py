@@ -24,8 +24,8 @@ from sros_tool.keystore.layout import (
     list_enclaves,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import GAP, Entry, read_ledger
-from sros_tool.keystore.reader import read_lists
+from sros_tool.keystore.ledger import GAP, Entry
+from sros_tool.keystore.reader import Keystore
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
@@ -77,12 +77,13 @@ def history(root: Path, *, now: datetime) -> History:
     """Return the ledger of a keystore, compared with its certificates and signed documents."""
     issued, revoked_files = _files(root, _active_paths(root)), _files(root, _revoked_paths(root))
     retired = _files(root, _retired_paths(root))
-    ledger = read_ledger(root)
+    keystore = Keystore(root)
+    ledger = keystore.ledger
     entries = ledger.entries
     # A new CA starts with an empty revocation list, and lists drop expired certificates, so the
     # ledger is asked too.
     revoked = {each.serial for each in entries if each.what == "revocation"}
-    revoked |= {f"{each.serial:x}" for crl in read_lists(root) for each in crl.revoked}
+    revoked |= {f"{entry.serial:x}" for crl in keystore.revocation_lists for entry in crl.revoked}
     moment = iso(now)
     settings = _files(root, iter((SETTINGS,)))
 

@@ -36,9 +36,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
 from sros_tool.errors import KeystoreError, PkiError, SrosError
-from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, ROLES, SETTINGS, ca_certificate
+from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, SETTINGS
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import digest, load_certificates, subject_text, validity_of
+from sros_tool.pki.certificates import digest, subject_text, validity_of
 from sros_tool.validity import Window, iso
 from sros_tool.xml import open_at_once, read_bytes
 
@@ -191,16 +191,6 @@ def document_entry(
 
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────
-
-
-def read_ledger(root: Path, *, having: tuple[str, str] | None = None) -> Ledger:
-    """Return the ledger of a keystore as `LedgerFile` reads it, with the CAs of the keystore.
-
-    Raises:
-        KeystoreError: the file cannot be read at all.
-    """
-    file = LedgerFile(root, lambda: _authorities(root))
-    return file.with_field(*having) if having else file.ledger()
 
 
 class _Reading(NamedTuple):
@@ -585,16 +575,6 @@ def _parse_any(line: bytes) -> Entry | None:
 
 def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
-
-
-def _authorities(root: Path) -> list[x509.Certificate]:
-    """Return the certificates of the CAs that the keystore trusts; none where unreadable."""
-    found: list[x509.Certificate] = []
-    for role in ROLES:
-        path = root / ca_certificate(role)
-        with suppress(SrosError):
-            found += load_certificates(read_bytes(path, "certificate"), f"'{path}'")
-    return found
 
 
 def _first_of(authorities: Iterable[x509.Certificate], found: Iterable[tuple[int, Entry]]) -> int:

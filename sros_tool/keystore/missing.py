@@ -8,7 +8,8 @@ from shlex import quote
 
 from sros_tool.errors import InvalidNameError, KeystoreError, SrosError
 from sros_tool.keystore.layout import FLEET, PRIVATE, PUBLIC, REVOKED, SETTINGS
-from sros_tool.keystore.ledger import Entry, read_ledger
+from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.reader import Keystore
 from sros_tool.names import check_enclave_name
 
 _SHOWN = 5
@@ -58,7 +59,7 @@ def no_such_enclave(
 def _revocation(root: Path, name: str) -> Entry | None:
     """Return the ledger entry of an enclave's revocation; None if it has a later certificate."""
     try:
-        entries = read_ledger(root, having=("enclave", name)).entries
+        entries = Keystore(root).ledger_with("enclave", name).entries
     except SrosError:
         return None  # the missing enclave is the error to report here
     of_enclave = [

@@ -518,19 +518,6 @@ def as_keystore(keystore: Path | Keystore) -> Keystore:
     return keystore if isinstance(keystore, Keystore) else Keystore(keystore)
 
 
-# ── parts of a keystore by its path ────────────────────────────────────────────────────────
-
-
-def load_settings(root: Path) -> Template:
-    """Return `Keystore.template` of a keystore that is opened for that alone."""
-    return Keystore(root).template
-
-
-def governance_of(root: Path) -> Governance:
-    """Return `Keystore.governance` of a keystore that is opened for that alone."""
-    return Keystore(root).governance
-
-
 def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
     """Raise `KeystoreError` if ``domain`` is given and not among ``domains``."""
     if domain is None or domain in domains:
@@ -550,26 +537,6 @@ def read_certificate(path: Path, what: str = "certificate") -> x509.Certificate:
         SrosError: the file is missing, or is not a readable certificate.
     """
     return load_certificate(read_bytes(path, what), f"'{path}'")
-
-
-def load_ca_certificate(root: Path, role: str) -> x509.Certificate:
-    """Return `Keystore.ca_certificate` of a keystore that is opened for that alone."""
-    return Keystore(root).ca_certificate(role)
-
-
-def authority_files(root: Path) -> Mapping[str, tuple[str, ...]]:
-    """Return `Keystore.authority_files` of a keystore that is opened for that alone."""
-    return Keystore(root).authority_files
-
-
-def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
-    """Return `Keystore.certificates_of` of a keystore that is opened for that alone."""
-    return Keystore(root).certificates_of(file)
-
-
-def read_lists(root: Path) -> tuple[RevocationList, ...]:
-    """Return `Keystore.revocation_lists` of a keystore that is opened for that alone."""
-    return Keystore(root).revocation_lists
 
 
 # ── signed permissions ─────────────────────────────────────────────────────────────────────

@@ -28,7 +28,7 @@ from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import Lifetime, Threshold, UnreadableEnclave, due_enclaves
 from sros_tool.keystore.layout import KEY_FILE, SETTINGS, is_keystore
-from sros_tool.keystore.reader import load_settings
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
@@ -750,7 +750,7 @@ class _Review:
         yield from self._checked("expiry", path, lambda: self._expiry(before or folder, folder))
 
     def _expiry(self, settings_of: Path, folder: Path) -> tuple[int, Content]:
-        settings = load_settings(settings_of)
+        settings = Keystore(settings_of).template
         due, unreadable, count = due_enclaves(
             folder, self.request.renew_within, self.request.at, settings
         )

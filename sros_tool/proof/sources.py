@@ -35,8 +35,7 @@ from sros_tool.keystore.layout import (
     is_keystore,
     permissions_ca_for,
 )
-from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.reader import Keystore, governance_of, load_settings
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, load_rights, load_zenoh_rights
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.zenoh.opened import is_signed
@@ -230,6 +229,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         )
     if source.kind != "keystore":
         return side
+    keystore = Keystore(path)
     folders = {name: enclave_path(path, name) for name in enclave_names(path, hidden=True)}
     trusting = {
         name: (each / IDENTITY_CA_FILE, each / CRL_FILE) for name, each in folders.items()
@@ -239,7 +239,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         governance=_of_all(path, folders.values()),
         authorities=_authorities(folders.values()),
         trusts=_trusts(trusting, _expiries(path)),
-        later=load_settings(path) if Keystore(path).is_home else None,
+        later=keystore.template if keystore.is_home else None,
         certified=_certified(folders),
     )
     if not has_zenoh_files(path, hidden=True):
@@ -307,7 +307,7 @@ def _of_all(root: Path, folders: Iterable[Path]) -> Governance:
                 f"`sros check {quote(str(root))}` shows what is wrong with it.",
             )
         same.add(data)
-    return governance_of(root)
+    return Keystore(root).governance
 
 
 def _authorities(folders: Iterable[Path]) -> frozenset[tuple[str, str]]:
@@ -329,7 +329,7 @@ def _expiries(root: Path) -> dict[int, str]:
     if not (root / CRL).exists():
         return {}
     found: dict[int, str] = {}
-    for each in read_ledger(root, having=("what", "certificate")).entries:
+    for each in Keystore(root).ledger_with("what", "certificate").entries:
         with suppress(ValueError):
             serial = int(each.serial, 16)
             found[serial] = max(found.get(serial, ""), each.not_after or _NEVER)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from sros_tool.keystore.reader import load_ca_certificate
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.zenoh import wanted
 from sros_tool.pki import smime
 from sros_tool.translate_zenoh import StatedRight, remote_of
@@ -53,7 +53,7 @@ def test_files_are_signed_whole_and_the_same_again(folder: Path) -> None:
         "wrote ks/enclaves/b/session.json5",
     ]
     assert "restart the processes of 3 enclaves" in ended.err
-    authority = load_ca_certificate(folder / "ks", "permissions")
+    authority = Keystore(folder / "ks").ca_certificate("permissions")
     for path, signed in SIGNED.items():
         document = (folder / "ks" / path).read_bytes()
         message = smime.parse((folder / "ks" / signed).read_bytes())

@@ -17,7 +17,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain import asking
 from sros_tool.explain.log import LogFinding, explain_log
 from sros_tool.files import policies_dir
-from sros_tool.keystore.ledger import Ledger
+from sros_tool.keystore.ledger import Ledger, LedgerFile
 from sros_tool.keystore.participant import LoadedEnclave, load_enclave_of
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import identity_of, load_certificate
@@ -824,12 +824,12 @@ def test_how_often_files_are_read_is_not_for_the_log_to_choose(
         read.append(name)
         return load_enclave_of(opening, name, at=at)
 
-    def refuse(_root: Path) -> Ledger:
+    def refuse(_file: LedgerFile, *_asked: str) -> Ledger:
         raise AssertionError("the ledger was read")
 
     monkeypatch.setattr(asking, "load_enclave_of", opened)
-    monkeypatch.setattr("sros_tool.keystore.ledger.read_ledger", refuse)
-    monkeypatch.setattr("sros_tool.keystore.missing.read_ledger", refuse)
+    monkeypatch.setattr(LedgerFile, "ledger", refuse)
+    monkeypatch.setattr(LedgerFile, "with_field", refuse)
     findings = json.loads(sros("explain", keystore, "--log", tmp_path / "log", "--json").out)
     assert [each["checked"] for each in findings["findings"]].count(True) == 3
     assert read == [ENCLAVE]

@@ -14,7 +14,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from sros_tool.keystore.layout import ENCLAVES
-from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.reader import Keystore
 from sros_tool.validity import iso, parse_iso
 from tests.keystore.test_confirmation import hostile
 from tests.support.harness import Ended, policy_text, publish, sros
@@ -74,7 +74,7 @@ class Field:
 
     def issued(self, what: str, enclave: str) -> list[str]:
         """Return when what an enclave has was issued."""
-        entries = read_ledger(self.root).entries
+        entries = Keystore(self.root).ledger.entries
         return [each.time for each in entries if (each.what, each.enclave) == (what, enclave)]
 
 

@@ -28,9 +28,10 @@ from sros_tool.keystore.describe import describe
 from sros_tool.keystore.fleet_metrics import fleet_metrics
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.history import history
-from sros_tool.keystore.ledger import certificate_entry, read_ledger
+from sros_tool.keystore.ledger import certificate_entry
 from sros_tool.keystore.lifecycle.rotation.state import read_rotation, rotation_status
 from sros_tool.keystore.participant import JoinContext
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.template import parse_template, read_template, render_template
 from sros_tool.names import check_enclave_name
@@ -230,7 +231,7 @@ def _log(data: bytes, _place: Place) -> None:
 
 def _ledger(data: bytes, place: Place) -> None:
     place.replace("ledger.jsonl", data)
-    read_ledger(place.keystore)
+    _ = Keystore(place.keystore).ledger
     history(place.keystore, now=NOW)
 
 

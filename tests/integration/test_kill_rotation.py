@@ -18,7 +18,7 @@ from sros_tool.keystore.lifecycle.rotation.state import (
     read_rotation,
     rotation_status,
 )
-from sros_tool.keystore.reader import open_enclave, read_lists
+from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child
@@ -56,7 +56,7 @@ def see(root: Path) -> State:
     for path in (*root.glob("private/*.pem"), *root.glob("retired/*.key.pem")):
         # One that is on its way out may be a broken link for a moment.
         assert not path.exists() or path.stat().st_mode & 0o777 == 0o600, path
-    lists = tuple(len(each.revoked) for each in read_lists(root))
+    lists = tuple(len(each.revoked) for each in Keystore(root).revocation_lists)
     on = tuple((each.state, each.enclaves) for each in rotation_status(root, now=LATER).authorities)
     return tuple(names), str(read_rotation(root).stage), on, lists
 

@@ -13,7 +13,7 @@ from sros_tool.keystore.history import history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.update import present_settings, update_keystore
-from sros_tool.keystore.reader import Keystore, authority_files, open_enclave
+from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child
@@ -62,7 +62,7 @@ def settled(root: Path) -> State:
     assert not present_settings(root).edits
     now = see(root)
     one = ("ca",) if now[0] == "sros2" else ("identity_ca", "permissions_ca")
-    assert tuple(sorted(authority_files(root))) == one
+    assert tuple(sorted(Keystore(root).authority_files)) == one
     return now
 
 

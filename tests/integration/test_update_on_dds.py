@@ -16,7 +16,7 @@ from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.lifecycle.update import present_settings, update_keystore
-from sros_tool.keystore.reader import governance_of
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import NamedValues, load_template, with_values
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
@@ -95,7 +95,7 @@ def test_which_governance_disturbs(ask: Ask, tmp_path: Path) -> None:
         target = with_values(present_settings(root).settings, values, rules)
         domains = DomainSet.of((DOMAIN, DOMAIN), (domain, domain)) if domain else None
         update_keystore(other, target, domains, now=datetime.now(UTC), allow_looser=True)
-        found = mismatch(governance_of(root), governance_of(other))
+        found = mismatch(Keystore(root).governance, Keystore(other).governance)
         disturbed = found.everything or f"topic {topic}" in found.names
         assert disturbed == (expected == SILENT)
         one, two = (root, other) if number % 2 else (other, root)

@@ -10,7 +10,6 @@ import pytest
 
 from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.layout import LEDGER, enclave_path
-from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import Keystore
@@ -57,7 +56,7 @@ def test_revoking_another_drops_it_too_and_the_ledger_keeps_it(tmp_path: Path) -
     assert serial not in listed(root)
     assert other in listed(root)
     assert f"{serial:x}" in {
-        each.serial for each in read_ledger(root).entries if each.what == "revocation"
+        each.serial for each in Keystore(root).ledger.entries if each.what == "revocation"
     }
     (found,) = [
         item

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from sros_tool.keystore.layout import list_enclaves
-from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.missing import likely_names, no_such_enclave
+from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import load_certificate
 from tests.support.harness import sros
 
@@ -78,7 +78,7 @@ def test_of_a_revoked_enclave_it_says_since_when(tmp_path: Path) -> None:
     assert serial != first
     sros("revoke", root, "/camera", "--reason", "keyCompromise").ok()
     (entry, *_) = (
-        e for e in read_ledger(root).entries if e.what == "revocation" and e.serial == serial
+        e for e in Keystore(root).ledger.entries if e.what == "revocation" and e.serial == serial
     )
     said = (
         f"enclave /camera of keystore '{root}' was revoked at {entry.time} (keyCompromise). Its "

@@ -14,7 +14,6 @@ from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.expiry import Threshold, _lifetimes, parse_threshold
 from sros_tool.keystore.layout import enclave_path
-from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
@@ -355,7 +354,7 @@ def test_all_earlier_certificates_of_the_renewed_are_revoked(tmp_path: Path) -> 
         assert (enclave_path(root, name) / "crl.pem").is_symlink()
         assert not problems(root, name, LATER)
     told = {
-        int(e.serial, 16): e.reason for e in read_ledger(root).entries if e.what == "revocation"
+        int(e.serial, 16): e.reason for e in Keystore(root).ledger.entries if e.what == "revocation"
     }
     assert told == revoked(root)
     # What was revoked already stays as it was, and nothing is listed twice.

@@ -18,7 +18,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.layout import enclave_path, list_enclaves
-from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
@@ -111,7 +110,9 @@ def test_earlier_certificates_are_revoked_too(tmp_path: Path) -> None:
     revoke(root, ["/a"], now=NOW + 30 * DAY)
     assert {each.serial for each in crl_of(root).revoked} == set(serials)
     assert not crl_of(root).revokes(other)
-    told = [int(each.serial, 16) for each in read_ledger(root).entries if each.what == "revocation"]
+    told = [
+        int(each.serial, 16) for each in Keystore(root).ledger.entries if each.what == "revocation"
+    ]
     assert sorted(told) == sorted(serials)
 
 

@@ -16,7 +16,6 @@ import pytest
 from benchmarks.inputs import fleet_file, fleet_policy
 from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_names
-from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.reader import Keystore
 from sros_tool.validity import parse_iso
 from tests.support.children import LONG
@@ -68,7 +67,7 @@ def test_all_of_them_are_there_and_sound(root: Path) -> None:
     names = enclave_names(root)
     assert len(names) == MANY
     assert sros("list_enclaves", root).ok().out.splitlines() == list(names)
-    ledger = read_ledger(root)
+    ledger = Keystore(root).ledger
     assert (ledger.gaps, ledger.unchained) == ((), 0)
     assert ledger.lines >= 2 * MANY
     bare = ("--exclude", "enclave.node-cannot-start")  # the policy leaves out the common part
@@ -110,7 +109,7 @@ def test_revoking_a_robot_and_renewing_the_others(root: Path) -> None:
     done = sros("renew", root, "--all-expiring", "100y").ok()
     assert done.out.count("renewed enclave") == len(rest)
     assert all((root / f"enclaves{name}/cert.pem").read_bytes() != before[name] for name in rest)
-    made = history(root, now=parse_iso(read_ledger(root).entries[-1].time))
+    made = history(root, now=parse_iso(Keystore(root).ledger.entries[-1].time))
     assert (made.gaps, made.unexplained) == ((), ())
     current = [e for e in made.items if e.status is HistoryStatus.CURRENT and e.entry.enclave]
     assert len(current) == 2 * len(rest)

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.reader import load_settings
+from sros_tool.keystore.reader import Keystore
 from tests.support.harness import policy_text, publish, sros
 from tests.support.made_by_ros2 import RELEASES, make
 
@@ -78,10 +77,10 @@ def test_the_first_write_takes_it_over_and_says_so(words: tuple[str, ...], tmp_p
     assert "adopt" in str(json.loads(sros(*words, "--dry-run", "--json").ok().out)["changes"])
     ended = sros(*words).ok()
     assert "which ros2/sros2 made" in ended.err and "taken on trust" in ended.err
-    assert load_settings(root).name == "sros2"
+    assert Keystore(root).template.name == "sros2"
     found = {each["id"] for each in json.loads(sros("check", root, "--json").out)["findings"]}
     assert not found & {"keystore.settings-missing", "keystore.not-in-ledger"}
-    assert not read_ledger(root).gaps
+    assert not Keystore(root).ledger.gaps
     assert "taken on trust" not in sros("renew", root, "/b/c").ok().err
 
 

@@ -20,13 +20,12 @@ from sros_tool.keystore import history as history_of_keystores
 from sros_tool.keystore.expiry import Threshold, _lifetimes
 from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_path
-from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
-from sros_tool.keystore.reader import Keystore, certificates_of, open_enclave, read_lists
+from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import issued_by, validity_of
@@ -110,7 +109,7 @@ class Verified:
         found = [f"{life}" for life in self._common_life if not life.contains(now)]
         crl = Keystore(self._root).revocation_list
         if crl:
-            (authority, *_) = certificates_of(self._root, "identity_ca")
+            (authority, *_) = Keystore(self._root).certificates_of("identity_ca")
             assert signed_by(crl.list, authority)
             if not Window(crl.this_update, crl.next_update).contains(now):
                 found.append("crl.pem")
@@ -199,11 +198,11 @@ class Thief:
 
 def refusal(root: Path, thief: Thief, now: datetime) -> str:
     """Why whoever trusts all CAs of the keystore, as Fast DDS does, refuses a thief; or ""."""
-    trusted = certificates_of(root, "identity_ca")
+    trusted = Keystore(root).certificates_of("identity_ca")
     issuers = [each for each in trusted if issued_by(thief.certificate, each)]
     if not issuers:
         return "not trusted"
-    lists = [each for each in read_lists(root) if signed_by(each.list, issuers[0])]
+    lists = [each for each in Keystore(root).revocation_lists if signed_by(each.list, issuers[0])]
     if any(each.revokes(thief.certificate.serial_number) for each in lists):
         return "revoked"
     return "" if validity_of(thief.certificate).contains(now) else "ended"
@@ -298,7 +297,9 @@ def test_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             assert not told.remarks
             create_enclaves(root, [gone], now=now)  # made anew, with what a node needs and no more
             rights.pop(gone, None)
-        if min(each.next_update for each in read_lists(root)) - now < timedelta(days=70):
+        if min(each.next_update for each in Keystore(root).revocation_lists) - now < timedelta(
+            days=70
+        ):
             refresh_crl(root, now=now)
         assert not verified.problems(names, now), now
         check_history(root, now)
@@ -330,7 +331,7 @@ def test_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert counts["expired"] > ENCLAVES * 2 * YEARS
     assert renewed > ENCLAVES * YEARS
     # The list lost what had ended; the ledger has it all.
-    known = {each.serial for each in read_ledger(root).entries if each.what == "revocation"}
+    known = {each.serial for each in Keystore(root).ledger.entries if each.what == "revocation"}
     assert {f"{thief.certificate.serial_number:x}" for thief in thieves} <= known
     assert longest < len(known) / 2
     assert verified.in_full > ENCLAVES * YEARS, verified.in_full

@@ -22,7 +22,6 @@ from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.history import history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
-from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
@@ -33,13 +32,7 @@ from sros_tool.keystore.lifecycle.update import (
     present_settings,
     update_keystore,
 )
-from sros_tool.keystore.reader import (
-    Keystore,
-    authority_files,
-    governance_of,
-    load_settings,
-    open_enclave,
-)
+from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import (
     NamedValues,
     ShortLived,
@@ -140,8 +133,8 @@ def test_from_development_to_production(root: Path) -> None:
     assert done.names("renewed") == ("/free", "/robot")
     assert not done.looser
     template = load_template("production")
-    assert governance_of(root) == governance_for(template.protection, ZERO)
-    assert load_settings(root) == template
+    assert Keystore(root).governance == governance_for(template.protection, ZERO)
+    assert Keystore(root).template == template
     for name, key in keys.items():
         folder = enclave_path(root, name)
         assert (folder / "key.pem").read_bytes() == key
@@ -164,7 +157,7 @@ def test_and_back(tmp_path: Path) -> None:
         to(root, "development", allow_looser=False)
     assert snapshot(root) == before
     done = to(root, "development")
-    assert load_settings(root) == load_template("development")
+    assert Keystore(root).template == load_template("development")
     assert len(certificate(enclave_path(root, "/robot") / "cert.pem").subject.rdns) == 1
     assert until(root, "/robot") == (5 * 365, 5 * 365)  # with the CAs, at the latest
     assert any("/free gains" in each for each in done.looser)
@@ -235,11 +228,11 @@ def test_rules_for_names(root: Path) -> None:
     assert "on topic /camera/*" in told(done)
     expressions = [
         each.topic_expression
-        for each in governance_of(root).domain_access_rules[0].topic_access_rules
+        for each in Keystore(root).governance.domain_access_rules[0].topic_access_rules
     ]
     assert expressions == ["rt/camera/*", "*"]
     to(root, with_values(present_settings(root).settings, dropped=[("topic", "/camera/*")]))
-    assert load_settings(root) == load_template("development")
+    assert Keystore(root).template == load_template("development")
 
 
 SIGNED = ("data=NONE", "metadata=SIGN")
@@ -258,13 +251,13 @@ def test_a_rule_replaces_the_one_for_the_same_names(
 ) -> None:
     for name, values in ((first, SIGNED), (second, ("data=ENCRYPT",))):
         sros("update_keystore", root, "--rule", " ".join((name, *values)), "--allow-looser").ok()
-    for settings in (load_settings(root), present_settings(root).settings):
+    for settings in (Keystore(root).template, present_settings(root).settings):
         (rule,) = settings.protection.named
         assert (str(rule), rule.protection.data) == (named, "ENCRYPT")
     assert "governance.unreachable-rule" not in found(root)
     kind, _, name = first.partition(" ")
     sros("update_keystore", root, "--drop-rule", f"{kind} {name}").ok()
-    assert load_settings(root).protection.named == ()
+    assert Keystore(root).template.protection.named == ()
 
 
 def test_a_rule_that_would_never_apply_is_refused(root: Path, tmp_path: Path) -> None:
@@ -339,11 +332,11 @@ def test_rights_that_were_put_back_are_not_signed_again(root: Path) -> None:
 
 def test_the_stages(root: Path) -> None:
     target = load_template("production")
-    governance = governance_of(root)
+    governance = Keystore(root).governance
     first = to(root, target, next_stage=True)
     assert (first.done, first.left) == ((UpdateStage.CREDENTIALS,), (UpdateStage.GOVERNANCE,))
-    assert governance_of(root) == governance
-    assert load_settings(root).name == "development"
+    assert Keystore(root).governance == governance
+    assert Keystore(root).template.name == "development"
     assert "one by one" in first.remarks[0].text
     assert found(root) == set()
     # What is created between the stages follows the new settings already.
@@ -353,7 +346,7 @@ def test_the_stages(root: Path) -> None:
     assert (second.done, second.left) == ((UpdateStage.GOVERNANCE,), ())
     assert (second.names("renewed"), second.names("signed")) == ((), ())
     assert "together" in second.remarks[0].text
-    assert load_settings(root) == target
+    assert Keystore(root).template == target
     third = to(root, target, next_stage=True)
     assert (third.done, third.changes) == ((), ())
 
@@ -372,7 +365,7 @@ def test_the_command_of_the_second_stage(root: Path) -> None:
     assert (forgotten.status, "Name the goal again" in forgotten.err) == (2, True)
     second = sros(*printed(first.err)).ok()
     assert "renewed" not in second.out
-    assert load_settings(root) == load_template("production")
+    assert Keystore(root).template == load_template("production")
     crl = Keystore(root).revocation_list
     assert crl
     assert len(crl.revoked) == 2
@@ -424,7 +417,7 @@ def test_one_ca_becomes_two(by_ros2: bool, tmp_path: Path) -> None:
         root = make(tmp_path, "sros2")
     done = to(root, "production", allow_looser=False)
     assert "rotate_ca" in told(done)
-    assert set(authority_files(root)) == {"identity_ca", "permissions_ca"}
+    assert set(Keystore(root).authority_files) == {"identity_ca", "permissions_ca"}
     assert not list(root.glob("*/ca.*"))
     # The two files still hold one CA, and that is found until the permissions CA is replaced.
     assert found(root) - {"keystore.folder-open"} == {"keystore.one-authority"}
@@ -489,7 +482,7 @@ def test_two_cas_do_not_become_one(root: Path) -> None:
     assert snapshot(root) == before
     kept = with_values(load_template("sros2"), [("authorities.layout", "separate")])
     to(root, kept)
-    assert load_settings(root).name == "sros2"
+    assert Keystore(root).template.name == "sros2"
 
 
 def test_a_key_is_not_moved(root: Path) -> None:
@@ -569,7 +562,7 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
     edit(root)
     update_keystore(root, target, domains, now=LATER, allow_looser=True, replace_edits=True)
     assert finding not in found(root)
-    assert governance_of(root).domain_access_rules[0].rtps_protection_kind == "NONE"
+    assert Keystore(root).governance.domain_access_rules[0].rtps_protection_kind == "NONE"
     sound(root)
 
 
@@ -649,7 +642,7 @@ def test_during_a_rotation(stages: int, root: Path) -> None:
         assert not open_enclave(enclave_path(root, name), now=LATER).problems
     rotate_ca(root, now=LATER, finish=True)
     sound(root)
-    assert load_settings(root) == target
+    assert Keystore(root).template == target
 
 
 def test_settings_that_changed_meanwhile(root: Path) -> None:
@@ -677,7 +670,7 @@ def test_a_governance_of_one_s_own_is_not_replaced_unasked(tmp_path: Path) -> No
 def _sign_governance(root: Path, old: str, new: str) -> None:
     """Edit the governance as its owner does who signs it with another tool."""
     _put(root / "enclaves/governance.xml", old, new)
-    authorities = load_authorities(Keystore(root), load_settings(root), IN_KEYSTORE, NOW)
+    authorities = load_authorities(Keystore(root), Keystore(root).template, IN_KEYSTORE, NOW)
     document = (root / "enclaves/governance.xml").read_bytes()
     (root / "enclaves/governance.p7s").write_bytes(authorities.permissions.sign(document, "it"))
 
@@ -687,7 +680,7 @@ def test_a_governance_that_was_signed_elsewhere(root: Path) -> None:
     _sign_governance(root, "<rtps_protection_kind>SIGN", "<rtps_protection_kind>NONE")
     assert "governance.not-as-settings" in found(root)
     sros("update_keystore", root, "--discard-edits").ok()
-    assert governance_of(root).domain_access_rules[0].rtps_protection_kind == "SIGN"
+    assert Keystore(root).governance.domain_access_rules[0].rtps_protection_kind == "SIGN"
     assert "governance.not-as-settings" not in found(root)
 
 
@@ -765,14 +758,17 @@ def test_the_options(root: Path) -> None:
     ).ok()  # fmt: skip
     assert str(present_settings(root).domains) == "0,7"
     sros("update_keystore", root, "--drop-rule", "topic /camera/*").ok()
-    assert governance_of(root).domain_access_rules[0].topic_access_rules[0].topic_expression == "*"
+    assert (
+        Keystore(root).governance.domain_access_rules[0].topic_access_rules[0].topic_expression
+        == "*"
+    )
     _stronger_settings(root)
     assert "--take-edits" in sros("update_keystore", root, "--set", "protection.rtps=NONE").err
     sros("update_keystore", root, "--take-edits").ok()
-    assert load_settings(root).protection.rtps == "ENCRYPT"
+    assert Keystore(root).template.protection.rtps == "ENCRYPT"
     _put(root / "sros.toml", 'rtps = "ENCRYPT"', 'rtps = "NONE"')
     sros("update_keystore", root, "--discard-edits").ok()
-    assert load_settings(root).protection.rtps == "ENCRYPT"
+    assert Keystore(root).template.protection.rtps == "ENCRYPT"
 
 
 @pytest.mark.parametrize(
@@ -803,5 +799,5 @@ def test_no_keystore(tmp_path: Path) -> None:
 
 def test_the_settings_are_in_the_ledger(root: Path) -> None:
     to(root, "production")
-    entries = [each for each in read_ledger(root).entries if each.what == "settings"]
+    entries = [each for each in Keystore(root).ledger.entries if each.what == "settings"]
     assert ['name = "production"' in each.settings for each in entries] == [False, True]

@@ -16,7 +16,7 @@ from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack, unpack
 from sros_tool.keystore.layout import PERMISSIONS, SEAL
-from sros_tool.keystore.reader import Keystore, load_settings
+from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.keys import load_key
 from tests.support.harness import Ended, policy_text, publish, snapshot, sros
 
@@ -208,7 +208,9 @@ def test_a_sealed_answer_with_files_that_do_not_fit(
     files = unpack((folder / "far.tgz").read_bytes())
     del files[SEAL]
     files = spoil(files, root)
-    authority = load_authority(Keystore(root), PERMISSIONS, load_settings(root), IN_KEYSTORE, now)
+    authority = load_authority(
+        Keystore(root), PERMISSIONS, Keystore(root).template, IN_KEYSTORE, now
+    )
     key = load_key((folder / "robot/enclaves/far/key.pem").read_bytes(), "key").public_key()
     answer = RequestAnswer("/far", files, seal(files, 9, authority))
     if not why:

@@ -11,7 +11,7 @@ import pytest
 
 from sros_tool.files import templates_dir
 from sros_tool.keystore.lifecycle.zenoh import set_zenoh
-from sros_tool.keystore.reader import load_ca_certificate
+from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
 from sros_tool.zenoh.network import ZenohNetwork
 from tests.support.harness import policy_text, publish, snapshot, sros
@@ -45,7 +45,7 @@ def folder(made: Path, tmp_path: Path) -> Path:
 def in_step(root: Path) -> None:
     """The files are what the keystore needs, and signed by its permissions CA."""
     assert sros("zenoh", root, "--check").status == 0
-    authority = load_ca_certificate(root, "permissions")
+    authority = Keystore(root).ca_certificate("permissions")
     documents = list((root / "enclaves").rglob("*.json5"))
     assert documents
     for each in documents:

@@ -14,7 +14,7 @@ import pytest
 
 from sros_tool.files import templates_dir
 from sros_tool.keystore.layout import enclave_names
-from sros_tool.keystore.reader import governance_of
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
@@ -207,7 +207,7 @@ def test_the_flow_agrees_with_the_one_that_explain_follows(
             load_rights(root).rights,
             without=OF_EVERY_NODE,
             questions=QUESTIONS,
-            unguarded=unguarded(governance_of(root)),
+            unguarded=unguarded(Keystore(root).governance),
             everybody=enclave_names(root),
         )
         path = tmp_path / "open.html"

@@ -33,7 +33,7 @@ from sros_tool.keystore.lifecycle.enclaves import write_enclaves
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.protection import with_stated
-from sros_tool.keystore.reader import check_domain, load_settings
+from sros_tool.keystore.reader import Keystore, check_domain
 from sros_tool.keystore.settings import with_places, write_settings
 from sros_tool.keystore.template import Template, template_names
 from sros_tool.keystore.transaction.recovery import tidy
@@ -313,7 +313,7 @@ def _revoked_before(
 
 def refuse_other_template(root: Path, template: Template) -> None:
     """Raise `UsageError` if the existing keystore ``root`` was made from another template."""
-    present = load_settings(root)
+    present = Keystore(root).template
     named = template.name == present.name and template.name in template_names()
     plain = replace(template, name=present.name, description=present.description)
     if not (named or with_places(plain, present) == present):

@@ -23,7 +23,7 @@ from sros_tool.keystore.outcomes import (
     changes_below,
     enclave_result,
 )
-from sros_tool.keystore.reader import load_ca_certificate
+from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words, shows
 
@@ -163,7 +163,7 @@ def shown_keystore(
     for roles in [(role,) for role in ROLES] if separate else [ROLES]:
         role, certificate = roles[0], None
         if not result.dry_run:
-            certificate = load_ca_certificate(result.root, role)
+            certificate = Keystore(result.root).ca_certificate(role)
         elif role in imported:
             certificate = load_certificate(imported[role], f"of the {role} CA")
         authorities.append(KeystoreAuthority(authority_facts(roles, certificate), role in imported))

@@ -68,12 +68,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     rights_text,
 )
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
-from sros_tool.keystore.reader import (
-    Keystore,
-    as_keystore,
-    authority_files,
-    load_settings,
-)
+from sros_tool.keystore.reader import Keystore, as_keystore
 from sros_tool.keystore.recorded import EarlierRights, RecordedRights
 from sros_tool.keystore.settings import (
     HandEdits,
@@ -237,7 +232,7 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
             "Edit one of them first, or name what to change with --set or --template.",
         )
     if present.written is None and not present.without_settings:
-        load_settings(root)  # raises what is wrong with them
+        _ = Keystore(root).template  # raises what is wrong with them
         raise KeystoreError(
             f"there is no {SETTINGS} in keystore '{root}', so it states no change",
             "",
@@ -287,7 +282,7 @@ def _checked_target(root: Path, present: PresentSettings, target: Template) -> T
                 f"Leave authorities.{name} out; `sros rotate_ca --{name.replace('_', '-')}` makes "
                 "a CA with a key elsewhere.",
             )
-    if not target.separate_authorities and len(authority_files(root)) > 1:
+    if not target.separate_authorities and len(Keystore(root).authority_files) > 1:
         raise UsageError(
             "a keystore with separate CAs does not go back to one CA for both",
             "With one CA, every enclave can sign its own permissions (Cyclone DDS 0.10.2, Fast DDS "
