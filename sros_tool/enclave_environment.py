@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.participant import JoinContext
-    from sros_tool.keystore.reader import OpenedEnclave
+    from sros_tool.keystore.reader import Keystore, OpenedEnclave
     from sros_tool.keystore.zenoh.opened import OpenedZenoh
     from sros_tool.pki.token import TokenUri
 
@@ -83,14 +83,12 @@ def loadable_environment(
     from sros_tool.keystore.issuing.tokens import pin_notes
     from sros_tool.keystore.layout import (
         KEY_FILE,
-        check_keystore,
         enclave_path,
         has_enclave,
-        list_enclaves,
     )
     from sros_tool.keystore.missing import no_such_enclave
     from sros_tool.keystore.participant import JoinContext
-    from sros_tool.keystore.reader import open_enclave
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.names import check_enclave_name
     from sros_tool.pki.token import MODULE_VARIABLE
     from sros_tool.runtime.environment import (
@@ -114,17 +112,18 @@ def loadable_environment(
     used = chosen_rmw(rmw, environment)
     with_zenoh = _uses_zenoh(rmw, used)
     check_enclave_name(name)
-    check_keystore(root)
+    keystore = Keystore(root)
+    keystore.check()
     if not has_enclave(root, name):
-        raise no_such_enclave(root, name, list_enclaves(root))
-    folder = enclave_path(root, name)
-    state = open_enclave(folder, now=now)
+        raise no_such_enclave(root, name, keystore.names)
+    folder = keystore.folder(name)
+    state = keystore.enclave(name, now=now)
     domains = state.domains() if wanted is not None else state.joined_domains()
-    zenoh = _opened_zenoh(root, name, state, now) if with_zenoh and not state.token else None
+    zenoh = _opened_zenoh(keystore, name, state, now) if with_zenoh and not state.token else None
     if zenoh and domains:
         wanted = _zenoh_domain(root, zenoh, wanted, domains)
     domain = choose_domain(domains, wanted, root) if domains else 0
-    state = open_enclave(folder, now=now, domain=domain)
+    state = keystore.enclave(name, now=now, domain=domain)
     if not with_zenoh:
         state = _check_joining(name, folder, state, used, JoinContext(domain, now, zone))
     problems = state.problems_at_home if target else state.problems
@@ -145,7 +144,7 @@ def loadable_environment(
             _check_folders_closed(root, folder, name)
         if not zenoh:
             vendor = vendor_of(used) or vendor_here(environment)[0]
-            _check_dates_here(name, folder, vendor, JoinContext(domain, now, zone))
+            _check_dates_here(name, keystore, vendor, JoinContext(domain, now, zone))
     variables = secured_environment(target or root, name, domain)
     if zenoh:
         place = enclave_path(target or root, name)
@@ -222,18 +221,18 @@ def _check_joining(
     )
 
 
-def _check_dates_here(name: str, folder: Path, vendor: Vendor, context: JoinContext) -> None:
+def _check_dates_here(name: str, keystore: Keystore, vendor: Vendor, context: JoinContext) -> None:
     """Raise `KeystoreError` if DDS takes permissions that are valid for expired in this time zone.
 
     Fast DDS reads their dates, which are in UTC, as local time.
     """
     from sros_tool.explain.evaluator import Evaluator
     from sros_tool.explain.question import ask
-    from sros_tool.keystore.participant import load_enclave
+    from sros_tool.keystore.participant import load_enclave_of
 
     if not context.zone.utcoffset(context.at.replace(tzinfo=None)):
         return
-    enclave = load_enclave(name, folder, at=context.at)
+    enclave = load_enclave_of(keystore, name, at=context.at)
     answer = Evaluator(vendor, enclave, context).answer(ask("join"))
     if not answer.allowed and answer.decision.reason in ("expired", "not-yet-valid"):
         raise KeystoreError(
@@ -311,19 +310,21 @@ def _uses_zenoh(named: str | None, rmw: str) -> bool:
     return False
 
 
-def _opened_zenoh(root: Path, name: str, state: OpenedEnclave, now: datetime) -> OpenedZenoh:
+def _opened_zenoh(
+    keystore: Keystore, name: str, state: OpenedEnclave, now: datetime
+) -> OpenedZenoh:
     """Return the Zenoh configurations of an enclave.
 
     Raises:
         KeystoreError: it has none, or one that its permissions CA did not sign as it is, or that
             does not state the rights of its permissions.
     """
-    from sros_tool.keystore.layout import PUBLIC, enclave_path
+    from sros_tool.keystore.layout import PUBLIC
     from sros_tool.keystore.zenoh.opened import ZenohFault, open_zenoh
 
-    found = open_zenoh(enclave_path(root, name), name, state)
+    root, found = keystore.root, open_zenoh(keystore.folder(name), name, state)
     if not found.problems:
-        _refuse_outdated(root, name, now)
+        _refuse_outdated(keystore, name, now)
         return found
     write = f"`sros zenoh {quote(str(root))}`"
     if not (root / PUBLIC).is_dir():
@@ -342,27 +343,25 @@ def _opened_zenoh(root: Path, name: str, state: OpenedEnclave, now: datetime) ->
     )
 
 
-def _refuse_outdated(root: Path, name: str, now: datetime) -> None:
+def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
     """Raise `KeystoreError` if the file of an enclave has not the rights of all others.
 
     A router, and a session that connects to others, enforces those rights: with a file of before,
     validly signed, it would enforce those of before.  An export does not have them.
     """
     from sros_tool.keystore.layout import PERMISSIONS, SETTINGS
-    from sros_tool.keystore.reader import Keystore, open_keystore
     from sros_tool.keystore.zenoh.wanted import zenoh_drift
     from sros_tool.zenoh.configuration import Mode
 
-    if not (root / SETTINGS).exists():
+    if not keystore.has(SETTINGS):
         return
-    keystore = open_keystore(root)
     network = keystore.settings.zenoh if keystore.settings else None
     if network is None or (network.router != name and network.mode is Mode.CLIENT):
         return
-    authority = Keystore(root).ca_certificate(PERMISSIONS)
+    authority = keystore.ca_certificate(PERMISSIONS)
 
     def drifted(moment: datetime | None) -> bool:
-        drifts, _ = zenoh_drift(root, network, keystore.domains, authority, moment)
+        drifts, _ = zenoh_drift(keystore, network, keystore.domains, authority, moment)
         return any(drift.enclave == name for drift in drifts)
 
     # The router starts although the permissions of another enclave have expired since.

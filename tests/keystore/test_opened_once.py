@@ -35,6 +35,7 @@ QUESTIONS = {
     "view": ("view", "ks", "-o", "view.html", "--force"),
     "explain": ("explain", "ks", "/e1", "publish", "/x"),
     "explain --who": ("explain", "ks", "--who", "publish", "/chatter"),
+    "env": ("env", "ks", "/e1"),
     "inspect": ("inspect", "ks"),
     "verify": ("verify", "ks"),
     "metrics": ("metrics", "ks"),
