@@ -366,7 +366,7 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
 
     # The router starts although the permissions of another enclave have expired since.
     if drifted(now) and drifted(None):
-        where = quote(str(root))
+        where = quote(str(keystore.root))
         raise KeystoreError(
             f"the Zenoh configuration of enclave {name} is not in step with the keystore",
             "It states the rights of other enclaves otherwise than their permissions.",
