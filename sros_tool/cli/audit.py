@@ -132,20 +132,20 @@ def audit(
     secured = enclave is not None
     then = "the result is shown"
     snapshot, rmw = observe(environment, watch, spin_time, report, secured=secured, then=then)
-    found = judge(snapshot.everything)
+    audited = judge(snapshot.everything)
     kept_changing = snapshot.seconds if not snapshot.settled else 0
-    fine = found.allowed and (partial or (found.complete and not kept_changing))
-    if not found.observation.nodes:
+    fine = audited.allowed and (partial or (audited.complete and not kept_changing))
+    if not audited.observation.nodes:
         raise UnavailableError(
             "there is nothing to audit: no node was observed",
             why_empty(environment, snapshot.seconds, rmw, enclave),
         )
     existed = patch is not None and patch.exists()
-    written = _write_patch(found, patch, dry_run=dry_run)
+    written = _write_patch(audited, patch, dry_run=dry_run)
     if as_json:
         from sros_tool.explain.audit import AuditResult, RefusedEnclave
 
-        refused = sorted(found.refused.items())
+        refused = sorted(audited.refused.items())
         print_json(
             AuditResult(
                 source,
@@ -153,23 +153,23 @@ def audit(
                 enclaves.vendor,
                 enclaves.context.domain,
                 fine,
-                denied=found.denied,
+                denied=audited.denied,
                 refused=[RefusedEnclave(name, reason) for name, reason in refused],
-                unseen=found.unseen,
-                unjudged=found.unjudged,
-                observation=found.observation,
+                unseen=audited.unseen,
+                unjudged=audited.unjudged,
+                observation=audited.observation,
                 settled=snapshot.settled,
                 partial=partial,
                 patch=patch if written else None,
                 dry_run=dry_run,
                 changes=file_change(patch, existed=existed) if patch and written else (),
-                notes=(*found.notes, *found.missing.notes),
+                notes=(*audited.notes, *audited.missing.notes),
             )
         )
     else:
-        _show(found, enclaves, kept_changing)
-    print_notes((*found.notes, *found.missing.notes))
-    if found.allowed and not fine:
+        _show(audited, enclaves, kept_changing)
+    print_notes((*audited.notes, *audited.missing.notes))
+    if audited.allowed and not fine:
         echo(_NOT_ALL, err=True)
     if written:
         policy = shlex.quote(str(source)) if enclaves.what == "policy" else "POLICY"
@@ -177,7 +177,7 @@ def audit(
         echo(f"{written}; add it: {command}", err=True)
     elif patch is not None:
         stays = f"; the earlier '{patch}' stays" if existed else ""
-        said = "no patch is needed" if found.allowed else _NO_PATCH
+        said = "no patch is needed" if audited.allowed else _NO_PATCH
         echo(said + stays, err=True)
     return 0 if fine else 1
 
@@ -232,13 +232,13 @@ def _enclaves(
     return policy_enclaves(read_policy_for(source, fleet), governance, chosen, context)
 
 
-def _write_patch(found: Audit, patch: Path | None, *, dry_run: bool) -> str:
+def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
     """Write the rights to add to ``patch``; return what was done, "" if there is nothing to add."""
     from sros_tool.graph.draft import render
 
-    if patch is None or not found.missing.profiles:
+    if patch is None or not audited.missing.profiles:
         return ""
-    document = render(found.missing)
+    document = render(audited.missing)
     if dry_run:
         return f"would {'replace' if patch.exists() else 'write'} '{patch}'"
     return save(patch, document)
@@ -247,31 +247,33 @@ def _write_patch(found: Audit, patch: Path | None, *, dry_run: bool) -> str:
 # ── output ──────────────────────────────────────────────────────────────────────────────
 
 
-def _denied(found: Audit) -> list[str]:
+def _denied(audited: Audit) -> list[str]:
     """Return a line for each enclave that is refused, and for each right that is denied."""
-    refused = [f"{name}: every process: {reason}" for name, reason in sorted(found.refused.items())]
-    return [*refused, *map(str, found.denied)]
+    refused = [
+        f"{name}: every process: {reason}" for name, reason in sorted(audited.refused.items())
+    ]
+    return [*refused, *map(str, audited.denied)]
 
 
-def _show(found: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None:
+def _show(audited: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None:
     """Print what is denied and unseen; the verdict names everything that it does not cover."""
-    for line in (*_denied(found), *(f"not seen: {node}" for node in found.unseen)):
+    for line in (*_denied(audited), *(f"not seen: {node}" for node in audited.unseen)):
         echo(line)
-    what = [counted(len(found.denied), "right")] if found.denied else []
-    what += [counted(len(found.refused), "whole enclave")] if found.refused else []
+    what = [counted(len(audited.denied), "right")] if audited.denied else []
+    what += [counted(len(audited.refused), "whole enclave")] if audited.refused else []
     verdict = f"{' and '.join(what) or 'nothing'} would be denied of "
-    verdict += f"{counted(len(found.observation.nodes), 'node')} with "
+    verdict += f"{counted(len(audited.observation.nodes), 'node')} with "
     verdict += (
-        f"{counted(found.observation.endpoint_count, 'endpoint')}, on {enclaves.vendor.title}"
+        f"{counted(audited.observation.endpoint_count, 'endpoint')}, on {enclaves.vendor.title}"
     )
-    if found.unseen:
-        number, of = len(found.expected), len(found.expected) - len(found.unseen)
+    if audited.unseen:
+        number, of = len(audited.expected), len(audited.expected) - len(audited.unseen)
         seen = f"{of} of {counted(number, 'node')} of the {enclaves.what}"
         verdict = f"only {seen} {'was' if of == 1 else 'were'} seen: {verdict}"
-    if found.unjudged:
-        verdict += f"; not judged: {', '.join(found.unjudged)}"
+    if audited.unjudged:
+        verdict += f"; not judged: {', '.join(audited.unjudged)}"
     if kept_changing:
         verdict += f"; the ROS graph kept changing for {kept_changing:.0f} s"
     echo(verdict, err=True)
-    if any(denied_right.by_rule for denied_right in found.denied):
+    if any(denied_right.by_rule for denied_right in audited.denied):
         echo("a DENY denies some of it; no right that is added changes that", err=True)

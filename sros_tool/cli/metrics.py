@@ -97,13 +97,13 @@ def metrics(
         findings = keystore_findings(
             keystore, now=moment, zone=local_zone(os.environ), policies=wanted
         )
-        found = keystore_metrics(keystore, findings, now=moment, each_enclave=not earliest)
-        found += _of_processes(moment) if runtime else ()
-    text = render_metrics(found)
+        gauges = keystore_metrics(keystore, findings, now=moment, each_enclave=not earliest)
+        gauges += _of_processes(moment) if runtime else ()
+    text = render_metrics(gauges)
     changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, text.encode()) if output and not dry_run else ""
     if as_json:
-        print_json(KeystoreMetrics(root, found, dry_run, changes, ()))
+        print_json(KeystoreMetrics(root, gauges, dry_run, changes, ()))
     elif dry_run:
         echo(f"would write {output or 'to standard output'}: {len(text)} characters")
     elif output:

@@ -286,10 +286,10 @@ def _difference_markdown(
     parts = []
     rest = "which `sros diff_policy` shows"
     for sign, title in (("+", "added"), ("-", "removed")):
-        found = [line.removeprefix(f"{sign} ") for line in lines if line.startswith(sign)]
-        if found:
-            parts.append(f"**{len(found)} {title}**")
-            parts.append(bounded(map(code, found), _MOST_LINES, rest))
+        signed = [line.removeprefix(f"{sign} ") for line in lines if line.startswith(sign)]
+        if signed:
+            parts.append(f"**{len(signed)} {title}**")
+            parts.append(bounded(map(code, signed), _MOST_LINES, rest))
     notes = [f"{note.id}: {note.text}" for note in (*first.notes, *second.notes)]
     if notes:
         parts += ["**Notes**", bounded(map(code, notes), 4000, rest)]
@@ -315,7 +315,7 @@ def _drawn_difference(
     changed: dict[str, set[str]] = {}
     for right in (*difference.only_first, *difference.only_second):
         changed.setdefault(right.kind, set()).add(right.name)
-    names = {kind: Names(sorted(found)) for kind, found in changed.items()}
+    names = {kind: Names(sorted(members)) for kind, members in changed.items()}
 
     def side(title: str, of: RightsSource) -> PictureSource:
         used = (e for e in of.rights if e.kind in names and names[e.kind].meets(e.name))
@@ -338,9 +338,9 @@ def _protection_differences(
     if first.protections is None or second.protections is None:
         return []
     one, other = set(first.protections), set(second.protections)
-    found = [("-", protection) for protection in first.protections if protection not in other]
-    found += [("+", protection) for protection in second.protections if protection not in one]
-    return sorted(found, key=lambda line: (line[1].enclave, line[1].name, line[0] == "+"))
+    differences = [("-", protection) for protection in first.protections if protection not in other]
+    differences += [("+", protection) for protection in second.protections if protection not in one]
+    return sorted(differences, key=lambda line: (line[1].enclave, line[1].name, line[0] == "+"))
 
 
 def _difference_lines(
@@ -646,16 +646,16 @@ def policies(
     if target is not None:
         _copy(source, target, as_json=as_json, dry_run=dry_run)
         return 0
-    found = {path: read_policy(path) for path in sorted(source.glob("*.xml"))}
+    shipped = {path: read_policy(path) for path in sorted(source.glob("*.xml"))}
     if as_json:
         listed = [
             PolicyFile(path, [enclave.path for enclave in policy.enclaves])
-            for path, policy in found.items()
+            for path, policy in shipped.items()
         ]
         print_json(ShippedPolicies(listed))
         return 0
-    width = max(len(path.name) for path in found)
-    for path, policy in found.items():
+    width = max(len(path.name) for path in shipped)
+    for path, policy in shipped.items():
         echo(f"{path.name:{width}}  {', '.join(each.path for each in policy.enclaves)}")
     echo(f"they are in '{source}'", err=True)
     return 0
@@ -866,14 +866,14 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
     from sros_tool.fleet.enclaves import folded
     from sros_tool.reach import path_text
 
-    found = [
+    reached = [
         (
             new_reach.source,
             f"+ {new_reach.source} can influence {new_reach.target}: {path_text(new_reach.path)}",
         )
         for new_reach in reach
     ]
-    lines = list(folded(head.fleet, found))
+    lines = list(folded(head.fleet, reached))
     more = len(lines) - _MOST_NEW_LINES
     if more > 0:
         lines[_MOST_NEW_LINES:] = [f"+ and {more} more that can influence others (--json has all)"]

@@ -220,7 +220,7 @@ def env(
     if there is None and in_container:
         there = INSTALLED
     target = None if there is None else target_path(there)
-    found = enclave_environment(
+    secured = enclave_environment(
         root, rest[0], domain, rmw, accept_key=accept_readable_key, target=target
     )
     if target and in_container:
@@ -231,18 +231,18 @@ def env(
             rest[0],
             form,
             target=target,
-            variables=found.variables,
+            variables=secured.variables,
             name=container or "",
             image=image or "",
             now=now(),
         )
     else:
-        text = render_environment(found.variables, "json" if as_json else form)
-    notes = [*found.notes, *found.enclave_notes]
-    if found.needs_pin:
+        text = render_environment(secured.variables, "json" if as_json else form)
+    notes = [*secured.notes, *secured.enclave_notes]
+    if secured.needs_pin:
         notes.append(Note("token.no-pin", _NO_PIN))
     if as_json:
-        print_json(PrintedEnvironment(root, rest[0], found.variables, notes))
+        print_json(PrintedEnvironment(root, rest[0], secured.variables, notes))
     else:
         echo_document(text)
         print_notes(notes)
@@ -353,7 +353,7 @@ def run(
             f"Leave `--enclave {shlex.quote(other)}` out, or name the same enclave: `sros run "
             f"{shlex.quote(str(root))} {shlex.quote(other)} -- COMMAND`.",
         )
-    found = enclave_environment(root, name, domain, rmw, accept_key=accept_readable_key)
+    secured = enclave_environment(root, name, domain, rmw, accept_key=accept_readable_key)
     program = shutil.which(command[0])
     if program is None:
         raise UsageError(
@@ -368,16 +368,16 @@ def run(
             f"added {added}, so that the ROS graph shows the enclave (--no-ros-args: do not)",
             err=True,
         )
-    environment = {**os.environ, **found.variables}
+    environment = {**os.environ, **secured.variables}
     pin = environment.pop(_FAST_DDS_PIN, None)
-    if found.needs_pin and pin is None:
+    if secured.needs_pin and pin is None:
         print_notes([Note("token.no-pin", _NO_PIN)])
-    elif found.needs_pin and pin is not None:
+    elif secured.needs_pin and pin is not None:
         environment[_FAST_DDS_PIN] = pin
-    print_notes(found.notes)
+    print_notes(secured.notes)
     names_it = enclave_argument(command) == name or _is_demo(command)
     if not names_it:
-        print_notes(found.enclave_notes)
+        print_notes(secured.enclave_notes)
     sys.stdout.flush()
     sys.stderr.flush()
     for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them, and COMMAND would too
@@ -411,16 +411,16 @@ def _enclave_of_node(file: Path, command: Sequence[str]) -> str:
         )
     ns, name = node
     full = f"/{ns.strip('/')}/{name}".replace("//", "/")
-    found = read_policy(file).enclaves_of_node(ns, name)
-    if len(found) != 1:
-        names = ", ".join(enclave.path for enclave in found[:3])
-        what = f"in {len(found)} enclaves, such as {names}" if found else "in no enclave"
+    enclaves = read_policy(file).enclaves_of_node(ns, name)
+    if len(enclaves) != 1:
+        names = ", ".join(enclave.path for enclave in enclaves[:3])
+        what = f"in {len(enclaves)} enclaves, such as {names}" if enclaves else "in no enclave"
         raise UsageError(
             f"the policy '{file}' has the node {full} {what}",
             "A process runs in one enclave.",
             f'Give it a profile in one enclave: `<profile ns="{ns}" node="{name}">`.',
         )
-    return found[0].path
+    return enclaves[0].path
 
 
 @click.command(
@@ -582,13 +582,13 @@ def units(
         files[TEMPLATE] = node_template(user or _NODE_USER)
         with progress("checking"):
             for name in names:
-                found = enclave_environment(
+                secured = enclave_environment(
                     root, name, domain, rmw, accept_key=accept_readable_key, target=place
                 )
-                notes += [*found.notes, *found.enclave_notes]
+                notes += [*secured.notes, *secured.enclave_notes]
                 files[f"sros@{unit_instance(name)}.service.d/enclave.conf"] = node_settings(
                     name,
-                    found.variables,
+                    secured.variables,
                     str(place),
                     command=command,
                     below=enclaves_below(root, name),
@@ -633,7 +633,7 @@ def _owner(root: Path) -> str:
 
 def _this_program() -> str:
     """Return the absolute path of the program sros that runs.  Raises `UsageError`."""
-    found = shutil.which(sys.argv[0]) or shutil.which("sros")
-    if found is None or not os.access(found, os.X_OK):
+    path = shutil.which(sys.argv[0]) or shutil.which("sros")
+    if path is None or not os.access(path, os.X_OK):
         raise UsageError("this program has no path of its own", "", "Add --sros FILE.")
-    return str(Path(found).absolute())
+    return str(Path(path).absolute())

@@ -186,8 +186,8 @@ def _network(settings: Template, given: dict[str, str]) -> ZenohNetwork:
     from sros_tool.zenoh.network import ZenohNetwork
 
     network = settings.zenoh or ZenohNetwork()
-    found = with_values(replace(settings, zenoh=network), list(given.items())).zenoh
-    return found or network
+    chosen = with_values(replace(settings, zenoh=network), list(given.items())).zenoh
+    return chosen or network
 
 
 def _domains(text: str | None) -> str:
@@ -273,11 +273,11 @@ def _show_from(
     return 1 if any(finding.severity >= ERROR for finding in findings) else 0
 
 
-def _lines(document: ConfigurationDocument, found: Sequence[RightsBehindRules]) -> Iterator[str]:
+def _lines(document: ConfigurationDocument, subjects: Sequence[RightsBehindRules]) -> Iterator[str]:
     from sros_tool.checks.zenoh import VERBS
 
     yield f"{document.name}: the configuration of a {_kind(document)}"
-    for rights in found:
+    for rights in subjects:
         if not (rights.rights or rights.unsaid or rights.denied):
             continue
         obeys = ", by rules that bind only itself" if rights.own else ""
@@ -306,17 +306,17 @@ def _kind(document: ConfigurationDocument) -> str:
     return mode if mode == "router" else f"session (mode {mode})"
 
 
-def _who(found: RightsBehindRules) -> str:
-    if found.own:
-        return f"the process itself ({found.subject})"
-    if found.names is None:
-        return f"everybody who gets a connection{f' ({found.subject})' if found.subject else ''}"
-    return first_few(found.names, _MOST_KEYS)
+def _who(rights: RightsBehindRules) -> str:
+    if rights.own:
+        return f"the process itself ({rights.subject})"
+    if rights.names is None:
+        return f"everybody who gets a connection{f' ({rights.subject})' if rights.subject else ''}"
+    return first_few(rights.names, _MOST_KEYS)
 
 
-def _why_no_policy(found: Sequence[RightsBehindRules]) -> str:
+def _why_no_policy(subjects: Sequence[RightsBehindRules]) -> str:
     """Say which subjects have rights, but are no enclaves."""
-    strangers = [_who(rights) for rights in found if rights.rights]
+    strangers = [_who(rights) for rights in subjects if rights.rights]
     if not strangers:
         return "They allow no ROS name that anybody may publish, subscribe, call or serve."
     return (
@@ -325,11 +325,11 @@ def _why_no_policy(found: Sequence[RightsBehindRules]) -> str:
     )
 
 
-def _left_out(found: Sequence[RightsBehindRules]) -> Iterator[Note]:
+def _left_out(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
     """Yield notes about what the rules allow or deny, and the policy does not state."""
     from sros_tool.translate_from_zenoh import enclave_of
 
-    for rights in found:
+    for rights in subjects:
         if (rights.rights or rights.unsaid) and not enclave_of(rights):
             yield Note("zenoh.no-enclave", f"{_who(rights)}: no enclave, so not in the policy")
         elif rights.unsaid:
@@ -340,7 +340,7 @@ def _left_out(found: Sequence[RightsBehindRules]) -> Iterator[Note]:
                 f"states exactly: {keys}",
             )
     domains = sorted(
-        {one.domain for rights in found for one in rights.rights} - {"0", "*"}, key=int
+        {one.domain for rights in subjects for one in rights.rights} - {"0", "*"}, key=int
     )
     if domains:
         yield Note(

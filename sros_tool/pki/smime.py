@@ -468,12 +468,12 @@ def _signature(signer: der.Value) -> Signature:
     _digest_of(algorithm)
     for attribute in unsigned:
         _attributes(attribute.content)
-    found = [_attributes(attribute.content) for attribute in attributes]
+    contents = [_attributes(attribute.content) for attribute in attributes]
     return Signature(
         named,
         # The signature covers the attributes with the tag SET, not with their tag in SignerInfo.
         b"".join(b"\x31" + attribute.whole[1:] for attribute in attributes if attribute.content),
-        b"".join(map(_message_digest, found)),
+        b"".join(map(_message_digest, contents)),
         value.content,
         _issuer_and_serial(identifier),
     )
@@ -499,15 +499,15 @@ def _check_values(*values: der.Value) -> None:
 
 def _attributes(attributes: bytes) -> dict[bytes, der.Value]:
     """Return the first values of attributes by type, after checking their form (RFC 5652, 11)."""
-    found: dict[bytes, der.Value] = {}
+    by_kind: dict[bytes, der.Value] = {}
     for attribute in der.children(attributes):
         name, values = _parts(attribute, der.OID, der.SET)
         (value,) = der.children(values.content)
         if attribute.tag != der.SEQUENCE:
             raise ValueError("not an attribute")
         _check_values(name, value)
-        found.setdefault(name.content, value)
-    return found
+        by_kind.setdefault(name.content, value)
+    return by_kind
 
 
 def _message_digest(attributes: Mapping[bytes, der.Value]) -> bytes:
