@@ -26,6 +26,13 @@ _MAX_NAMES = 20
 _CLOSED_SHOWN = 3
 
 
+def json_form(result: Changed, form: str, **more: object) -> tuple[object, ...]:
+    """Return what ``--json`` prints of a change; ``form`` is a class in `lifecycle.shown`."""
+    from sros_tool.keystore.lifecycle import shown
+
+    return shown.shown(result, getattr(shown, form), **more)
+
+
 def print_changed(
     result: Changed,
     form: tuple[object, ...] | None = None,

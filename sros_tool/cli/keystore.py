@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sros_tool.cli.changed import print_changed, rights_lines, shown_names
+from sros_tool.cli.changed import json_form, print_changed, rights_lines, shown_names
 from sros_tool.cli.common import (
     PATH,
     SeveralValues,
@@ -306,11 +306,9 @@ def _show(
     shown = None
     if as_json:
         from sros_tool.checks.signed import as_note
-        from sros_tool.keystore.lifecycle.shown import EnclaveCreation
-        from sros_tool.keystore.lifecycle.shown import shown as json_form
 
         notes = [as_note(finding) for finding in findings]
-        shown = json_form(result, EnclaveCreation, notes=notes)
+        shown = json_form(result, "MadeEnclaves", notes=notes)
     lasting = (lasting_text(result.root, rights) for rights in result.rights)
     print_changed(
         result,
@@ -319,7 +317,7 @@ def _show(
         told=_told_of(result, as_json),
         after=filter(None, lasting),
     )
-    if not as_json:
+    if findings and not as_json:
         print_signed(findings, [policy.file for policy in policies])
 
 
@@ -838,11 +836,11 @@ def _show_update(update: KeystoreUpdate, undone: Sequence[str], again: str, as_j
     stage that is left.
     """
     if as_json:
-        from sros_tool.keystore.lifecycle.shown import TemplateChange, UpdatedKeystore, shown
+        from sros_tool.keystore.lifecycle.shown import TemplateChange
 
-        value = shown(
+        value = json_form(
             update,
-            UpdatedKeystore,
+            "UpdatedKeystore",
             needs_allow_looser=bool(update.looser),
             template=TemplateChange(update.before, update.after),
             notes=[Note("keystore.edit-undone", clause) for clause in undone],

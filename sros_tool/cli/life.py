@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sros_tool.cli.changed import print_changed, print_follow_up, print_plan
+from sros_tool.cli.changed import json_form, print_changed, print_follow_up, print_plan
 from sros_tool.cli.common import (
     PATH,
     allow_refusal_option,
@@ -114,15 +114,9 @@ def renew(
             dry_run=dry_run,
             progress=step,
         )
-    shown = None
-    if as_json:
-        from sros_tool.keystore.lifecycle.shown import RenewedEnclaves
-        from sros_tool.keystore.lifecycle.shown import shown as json_form
-
-        shown = json_form(result, RenewedEnclaves)
     print_changed(
         result,
-        shown,
+        json_form(result, "RenewedEnclaves") if as_json else None,
         (f"renewed enclave {name}" for name in result.outcomes),
         told=_replaced_lines(result),
     )
@@ -230,11 +224,10 @@ def revoke(
     result = replace(result, remarks=(*selection_notes, *result.remarks))
     shown = None
     if as_json:
-        from sros_tool.keystore.lifecycle.shown import RevokedEnclave, RevokedEnclaves
-        from sros_tool.keystore.lifecycle.shown import shown as json_form
+        from sros_tool.keystore.lifecycle.shown import RevokedEnclave
 
         enclaves = list(map(RevokedEnclave, result.outcomes))
-        shown = json_form(result, RevokedEnclaves, enclaves=enclaves)
+        shown = json_form(result, "RevokedEnclaves", enclaves=enclaves)
     print_changed(result, shown, (f"revoked enclave {name}" for name in result.outcomes))
 
 
@@ -470,12 +463,9 @@ def rotate_ca(
             )
     shown = None
     if as_json:
-        from sros_tool.keystore.lifecycle.shown import RotationChange
-        from sros_tool.keystore.lifecycle.shown import shown as json_form
-
         shown = json_form(
             step,
-            RotationChange,
+            "RotationChange",
             authorities=step.files,
             old_keys_elsewhere=step.kept_elsewhere,
             remarks=() if dry_run else rotation_status(root, now=now()).remarks,

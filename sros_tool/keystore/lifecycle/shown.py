@@ -90,7 +90,7 @@ def enclave_results(result: Changed) -> list[EnclaveResult[str]]:
 # ── create_keystore, create_enclave, create_permission, generate_artifacts ──────────────────
 
 
-class EnclaveCreation(NamedTuple, Generic[Outcome]):
+class _EnclaveCreation(NamedTuple, Generic[Outcome]):
     """The enclaves that were created or got new permissions."""
 
     keystore: NamedKeystore
@@ -107,7 +107,7 @@ class EnclaveCreation(NamedTuple, Generic[Outcome]):
 
 
 CreatedEnclaves = Annotated[
-    EnclaveCreation[
+    _EnclaveCreation[
         Annotated[
             str,
             Words(("created", "completed", "kept")),
@@ -117,10 +117,10 @@ CreatedEnclaves = Annotated[
     "The enclaves that were created, or existed.",
 ]
 ChangedEnclave = Annotated[
-    EnclaveCreation[Annotated[str, Words(("changed",)), "Its permissions were replaced."]],
+    _EnclaveCreation[Annotated[str, Words(("changed",)), "Its permissions were replaced."]],
     "The enclave with its new permissions.",
 ]
-MadeEnclaves = EnclaveCreation[
+MadeEnclaves = _EnclaveCreation[
     Annotated[
         str,
         Words(("created", "changed", "completed", "kept")),
