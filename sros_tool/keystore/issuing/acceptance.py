@@ -10,6 +10,7 @@ evaluated for all.
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -362,11 +363,24 @@ class _FilesOfChange:
         self.changed = transaction.changed_folders()
         self._keystore = keystore
         self._after: dict[str, bytes] = {}
+        self._places: dict[str, str] = {}
 
     def places_after(self, name: str) -> dict[str, str]:
         """Map the files of an enclave to where their content will be."""
         folder = enclave_folder(name)
-        return {file: self.transaction.place_after(f"{folder}/{file}") for file in _LOADED}
+        return {file: self._place_after(f"{folder}/{file}") for file in _LOADED}
+
+    def _place_after(self, path: str) -> str:
+        """Return where the content of a path will be; enclaves have links to the same files."""
+        target = self.transaction.target_after(path)
+        if target is None:
+            return path
+        if target.startswith("/"):
+            return self.transaction.place_after(path)
+        linked = os.path.normpath(f"{path.rpartition('/')[0]}/{target}")
+        if linked not in self._places:
+            self._places[linked] = self.transaction.place_after(path)
+        return self._places[linked]
 
     def before(self, name: str) -> Files:
         """Return the files of an enclave as they are; none if one is missing."""

@@ -250,7 +250,7 @@ class Transaction:
     def place_after(self, path: str) -> str:
         """Return where the content of ``path`` will be, through links, for `content_after`."""
         for _ in range(_MOST_LINKS):
-            target = self._target_after(path)
+            target = self.target_after(path)
             if target is None:
                 break
             path = os.path.normpath(f"{path.rpartition('/')[0]}/{target}")
@@ -278,7 +278,7 @@ class Transaction:
         """
         return sorted(path for path, kept in self._kept.items() if kept is None)
 
-    def _target_after(self, path: str) -> str | None:
+    def target_after(self, path: str) -> str | None:
         """Return the target of the link that will be at ``path``; None if it will be no link."""
         if not self.is_staged(path):
             return _link_target(f"{self.root}/{path}")
