@@ -705,11 +705,9 @@ def update_keystore(
     The exit status of a dry run is 1 if --allow-looser is needed and missing.
     """
     from sros_tool.dds.domains import DomainSet
-    from sros_tool.keystore.lifecycle.update import (
-        edited_settings,
-        present_settings,
-    )
+    from sros_tool.keystore.lifecycle.update import edited_settings
     from sros_tool.keystore.lifecycle.update import update_keystore as work
+    from sros_tool.keystore.settings import present_settings
     from sros_tool.keystore.template import load_template, with_values
 
     root = root or keystore_from_environment()

@@ -28,6 +28,7 @@ from sros_tool.keystore.layout import (
     SETTINGS,
 )
 from sros_tool.keystore.reader import Keystore, as_keystore
+from sros_tool.keystore.settings import present_settings, write_settings
 from sros_tool.translate import protection_for
 
 if TYPE_CHECKING:
@@ -99,9 +100,6 @@ def _present(keystore: Keystore, names: Iterable[str], now: datetime) -> Iterato
 
 
 def _settings(transaction: Transaction, keystore: Keystore, now: datetime) -> Iterator[Entry]:
-    from sros_tool.keystore.lifecycle.update import present_settings
-    from sros_tool.keystore.settings import write_settings
-
     present = present_settings(keystore)
     if protection_for(present.governance):  # else settings would say another protection
         yield write_settings(transaction, present.settings, now)

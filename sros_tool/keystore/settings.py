@@ -1,4 +1,4 @@
-"""The settings of a keystore: writing ``sros.toml``, and finding what was edited by hand.
+"""The settings of a keystore: writing ``sros.toml``, those in force, and what was edited by hand.
 
 The ledger has the text of the settings as sros wrote them last, so that an edit is noticed, can be
 carried out (`sros_tool.keystore.lifecycle.update`) or undone.
@@ -16,13 +16,14 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
 
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
-from sros_tool.errors import Note, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.keystore.layout import GOVERNANCE_P7S, GOVERNANCE_XML, SETTINGS
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import Keystore, as_keystore
 from sros_tool.keystore.template import Template, parse_template, render_template, settings_values
-from sros_tool.translate import governance_for
+from sros_tool.translate import governance_for, protection_for
 from sros_tool.validity import iso
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def write_settings(transaction: Transaction, template: Template, now: datetime) 
     return Entry(iso(now), "settings", sha256=digest, settings=text)
 
 
-def recorded_settings(ledger: Ledger) -> Template | None:
+def _recorded_settings(ledger: Ledger) -> Template | None:
     """Return the settings that sros wrote last, or None if the ledger has none.
 
     Only lines after the last gap count: others may be forged, or older than the settings.
@@ -75,6 +76,90 @@ class HandEdits:
         """Return all clauses, each once."""
         found = (*self.settings, *self.unsigned, self.governance)
         return tuple(dict.fromkeys(each for each in found if each))
+
+
+@dataclass(frozen=True, slots=True)
+class PresentSettings:
+    """The settings that are in force in a keystore, and what was edited by hand.
+
+    ``settings`` are as sros wrote them last, with the protection of the signed ``governance``.
+    ``written`` are those that ``sros.toml`` states now; None if it is missing or cannot be read,
+    and for a keystore ``without_settings``, as ros2/sros2 makes them.  ``recorded`` are those of
+    the ledger.
+    """
+
+    settings: Template
+    written: Template | None
+    governance: Governance
+    edits: HandEdits
+    without_settings: bool = False
+    recorded: Template | None = None
+
+    @property
+    def domains(self) -> DomainSet:
+        """The domains of the signed governance."""
+        return self.governance.domains().closed()
+
+    def undone(self) -> Template:
+        """Return the settings without the edits: as recorded, or else as the governance has it.
+
+        Raises:
+            KeystoreError: as `base`.
+        """
+        return self.recorded or self.base()
+
+    def base(self) -> Template:
+        """Return the settings that single changes start from.
+
+        Raises:
+            KeystoreError: no settings can state the governance, so a change would replace it.
+        """
+        if self.without_settings and protection_for(self.governance) is None:
+            raise KeystoreError(
+                "the governance of the keystore states what settings cannot",
+                "It has several domain rules, no rule for * at its end, or a rule for a DDS topic "
+                "that is no topic, service or action of ROS. A single change would replace it.",
+                "Name all settings with --template, which shows with --dry-run what it replaces.",
+            )
+        return self.settings
+
+
+def present_settings(root: Path | Keystore) -> PresentSettings:
+    """Return the settings that are in force in a keystore.
+
+    Raises:
+        KeystoreError: ``root`` is no keystore, or its governance cannot be used.
+        DocumentError: its settings are malformed, and the ledger does not have those of before.
+    """
+    keystore = as_keystore(root)
+    keystore.check()
+    governance = keystore.governance
+    ledger = keystore.ledger_with("what", "settings")
+    recorded = _recorded_settings(ledger)
+    missing = not keystore.has(SETTINGS)
+    without_settings = missing and recorded is None
+    written, unreadable = None, ""
+    try:
+        loaded = recorded if missing and recorded else keystore.template
+        written = None if missing else loaded
+        unreadable = f"there is no {SETTINGS}" if missing and recorded else ""
+    except DocumentError as error:
+        if recorded is None:
+            raise DocumentError(
+                error.what,
+                error.why,
+                "The ledger does not have the settings of before: correct the file, or restore it "
+                "from a backup.",
+            ) from error
+        loaded, unreadable = recorded, f"{error.what}: {error.why}".removesuffix(".")
+    recorded = with_places(recorded, loaded) if recorded else None
+    settings = recorded or loaded
+    if protection := protection_for(governance):
+        settings = replace(settings, protection=protection)
+    edits = hand_edits(keystore, ledger, written, governance)
+    if unreadable:
+        edits = replace(edits, settings=(unreadable,))
+    return PresentSettings(settings, written, governance, edits, without_settings, recorded)
 
 
 _SHOWN = 3
@@ -122,7 +207,7 @@ def hand_edits(
 
     A keystore of ros2/sros2 has no settings, so only its ``governance.xml`` is compared.
     """
-    recorded = recorded_settings(ledger)
+    recorded = _recorded_settings(ledger)
     settings: tuple[str, ...] = ()
     unsigned: tuple[str, ...] = ()
     if present and recorded:

@@ -12,8 +12,9 @@ from sros_tool.errors import UsageError
 from sros_tool.keystore.history import history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
-from sros_tool.keystore.lifecycle.update import present_settings, update_keystore
+from sros_tool.keystore.lifecycle.update import update_keystore
 from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.settings import present_settings
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child

@@ -29,10 +29,10 @@ from sros_tool.keystore.lifecycle.update import (
     KeystoreUpdate,
     UpdateStage,
     edited_settings,
-    present_settings,
     update_keystore,
 )
 from sros_tool.keystore.reader import Keystore, open_enclave
+from sros_tool.keystore.settings import present_settings
 from sros_tool.keystore.template import (
     NamedValues,
     ShortLived,

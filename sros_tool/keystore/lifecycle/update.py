@@ -21,7 +21,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant
-from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError, UsageError
+from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.comparison import (
     Effect,
@@ -68,13 +68,12 @@ from sros_tool.keystore.lifecycle.replaced import (
     rights_text,
 )
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
-from sros_tool.keystore.reader import Keystore, as_keystore
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.recorded import EarlierRights, RecordedRights
 from sros_tool.keystore.settings import (
-    HandEdits,
+    PresentSettings,
     edit_remedy,
-    hand_edits,
-    recorded_settings,
+    present_settings,
     with_places,
     write_settings,
 )
@@ -104,52 +103,6 @@ class UpdateStage(StrEnum):
     """The signed governance, and the domains in governance and permissions."""
 
 
-@dataclass(frozen=True, slots=True)
-class PresentSettings:
-    """The settings that are in force in a keystore, and what was edited by hand.
-
-    ``settings`` are as sros wrote them last, with the protection of the signed ``governance``.
-    ``written`` are those that ``sros.toml`` states now; None if it is missing or cannot be read,
-    and for a keystore ``without_settings``, as ros2/sros2 makes them.  ``recorded`` are those of
-    the ledger.
-    """
-
-    settings: Template
-    written: Template | None
-    governance: Governance
-    edits: HandEdits
-    without_settings: bool = False
-    recorded: Template | None = None
-
-    @property
-    def domains(self) -> DomainSet:
-        """The domains of the signed governance."""
-        return self.governance.domains().closed()
-
-    def undone(self) -> Template:
-        """Return the settings without the edits: as recorded, or else as the governance has it.
-
-        Raises:
-            KeystoreError: as `base`.
-        """
-        return self.recorded or self.base()
-
-    def base(self) -> Template:
-        """Return the settings that single changes start from.
-
-        Raises:
-            KeystoreError: no settings can state the governance, so a change would replace it.
-        """
-        if self.without_settings and protection_for(self.governance) is None:
-            raise KeystoreError(
-                "the governance of the keystore states what settings cannot",
-                "It has several domain rules, no rule for * at its end, or a rule for a DDS topic "
-                "that is no topic, service or action of ROS. A single change would replace it.",
-                "Name all settings with --template, which shows with --dry-run what it replaces.",
-            )
-        return self.settings
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeystoreUpdate(Changed):
     """The result of an update.
@@ -177,44 +130,6 @@ class KeystoreUpdate(Changed):
 
 
 # ── what is, and what shall be ─────────────────────────────────────────────────────────────
-
-
-def present_settings(root: Path | Keystore) -> PresentSettings:
-    """Return the settings that are in force in a keystore.
-
-    Raises:
-        KeystoreError: ``root`` is no keystore, or its governance cannot be used.
-        DocumentError: its settings are malformed, and the ledger does not have those of before.
-    """
-    keystore = as_keystore(root)
-    keystore.check()
-    governance = keystore.governance
-    ledger = keystore.ledger_with("what", "settings")
-    recorded = recorded_settings(ledger)
-    missing = not keystore.has(SETTINGS)
-    without_settings = missing and recorded is None
-    written, unreadable = None, ""
-    try:
-        loaded = recorded if missing and recorded else keystore.template
-        written = None if missing else loaded
-        unreadable = f"there is no {SETTINGS}" if missing and recorded else ""
-    except DocumentError as error:
-        if recorded is None:
-            raise DocumentError(
-                error.what,
-                error.why,
-                "The ledger does not have the settings of before: correct the file, or restore it "
-                "from a backup.",
-            ) from error
-        loaded, unreadable = recorded, f"{error.what}: {error.why}".removesuffix(".")
-    recorded = with_places(recorded, loaded) if recorded else None
-    settings = recorded or loaded
-    if protection := protection_for(governance):
-        settings = replace(settings, protection=protection)
-    edits = hand_edits(keystore, ledger, written, governance)
-    if unreadable:
-        edits = replace(edits, settings=(unreadable,))
-    return PresentSettings(settings, written, governance, edits, without_settings, recorded)
 
 
 def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, DomainSet]:
