@@ -83,7 +83,10 @@ def units(robot: Path, tmp_path: Path) -> Iterator[Path]:
     yield path
 
 
-def test_a_talker_under_the_restrictions_of_its_unit_is_heard(robot: Path, units: Path) -> None:
+def test_a_talker_under_the_restrictions_of_its_unit_is_heard(
+    robot: Path, units: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", None)  # the unit has devices of its own: no /dev/shm
     place = tempfile.gettempdir()
     confined = (sys.executable, CONFINED, str(units), place, "--")
     speaks = replace(talker(robot, "/arm", topic="/x"), through=confined)
