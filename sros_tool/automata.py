@@ -582,10 +582,6 @@ class NameSet:
         limit = limit or SearchLimit()
         return all(each.shortest(limit, None) is None for each in _searches(self._node, limit))
 
-    def issubset(self, other: NameSet, limit: SearchLimit | None = None) -> bool:
-        """Return whether ``other`` has every name of this set; raises what `example` raises."""
-        return (self - other).is_empty(limit)
-
 
 def _between(node: _Node, begin: str, end: str) -> _Node:
     match node:

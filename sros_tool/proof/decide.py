@@ -182,9 +182,6 @@ class _Part:
         """By how many bytes the topic is longer than the name."""
         return len(self.begin) + len(self.end)
 
-    def name_in(self, topic: str) -> str:
-        return topic[len(self.begin) : len(topic) - len(self.end)]
-
     def topics(self, name: str) -> Topics:
         return Topics(self.begin, name, self.end)
 
