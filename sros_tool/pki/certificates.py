@@ -39,28 +39,9 @@ from sros_tool.pki.keys import KEY_LABELS, PrivateKey, PublicKey, algorithm, che
 from sros_tool.pki.tolerant import TolerantName
 from sros_tool.validity import Window
 
-_CA_USAGE = x509.KeyUsage(
-    digital_signature=True,  # a permissions CA signs governance and permissions documents
-    content_commitment=False,
-    key_encipherment=False,
-    data_encipherment=False,
-    key_agreement=False,
-    key_cert_sign=True,
-    crl_sign=True,
-    encipher_only=False,
-    decipher_only=False,
-)
-_LEAF_USAGE = x509.KeyUsage(
-    digital_signature=True,
-    content_commitment=False,
-    key_encipherment=False,
-    data_encipherment=False,
-    key_agreement=False,
-    key_cert_sign=False,
-    crl_sign=False,
-    encipher_only=False,
-    decipher_only=False,
-)
+# A permissions CA signs governance and permissions documents, too.
+_CA_USAGE = tolerant.key_usage("digital_signature", "key_cert_sign", "crl_sign")
+_LEAF_USAGE = tolerant.key_usage("digital_signature")
 Extension = TypeVar("Extension", bound=x509.ExtensionType)
 
 _ENCODINGS = {

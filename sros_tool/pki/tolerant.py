@@ -608,6 +608,11 @@ _USAGES = (
 """The bits of a keyUsage, in order (RFC 5280, 4.2.1.3)."""
 
 
+def key_usage(*usages: str) -> x509.KeyUsage:
+    """Return a keyUsage that allows these usages alone, by the names of `x509.KeyUsage`."""
+    return x509.KeyUsage(**{usage: usage in usages for usage in _USAGES})
+
+
 def _extended_key_usage(content: bytes) -> x509.ExtendedKeyUsage:
     parts = _inside(content)
     if any(part.tag != der.OID for part in parts):
