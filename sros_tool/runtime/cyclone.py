@@ -42,7 +42,7 @@ INSTALL_ADVICE = (
 )
 
 _SUPPORTED = "0.10."
-_NEEDED_FIRST = ("_platform", "_hoofs", "_posh", "_binding_c")
+_NEEDED_FIRST = ("_platform", "_hoofs", "_posh.", "_posh_roudi", "_posh", "_binding_c")
 _KEPT_LOG_LINES = 200
 
 STRING_TYPE = "std_msgs::msg::dds_::String_"

@@ -17,6 +17,7 @@ from sros_tool.demo.scenarios.communication import ISOLATION, LISTENER, TALKER, 
 from sros_tool.demo.scenarios.model import OWN, UNSECURED, Identity
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
+from sros_tool.runtime import cyclone
 from sros_tool.runtime.cyclone import load_cyclone
 from tests.support.children import PATIENCE
 
@@ -173,6 +174,13 @@ def test_a_domain_that_the_keystore_is_not_for(
     code = "print(attempt(lambda _: join(), ''))"
     assert child(TALKER, code) == ["made"]
     assert child(TALKER, code, DOMAIN + 1) == ["refused"]
+
+
+def test_libraries_are_loaded_after_those_that_they_need() -> None:
+    """Otherwise the system's copy is loaded, as that of RouDi where cyclonedds-dev is installed."""
+    order = ("hoofs", "posh", "posh_roudi", "posh_config", "posh_gateway", "binding_c")
+    files = [Path(f"libiceoryx_{each}.so.2") for each in order]
+    assert sorted(reversed(files), key=cyclone._load_order) == files
 
 
 def test_unpacked_packages_are_used_alone(tmp_path: Path) -> None:
