@@ -17,7 +17,7 @@ PROJECT = tomllib.loads((HERE / "pyproject.toml").read_text())["project"]
 NAME = PROJECT["name"]
 LINKED = Path.cwd().resolve() != HERE
 """With --symlink-install, colcon runs a link to this file among links to all packages."""
-BESIDE = () if LINKED else ("policies",)
+BESIDE = () if LINKED else ("policies", "keystore_templates")
 """What lies next to the package and belongs into it; the linked package finds it there."""
 
 

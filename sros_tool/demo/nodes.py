@@ -11,9 +11,10 @@ import math
 import os
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from sros_tool.runtime.events import EventKind, EventWriter
 
@@ -23,7 +24,8 @@ FIBONACCI_ORDER = 5
 """The order of the sequence that an action client requests in each goal."""
 
 
-class NodeOptions(NamedTuple):
+@dataclass(frozen=True)
+class NodeOptions:
     """The options of a node.
 
     ``topic`` is the ROS name of the role's topic, service or action.  ``period`` is in seconds.
