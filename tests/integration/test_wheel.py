@@ -89,7 +89,7 @@ def test_the_manual_page_is_in_it(unpacked: Path) -> None:
 
 
 def test_every_file_of_the_package_is_in_it(unpacked: Path) -> None:
-    names = known_files("sros_tool", "policies")
+    names = known_files("sros_tool", "policies", "keystore_templates")
     assert len(names) > 100
     places = [name if name.startswith("sros_tool/") else f"sros_tool/{name}" for name in names]
     assert [name for name in places if not (unpacked / name).is_file()] == []
