@@ -44,6 +44,7 @@ from sros_tool.runtime.processes import Process, RunningProcesses, plain
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.validity import iso
+from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
 DAEMON_UNSECURED = FindingKind(
@@ -344,8 +345,7 @@ def _not_secured(
 
 
 def _some(nodes: Sequence[Process]) -> str:
-    more = f" and {len(nodes) - _MOST_NODES} more" if len(nodes) > _MOST_NODES else ""
-    return ", ".join(f"{each.label} {_where(each)}" for each in nodes[:_MOST_NODES]) + more
+    return first_few([f"{node.label} {_where(node)}" for node in nodes], _MOST_NODES)
 
 
 # ── next to each other ─────────────────────────────────────────────────────────────────────

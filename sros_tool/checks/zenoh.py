@@ -12,6 +12,7 @@ from sros_tool.errors import DocumentError
 from sros_tool.policy.patterns import ComparisonLimit
 from sros_tool.translate_from_zenoh import RightsBehindRules, is_self_limiting
 from sros_tool.values import DryRun, FileChange, Notes, Words
+from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import Message
 from sros_tool.zenoh.configuration import Mode
@@ -385,8 +386,7 @@ def _overlapping(subjects: Sequence[AclSubject]) -> Iterator[tuple[AclSubject, A
 
 
 def _ids(subjects: Sequence[AclSubject]) -> str:
-    more = f" and {len(subjects) - _FEW} more" if len(subjects) > _FEW else ""
-    return ", ".join(each.id for each in subjects[:_FEW]) + more
+    return first_few([subject.id for subject in subjects], _FEW)
 
 
 def _described(subject: AclSubject) -> str:

@@ -12,6 +12,7 @@ from itertools import combinations
 
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Criteria, Permissions
 from sros_tool.errors import Note
+from sros_tool.wording import first_few
 
 _SHOWN = 3
 _LONGEST_TOPIC = 251  # bytes, of DDS names
@@ -137,8 +138,7 @@ def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
 
 def some_pairs(pairs: Sequence[tuple[str, str]]) -> str:
     """Return the first pairs in words: "/robot for /robot/admin and 2 more"."""
-    shown = ", ".join(f"{inner} for {outer}" for inner, outer in pairs[:_SHOWN])
-    return f"{shown} and {len(pairs) - _SHOWN} more" if len(pairs) > _SHOWN else shown
+    return first_few([f"{inner} for {outer}" for inner, outer in pairs], _SHOWN)
 
 
 def _contained(
@@ -150,5 +150,4 @@ def _contained(
 
 
 def _some(topics: list[str]) -> str:
-    shown = ", ".join(topics[:_SHOWN])
-    return f"{shown} and {len(topics) - _SHOWN} more" if len(topics) > _SHOWN else shown
+    return first_few(topics, _SHOWN)

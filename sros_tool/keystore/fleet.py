@@ -22,6 +22,7 @@ from sros_tool.keystore.layout import FLEET, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import Keystore, as_keystore
 from sros_tool.validity import iso
+from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
     from sros_tool.keystore.transaction.transaction import Transaction
@@ -251,11 +252,10 @@ def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
         if left:
             is_there = robot.name in after.robots
             why = "has other paths of enclaves now" if is_there else "is no longer in the fleet"
-            shown = ", ".join(left[:_SHOWN])
-            more = f" and {len(left) - _SHOWN} more" if len(left) > _SHOWN else ""
+            shown = first_few(left, _SHOWN)
             yield Note(
                 "fleet.left-enclaves",
-                f"the robot {robot.name} {why}: {shown}{more} stay as they are, and work. To take "
+                f"the robot {robot.name} {why}: {shown} stay as they are, and work. To take "
                 f"them back, run `sros revoke {quote(str(root))} {words_for(root, left)}`.",
             )
 

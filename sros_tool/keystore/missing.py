@@ -11,6 +11,7 @@ from sros_tool.keystore.layout import FLEET, PRIVATE, PUBLIC, REVOKED, SETTINGS
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import Keystore
 from sros_tool.names import check_enclave_name
+from sros_tool.wording import first_few
 
 _SHOWN = 5
 """The number of enclaves that an error names; it counts the others."""
@@ -45,8 +46,7 @@ def no_such_enclave(
         check_enclave_name(name)
     except InvalidNameError as error:
         return error
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    why = f"The keystore has {', '.join(names[:_SHOWN]) or 'no enclave'}{more}."
+    why = f"The keystore has {first_few(names, _SHOWN) or 'no enclave'}."
     if not any((root / part).exists() for part in (PUBLIC, PRIVATE, SETTINGS)):
         where = f"`sros distribute_key KEYSTORE {name} {quote(str(root))}`"
         return KeystoreError(what, why, f"If it is not a typo, export it with {where}.")

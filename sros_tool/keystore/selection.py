@@ -13,6 +13,7 @@ from sros_tool.fleet.enclaves import Unrecorded, robot_of, unrecorded_enclaves
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_fleet, words_for
 from sros_tool.keystore.layout import PRIVATE, SETTINGS, check_keystore, list_enclaves
 from sros_tool.values import NamedKeystore, shows
+from sros_tool.wording import first_few
 
 
 @shows(optional=("robots",))
@@ -113,8 +114,7 @@ def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator
 
 
 def _some(names: list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return f"{', '.join(names[:_SHOWN])}{more}"
+    return first_few(names, _SHOWN)
 
 
 def _of_robots(

@@ -25,6 +25,7 @@ from sros_tool.keystore.reader import Keystore, as_keystore
 from sros_tool.keystore.template import Template, parse_template, render_template, settings_values
 from sros_tool.translate import governance_for, protection_for
 from sros_tool.validity import iso
+from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
     from sros_tool.keystore.transaction.transaction import Transaction
@@ -174,9 +175,8 @@ def edit_notes(root: Path | Keystore, governance: Governance) -> tuple[Note, ...
     edits = found_edits(keystore, governance)
     if not edits:
         return ()
-    clauses = edits.clauses()
-    more = f"; and {len(clauses) - _SHOWN} more" if len(clauses) > _SHOWN else ""
-    text = f"{'; '.join(clauses[:_SHOWN])}{more}. Only what is issued from now on may follow it, "
+    clauses = first_few(edits.clauses(), _SHOWN, "; ", "; and ")
+    text = f"{clauses}. Only what is issued from now on may follow it, "
     text += f"and the signed governance does not: {edit_remedy(keystore.root)}"
     return (Note("keystore.edited", text),)
 

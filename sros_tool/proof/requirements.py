@@ -26,6 +26,7 @@ from sros_tool.names import expression_problem, is_expression
 from sros_tool.policy.model import RIGHTS, Source
 from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import KIND_OF
+from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
 _MOST_REQUIREMENTS = 1000
@@ -195,9 +196,7 @@ def _those(enclaves: Iterable[str]) -> str:
 
 def _listed(names: Iterable[str]) -> str:
     """Return a list as text; of a long one only its beginning."""
-    found = list(names)
-    more = f" and {len(found) - 4} more" if len(found) > 4 else ""
-    return (", ".join(found[:4]) or "nothing") + more
+    return first_few(list(names), 4) or "nothing"
 
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────

@@ -50,6 +50,7 @@ from sros_tool.proof.requirements import Requirement, read_requirements
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
 from sros_tool.proof.system import System, load_system, policy_system
 from sros_tool.values import Words
+from sros_tool.wording import first_few
 
 _HEAD, _BASE = "HEAD", "BASE"
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
@@ -622,9 +623,8 @@ class _Review:
         if asked.repository.commit(_HEAD) != asked.head:
             yield "the commit that is checked out is another one than the one that is reviewed"
         elif differing := self.head.differing(top):
-            more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
-            files = ", ".join(f"'{each}'" for each in differing[:3])
-            yield f"the checkout has other content than the commit that is reviewed: {files}{more}"
+            files = first_few([f"'{path}'" for path in differing], 3)
+            yield f"the checkout has other content than the commit that is reviewed: {files}"
 
     # ── policies ───────────────────────────────────────────────────────────────────────────
 

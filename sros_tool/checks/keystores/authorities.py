@@ -45,6 +45,7 @@ from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, few_rounds, load_key
 from sros_tool.pki.token import is_token_uri
 from sros_tool.validity import iso
+from sros_tool.wording import first_few
 
 NOT_A_CA = FindingKind(
     "keystore.not-a-ca",
@@ -369,8 +370,7 @@ def _left_enclaves(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]
         if robot := left_robot_of(fleet, name):
             robots.setdefault(robot, []).append(name)
     for robot, names in list(robots.items())[:_MOST_LEFT]:
-        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-        clause = f"{robot}: {', '.join(names[:_SHOWN])}{more}"
+        clause = f"{robot}: {first_few(names, _SHOWN)}"
         yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown(FLEET))
     if (more_robots := len(robots) - _MOST_LEFT) > 0:
         clause = f"and of {more_robots} more robots"

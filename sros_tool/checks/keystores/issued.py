@@ -33,6 +33,7 @@ from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy.model import stated_protections
 from sros_tool.policy.rights import Right, compare, policy_rights
 from sros_tool.translate import grant_rights
+from sros_tool.wording import first_few
 
 SERIAL_TWICE = FindingKind(
     "keystore.serial-twice",
@@ -373,8 +374,8 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
         shown = [
             f"{sign} {right.qualifier} {right.describe()}" for sign, right in difference.lines()
         ]
-        more = f" and {len(shown) - _RIGHTS_SHOWN} more" if len(shown) > _RIGHTS_SHOWN else ""
-        text = f"policy (-) and permissions (+) differ: {'; '.join(shown[:_RIGHTS_SHOWN])}{more}"
+        rights = first_few(shown, _RIGHTS_SHOWN, "; ")
+        text = f"policy (-) and permissions (+) differ: {rights}"
         yield STALE.found(name, text, enclave.file("permissions.p7s"))
 
 

@@ -58,6 +58,7 @@ from sros_tool.keystore.unchanged import of_one_state
 from sros_tool.parallel import map_slices, tick
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right
+from sros_tool.wording import first_few
 
 _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
@@ -242,6 +243,4 @@ def _one_of(group: list[Finding]) -> Finding:
     subjects = list(dict.fromkeys(each.subject for each in group))
     if len(subjects) == 1:
         return group[0]
-    shown = ", ".join(subjects[:_NAMES_SHOWN])
-    more = f" and {len(subjects) - _NAMES_SHOWN} more" if len(subjects) > _NAMES_SHOWN else ""
-    return replace(group[0], subject=shown + more)
+    return replace(group[0], subject=first_few(subjects, _NAMES_SHOWN))

@@ -11,6 +11,7 @@ from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, some_name
 from sros_tool.dds.permissions import Criteria, Grant
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.patterns import overlap
+from sros_tool.wording import first_few
 
 _MAPPING = 'ROS 2 design "Topic and Service name mapping to DDS"; rmw_dds_common; measured.'
 
@@ -78,8 +79,8 @@ def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Itera
     named = dict.fromkeys((*_stated(grant, allow=True), *_stated(grant, allow=False)))
     problems = [text for each in named if (text := ros_name_problem(each))]
     if problems:
-        more = f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
-        yield NO_ROS_NAME.found(enclave.name, "; ".join(problems[:_SHOWN]) + more, file)
+        text = first_few(problems, _SHOWN, "; ", "; and ")
+        yield NO_ROS_NAME.found(enclave.name, text, file)
     relayed = {topic for rule in grant.rules for topic in _topics(rule.relay) if rule.allow}
     if relayed and (only := sorted(relayed.difference(_stated(grant, allow=True)))):
         text = f"{some_names(only)} {'is' if len(only) == 1 else 'are'} allowed only in <relay>"

@@ -27,6 +27,7 @@ from sros_tool.keystore.template import Template
 from sros_tool.policy.model import StatedProtection
 from sros_tool.policy.protection import Level
 from sros_tool.translate import governance_for
+from sros_tool.wording import first_few
 
 _SHOWN = 5
 
@@ -83,11 +84,11 @@ def raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection])
     after = governance_for(protection, governance.domains().closed())
     write_governance(change, after, names=change.names)
     change.entries.append(write_settings(change.transaction, change.template, change.now))
-    more = f" and {len(less) - _SHOWN} more" if len(less) > _SHOWN else ""
+    demanded = [f"{name} {name.word} ({name.source})" for name in less]
     changes = compare_governance(governance, after)
     text = (
         f"The governance of the keystore changes, because policies demand it: "
-        f"{', '.join(f'{name} {name.word} ({name.source})' for name in less[:_SHOWN])}{more}. "
+        f"{first_few(demanded, _SHOWN)}. "
         f"{'; '.join(dict.fromkeys(each.meaning for each in changes[:_SHOWN]))}."
     )
     change.restart = change.names

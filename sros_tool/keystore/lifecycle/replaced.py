@@ -26,6 +26,7 @@ from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, compare
 from sros_tool.translate import grant_rights
 from sros_tool.validity import iso
+from sros_tool.wording import first_few
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,12 +144,11 @@ def rights_text(rights: Sequence[Right]) -> str:
 
     A denial that was added is lost, and one that was taken away is gained.
     """
-    shown = ", ".join(
-        each.describe() + ("" if each.qualifier is ALLOW else " (by a denial)")
-        for each in rights[:_RIGHTS_SHOWN]
-    )
-    more = len(rights) - _RIGHTS_SHOWN
-    return f"{shown} and {more} more" if more > 0 else shown
+    described = [
+        right.describe() + ("" if right.qualifier is ALLOW else " (by a denial)")
+        for right in rights
+    ]
+    return first_few(described, _RIGHTS_SHOWN)
 
 
 def _both_text(rights: Sequence[Right], domains: str) -> str:

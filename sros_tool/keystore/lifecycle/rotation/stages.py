@@ -217,10 +217,9 @@ def _of_no_robot(keystore: Keystore, names: Iterable[str]) -> Iterator[Note]:
 
 
 def _would_cut_off(root: Path, rotation: Rotation, robots: Sequence[str]) -> KeystoreError:
-    more = f" and {len(robots) - _SHOWN} more" if len(robots) > _SHOWN else ""
     stage = "a rotation" if rotation.stage is RotationStage.NONE else f"the stage {rotation.stage}"
     return KeystoreError(
-        f"not every robot has confirmed {stage}: {', '.join(robots[:_SHOWN])}{more}",
+        f"not every robot has confirmed {stage}: {first_few(robots, _SHOWN)}",
         "The next step would cut them off from the others.",
         f"Bring them the present files and confirm them; see `sros fleet status "
         f"{quote(str(root))}`. --allow-unconfirmed goes on without them.",
