@@ -7,7 +7,6 @@ and the controls held; a refusal counts only if DDS Security reported it, for th
 from __future__ import annotations
 
 import re
-import signal
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -24,7 +23,7 @@ from sros_tool.demo.scenarios.model import (
     Wire,
 )
 from sros_tool.demo.wire import Injection, WireCount
-from sros_tool.runtime.events import Event, EventKind, ProcessStage
+from sros_tool.runtime.events import Event, EventKind, ProcessStage, signal_name
 from sros_tool.runtime.vendor_log import (
     endpoint_refusal,
     missing_security,
@@ -468,10 +467,7 @@ def _refused(name: str, stage: ProcessStage | None, reason: str) -> _Finding:
 def _end_of(record: PartyRecord) -> str:
     status = record.status or 0
     if status < 0:
-        try:
-            return f"was ended by {signal.Signals(-status).name}"
-        except ValueError:
-            return f"was ended by signal {-status}"
+        return f"was ended by {signal_name(-status)}"
     last = " ".join(record.output.strip().splitlines()[-1:])
     return f"ended by itself with status {status}. {last}".strip()
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -148,3 +149,11 @@ def parse_event(line: bytes, path: Path) -> Event:
         raise DocumentError(
             f"cannot read the report {path}", f"A line is not an event: {error}."
         ) from error
+
+
+def signal_name(number: int) -> str:
+    """Return the name of a signal that ended a process, such as ``SIGSEGV``."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, NamedTuple
 
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
-from sros_tool.runtime.events import Event, EventKind, ProcessStage, read_events
+from sros_tool.runtime.events import Event, EventKind, ProcessStage, read_events, signal_name
 from sros_tool.runtime.netns import end_with_parent
 from sros_tool.runtime.rmw import RMW, middleware_of, rmw_implementations
 from sros_tool.runtime.vendor_log import (
@@ -304,16 +304,9 @@ def _ending(run: ProbeRun) -> str:
     if run.status is None:
         return "The probe process gave no answer in time."
     if run.status < 0:
-        return f"The probe process was ended by {_signal_name(-run.status)}."
+        return f"The probe process was ended by {signal_name(-run.status)}."
     last = run.output.strip().splitlines()[-1:]
     return f"The probe process ended with status {run.status}. {' '.join(last)}".strip()
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 def _happened(events: Sequence[Event], kind: EventKind, stage: ProcessStage) -> bool:
