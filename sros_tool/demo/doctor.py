@@ -1,4 +1,8 @@
-"""The diagnosis of `sros doctor`: the DDS stacks of this machine, and which enforce security."""
+"""The diagnosis of `sros doctor`: which DDS enforces security here, and whose `ros2 security` runs.
+
+ros2cli takes the last of the packages that have the command.  Source: ros2cli 0.32,
+``entry_points.py``: entry points by name, in the order of ``sys.path``.
+"""
 
 from __future__ import annotations
 

@@ -5,6 +5,9 @@ not a plain ROS name is left out, above all a topic that is *named* like a wildc
 uses relative names where they are shorter, and ``*`` for the part of a node's name that changes
 with every start.  A common part is included only if the node has every right in it, so that an
 include never grants more than was observed.
+
+The graph shows the enclave / for a process that was started without ``--ros-args --enclave``, as
+those of a robot that is not secured yet usually are: `enclave_per_node` chooses one for each.
 """
 
 from __future__ import annotations

@@ -1,10 +1,15 @@
-"""The security messages that DDS vendors, rcl and the RMWs log, and their meanings.
+"""The security messages that DDS vendors, Zenoh, rcl and the RMWs log, and their meanings.
 
 Fast DDS writes coloured text to standard output, Cyclone DDS writes to its log sink or to standard
 error.  With ROS_SECURITY_LOG_FILE, Fast DDS writes the reasons of refusals to that file instead, in
 another form.  Each text was seen in a real log of Fast DDS 2.9.1 or 2.14.5 (Permissions.cpp,
 SecurityManager.cpp, PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c, authentication.c,
 q_omg_security.c), or rcl of Jazzy.
+
+rmw_zenoh prints what is a warning or worse for nodes, and what is informative for its router;
+RUST_LOG=zenoh=debug makes a process say why a connection failed, and RUST_LOG=zenoh=trace which
+messages access control drops.  Each text was seen in a log of Zenoh 1.10.2, but for those of
+rmw_zenoh_cpp, which are from its source.
 
 To add a vendor, add its rows to `LOG_TEXTS`, the text that it puts around a reason to `_FRAME`,
 and its words for writers and readers to `DIRECTIONS`.
