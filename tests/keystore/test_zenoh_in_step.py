@@ -214,9 +214,7 @@ def test_a_template_may_choose_the_network(folder: Path) -> None:
     ],
 )
 def test_a_template_with_another_network_is_refused(line: str, text: str, folder: Path) -> None:
-    production = (
-        Path(__file__).parents[2] / "keystore_templates/production.toml"
-    ).read_text()
+    production = (Path(__file__).parents[2] / "keystore_templates/production.toml").read_text()
     (folder / "robot.toml").write_text(f"{production}\n[zenoh]\n{line}\n")
     ended = sros("create_keystore", "ks", "--template", "robot.toml", cwd=folder)
     assert ended.status == 2 and text in ended.err

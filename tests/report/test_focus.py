@@ -143,9 +143,7 @@ def test_what_the_governance_leaves_open_is_open_to_all(tmp_path: Path) -> None:
     policy = tmp_path / "robot.xml"
     policy.write_text(policy_text(CHAIN))
     template = tmp_path / "open.toml"
-    shipped = (
-        MOBILE_ROBOT.parent.parent / "keystore_templates/production.toml"
-    ).read_text()
+    shipped = (MOBILE_ROBOT.parent.parent / "keystore_templates/production.toml").read_text()
     rule = '\n[[protection.topic]]\nnames = ["/cmd_vel"]\nwrite_access_control = false\n'
     template.write_text(shipped + rule)
     found = value(policy, "--template", template, "--focus", "/cmd_vel")["focus"]
