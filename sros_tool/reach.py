@@ -25,7 +25,7 @@ from sros_tool.names import ACTION_SEPARATOR, READING_SERVICES, is_expression
 from sros_tool.policy.model import DENY
 from sros_tool.policy.patterns import common_name, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import Right
-from sros_tool.topics import SERVICE_ENDS, dds_names
+from sros_tool.topics import SERVICE_ENDS
 from sros_tool.values import shows
 
 
@@ -203,8 +203,9 @@ class Network:
         allowed: dict[tuple[str, str], set[str]] = defaultdict(set)
         for right in rights:
             into = denied if right.qualifier is DENY else allowed
-            for direction, topic in _topics(right):
-                into[right.enclave, direction].add(topic)
+            for direction, topics in right.topics._asdict().items():
+                if topics:
+                    into[right.enclave, direction].update(topics)
         ignored = ["rt" + name for name in without]
         ignored += [f"rq/{name.lstrip('/')}{SERVICE_ENDS['rq']}" for name in questions]
         for (enclave, direction), topics in sorted(allowed.items()):
@@ -280,16 +281,6 @@ class Network:
             for other in others.meeting(end.topic):
                 if other.enclave not in known and (name := _shared(end, other)):
                     yield _hop(end, other, name) if forward else _hop(other, end, name)
-
-
-def _topics(right: Right) -> Iterator[tuple[str, str]]:
-    """Yield direction and DDS topic for each topic that a right needs."""
-    if right.kind == "dds":
-        yield right.right, right.name
-        return
-    names = dds_names(right.right, right.name)
-    yield from (("publish", topic) for topic in names.publish)
-    yield from (("subscribe", topic) for topic in names.subscribe)
 
 
 def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from sros_tool.errors import PolicyError
-from sros_tool.names import expand, expression_problem, is_expression
+from sros_tool.names import expression_problem, is_expression
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Source
 from sros_tool.policy.patterns import Names, covers
-from sros_tool.policy.rights import Right, parts
+from sros_tool.policy.rights import Right, parts, placed_rights
 from sros_tool.policy.subtraction import (
     IN_PART,
     CannotSubtract,
@@ -93,14 +93,9 @@ class StatedRight(NamedTuple):
 def stated_rights(enclave: Enclave) -> tuple[StatedRight, ...]:
     """Return the rights of an enclave with absolute names, each action as its parts."""
     return tuple(
-        StatedRight(part, group.source_of(index))
-        for profile in enclave.all_profiles()
-        for group in profile.groups
-        for index, name in enumerate(group.names)
-        for right, qualifier in group.rights
-        for part in parts(
-            Right(enclave.path, qualifier, right, expand(name, profile.ns, profile.node))
-        )
+        StatedRight(part, placed.source)
+        for placed in placed_rights(enclave)
+        for part in parts(placed.right)
     )
 
 

@@ -59,7 +59,7 @@ from sros_tool.policy.model import (
     stated_protections,
 )
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
-from sros_tool.policy.rights import WHOLE, Right, Rules, parts, policy_rights
+from sros_tool.policy.rights import WHOLE, Right, Rules, parts, placed_rights, policy_rights
 from sros_tool.topics import GOAL
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
@@ -110,18 +110,11 @@ class _CheckedPolicy:
     @cached_property
     def statements(self) -> tuple[_Statement, ...]:
         """Every right and denial, in the order of the document."""
-        return tuple(each for enclave in self.policy.enclaves for each in _statements(enclave))
-
-
-def _statements(enclave: Enclave) -> Iterator[_Statement]:
-    for profile in enclave.all_profiles():
-        for group in profile.groups:
-            for index, written in enumerate(group.names):
-                name = expand(written, profile.ns, profile.node)
-                source = group.source_of(index)
-                for right, qualifier in group.rights:
-                    stated = Right(enclave.path, qualifier, right, name)
-                    yield _Statement(stated, written, source, profile)
+        return tuple(
+            _Statement(placed.right, placed.written, placed.source, placed.profile)
+            for enclave in self.policy.enclaves
+            for placed in placed_rights(enclave)
+        )
 
 
 NEVER_MATCHES = FindingKind(

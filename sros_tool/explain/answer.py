@@ -6,7 +6,6 @@ What ``--json`` shows of an answer are the classes here, with their docstrings.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
@@ -19,10 +18,9 @@ from sros_tool.dds.permissions import Grant
 from sros_tool.explain.question import Part, Question
 from sros_tool.keystore.participant import LoadedEnclave
 from sros_tool.keystore.reader import Keystore, Problem
-from sros_tool.names import expand, is_expression
+from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Profile, Qualifier, Source
-from sros_tool.policy.rights import Right
-from sros_tool.topics import dds_names
+from sros_tool.policy.rights import PlacedRight, Right, placed_rights
 from sros_tool.values import Words, shows
 
 ADDITION = "allow.xml"
@@ -424,35 +422,23 @@ def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
     # Cyclone DDS denies a whole topic, also because of a rule for the other direction.
     other = AccessVerb.SUBSCRIBE if part.verb is AccessVerb.PUBLISH else AccessVerb.PUBLISH
     for verb in (part.verb, other):
-        found = tuple(
-            each
-            for each in _lines(policy)
-            if each.qualifier is qualifier and expression in _topics(each, verb)
+        lines = tuple(
+            _line(placed)
+            for placed in placed_rights(policy)
+            if placed.right.qualifier is qualifier
+            and expression in getattr(placed.right.topics, verb)
         )
-        if found:
-            return found
+        if lines:
+            return lines
     return ()
 
 
 def lines_of_right(policy: Enclave, right: Right) -> tuple[PolicyLine, ...]:
     """Return the names in an enclave's policy that state a right or denial."""
-    return tuple(
-        each
-        for each in _lines(policy)
-        if (each.qualifier, each.right) == (right.qualifier, right.right)
-        and expand(each.name, each.profile.ns, each.profile.node) == right.name
-    )
+    stated = (placed for placed in placed_rights(policy) if placed.right[1:] == right[1:])
+    return tuple(map(_line, stated))
 
 
-def _lines(policy: Enclave) -> Iterator[PolicyLine]:
-    for profile in policy.all_profiles():
-        for group in profile.groups:
-            for index, name in enumerate(group.names):
-                source = group.source_of(index)
-                for right, qualifier in group.rights:
-                    yield PolicyLine(source, qualifier, right, name, group, profile)
-
-
-def _topics(line: PolicyLine, verb: AccessVerb) -> tuple[str, ...]:
-    names = dds_names(line.right, expand(line.name, line.profile.ns, line.profile.node))
-    return names.publish if verb is AccessVerb.PUBLISH else names.subscribe
+def _line(placed: PlacedRight) -> PolicyLine:
+    right, written, source, group, profile = placed
+    return PolicyLine(source, right.qualifier, right.right, written, group, profile)

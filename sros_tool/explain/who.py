@@ -9,7 +9,6 @@ from sros_tool.errors import Note
 from sros_tool.explain.asking import rights_naming, taken_for_action
 from sros_tool.explain.question import Question, about_action, ask
 from sros_tool.keystore.reader import Keystore
-from sros_tool.parallel import map_slices, tick
 
 
 class EnclaveOutcome(Protocol):
@@ -99,6 +98,7 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
 
 def of_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_Outcome, ...]:
     """Return what is decided for each of many enclaves, on all cores, sorted by name."""
+    from sros_tool.parallel import map_slices, tick  # a question about one enclave needs none
 
     def work(part: Sequence[str]) -> list[_Outcome]:
         outcomes = []

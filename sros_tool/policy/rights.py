@@ -13,9 +13,19 @@ from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 from sros_tool.names import expand
-from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Profile, Qualifier
+from sros_tool.policy.model import (
+    ALLOW,
+    DENY,
+    RIGHTS,
+    Enclave,
+    Group,
+    Policy,
+    Profile,
+    Qualifier,
+    Source,
+)
 from sros_tool.policy.patterns import ComparisonLimit, Names
-from sros_tool.topics import ACTION_PARTS, GOAL
+from sros_tool.topics import ACTION_PARTS, GOAL, DdsNames, dds_names
 from sros_tool.values import Words, shows
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
@@ -51,6 +61,14 @@ class Right(NamedTuple):
     def kind(self) -> KindOfName:
         """The kind of the name; ``dds`` is a DDS topic without a ROS name."""
         return KIND_OF[self.right] if self.name.startswith("/") else "dds"
+
+    @property
+    def topics(self) -> DdsNames:
+        """The DDS topics that it is about, to publish and to subscribe, perhaps with wildcards."""
+        if self.kind != "dds":
+            return dds_names(self.right, self.name)
+        writes = self.right == "publish"
+        return DdsNames((self.name,) if writes else (), () if writes else (self.name,))
 
     def __str__(self) -> str:
         """Return text such as ``/talker ALLOW publish topic /chatter``."""
@@ -89,6 +107,27 @@ def policy_rights(policy: Policy) -> frozenset[Right]:
         for profile in enclave.all_profiles()
         for right in profile_rights(enclave.path, profile)
     )
+
+
+class PlacedRight(NamedTuple):
+    """A right as a group of a policy states it; ``written`` is the name as written there."""
+
+    right: Right
+    written: str
+    source: Source
+    group: Group
+    profile: Profile
+
+
+def placed_rights(enclave: Enclave) -> Iterator[PlacedRight]:
+    """Yield each right and denial of an enclave with its place, in the order of the document."""
+    for profile in enclave.all_profiles():
+        for group in profile.groups:
+            for index, written in enumerate(group.names):
+                name, source = expand(written, profile.ns, profile.node), group.source_of(index)
+                for right, qualifier in group.rights:
+                    stated = Right(enclave.path, qualifier, right, name)
+                    yield PlacedRight(stated, written, source, group, profile)
 
 
 def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:

@@ -18,7 +18,8 @@ from typing import Annotated, NamedTuple
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb
-from sros_tool.dds.decision.matching import ExpressionIndex, matches, names_of
+from sros_tool.dds.decision.expressions import names_of
+from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.subjects import (
     ComparisonCrash,
     also_fitting,
@@ -42,7 +43,6 @@ from sros_tool.proof.sources import AT, AccessSource
 from sros_tool.proof.worlds import ROS_TOPICS
 from sros_tool.proof.zenoh_settings import unknown_settings
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
-from sros_tool.topics import dds_names
 from sros_tool.translate import grant_rights
 from sros_tool.values import Words, shows
 
@@ -476,7 +476,7 @@ def _of_rights(side: AccessSource, robots: Mapping[str, int]) -> Callable[[str, 
                     topic
                     for right in own
                     if (right.qualifier is ALLOW) is allows
-                    for topic in _topics_of(right)[verb]
+                    for topic in getattr(right.topics, verb)
                 ]
                 for verb in _VERBS
             }
@@ -508,14 +508,6 @@ def _by_enclave(rights: Iterable[Right]) -> dict[str, list[Right]]:
     for each in sorted(rights):
         found[each.enclave].append(each)
     return found
-
-
-def _topics_of(right: Right) -> dict[AccessVerb, tuple[str, ...]]:
-    """Return the DDS topics of a right that it writes and reads, as expressions."""
-    if right.kind == "dds":
-        return {verb: (right.name,) if right.right == verb else () for verb in _VERBS}
-    names = dds_names(right.right, right.name)
-    return {AccessVerb.PUBLISH: names.publish, AccessVerb.SUBSCRIBE: names.subscribe}
 
 
 # ── rights ─────────────────────────────────────────────────────────────────────────────────
@@ -614,7 +606,7 @@ class _Denials:
     """What an enclave is denied to write, or to read: ``names`` has all of it."""
 
     def __init__(self, rights: Sequence[Right], verb: AccessVerb, style: Style) -> None:
-        pairs = [(right, text) for right in rights for text in _topics_of(right)[verb]]
+        pairs = [(right, text) for right in rights for text in getattr(right.topics, verb)]
         self._rights = [right for right, _ in pairs]
         self._index = ExpressionIndex(style, (text for _, text in pairs))
         self.names = names_of(style, (text for _, text in pairs))
@@ -667,7 +659,7 @@ class _Stated:
         limit: SearchLimit,
     ) -> Iterator[Gain]:
         allowed = [
-            (each, _topics_of(each)[verb])
+            (each, getattr(each.topics, verb))
             for name in (enclave, *world.lenders(self._new, enclave))
             for each in self._allowed.get(name, ())
         ]

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import Style
-from sros_tool.names import expand, is_expression
+from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW, Enclave, Policy, Source
-from sros_tool.policy.rights import Right
+from sros_tool.policy.rights import Right, placed_rights
 from sros_tool.proof.decide import Use
-from sros_tool.topics import dds_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,21 +60,13 @@ class _Lazy:
         self._enclave = enclave
 
     def __iter__(self) -> Iterator[Place]:
-        for profile in self._enclave.all_profiles():
-            for group in profile.groups:
-                for index, written in enumerate(group.names):
-                    name = expand(written, profile.ns, profile.node)
-                    for right, qualifier in group.rights:
-                        if qualifier is ALLOW:
-                            stated = Right(self._enclave.path, ALLOW, right, name)
-                            yield Place(stated, group.source_of(index))
+        for placed in placed_rights(self._enclave):
+            if placed.right.qualifier is ALLOW:
+                yield Place(placed.right, placed.source)
 
 
 def topics_of(right: Right) -> Iterator[tuple[bool, str]]:
     """Yield the DDS topics of a right, with True for those that it writes."""
-    if right.kind == "dds":
-        yield right.right == "publish", right.name
-        return
-    names = dds_names(right.right, right.name)
-    yield from ((True, topic) for topic in names.publish)
-    yield from ((False, topic) for topic in names.subscribe)
+    written, read = right.topics
+    yield from ((True, topic) for topic in written)
+    yield from ((False, topic) for topic in read)

@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 from sros_tool.automata import NameSet, SearchLimit
-from sros_tool.dds.decision.matching import names_of
+from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule

@@ -39,7 +39,6 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, load_rights, load_zenoh_rights
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.zenoh.opened import is_signed
-from sros_tool.names import expand
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     common_name,
@@ -53,7 +52,7 @@ from sros_tool.pki.crl import embedded_lists, load_crl, names_issuers, refusal_o
 from sros_tool.pki.requests import key_digest
 from sros_tool.policy.document import PolicyFiles, policy_files, read_policy, refuse_fallbacks
 from sros_tool.policy.model import Enclave, Policy, Source, StatedProtection, stated_protections
-from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.policy.rights import Right, placed_rights, policy_rights
 from sros_tool.proof.revisions import PREFIX, Revision, find_revision
 from sros_tool.proof.zenoh_settings import LONE, SIGNED, SignedConfiguration
 from sros_tool.translate import permissions_for
@@ -143,17 +142,11 @@ class AccessSource:
 
     def sources_of(self, enclave: str) -> dict[Right, Source]:
         """Return the file and line that states each right of an enclave, if it is of a policy."""
-        found: dict[Right, Source] = {}
+        sources: dict[Right, Source] = {}
         stated = self.enclaves.get(enclave)
-        for profile in stated.all_profiles() if stated else ():
-            for group in profile.groups:
-                for index, name in enumerate(group.names):
-                    full = expand(name, profile.ns, profile.node)
-                    for right, qualifier in group.rights:
-                        key = Right(enclave, qualifier, right, full)
-                        if key not in found:
-                            found[key] = self.shown_source(group.source_of(index))
-        return found
+        for placed in placed_rights(stated) if stated else ():
+            sources.setdefault(placed.right, self.shown_source(placed.source))
+        return sources
 
     def shown_source(self, source: Source) -> Source:
         """Return a source of this side as a user would name it."""

@@ -15,7 +15,7 @@ from string import ascii_letters, digits
 from types import MappingProxyType
 
 from sros_tool.automata import Automaton, Letters, NameSet, SearchLimit
-from sros_tool.dds.decision.matching import names_of
+from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.names import is_expression
 from sros_tool.policy.protection import Level

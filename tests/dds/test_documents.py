@@ -6,6 +6,8 @@ import re
 import string
 from base64 import b64encode
 from pathlib import Path
+from random import Random
+from typing import Any
 from xml.sax import saxutils
 
 import pytest
@@ -14,6 +16,8 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from sros_tool.dds.decision import cyclone, fastdds
+from sros_tool.dds.decision.documents import canonical_governance, read_governance_as
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import (
     DomainRule,
@@ -23,6 +27,7 @@ from sros_tool.dds.governance import (
     attributes,
     parse_governance,
     render_governance,
+    settings,
 )
 from sros_tool.dds.permissions import (
     LARGE_BYTES,
@@ -246,3 +251,66 @@ def test_a_node_starts_without_what_it_does_not_need() -> None:
     assert "sros_tool.topics" in found
     heavy = {"http.client", "ssl", "urllib.request", "uuid", "lxml.etree", "sros_tool.translate"}
     assert heavy.isdisjoint(found)
+
+
+# ── documents that all vendors read alike ──────────────────────────────────────────────────
+
+_DRAWN = 40
+_EXPRESSIONS = ("*", "rt/chatter", "rq/*Request", "rr/a/bReply", "rt/[ab]?", "ros_discovery_info")
+
+
+def _drawn(random: Random, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
+    return {each.name: random.choice(each.values) for each in attributes(rule)}
+
+
+def drawn_governance(random: Random) -> Governance:
+    rules = []
+    for _ in range(random.randint(1, 3)):
+        first = random.randint(0, 200)
+        topics = tuple(
+            TopicRule(topic_expression=random.choice(_EXPRESSIONS), **_drawn(random, TopicRule))
+            for _ in range(random.randint(1, 4))
+        )
+        domains = DomainSet.of((first, first + random.choice((0, 3, 30))), (0, 0))
+        rules.append(
+            DomainRule(domains=domains, topic_access_rules=topics, **_drawn(random, DomainRule))
+        )
+    return Governance(tuple(rules))
+
+
+@pytest.mark.parametrize("seed", range(_DRAWN))
+def test_every_vendor_reads_what_sros_writes_alike(seed: int) -> None:
+    governance = drawn_governance(Random(seed))
+    document = render_governance(governance)
+    assert canonical_governance(document) == governance
+    assert canonical_governance(document.replace(b"\n", b"\r\n")) == governance
+    for vendor in Vendor:
+        assert read_governance_as(vendor, document) == governance
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"<topic_rule>", b"<!-- odd --><topic_rule>"),
+        (b"</id>", b" </id>"),
+        (b"true<", b"1<"),
+        (b"<topic_expression>*<", b"<topic_expression> *<"),
+        (b"<topic_expression>*<", b"<topic_expression><"),
+        (b"<topic_expression>*<", b"<topic_expression>a&amp;b<"),
+        (b"<id>0</id>", b"<id_range><min>0</min></id_range>"),
+        (b"<id>0</id>", b"<id>231</id>"),
+    ],
+)
+def test_a_document_that_vendors_may_read_in_their_own_ways_is_left_to_them(
+    old: bytes, new: bytes
+) -> None:
+    plain = settings(TopicRule, protect=True)
+    rule = DomainRule(
+        domains=DomainSet.of((0, 0)),
+        topic_access_rules=(TopicRule(topic_expression="*", **plain),),
+        **settings(DomainRule, protect=True),
+    )
+    document = render_governance(Governance((rule,)))
+    assert canonical_governance(document)
+    assert old in document
+    assert canonical_governance(document.replace(old, new)) is None

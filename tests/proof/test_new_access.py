@@ -21,7 +21,10 @@ from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import MEASURED, Style
 from sros_tool.errors import DocumentError, UsageError
 from sros_tool.fleet.fleet_file import read_fleet
-from sros_tool.proof import growth, sources
+from sros_tool.policy import rights as policy_rights
+from sros_tool.policy.model import Enclave
+from sros_tool.policy.rights import PlacedRight, placed_rights
+from sros_tool.proof import sources
 from sros_tool.proof.growth import Gain, compare_access
 from sros_tool.proof.repository import Repository
 from sros_tool.proof.sources import load_side
@@ -699,11 +702,12 @@ def test_the_work_grows_with_the_number_of_new_names(
     sides = load_side(base), load_side(head)
     asked: list[str] = []
 
-    def expand(name: str, *_: str) -> str:
-        asked.append(name)
-        return f"/{name}"
+    def counted(enclave: Enclave) -> Iterator[PlacedRight]:
+        for placed in placed_rights(enclave):
+            asked.append(placed.written)
+            yield placed
 
-    monkeypatch.setattr(sources, "expand", expand)
+    monkeypatch.setattr(sources, "placed_rights", counted)
     added = compare_access(*sides).added
     assert len(added) == 100
     assert all(each.source and each.source.line == 2 for each in added)
@@ -725,7 +729,7 @@ def test_the_work_grows_with_the_number_of_denials_that_are_gone(
         asked.append(name)
         return dds_names(right, name)
 
-    monkeypatch.setattr(growth, "dds_names", topics)
+    monkeypatch.setattr(policy_rights, "dds_names", topics)
     added = compare_access(*sides).added
     assert len(added) == 200
     assert all(each.denied and each.denied.name == each.name for each in added)

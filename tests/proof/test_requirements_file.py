@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.automata import NameSet
-from sros_tool.dds.decision.matching import names_of
+from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.errors import DocumentError
 from sros_tool.policy.model import ALLOW, Source

@@ -12,14 +12,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from enum import Enum, auto
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import groupby, takewhile
 from string import ascii_letters, digits
+from typing import TYPE_CHECKING, NamedTuple
 
-from sros_tool.automata import Automaton, Letters, NameSet
 from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.matching import ExpressionIndex, matches, names_of
+from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.moments import read_moment
 from sros_tool.dds.decision.subjects import ComparisonCrash, certified_text, same_subject
 from sros_tool.dds.decision.vendors import (
@@ -33,6 +33,9 @@ from sros_tool.dds.decision.vendors import (
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
+
+if TYPE_CHECKING:
+    from sros_tool.automata import NameSet
 
 
 def _choose_grant(
@@ -119,8 +122,7 @@ NumberedRule = tuple[int, Rule]
 """A rule with its index in the grant."""
 
 
-@dataclass(frozen=True, slots=True)
-class RuleVerdict:
+class RuleVerdict(NamedTuple):
     """The verdict of the rules: ALLOWED, DENIED or CRASHES, why, by which rule and expression."""
 
     outcome: Outcome
@@ -134,8 +136,7 @@ class RuleVerdict:
         return self.outcome is Outcome.ALLOWED
 
 
-@dataclass(frozen=True, slots=True)
-class _Entry:
+class _Entry(NamedTuple):
     """One ``<topic>`` of a rule, with the ``partitions`` that the vendor compares for it."""
 
     criteria: int
@@ -245,6 +246,8 @@ class _GrantRules:
 
     def names(self) -> NameSet:
         """Return the topics that `ask` allows in the default partition."""
+        from sros_tool.automata import NameSet
+
         rules: list[tuple[NameSet, bool]] = []
         for _, some in groupby(self._entries, key=lambda each: each.criteria):
             group = list(some)
@@ -257,11 +260,13 @@ class _GrantRules:
             before = list(takewhile(lambda each: each.expression, group))
             if len(before) < len(group):
                 passed = self._names_of(before)
-                rules.append((_EVERY_TOPIC - passed, False))
+                rules.append((_every_topic() - passed, False))
         return NameSet.first(rules, self._otherwise.allowed)
 
     def topic_names(self) -> NameSet:
         """Return the topics that `ask_topic` allows."""
+        from sros_tool.automata import NameSet
+
         return NameSet.first(self._deciding(self._entries), self._otherwise.allowed)
 
     def _deciding(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
@@ -286,8 +291,11 @@ class _GrantRules:
         return any(_named(style, named, each) for each in wanted)
 
 
-_of_texts = lru_cache(maxsize=8192)(names_of)
-"""Several vendors, and several enclaves, have the same names."""
+@lru_cache(maxsize=8192)  # several vendors, and several enclaves, have the same names
+def _of_texts(style: Style, texts: tuple[str, ...]) -> NameSet:
+    from sros_tool.dds.decision.expressions import names_of
+
+    return names_of(style, texts)
 
 
 def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
@@ -349,7 +357,7 @@ class GovernedDomain:
         """Yield the topic rules in order, each with all topics that its expression matches."""
         for rule in self._topic_rules:
             text = _usable_expression(self._traits, rule.topic_expression)
-            yield names_of(self._traits.style, (text,)), rule
+            yield _of_texts(self._traits.style, (text,)), rule
 
     def all_controlled(self) -> bool:
         """Return whether every topic rule controls reading and writing."""
@@ -452,14 +460,25 @@ class _Kind(Enum):
     """These, and the rules for the topic itself."""
 
 
-_EVERY_TOPIC = ~NameSet()
-_PLAIN_TOPICS = NameSet((), [Automaton(((0, ~Letters.of("*?["), 0),), frozenset((0,)))])
-_IN_TOPIC = Letters.of(f"{ascii_letters}_/")
-_VALID_TOPICS = NameSet(
-    (),
-    [Automaton(((0, _IN_TOPIC, 1), (1, _IN_TOPIC | Letters.of(digits), 1)), frozenset((1,)))],
-)
-"""The topics that `_is_topic_name` accepts."""
+@cache
+def _every_topic() -> NameSet:
+    from sros_tool.automata import NameSet
+
+    return ~NameSet()
+
+
+@cache
+def _usable_topics(*, created: bool) -> NameSet:
+    """Return the topics without wildcards, or those that `_is_topic_name` accepts (``created``)."""
+    from sros_tool.automata import Automaton, Letters, NameSet
+
+    if not created:
+        return NameSet((), [Automaton(((0, ~Letters.of("*?["), 0),), frozenset((0,)))])
+    first = Letters.of(f"{ascii_letters}_/")
+    edges = ((0, first, 1), (1, first | Letters.of(digits), 1))
+    return NameSet((), [Automaton(edges, frozenset((1,)))])
+
+
 _TOPIC_NAME = re.compile(r"[A-Za-z_/][A-Za-z0-9_/]*\Z")
 _ENDPOINTS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
@@ -548,6 +567,8 @@ class Access:
 
         That is in the default partition, and whatever the length of their names.
         """
+        from sros_tool.automata import NameSet
+
         if self._join.outcome in (Outcome.REFUSED, Outcome.CRASHES) or self._grant is None:
             return NameSet()
         rules = list(self._governed.names_by_rule())
@@ -560,8 +581,7 @@ class Access:
             for kind in dict.fromkeys(kinds)
             if kind is not _Kind.NOTHING
         )
-        usable = _VALID_TOPICS if self._traits.creates_topics else _PLAIN_TOPICS
-        return NameSet.union(found) & usable
+        return NameSet.union(found) & _usable_topics(created=self._traits.creates_topics)
 
     def protection(self) -> tuple[tuple[NameSet, DomainRule, TopicRule], ...]:
         """Return the topic rules of the domain, each with its topics: the first match counts."""
@@ -584,7 +604,7 @@ class Access:
 
     def _allowed_in(self, verb: AccessVerb, kind: _Kind) -> NameSet:
         if kind is _Kind.EVERYTHING:
-            return _EVERY_TOPIC
+            return _every_topic()
         allowed = self._own[verb].names()
         if self._peers is not self._own:
             allowed &= self._peers[verb].names()

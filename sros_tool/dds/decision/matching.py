@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
-from sros_tool.automata import ANY_LETTER, Automaton, Letters, NameSet
 from sros_tool.dds.decision.vendors import Style
 
 _Matcher = Callable[[str], object]
@@ -16,61 +15,6 @@ _SPECIAL = frozenset("*?[")
 """An expression without any of these means itself, for every vendor."""
 
 _BEFORE_SPECIAL = re.compile(r"[^*?\[]*")
-_CLASS = re.compile(r"\[:([a-y]*):\]")
-_EQUIVALENT = re.compile(r"\[=(.)=\]", re.DOTALL)
-_NOTHING = Letters(())
-_OPENING = Letters.of("[")
-_DIGIT, _LOWER, _UPPER = (Letters.between([ends]) for ends in (("0", "9"), ("a", "z"), ("A", "Z")))
-_CLASSES = {
-    "alnum": _DIGIT | _LOWER | _UPPER,
-    "alpha": _LOWER | _UPPER,
-    "blank": Letters.of(" \t"),
-    "cntrl": Letters.between([("\0", "\x1f"), ("\x7f", "\x7f")]),
-    "digit": _DIGIT,
-    "graph": Letters.between([("!", "~")]),
-    "lower": _LOWER,
-    "print": Letters.between([(" ", "~")]),
-    "punct": Letters.between([("!", "/"), (":", "@"), ("[", "`"), ("{", "~")]),
-    "space": Letters.between([(" ", " "), ("\t", "\r")]),
-    "upper": _UPPER,
-    "xdigit": Letters.between([("0", "9"), ("A", "F"), ("a", "f")]),
-}
-
-
-def _pieces(style: Style, expression: str) -> list[Letters | None]:
-    """Return the letters of an expression in a row, with None where any text may be."""
-    take_set = _FnmatchSets(expression).take if style is Style.FNMATCH else _cyclone_set
-    pieces: list[Letters | None] = []
-    index = 0
-    while index < len(expression):
-        char = expression[index]
-        index += 1
-        if char == "*":
-            pieces.append(None)
-        elif char == "?":
-            pieces.append(ANY_LETTER)
-        elif char == "[":
-            letters, index = take_set(expression, index)
-            pieces.append(letters)
-        else:
-            pieces.append(Letters.of(char))
-    return pieces
-
-
-@lru_cache(maxsize=65536)
-def _automaton(style: Style, expression: str) -> Automaton | None:
-    """Return an automaton for the same names; None if ``expression`` matches only itself."""
-    if _SPECIAL.isdisjoint(expression):
-        return None
-    return Automaton.sequence(_pieces(style, expression))
-
-
-def names_of(style: Style, expressions: Iterable[str]) -> NameSet:
-    """Return the names that any of the expressions matches."""
-    made = {each: _automaton(style, each) for each in expressions}
-    return NameSet(
-        (each for each, wild in made.items() if wild is None), filter(None, made.values())
-    )
 
 
 @lru_cache(maxsize=65536)
@@ -79,22 +23,25 @@ def _matcher(style: Style, expression: str) -> _Matcher | None:
     if _SPECIAL.isdisjoint(expression):
         return None
     segments = [""]  # the text between stars
-    for piece in _pieces(style, expression):
-        if piece is not None:
-            segments[-1] += _pattern(piece)
+    for pattern in _patterns(style, expression):
+        if pattern:
+            segments[-1] += pattern
         elif segments[-1] or len(segments) == 1:
             segments.append("")
     return re.compile(_joined(segments) + r"\Z", re.DOTALL).match
 
 
-def _pattern(letters: Letters) -> str:
-    """Return a regular expression for one of some letters."""
-    if letters == ANY_LETTER:
-        return "."
-    if single := letters.single():
-        return re.escape(single)
-    ranges = "".join(f"\\U{low:08x}-\\U{high:08x}" for low, high in letters.ranges)
-    return f"[{ranges}]" if ranges else "(?!)"
+def _patterns(style: Style, expression: str) -> Iterable[str]:
+    """Return regular expressions for the letters of an expression, with "" where any text may be.
+
+    Only the sets of letters are read in a vendor's own way.
+    """
+    if "[" in expression:
+        from sros_tool.dds.decision.expressions import pattern_of, pieces_of
+
+        pieces = pieces_of(style, expression)
+        return ["" if piece is None else pattern_of(piece) for piece in pieces]
+    return ["" if char == "*" else "." if char == "?" else re.escape(char) for char in expression]
 
 
 def _joined(segments: list[str]) -> str:
@@ -161,127 +108,3 @@ class ExpressionIndex:
             for position, text in enumerate(self._texts)
             if matches(self._style, text, name) or matches(self._style, name, text)
         ]
-
-
-class _FnmatchSets:
-    """Reads the sets of an expression as glibc does, in linear time."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-        self._known: dict[int, tuple[bool, bool]] = {}
-
-    def take(self, text: str, start: int) -> tuple[Letters, int]:
-        """Return the set after ``[``, and the index after the set.
-
-        After an unknown class or symbol, and after a range without its end, no further character
-        matches.  In all other cases, or if ``[`` was in it before, an unclosed set is a plain
-        ``[``.
-        """
-        index = start
-        negated = text[index : index + 1] in ("!", "^")
-        index += negated
-        closed, plain = self._end_of(index, first=True)
-        if not closed:
-            return (_OPENING if plain else _NOTHING), start
-        members: list[Letters] = []
-        goes_on = first = True
-        while first or text[index] != "]":
-            first = False
-            letters, _, index = _token(text, index)
-            goes_on = goes_on and letters is not None
-            if goes_on and letters:
-                members.append(letters)
-        if negated and not goes_on:
-            return _NOTHING, index + 1
-        return _set_of(members, negated), index + 1
-
-    def _end_of(self, index: int, *, first: bool) -> tuple[bool, bool]:
-        """Return whether a set whose members go on at ``index`` is closed, and plain if not.
-
-        What was found for an index is kept: many unclosed sets would take quadratic time.
-        """
-        text = self._text
-        path: list[tuple[int, bool | None]] = []
-        closed, plain = False, True
-        while index < len(text):
-            if not first and text[index] == "]":
-                closed = True
-                break
-            if not first and index in self._known:
-                closed, plain = self._known[index]
-                break
-            letters, a_range, after = _token(text, index)
-            decided = None
-            if letters is None:
-                decided = False
-            elif letters == _OPENING and not a_range:
-                decided = True
-            path.append((index, decided))
-            index, first = after, False
-        for place, decided in reversed(path):
-            plain = plain if decided is None else decided
-            if text[place] != "]":  # the first member of a set may be one; later it closes the set
-                self._known[place] = closed, plain
-        return closed, plain
-
-
-def _set_of(members: list[Letters], negated: bool) -> Letters:
-    letters = Letters.union(members)
-    return ~letters if negated else letters
-
-
-def _token(text: str, index: int) -> tuple[Letters | None, bool, int]:
-    """Return the letters of a class, a range or a character, whether it is a range, and what
-    follows.
-
-    None stands for a member that glibc does not know.
-    """
-    if found := _CLASS.match(text, index):
-        return _CLASSES.get(found[1]), False, found.end()
-    if found := _EQUIVALENT.match(text, index):
-        return Letters.of(found[1]), False, found.end()
-    low, index = _member(text, index)
-    if text[index : index + 1] != "-" or text[index + 1 : index + 2] == "]":
-        return (None if low is None else Letters.of(low)), False, index
-    high, index = _member(text, index + 1)
-    if low is None or high is None:
-        return None, True, index
-    return Letters.between([(low, high)]), True, index
-
-
-def _member(text: str, index: int) -> tuple[str | None, int]:
-    """Return one character of a set, also if written ``[.a.]``; None without one."""
-    if text[index : index + 2] != "[.":
-        return (text[index] if index < len(text) else None), index + 1
-    end = text.find(".]", index + 2)
-    if end < 0:
-        return None, len(text)
-    return (text[index + 2] if end == index + 3 else None), end + 2
-
-
-def _cyclone_set(text: str, start: int) -> tuple[Letters, int]:
-    """Return the set after ``[`` as Cyclone DDS 0.10 reads it, and the index after the set.
-
-    Its loop takes the closing bracket for a member before it ends, and looks for a range there,
-    too: ``[ab]`` also matches ``]``, and ``[ab]-x`` is one set with the range ``]`` to ``x``.
-    """
-    index = start
-    negated = text[index : index + 1] == "!"
-    index += negated
-    members: list[tuple[str, str]] = []
-    last = text[index : index + 1]
-    while last != "]":
-        last = text[index : index + 1]
-        if not last:
-            return _NOTHING, len(text)
-        if text[index + 1 : index + 2] == "-":
-            high = text[index + 2 : index + 3]
-            if high in ("", "]"):
-                return _NOTHING, len(text)
-            members.append((last, high))
-            index += 2
-        else:
-            members.append((last, last))
-        index += 1
-    letters = Letters.between(members)
-    return (~letters if negated else letters), index
