@@ -11,7 +11,7 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from sros_tool.errors import KeystoreError, Note, UsageError
-from sros_tool.keystore.unchanged import of_one_state
+from sros_tool.keystore.reader import of_one_state
 from sros_tool.owners import other_writers
 
 if TYPE_CHECKING:

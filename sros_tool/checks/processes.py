@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, tzinfo
@@ -34,6 +34,7 @@ from sros_tool.checks.zenoh_environment import (
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import IDENTITY_CA_FILE, enclave_path, search_enclaves
 from sros_tool.pki.certificates import load_certificates
+from sros_tool.prometheus import Metric, Sample
 from sros_tool.runtime.environment import (
     NO_CONFIGURATION,
     OVERRIDE,
@@ -168,7 +169,7 @@ class Security(StrEnum):
     UNKNOWN = "unknown"
 
 
-def security_of(process: Process) -> Security:
+def _security_of(process: Process) -> Security:
     """Return the security with which a process runs."""
     if process.is_zenoh:
         if process.configuration and process.configuration.problem:
@@ -200,7 +201,7 @@ def process_findings(
     is_secured_here = environment.get(ENABLE) == "true"
     here = ("", environment.get(DOMAIN) or "0")
     nodes = [each for each in running.processes if not each.is_daemon]
-    security = {each.pid: security_of(each) for each in nodes}
+    security = {each.pid: _security_of(each) for each in nodes}
     secured = [each for each in nodes if security[each.pid] is Security.SECURED]
     closed = {_place(each) for each in nodes if each.asks_for_security}
     closed |= {here} if is_secured_here else set()
@@ -474,3 +475,40 @@ def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
         yield CONTAINER_ALONE.found("processes", text)
     if reasons:
         yield PROCESS_NOT_SEEN.found("processes", "; ".join(reasons))
+
+
+# ── metrics ───────────────────────────────────────────────────────────────────────────────
+
+
+def runtime_metrics(
+    environment: Mapping[str, str], running: RunningProcesses, *, now: datetime, zone: tzinfo
+) -> tuple[Metric, ...]:
+    """Return the metrics of the processes that run, from the place of an environment."""
+    security = Counter(_security_of(each) for each in running.processes)
+    findings = process_findings(environment, running, now=now, zone=zone)
+    kinds = Counter((each.severity, each.id) for each in findings)
+    return (
+        Metric(
+            "sros_processes",
+            "Number of processes that speak ROS 2 by their security (secured, open or unknown).",
+            tuple(Sample(security[each], {"security": each.value}) for each in Security),
+        ),
+        Metric(
+            "sros_processes_not_seen",
+            "Number of processes that could not be looked at, which may be nodes.",
+            (Sample(len(running.unseen) + bool(running.hidden)),),
+        ),
+        Metric(
+            "sros_process_findings",
+            "Number of findings of `sros check runtime` about processes by the id of their kind.",
+            tuple(
+                Sample(number, {"severity": severity.word, "id": identity})
+                for (severity, identity), number in sorted(kinds.items())
+            ),
+        ),
+        Metric(
+            "sros_processes_examined_timestamp_seconds",
+            "When the processes were examined, in seconds since 1970.",
+            (Sample(int(now.timestamp())),),
+        ),
+    )

@@ -253,7 +253,7 @@ def _status(
         print_json(ComparedFleet(moment, found))
         return 0 if found.complete else 1
     if prometheus:
-        from sros_tool.keystore.fleet_metrics import fleet_metrics
+        from sros_tool.keystore.fleet_status import fleet_metrics
         from sros_tool.prometheus import render_metrics
 
         text = render_metrics(fleet_metrics(found, now=moment))

@@ -113,7 +113,7 @@ def metrics(
 
 
 def _of_processes(moment: datetime) -> tuple[Metric, ...]:
-    from sros_tool.checks.runtime_metrics import runtime_metrics
+    from sros_tool.checks.processes import runtime_metrics
     from sros_tool.runtime.processes import ProcessTable
 
     running = ProcessTable().look(moment)

@@ -117,8 +117,7 @@ def zenoh(
     """
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
     from sros_tool.keystore.lifecycle.zenoh import set_zenoh
-    from sros_tool.keystore.reader import Keystore
-    from sros_tool.keystore.unchanged import of_one_state
+    from sros_tool.keystore.reader import Keystore, of_one_state
 
     if existing:
         _refuse_with_from(root, router, *endpoints, *listen, mode, domain, off, only_check)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,11 @@ from cryptography import x509
 from sros_tool.dds.governance import Governance, parse_governance, values_of
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, SrosError
-from sros_tool.keystore.describe_zenoh import (
-    content_problems,
-    describe_configuration,
-    opened_at,
-)
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
     GOVERNANCE_P7S,
     KEY_URI_FILE,
+    PERMISSIONS_FILE,
     ROLES,
     ZENOH_SIGNED,
     ca_certificate,
@@ -32,7 +30,9 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave, open_enclave
+from sros_tool.keystore.zenoh.opened import OpenedZenoh, ZenohFault, open_zenoh
 from sros_tool.pki.certificates import (
+    common_name_of,
     digest,
     load_certificates,
     subject_text,
@@ -42,9 +42,14 @@ from sros_tool.pki.chains import Checks, chain_fault
 from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
 from sros_tool.pki.keys import algorithm, holds_private_key, load_key
 from sros_tool.pki.token import TokenUri, read_token_file
+from sros_tool.policy.rights import KIND_OF
 from sros_tool.translate import RosRight, ros_rights
+from sros_tool.translate_zenoh import domains_of, stated_names
 from sros_tool.validity import iso
 from sros_tool.xml import parse
+from sros_tool.zenoh.access import AccessRule
+from sros_tool.zenoh.configuration import Configuration, Mode, parse_rendered
+from sros_tool.zenoh.document import parse_configuration
 from sros_tool.zenoh.network import ZenohNetwork
 
 Description = dict[str, Any]
@@ -128,7 +133,7 @@ def _configuration(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
 ) -> Description:
     """Describe a Zenoh configuration, with the signature of the same document next to it."""
-    described = describe_configuration(data)
+    described = _describe_configuration(data)
     signature: Description = {"signed": False, "signature_verified": False}
     signed = path.with_name(ZENOH_SIGNED.get(path.name, path.name))
     if signed != path and signed.exists():
@@ -137,7 +142,7 @@ def _configuration(
         if files.signed(message).text != data:
             problem = f"it is not the document that was signed in {signed.name}"
             signature |= {"signature_verified": False, "signature_problem": problem}
-    return {**described, "problems": content_problems(path, now), **signature}
+    return {**described, "problems": _content_problems(path, now), **signature}
 
 
 def _keystore(root: Path, now: datetime) -> Description:
@@ -204,7 +209,7 @@ def _network(network: ZenohNetwork) -> Description:
 
 def _zenoh(folder: Path, now: datetime) -> Description:
     """Describe the Zenoh configurations of an enclave: the files, and what is wrong with them."""
-    opened = opened_at(folder, now)
+    opened = _opened_at(folder, now)
     if opened is None or not opened.files:
         return {"zenoh": None}
     return {
@@ -316,8 +321,8 @@ def _signed(
     signature = _signature(path, data, now, authority, files)
     if signed.document.lstrip()[:1] == b"<":
         return {**_document(signed.document, now), **signature}
-    described = describe_configuration(signed.text)
-    return {**described, "problems": content_problems(path, now), **signature}
+    described = _describe_configuration(signed.text)
+    return {**described, "problems": _content_problems(path, now), **signature}
 
 
 def _signature(
@@ -405,3 +410,93 @@ def _governance(governance: Governance) -> Description:
             for rule in governance.domain_access_rules
         ]
     }
+
+
+# ── configurations of Zenoh ───────────────────────────────────────────────────────────────
+
+
+_ABOUT_THE_CONTENT = (
+    ZenohFault.OTHER_DOCUMENT,
+    ZenohFault.MALFORMED,
+    ZenohFault.OUT_OF_DATE,
+    ZenohFault.OTHER_NAME,
+)
+
+
+def _describe_configuration(document: bytes) -> dict[str, Any]:
+    """Describe any Zenoh configuration; ``rights`` only of one that sros wrote.
+
+    Raises:
+        DocumentError: Zenoh would not accept it.
+    """
+    found = parse_configuration(document, "its content")
+    own: Configuration | None = None
+    with suppress(SrosError):
+        own = parse_rendered(document, "its content")
+    access = found.access
+    return {
+        "kind": "Zenoh configuration",
+        "mode": found.mode.value,
+        "connect": [each.text for each in found.connect],
+        "listen": [each.text for each in found.listen],
+        "access_control": {
+            "enabled": access.enabled,
+            "default": "allow" if access.allows_by_default else "deny",
+            "rules": len(access.rules),
+            "subjects": len(access.subjects),
+        },
+        "made_by_sros": own is not None,
+        "domains": sorted(domains_of(own.access_control)) if own else [],
+        "rights": _remote_rights(own) if own else [],
+    }
+
+
+def _remote_rights(configuration: Configuration) -> list[dict[str, Any]]:
+    """Return what each remote enclave may do here, and whether it is as the router of a session.
+
+    The router of a session in client mode may send what the session may get, and the reverse: its
+    entry shows the rights of the session's own enclave.
+    """
+    is_client = configuration.mode is Mode.CLIENT
+    return [
+        {
+            "enclave": each.common_name,
+            "own_rights_by_router": is_client,
+            "may": _names(rule.mirrored() if is_client else rule for rule in each.rules),
+        }
+        for each in configuration.access_control.remotes
+    ]
+
+
+def _names(rules: Iterable[AccessRule]) -> dict[str, dict[str, list[str]]]:
+    """Map the names that rules allow, by kind and right, as descriptions of permissions do."""
+    table: dict[str, dict[str, list[str]]] = {}
+    for right, name in stated_names(rules):
+        table.setdefault(KIND_OF[right], {}).setdefault(right, []).append(name)
+    return table
+
+
+def _opened_at(folder: Path, now: datetime) -> OpenedZenoh | None:
+    """Return the Zenoh configurations of the enclave in ``folder``; None if it is no enclave."""
+    if not all((folder / file).exists() for file in (CERTIFICATE_FILE, PERMISSIONS_FILE)):
+        return None
+    state = open_enclave(folder, now=now)
+    name = common_name_of(state.certificate.subject) if state.certificate else ""
+    return open_zenoh(folder, name, state)
+
+
+def _content_problems(path: Path, now: datetime) -> list[str]:
+    """Return how a configuration, or a signed one, does not fit the enclave that it lies in.
+
+    Of a configuration, `describe` itself says whether it is the document that was signed.
+    """
+    told = {ZenohFault.OTHER_DOCUMENT} if path.name in ZENOH_SIGNED else set()
+    names = [pair for pair in ZENOH_SIGNED.items() if path.name in pair]
+    opened = _opened_at(path.absolute().parent, now) if names else None
+    return [
+        str(each)
+        for each in (opened.problems if opened else ())
+        if each.fault in _ABOUT_THE_CONTENT
+        and each.fault not in told
+        and each.file in (*names[0], CERTIFICATE_FILE)
+    ]

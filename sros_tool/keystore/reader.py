@@ -14,10 +14,10 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, wraps
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Generic, TypeVar, overload
+from typing import TYPE_CHECKING, Concatenate, Generic, ParamSpec, TypeVar, overload
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import rsa
@@ -37,6 +37,7 @@ from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_URI_FILE,
+    LEDGER,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
@@ -1008,3 +1009,55 @@ class _EnclaveFiles:
         if domain is not None and not any(domain in rule.domains.closed() for rule in rules):
             text = f"none of its rules allows anything in domain {domain}"
             self._add(name, text, Fault.PERMISSIONS_DOMAIN)
+
+
+# ── reading one state while another process writes ────────────────────────────────────────
+
+
+_MOST_READS = 5
+
+Result = TypeVar("Result")
+Arguments = ParamSpec("Arguments")
+Opened = TypeVar("Opened", Path, Keystore)
+
+
+def of_one_state(
+    read: Callable[Concatenate[Opened, Arguments], Result],
+) -> Callable[Concatenate[Opened, Arguments], Result]:
+    """Return ``read``, a function of a keystore, so that it reads again what was changed meanwhile.
+
+    A keystore that is changed all the time is read five times; what the last one returns or raises
+    counts.
+    """
+
+    @wraps(read)
+    def read_again(opened: Opened, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+        root = opened.root if isinstance(opened, Keystore) else opened
+        for _ in range(_MOST_READS - 1):
+            before = _state(root)
+            try:
+                result = read(opened, *arguments, **named)
+            except SrosError:
+                if _state(root) == before:
+                    raise
+            else:
+                if _state(root) == before:
+                    return result
+            if isinstance(opened, Keystore):
+                opened.forget()
+        return read(opened, *arguments, **named)
+
+    return read_again  # type: ignore[return-value]  # mypy knows the name of the first argument
+
+
+def _state(root: Path) -> object:
+    """Return what each change of a keystore changes: the ledger gets another file."""
+    found: list[tuple[int, int, int] | None] = []
+    for name in (LEDGER, SETTINGS):
+        try:
+            state = os.stat(root / name)  # noqa: PTH116 - the link of a change under way, too
+        except OSError:
+            found.append(None)
+        else:
+            found.append((state.st_ino, state.st_size, state.st_mtime_ns))
+    return found

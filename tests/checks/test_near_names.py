@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.checks.near_names import NearNames
-from sros_tool.checks.policies import policy_file_findings
+from sros_tool.checks.policies import NearNames, policy_file_findings
 from sros_tool.files import policies_dir
 from tests.checks.policy_cases import services, topics
 

@@ -11,7 +11,7 @@ import pytest
 
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.errors import KeystoreError, PkiError
-from sros_tool.keystore.authorities import imported
+from sros_tool.keystore.authorities import authority as authorities
 from sros_tool.keystore.authorities.authority import load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.delivery import answer
@@ -177,7 +177,7 @@ def test_an_answer_of_a_weak_ca_is_refused(tmp_path: Path, monkeypatch: pytest.M
     place = ("--identity-ca", tmp_path / "ca.pem", "--identity-key", tmp_path / "ca.key")
     assert "weak key" in sros("create_keystore", home, *place).err
     with monkeypatch.context() as opened:
-        opened.setattr(imported, "weakness", lambda _: "")
+        opened.setattr(authorities, "weakness", lambda _: "")
         sros("create_keystore", home, *place).ok()
     assert "The key is weak: EC secp224r1" in sros("rotate_ca", home, "--same-key").err
     create_request(robot, NAME)

@@ -6,6 +6,7 @@ A file that is reached by several links is one file, under the name that it has 
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
 import struct
 import threading
@@ -18,12 +19,13 @@ _CLOSED = 0x18
 """Events between two openings, without which the system reports both as one."""
 _EVENT = struct.Struct("iIII")
 _LARGEST = 1 << 16
+_LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def can_count() -> bool:
     """Return whether the system has inotify, and lets this process use it."""
     try:
-        handle = _libc().inotify_init1(os.O_CLOEXEC)
+        handle = _LIBC.inotify_init1(os.O_CLOEXEC)
     except (AttributeError, OSError):
         return False
     if handle >= 0:
@@ -41,6 +43,7 @@ def count_opens(root: Path, work: Callable[[], object]) -> Counter[str]:
     finally:
         watch.stop()
         reader.join()
+    assert watch.ended, "the counting ended early"
     return watch.opened
 
 
@@ -49,8 +52,9 @@ class _Watch:
 
     def __init__(self, root: Path) -> None:
         self.opened: Counter[str] = Counter()
+        self.ended = False
         self._root = root
-        self._handle = _libc().inotify_init1(os.O_CLOEXEC)
+        self._handle = _LIBC.inotify_init1(os.O_CLOEXEC)
         self._folders: dict[int, str] = {}
         self._end = root / ".counted"
         for folder, _, _ in os.walk(root):
@@ -58,7 +62,9 @@ class _Watch:
 
     def _add(self, folder: str) -> None:
         events = _OPEN | _CLOSED | _CREATE | _MOVED_TO
-        watch = _libc().inotify_add_watch(self._handle, os.fsencode(folder), events)
+        watch = _LIBC.inotify_add_watch(self._handle, os.fsencode(folder), events)
+        if watch < 0 and ctypes.get_errno() in (errno.ENOENT, errno.ENOTDIR):
+            return  # a folder of a change that was there for a moment
         assert watch >= 0, f"inotify_add_watch: {os.strerror(ctypes.get_errno())}"
         self._folders[watch] = folder
 
@@ -80,13 +86,10 @@ class _Watch:
                 path = os.path.join(self._folders[watch], name)
                 if path == os.fspath(self._end):
                     os.close(self._handle)
+                    self.ended = True
                     return
                 if mask & _IS_FOLDER:
                     if mask & (_CREATE | _MOVED_TO):
                         self._add(path)
                 elif mask & _OPEN:
                     self.opened[os.path.relpath(path, self._root)] += 1
-
-
-def _libc() -> ctypes.CDLL:
-    return ctypes.CDLL(None, use_errno=True)
