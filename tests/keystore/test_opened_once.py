@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import re
 import shutil
 import subprocess
@@ -13,6 +15,7 @@ import pytest
 from cryptography import x509
 
 from sros_tool.pki import certificates, crl, smime
+from tests.support import opens
 from tests.support.harness import sros
 from tests.support.opens import can_count, count_opens
 
@@ -111,6 +114,33 @@ def test_what_is_opened_twice_is_seen(tmp_path: Path) -> None:
             (tmp_path / name).read_bytes()
 
     assert count_opens(tmp_path, read) == {"inside/file": 2}
+
+
+def test_a_folder_that_is_gone_at_once_does_not_end_the_counting(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("content")
+
+    def change() -> None:
+        for number in range(100):
+            (tmp_path / f"staged{number}").mkdir()
+            (tmp_path / f"staged{number}").rmdir()
+        (tmp_path / "file").read_bytes()
+
+    assert count_opens(tmp_path, change) == {"file": 1}
+
+
+def test_counting_that_ends_early_is_no_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def change() -> None:
+        monkeypatch.setattr(opens._LIBC, "inotify_add_watch", fail)
+        (tmp_path / "new").mkdir()
+
+    def fail(*_: object) -> int:
+        ctypes.set_errno(errno.ENOSPC)
+        return -1
+
+    with pytest.raises(AssertionError, match="No space left on device"):
+        count_opens(tmp_path, change)
 
 
 @pytest.mark.parametrize("words", QUESTIONS.values(), ids=QUESTIONS)

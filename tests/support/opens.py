@@ -9,9 +9,9 @@ import ctypes
 import errno
 import os
 import struct
-import threading
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 _OPEN, _CREATE, _MOVED_TO, _IS_FOLDER = 0x20, 0x100, 0x80, 0x40000000
@@ -36,23 +36,20 @@ def can_count() -> bool:
 def count_opens(root: Path, work: Callable[[], object]) -> Counter[str]:
     """Return how often each file below ``root`` is opened while ``work`` runs, by relative path."""
     watch = _Watch(Path(os.path.realpath(root)))
-    reader = threading.Thread(target=watch.read)
-    reader.start()
-    try:
-        work()
-    finally:
-        watch.stop()
-        reader.join()
-    assert watch.ended, "the counting ended early"
-    return watch.opened
+    with ThreadPoolExecutor(1) as reader:
+        counted = reader.submit(watch.read)
+        try:
+            work()
+        finally:
+            watch.stop()
+        return counted.result()  # raises what ended the counting early
 
 
 class _Watch:
     """The events of all folders below ``root``."""
 
     def __init__(self, root: Path) -> None:
-        self.opened: Counter[str] = Counter()
-        self.ended = False
+        self._opened: Counter[str] = Counter()
         self._root = root
         self._handle = _LIBC.inotify_init1(os.O_CLOEXEC)
         self._folders: dict[int, str] = {}
@@ -73,8 +70,8 @@ class _Watch:
         self._end.touch()
         self._end.unlink()
 
-    def read(self) -> None:
-        """Count until `stop`."""
+    def read(self) -> Counter[str]:
+        """Return how often each file was opened until `stop`."""
         while True:
             events = os.read(self._handle, _LARGEST)
             place = 0
@@ -86,10 +83,9 @@ class _Watch:
                 path = os.path.join(self._folders[watch], name)
                 if path == os.fspath(self._end):
                     os.close(self._handle)
-                    self.ended = True
-                    return
+                    return self._opened
                 if mask & _IS_FOLDER:
                     if mask & (_CREATE | _MOVED_TO):
                         self._add(path)
                 elif mask & _OPEN:
-                    self.opened[os.path.relpath(path, self._root)] += 1
+                    self._opened[os.path.relpath(path, self._root)] += 1
