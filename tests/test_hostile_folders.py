@@ -539,6 +539,38 @@ def test_a_file_with_a_key_that_a_killed_process_left_is_removed_by_the_next(
     ]
 
 
+_BELOW_A_LINK: dict[str, Callable[[Folder], object]] = {
+    "read": lambda folder: folder.read("link/file"),
+    "names": lambda folder: folder.names("link"),
+    "create": lambda folder: os.close(folder.create("link/new", 0o600)),
+    "open_private": lambda folder: os.close(folder.open_private("link/file")),
+    "symlink": lambda folder: folder.symlink("nowhere", "link/new"),
+    "mkdir": lambda folder: folder.mkdir("link/new", 0o700),
+    "rename": lambda folder: folder.rename("own", "link/new"),
+    "link": lambda folder: folder.link("own", "link/new"),
+    "unlink": lambda folder: folder.unlink("link/file"),
+    "remove_tree": lambda folder: folder.remove_tree("link/inner"),
+}
+
+
+@pytest.mark.parametrize("operation", _BELOW_A_LINK.values(), ids=_BELOW_A_LINK)
+def test_no_operation_goes_through_a_link(
+    operation: Callable[[Folder], object], tmp_path: Path
+) -> None:
+    (tmp_path / "outside/inner").mkdir(parents=True)
+    (tmp_path / "outside/file").write_text("content")
+    (tmp_path / "opened").mkdir()
+    (tmp_path / "opened/own").write_text("own")
+    (tmp_path / "opened/link").symlink_to(tmp_path / "outside")
+    before = snapshot(tmp_path)
+    with (
+        Folder(tmp_path / "opened") as folder,
+        pytest.raises(KeystoreError, match="opened/link' is a symbolic link"),
+    ):
+        operation(folder)
+    assert snapshot(tmp_path) == before
+
+
 # ── keys that only root can read ───────────────────────────────────────────────────────────
 
 
