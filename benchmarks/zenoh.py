@@ -26,8 +26,7 @@ def zenoh_files(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fi
     from sros_tool.keystore.lifecycle.zenoh import set_zenoh
     from sros_tool.keystore.template import load_template
     from sros_tool.policy.document import read_policy
-    from sros_tool.zenoh.configuration import Mode
-    from sros_tool.zenoh.network import ZenohNetwork
+    from sros_tool.zenoh.configuration import Mode, ZenohNetwork
 
     now = datetime.now(UTC)
 

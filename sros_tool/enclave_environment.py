@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.reader import Keystore, OpenedEnclave
-    from sros_tool.keystore.zenoh.opened import OpenedZenoh
+    from sros_tool.keystore.zenoh_files import OpenedZenoh
     from sros_tool.pki.token import TokenUri
 
 RMWS = (
@@ -86,9 +86,9 @@ def loadable_environment(
         enclave_path,
         has_enclave,
     )
-    from sros_tool.keystore.missing import no_such_enclave
     from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.selection import no_such_enclave
     from sros_tool.names import check_enclave_name
     from sros_tool.pki.token import MODULE_VARIABLE
     from sros_tool.runtime.environment import (
@@ -320,7 +320,7 @@ def _opened_zenoh(
             does not state the rights of its permissions.
     """
     from sros_tool.keystore.layout import PUBLIC
-    from sros_tool.keystore.zenoh.opened import ZenohFault, open_zenoh
+    from sros_tool.keystore.zenoh_files import ZenohFault, open_zenoh
 
     root, found = keystore.root, open_zenoh(keystore.folder(name), name, state)
     if not found.problems:
@@ -350,7 +350,7 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
     validly signed, it would enforce those of before.  An export does not have them.
     """
     from sros_tool.keystore.layout import PERMISSIONS, SETTINGS
-    from sros_tool.keystore.zenoh.wanted import zenoh_drift
+    from sros_tool.keystore.zenoh_files import zenoh_drift
     from sros_tool.zenoh.configuration import Mode
 
     if not keystore.has(SETTINGS):

@@ -17,10 +17,9 @@ from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profi
 from sros_tool.policy.patterns import ComparisonLimit, covers
 from sros_tool.policy.rights import KIND_OF, RIGHT_ORDER, Right, folded
 from sros_tool.translate_zenoh import chunks_of, number_of_chunks
-from sros_tool.zenoh.access import Flow, Message
+from sros_tool.zenoh.access import AclRule, AclSubject, Enforcement, Flow, Message
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import ConfigurationDocument
-from sros_tool.zenoh.enforcement import AclRule, AclSubject, Enforcement
 from sros_tool.zenoh.key_expressions import ANY_CHUNKS, canonical, includes, intersects
 
 _HISTORY = "@adv"

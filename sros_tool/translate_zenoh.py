@@ -28,13 +28,14 @@ from sros_tool.policy.subtraction import (
 from sros_tool.zenoh.access import (
     AccessControl,
     AccessRule,
+    AclRule,
+    Enforcement,
     Flow,
     Message,
     RemoteRights,
     in_order,
     joined,
 )
-from sros_tool.zenoh.enforcement import AclRule, Enforcement
 from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical
 
 _ANY_TYPE = "/*/*"

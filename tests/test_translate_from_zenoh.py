@@ -18,10 +18,9 @@ from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Rules, folded, policy_rights
 from sros_tool.translate_from_zenoh import RightsBehindRules, name_of_key, policy_of, rights_behind
 from sros_tool.translate_zenoh import remote_rights
-from sros_tool.zenoh.access import AccessControl, Flow, Message
+from sros_tool.zenoh.access import AccessControl, Flow, Message, Remote
 from sros_tool.zenoh.configuration import Configuration, Mode
 from sros_tool.zenoh.document import parse_configuration
-from sros_tool.zenoh.enforcement import Remote
 from tests.support.children import LONG
 from tests.support.harness import sros
 from tests.support.zenoh_configurations import self_limiting

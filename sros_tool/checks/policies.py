@@ -23,15 +23,16 @@ from sros_tool.checks.kind import (
     Finding,
     FindingKind,
     RelatedPlace,
+    by_cause,
     some_names,
 )
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
 from sros_tool.dds.portable import mistaken_names, outside, some_pairs
-from sros_tool.errors import DocumentError, PolicyError, SrosError
+from sros_tool.errors import DocumentError, Note, PolicyError, SrosError
 from sros_tool.files import policies_dir
-from sros_tool.fleet.expansion import read_policy_for
+from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.keystore.protection import contradictions
@@ -1018,3 +1019,40 @@ def _one_edit(a: str, b: str) -> bool:
         return a[at:] == b[at + 1 :]
     changed_places = a[at : at + 2] == b[at : at + 2][::-1] and a[at + 2 :] == b[at + 2 :]
     return a[at + 1 :] == b[at + 1 :] or changed_places
+
+
+_MOST_ENCLAVES = 1000  # of each policy: signing must not wait for the check of a whole fleet
+
+
+def signed_findings(
+    policies: Iterable[Policy | FleetPolicy], enclaves: Collection[str], distribution: str = ""
+) -> list[tuple[Finding, ...]]:
+    """Return the errors and warnings in policies, the worst first, those of one cause together.
+
+    A policy for a fleet is checked as it is for one robot of each group, and of a larger policy
+    the first 1,000 enclaves.
+
+    Args:
+        policies: the policies.
+        enclaves: the enclaves that they are signed for; all others are left out.
+        distribution: the ROS 2 distribution of the nodes; "" is the latest.
+    """
+    found: list[Finding] = []
+    for each in policies:
+        policy = each.for_one_robot() if isinstance(each, FleetPolicy) else each
+        chosen = [one for one in policy.enclaves if one.path in enclaves][:_MOST_ENCLAVES]
+        found += findings_in(replace(policy, enclaves=tuple(chosen)), distribution)
+    shown = [each for each in found if each.severity >= WARNING]
+    shown.sort(key=lambda each: -each.severity.weight)
+    return list(by_cause(list(dict.fromkeys(shown))))
+
+
+def as_note(findings: tuple[Finding, ...]) -> Note:
+    """Return one finding, or findings of one cause, as a note."""
+    first = findings[0]
+    if first.cause and len(findings) > 1:
+        cause, place = first.cause, first.cause.place or first.place
+        text = f"{place}: {cause.title}. {cause.text} {cause.remedy}"
+    else:
+        text = f"{first.place}: {first.kind.title}: {first.text}. {first.remedy}"
+    return Note(first.id, text)

@@ -13,7 +13,15 @@ from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from sros_tool.checks.environment import asks_in_vain, value_text
+from sros_tool.checks.environment import (
+    OWN_CONFIGURATION,
+    PROCESS_OPEN,
+    asks_in_vain,
+    enforces_nothing,
+    is_zenoh,
+    open_because,
+    value_text,
+)
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.process_files import (
     LONGEST_PATH,
@@ -23,13 +31,6 @@ from sros_tool.checks.process_files import (
     file_findings,
     plain_path,
     unsecured_because,
-)
-from sros_tool.checks.zenoh_environment import (
-    OWN_CONFIGURATION,
-    PROCESS_OPEN,
-    enforces_nothing,
-    is_zenoh,
-    open_because,
 )
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import IDENTITY_CA_FILE, enclave_path, search_enclaves

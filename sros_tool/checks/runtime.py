@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 
-from sros_tool.checks.environment import variable_findings
+from sros_tool.checks.environment import variable_findings, zenoh_environment_findings
 from sros_tool.checks.keystores.keystore import joined
 from sros_tool.checks.kind import ERROR, Finding, FindingKind
 from sros_tool.checks.processes import process_findings
-from sros_tool.checks.zenoh_environment import zenoh_environment_findings
 from sros_tool.runtime.processes import RunningProcesses
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
 from sros_tool.runtime.variables import ENABLE, KEYSTORE

@@ -14,14 +14,13 @@ from sros_tool.translate_from_zenoh import RightsBehindRules, is_self_limiting
 from sros_tool.values import DryRun, FileChange, Notes, Words
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
-from sros_tool.zenoh.access import Message
+from sros_tool.zenoh.access import PROPERTIES, AclRule, AclSubject, Enforcement, Message
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import (
     ENCRYPTED,
     ConfigurationDocument,
     parse_configuration,
 )
-from sros_tool.zenoh.enforcement import PROPERTIES, AclRule, AclSubject, Enforcement
 from sros_tool.zenoh.key_expressions import includes, intersects, widest
 
 _MEASURED = "Zenoh 1.10.2, measured."

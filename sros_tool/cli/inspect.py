@@ -81,7 +81,7 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
 
 
 def _show_history(root: Path, as_json: bool) -> int:
-    from sros_tool.keystore.history import history
+    from sros_tool.keystore.describe import history
 
     found = history(root, now=now())
     if as_json:

@@ -322,8 +322,8 @@ def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> It
 
 if TYPE_CHECKING:
     from sros_tool.keystore.authorities.keyring import Keyring
-    from sros_tool.keystore.lifecycle.rotation.stages import RotationStep
-    from sros_tool.keystore.lifecycle.rotation.state import RotationStatus
+    from sros_tool.keystore.lifecycle.rotate import RotationStep
+    from sros_tool.keystore.lifecycle.rotation import RotationStatus
     from sros_tool.keystore.reader import Keystore
 
 _DONE = {
@@ -416,9 +416,9 @@ def rotate_ca(
     In a keystore with a fleet, a stage is refused while robots have not confirmed the one before
     (`sros fleet confirm`).
     """
-    from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca
-    from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca as work
-    from sros_tool.keystore.lifecycle.rotation.state import RotationStage, rotation_status
+    from sros_tool.keystore.lifecycle.rotate import renew_identity_ca
+    from sros_tool.keystore.lifecycle.rotate import rotate_ca as work
+    from sros_tool.keystore.lifecycle.rotation import RotationStage, rotation_status
     from sros_tool.validity import parse_span
 
     if sum((status, go_on, to is not None, finish, same_key)) > 1:
@@ -483,7 +483,7 @@ def rotate_ca(
 def _print_step(
     step: RotationStep, status: RotationStatus, *, together: bool, same_key: bool
 ) -> None:
-    from sros_tool.keystore.lifecycle.rotation.state import EXPORT_FIRST
+    from sros_tool.keystore.lifecycle.rotation import EXPORT_FIRST
 
     if not step.changes:
         done = (
@@ -520,8 +520,8 @@ def _print_step(
 
 def _unconfirmed(root: Path) -> tuple[str, ...] | str:
     """Return the robots that have not confirmed the stage of a rotation, or why that is unknown."""
-    from sros_tool.keystore.lifecycle.rotation.stages import robots_cut_off
-    from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+    from sros_tool.keystore.lifecycle.rotate import robots_cut_off
+    from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
     from sros_tool.keystore.reader import Keystore
 
     keystore = Keystore(root)

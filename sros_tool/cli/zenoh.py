@@ -34,8 +34,8 @@ from sros_tool.wording import first_few
 if TYPE_CHECKING:
     from sros_tool.keystore.template import Template
     from sros_tool.translate_from_zenoh import RightsBehindRules
+    from sros_tool.zenoh.configuration import ZenohNetwork
     from sros_tool.zenoh.document import ConfigurationDocument
-    from sros_tool.zenoh.network import ZenohNetwork
 
 _DONE = {"create": "wrote", "replace": "replaced", "remove": "removed"}
 _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer needed"}
@@ -182,7 +182,7 @@ def _refuse_with_from(*given: object) -> None:
 def _network(settings: Template, given: dict[str, str]) -> ZenohNetwork:
     """Return the network of the settings, or the usual one, with the values that are ``given``."""
     from sros_tool.keystore.template import with_values
-    from sros_tool.zenoh.network import ZenohNetwork
+    from sros_tool.zenoh.configuration import ZenohNetwork
 
     network = settings.zenoh or ZenohNetwork()
     chosen = with_values(replace(settings, zenoh=network), list(given.items())).zenoh

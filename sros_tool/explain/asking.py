@@ -153,7 +153,7 @@ def open_to_ask(
 
 
 def _not_in_policy(policy: Policy, name: str, file: Path) -> PolicyError:
-    from sros_tool.keystore.missing import likely_names
+    from sros_tool.keystore.selection import likely_names
 
     there = [each.path for each in policy.enclaves]
     meant = likely_names(name, there)
@@ -187,7 +187,7 @@ def signed_enclave(
         return load_enclave_of(keystore, name, at=at)
     if planned:
         return None
-    from sros_tool.keystore.missing import no_such_enclave
+    from sros_tool.keystore.selection import no_such_enclave
 
     raise no_such_enclave(root, name, list_enclaves(root))
 

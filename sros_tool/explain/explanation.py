@@ -200,7 +200,7 @@ def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:
 
 
 def _is_rotating(keystore: Path) -> bool:
-    from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+    from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 
     try:
         return read_rotation(keystore).stage is not RotationStage.NONE

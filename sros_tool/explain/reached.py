@@ -9,9 +9,9 @@ from typing import NamedTuple
 from sros_tool.errors import KeystoreError, Note
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import enclave_names
-from sros_tool.keystore.missing import likely_names, no_such_enclave
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource
+from sros_tool.keystore.selection import likely_names, no_such_enclave
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, Reach, unguarded
 from sros_tool.values import shows
 

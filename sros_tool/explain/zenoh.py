@@ -34,16 +34,15 @@ from sros_tool.keystore.layout import (
     has_zenoh_files,
     is_keystore,
 )
-from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.zenoh.opened import is_signed
-from sros_tool.keystore.zenoh.wanted import Drift, signed_path, zenoh_drift
+from sros_tool.keystore.selection import no_such_enclave
+from sros_tool.keystore.zenoh_files import Drift, is_signed, signed_path, zenoh_drift
 from sros_tool.pki.certificates import common_name_of, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, parts
 from sros_tool.values import shows
-from sros_tool.zenoh.access import Message
+from sros_tool.zenoh.access import Enforcement, Message
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.delivery import (
     Check,
@@ -56,7 +55,6 @@ from sros_tool.zenoh.delivery import (
     token,
 )
 from sros_tool.zenoh.document import ZenohEndpoint, parse_configuration
-from sros_tool.zenoh.enforcement import Enforcement
 from sros_tool.zenoh.key_expressions import includes
 
 _OF_TLS = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)

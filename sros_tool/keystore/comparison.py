@@ -16,7 +16,7 @@ from sros_tool.names import is_expression
 from sros_tool.policy.patterns import common_name, covers, overlap
 from sros_tool.topics import service_of
 from sros_tool.validity import Span, duration_text, span_text, window
-from sros_tool.zenoh.network import ZenohNetwork
+from sros_tool.zenoh.configuration import ZenohNetwork
 
 
 class Effect(StrEnum):

@@ -42,7 +42,7 @@ from sros_tool.keystore.layout import (
     has_enclave,
 )
 from sros_tool.keystore.ledger import Entry
-from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import Keystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import digest

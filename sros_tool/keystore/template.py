@@ -23,7 +23,7 @@ from sros_tool.validity import Span, duration_text, parse_duration, parse_span, 
 from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
-    from sros_tool.zenoh.network import ZenohNetwork
+    from sros_tool.zenoh.configuration import ZenohNetwork
 
 DEFAULT_TEMPLATE = "development"
 EVERYTHING, NODE_BASICS = "everything", "node_basics"
@@ -212,8 +212,11 @@ def _short_lived(table: _Table) -> Iterator[ShortLived]:
 
 
 def _zenoh(table: _Table) -> ZenohNetwork:
-    from sros_tool.zenoh.configuration import Mode, is_endpoint  # most keystores have none
-    from sros_tool.zenoh.network import ZenohNetwork
+    from sros_tool.zenoh.configuration import (  # most keystores have none
+        Mode,
+        ZenohNetwork,
+        is_endpoint,
+    )
 
     usual = ZenohNetwork()
     network = ZenohNetwork(

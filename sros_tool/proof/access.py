@@ -21,8 +21,7 @@ from sros_tool.proof.places import topics_of
 from sros_tool.proof.worlds import TopicAccess, named, valid_topics
 from sros_tool.topics import SERVICE_ENDS
 from sros_tool.translate_zenoh import StatedRight
-from sros_tool.zenoh.access import Flow, Message
-from sros_tool.zenoh.enforcement import Enforcement, Remote
+from sros_tool.zenoh.access import Enforcement, Flow, Message, Remote
 from sros_tool.zenoh.key_expressions import names_of
 
 _IN, _OUT = Flow.INGRESS, Flow.EGRESS

@@ -38,7 +38,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, load_rights, load_zenoh_rights
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.zenoh.opened import is_signed
+from sros_tool.keystore.zenoh_files import is_signed
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     common_name,
@@ -58,8 +58,8 @@ from sros_tool.proof.zenoh_settings import LONE, SIGNED, SignedConfiguration
 from sros_tool.translate import permissions_for
 from sros_tool.validity import iso, window
 from sros_tool.xml import read_bytes
+from sros_tool.zenoh.access import Enforcement
 from sros_tool.zenoh.document import ConfigurationDocument
-from sros_tool.zenoh.enforcement import Enforcement
 
 UNCERTAIN = {
     "rights.partitions",

@@ -56,8 +56,7 @@ from sros_tool.proof.worlds import LONGEST, TopicAccess, World, named
 from sros_tool.translate import governance_for, permissions_for, protected_topics
 from sros_tool.translate_zenoh import remote_rights, stated_rights
 from sros_tool.validity import window
-from sros_tool.zenoh.access import AccessControl
-from sros_tool.zenoh.enforcement import Enforcement
+from sros_tool.zenoh.access import AccessControl, Enforcement
 
 _ZENOH = "zenoh"
 """The world that is no vendor of DDS."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import UsageError
-from sros_tool.keystore.missing import likely_names
+from sros_tool.keystore.selection import likely_names
 from sros_tool.names import ACTION_SEPARATOR, is_expression
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.patterns import matches, overlap

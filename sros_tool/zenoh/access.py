@@ -1,16 +1,19 @@
-"""Access control of Zenoh: rules for remote processes by certificate, and what they decide.
+"""Access control of Zenoh: rules for remote processes, and what they decide.
 
-Only permission is stated, and what no rule allows is denied: a denial inside a wider permission
-holds neither against a query nor against a put with a wildcard key (measured with 1.10.2).
-Sources: zenoh.io "Access Control"; zenoh 1.9, access_control.rs and authorization.rs.
+`AccessControl` is what sros writes: only permission, only by certificate; what no rule allows is
+denied.  A denial inside a wider permission holds neither against a query nor against a put with a
+wildcard key (measured with 1.10.2).  `Enforcement` is what any configuration may state.
+Sources: zenoh.io "Access Control"; zenoh 1.9, access_control.rs and authorization.rs; compared
+with the wheel 1.10.2.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from itertools import product
 from typing import NamedTuple
 
 from sros_tool.automata import NameSet
@@ -147,3 +150,275 @@ _ORDER = {message: number for number, message in enumerate(Message)}
 @lru_cache(maxsize=64)  # the rules of all enclaves have the same few
 def _place(flow: Flow, messages: tuple[Message, ...]) -> tuple[bool, list[int]]:
     return flow is Flow.EGRESS, [_ORDER[each] for each in messages]
+
+
+@dataclass(frozen=True, slots=True)
+class Remote:
+    """A remote process as access control sees it; None is what it does not have.
+
+    ``common_name`` is the first one of its certificate, ``link_protocol`` such as "tls", and
+    ``interfaces`` are the network interfaces of the own host that the connection uses.
+    """
+
+    common_name: str | None = None
+    link_protocol: str | None = "tls"
+    username: str | None = None
+    interfaces: tuple[str, ...] = ()
+    zid: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AclRule:
+    """Messages in some directions, on keys that ``key_expressions`` include: allowed or denied.
+
+    ``line`` is its line in the file.
+    """
+
+    id: str
+    allows: bool
+    flows: tuple[Flow, ...]
+    messages: tuple[Message, ...]
+    key_expressions: tuple[str, ...]
+    line: int = field(default=0, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class AclSubject:
+    """Remote processes that have one of the values of every property; None stands for any value."""
+
+    id: str
+    cert_common_names: tuple[str, ...] | None = None
+    usernames: tuple[str, ...] | None = None
+    interfaces: tuple[str, ...] | None = None
+    link_protocols: tuple[str, ...] | None = None
+    zids: tuple[str, ...] | None = None
+    line: int = field(default=0, compare=False)
+
+    def is_named(self) -> bool:
+        """Return whether it states who the process is, and not only how it connects."""
+        return self.cert_common_names is not None or self.usernames is not None
+
+    def overlaps(self, other: AclSubject) -> bool:
+        """Return whether a process can match both as two subjects: with the rights of either.
+
+        Where both state the same properties, what matches both is one subject to Zenoh.
+        """
+        pairs = [(getattr(self, name), getattr(other, name)) for name in PROPERTIES]
+        return any((one is None) is not (two is None) for one, two in pairs) and all(
+            one is None or two is None or not set(one).isdisjoint(two) for one, two in pairs
+        )
+
+
+PROPERTIES = tuple(each.name for each in fields(AclSubject) if each.name not in ("id", "line"))
+"""The names of a subject's properties."""
+
+
+@dataclass(frozen=True, slots=True)
+class AclPolicy:
+    """Which rules hold for which subjects, by their ids: an entry of Zenoh's ``policies``."""
+
+    rules: tuple[str, ...]
+    subjects: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AccessDecision:
+    """Whether a message passes, and why.
+
+    ``rules`` are the ids of the rules that decide it, none if the default does; ``subjects`` the
+    ids of all subjects that match the remote process; ``why`` is a clause that says the reason.
+    """
+
+    allowed: bool
+    rules: tuple[str, ...]
+    subjects: tuple[str, ...]
+    why: str
+
+
+_OF_HISTORY = (Message.PUT, Message.QUERY)
+
+_Combination = tuple[str | None, ...]
+"""One value for each of `PROPERTIES`, None for any."""
+
+
+@dataclass(frozen=True)
+class Enforcement:
+    """The access control of a process: whether it is on, its rules, subjects and policies."""
+
+    enabled: bool = False
+    allows_by_default: bool = False
+    rules: tuple[AclRule, ...] = ()
+    subjects: tuple[AclSubject, ...] = ()
+    policies: tuple[AclPolicy, ...] = ()
+
+    def rules_of(self, subject: str) -> tuple[AclRule, ...]:
+        """Return the rules that policies apply to a subject, by its id."""
+        return self._rules_of.get(subject, ())
+
+    def subjects_of(self, remote: Remote) -> tuple[AclSubject, ...]:
+        """Return the subjects that match a remote process, in the order of the file."""
+        ids = {each for one in self._matching(remote) for each in self._combinations[one]}
+        return tuple(each for each in self.subjects if each.id in ids)
+
+    def names(self) -> frozenset[str]:
+        """Return the common names that subjects state: those of enclaves that rules are for."""
+        return frozenset(n for each in self.subjects for n in each.cert_common_names or ())
+
+    def unclear(self) -> str:
+        """Return why names alone do not decide what passes, as a clause; "" if they do."""
+        for each in self.subjects:
+            stated = {name for name in PROPERTIES if getattr(each, name) is not None}
+            if each.cert_common_names is not None and len(stated) > 1:
+                more = ", ".join(sorted(stated - {"cert_common_names"}))
+                return f"its subject {each.id[:80]!r} has conditions besides the name: {more}"
+        if any(not each.allows for each in self.rules):
+            return "it has denials, which do not hold for messages with wildcards"
+        for each in self.subjects:
+            if key := self._only_history(each.id):
+                return f"its subject {each.id[:80]!r} gets the history of {key[:80]!r} alone"
+        return ""
+
+    def _only_history(self, subject: str) -> str:
+        """Return a key whose history (``@adv``) a subject gets without the key itself, or ""."""
+        keys: dict[Flow, list[str]] = {each: [] for each in Flow}
+        history: dict[Flow, set[str]] = {each: set() for each in Flow}
+        for rule in self.rules_of(subject):
+            for flow, message in product(rule.flows, rule.messages):
+                if message not in _OF_HISTORY:
+                    continue
+                # Who asks for a history gets what the other flow lets pass.
+                other = Flow.EGRESS if flow is Flow.INGRESS else Flow.INGRESS
+                for key in rule.key_expressions:
+                    begin, of_history, _ = key.partition("/@adv")
+                    if of_history:
+                        history[flow if message is Message.PUT else other].add(begin)
+                    elif message is Message.PUT:
+                        keys[flow].append(key)
+        for flow, begins in history.items():
+            exact = set(keys[flow])
+            for begin in sorted(begins - exact):
+                if not any(includes(key, begin) for key in keys[flow]):
+                    return begin
+        return ""
+
+    def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
+        """Return whether a message from or to a remote process passes.
+
+        ``key`` is the key or key expression of the message: a rule applies if one of its own
+        includes that as a whole.  Subjects of the same values are one, and in it DENY wins.
+        Between different subjects that match, one that allows is enough; under default ALLOW that
+        is each one without a rule that denies.
+        """
+        if not self.enabled:
+            return AccessDecision(True, (), (), "access control is off")
+        subjects = tuple(each.id for each in self.subjects_of(remote))
+        default = "ALLOW" if self.allows_by_default else "DENY"
+        if not self._rules_of:
+            return self._by_default(subjects, f"no rule is in force, and the default is {default}")
+        if not subjects:
+            return self._by_default((), f"no subject matches, and the default is {default}")
+        denying: list[str] = []
+        for combination in self._matching(remote):
+            applying = [
+                rule
+                for rule in self._in_force[combination].get((flow, message), ())
+                if any(includes(each, key) for each in rule.key_expressions)
+            ]
+            denied = [rule.id for rule in applying if not rule.allows]
+            allowed = [rule.id for rule in applying if rule.allows]
+            if denied:
+                denying += denied
+            elif allowed or self.allows_by_default:
+                why = f"rule {allowed[0]} allows it" if allowed else "the default is ALLOW"
+                return AccessDecision(True, _once(allowed), subjects, why)
+        if denying:
+            return AccessDecision(False, _once(denying), subjects, f"rule {denying[0]} denies it")
+        return AccessDecision(False, (), subjects, "no rule allows it, and the default is DENY")
+
+    def passing(
+        self, remote: Remote, flow: Flow, message: Message, of: Callable[[Iterable[str]], NameSet]
+    ) -> NameSet:
+        """Return the keys, without wildcards, of which `decide` lets a message pass.
+
+        ``of`` returns the set of what key expressions include: of keys, or of other names for them.
+        """
+        everything = ~NameSet()
+        if not self.enabled:
+            return everything
+        combinations = self._matching(remote)
+        if not self._rules_of or not combinations:
+            return everything if self.allows_by_default else NameSet()
+        found = []
+        for combination in combinations:
+            rules = self._in_force[combination].get((flow, message), ())
+            denied = of(key for rule in rules if not rule.allows for key in rule.key_expressions)
+            allowed = of(key for rule in rules if rule.allows for key in rule.key_expressions)
+            found.append((everything if self.allows_by_default else allowed) - denied)
+        return NameSet.union(found)
+
+    def _by_default(self, subjects: tuple[str, ...], why: str) -> AccessDecision:
+        return AccessDecision(self.allows_by_default, (), subjects, why)
+
+    @cached_property
+    def _combinations(self) -> Mapping[_Combination, tuple[str, ...]]:
+        """The ids of the subjects for each combination of their values."""
+        found: dict[_Combination, list[str]] = {}
+        for subject in self.subjects:
+            values = (getattr(subject, name) or (None,) for name in PROPERTIES)
+            for combination in product(*values):
+                found.setdefault(combination, []).append(subject.id)
+        return {one: _once(ids) for one, ids in found.items()}
+
+    @cached_property
+    def _rules_of(self) -> Mapping[str, tuple[AclRule, ...]]:
+        rules = {each.id: each for each in self.rules}
+        found: dict[str, dict[str, AclRule]] = {}
+        for policy in self.policies:
+            for subject in policy.subjects:
+                found.setdefault(subject, {}).update((each, rules[each]) for each in policy.rules)
+        return {subject: tuple(of.values()) for subject, of in found.items()}
+
+    @cached_property
+    def _in_force(
+        self,
+    ) -> Mapping[_Combination, Mapping[tuple[Flow, Message], tuple[AclRule, ...]]]:
+        found: dict[_Combination, dict[tuple[Flow, Message], dict[str, AclRule]]] = {}
+        for combination, ids in self._combinations.items():
+            of = found.setdefault(combination, {})
+            for rule in (rule for each in ids for rule in self.rules_of(each)):
+                for place in product(rule.flows, rule.messages):
+                    of.setdefault(place, {})[rule.id] = rule
+        return {
+            combination: {place: tuple(rules.values()) for place, rules in of.items()}
+            for combination, of in found.items()
+        }
+
+    @cached_property
+    def _combinations_by_name(self) -> Mapping[str | None, tuple[_Combination, ...]]:
+        found: dict[str | None, list[_Combination]] = {}
+        for each in self._combinations:
+            found.setdefault(each[0], []).append(each)
+        return {name: tuple(of) for name, of in found.items()}
+
+    def _matching(self, remote: Remote) -> list[_Combination]:
+        values: tuple[tuple[str | None, ...], ...] = (
+            (remote.common_name,),
+            (remote.username,),
+            remote.interfaces,
+            (remote.link_protocol,),
+            (remote.zid,),
+        )
+        by_name = self._combinations_by_name
+        named = () if remote.common_name is None else by_name.get(remote.common_name, ())
+        return [
+            combination
+            for combination in (*named, *by_name.get(None, ()))
+            if all(
+                wanted is None or wanted in there
+                for wanted, there in zip(combination, values, strict=True)
+            )
+        ]
+
+
+def _once(ids: Iterable[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(ids))

@@ -1,5 +1,7 @@
 """Configurations of Zenoh processes as rmw_zenoh reads them, without paths and without keys.
 
+`ZenohNetwork` has the choices for all processes of a keystore.
+
 A file replaces the whole default of rmw_zenoh, so it also repeats those of its values that differ
 from Zenoh's own and that ROS needs (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_*_CONFIG.json5).
 """
@@ -27,6 +29,27 @@ class Mode(StrEnum):
     """Connects to the router, and directly to the processes that the router tells it of."""
     CLIENT = "client"
     """Connects to the router alone, which passes on all data."""
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohNetwork:
+    """The Zenoh network of a keystore's enclaves.
+
+    ``router`` is the enclave of the router; ``endpoints`` (``HOST:PORT``) are where the sessions
+    connect to it, and ``listen`` is where it listens, if elsewhere, such as ``[::]:7447``.
+    ``mode`` is that of the sessions, client or peer.  ``domains`` are ROS domains; empty for those
+    of the keystore's governance.
+    """
+
+    router: str = "/router"
+    endpoints: tuple[str, ...] = ("localhost:7447",)
+    listen: tuple[str, ...] = ()
+    mode: Mode = Mode.CLIENT
+    domains: tuple[int, ...] = ()
+
+    def listening(self) -> tuple[str, ...]:
+        """Return where the router listens."""
+        return self.listen or self.endpoints
 
 
 _QUERY_MILLISECONDS = 600_000

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from sros_tool.values import shows
-from sros_tool.zenoh.access import Flow, Message
+from sros_tool.zenoh.access import AccessDecision, Enforcement, Flow, Message, Remote
 from sros_tool.zenoh.configuration import Mode
-from sros_tool.zenoh.enforcement import AccessDecision, Enforcement, Remote
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,16 @@ from math import prod
 from typing import TypeVar
 
 from sros_tool.errors import DocumentError
-from sros_tool.zenoh.access import Flow, Message
+from sros_tool.zenoh.access import (
+    PROPERTIES,
+    AclPolicy,
+    AclRule,
+    AclSubject,
+    Enforcement,
+    Flow,
+    Message,
+)
 from sros_tool.zenoh.configuration import Mode
-from sros_tool.zenoh.enforcement import PROPERTIES, AclPolicy, AclRule, AclSubject, Enforcement
 from sros_tool.zenoh.json5 import MOST_BYTES, Json5Error, Json5Object, parse_json5
 from sros_tool.zenoh.key_expressions import expression_problem
 

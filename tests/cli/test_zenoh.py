@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
+from sros_tool.keystore import zenoh_files
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.zenoh import wanted
 from sros_tool.pki import smime
 from sros_tool.translate_zenoh import StatedRight, remote_of
 from sros_tool.zenoh.access import AccessRule, Flow, Message, RemoteRights
@@ -238,7 +238,7 @@ def test_rules_that_are_not_the_permissions_are_not_written(
         wider = AccessRule(Flow.EGRESS, (Message.PUT,), ("0/**",))
         return replace(rights, rules=rights.rules[1:] if lost else (*rights.rules, wider))
 
-    monkeypatch.setattr(wanted, "remote_of", wrong)
+    monkeypatch.setattr(zenoh_files, "remote_of", wrong)
     before = snapshot(folder)
     ended = sros("zenoh", "ks", cwd=folder)
     assert (ended.status, "would not have the intended content" in ended.err) == (2, True)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.keystore import zenoh_files
 from sros_tool.keystore.reader import OpenedEnclave
-from sros_tool.keystore.zenoh import opened
 from sros_tool.pki import smime
 from sros_tool.runtime.environment import NO_CONFIGURATION, REFUSING, render_refusal
 from tests.support.children import importing, run
@@ -276,14 +276,14 @@ def test_who_reads_while_another_writes_sees_one_state(
     """Between the permissions and the file of Zenoh, somebody changes both."""
     words = ("env", keystore, "/a", *ZENOH)
     before = sros(*words)
-    real, waiting = opened.open_zenoh, ["more.xml"]
+    real, waiting = zenoh_files.open_zenoh, ["more.xml"]
 
     def change_meanwhile(folder: Path, name: str, state: OpenedEnclave) -> object:
         if waiting:
             sros("create_permission", keystore, "/a", keystore.parent / waiting.pop()).ok()
         return real(folder, name, state)
 
-    monkeypatch.setattr(opened, "open_zenoh", change_meanwhile)
+    monkeypatch.setattr(zenoh_files, "open_zenoh", change_meanwhile)
     ended = sros(*words)
     assert not waiting
     assert (ended.status, ended.out) == (before.status, before.out), ended

@@ -15,7 +15,7 @@ from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.template import load_template
 
 pytestmark = pytest.mark.skipif(not shutil.which("openssl"), reason="the program openssl is needed")

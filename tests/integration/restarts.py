@@ -19,8 +19,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from sros_tool.keystore.layout import list_enclaves
-from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import RotationStage
+from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
+from sros_tool.keystore.lifecycle.rotation import RotationStage
 from sros_tool.keystore.lifecycle.update import UpdateStage, update_keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.events import EventKind, read_events

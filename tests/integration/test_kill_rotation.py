@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.history import history
+from sros_tool.keystore.describe import history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import (
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
+from sros_tool.keystore.lifecycle.rotation import (
     RotationStage,
     read_rotation,
     rotation_status,

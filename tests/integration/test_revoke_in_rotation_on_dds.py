@@ -12,8 +12,8 @@ import pytest
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import RotationStage
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
+from sros_tool.keystore.lifecycle.rotation import RotationStage
 from tests.integration.test_life_on_dds import (
     ANY,
     DOMAIN,

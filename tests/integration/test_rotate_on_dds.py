@@ -14,7 +14,7 @@ import pytest
 from sros_tool.dds.domains import DomainSet
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
+from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.template import load_template
 from tests.integration.test_life_on_dds import HEARD, SILENT, Question, ask_fast, compare, probe
 from tests.support.children import python

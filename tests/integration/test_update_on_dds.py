@@ -14,7 +14,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.keystore.comparison import mismatch
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
-from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.lifecycle.update import update_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.settings import present_settings

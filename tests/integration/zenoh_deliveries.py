@@ -23,11 +23,10 @@ import zenoh
 import zenoh.ext
 
 from sros_tool.runtime.netns import enter_isolation, try_isolation
-from sros_tool.zenoh.access import Flow, Message
+from sros_tool.zenoh.access import Enforcement, Flow, Message
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.delivery import ZenohProcess, call, publication, route, token
 from sros_tool.zenoh.document import parse_configuration
-from sros_tool.zenoh.enforcement import Enforcement
 from tests.integration.zenoh_world import PAUSE, drawn_rule, until, world
 
 TALKER, LISTENER, ROUTER = "/talker", "/listener", "/router"

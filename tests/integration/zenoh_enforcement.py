@@ -18,9 +18,8 @@ from typing import Any
 import zenoh
 
 from sros_tool.runtime.netns import enter_isolation, try_isolation
-from sros_tool.zenoh.access import Message
+from sros_tool.zenoh.access import Message, Remote
 from sros_tool.zenoh.document import parse_configuration
-from sros_tool.zenoh.enforcement import Remote
 from tests.integration.zenoh_world import MESSAGES, PAUSE, drawn_rule, observed_cases
 
 CASES = 60

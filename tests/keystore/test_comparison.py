@@ -28,8 +28,7 @@ from sros_tool.keystore.template import (
 )
 from sros_tool.policy.protection import Level
 from sros_tool.translate import governance_for, protection_for
-from sros_tool.zenoh.configuration import Mode
-from sros_tool.zenoh.network import ZenohNetwork
+from sros_tool.zenoh.configuration import Mode, ZenohNetwork
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 ZERO = DomainSet.of((0, 0))

@@ -11,7 +11,7 @@ import pytest
 from cryptography.hazmat.primitives import hashes
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.history import HistoryStatus, history
+from sros_tool.keystore.describe import HistoryStatus, history
 from sros_tool.keystore.layout import LEDGER
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.create import (

@@ -18,7 +18,7 @@ from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
+from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime

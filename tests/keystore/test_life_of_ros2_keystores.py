@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.history import HistoryStatus, history
+from sros_tool.keystore.describe import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
-from sros_tool.keystore.lifecycle.rotation.state import rotation_status
+from sros_tool.keystore.lifecycle.rotation import rotation_status
 from sros_tool.keystore.reader import Keystore, open_enclave
 from tests.support.harness import certificate, check_enclave_whole, remains, snapshot, sros
 from tests.support.made_by_ros2 import make

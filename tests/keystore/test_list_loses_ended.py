@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.history import HistoryStatus, history
+from sros_tool.keystore.describe import HistoryStatus, history
 from sros_tool.keystore.layout import LEDGER, enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from sros_tool.keystore.layout import list_enclaves
-from sros_tool.keystore.missing import likely_names, no_such_enclave
 from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.selection import likely_names, no_such_enclave
 from sros_tool.pki.certificates import load_certificate
 from tests.support.harness import sros
 

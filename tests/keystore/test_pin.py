@@ -22,8 +22,8 @@ from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.delivery.trust import read_pin
 from sros_tool.keystore.layout import PERMISSIONS, SEAL
 from sros_tool.keystore.lifecycle.create import create_keystore
-from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import RotationStage
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
+from sros_tool.keystore.lifecycle.rotation import RotationStage
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import digest

@@ -13,13 +13,13 @@ READERS = (
     "sros_tool.keystore.loading",
     "sros_tool.keystore.describe",
     "sros_tool.keystore.rights",
-    "sros_tool.keystore.history",
+    "sros_tool.keystore.describe",
     "sros_tool.keystore.expiry",
-    "sros_tool.keystore.missing",
+    "sros_tool.keystore.selection",
     "sros_tool.keystore.ledger",
-    "sros_tool.keystore.recorded",
-    "sros_tool.keystore.zenoh.opened",
-    "sros_tool.keystore.zenoh.wanted",
+    "sros_tool.keystore.rights",
+    "sros_tool.keystore.zenoh_files",
+    "sros_tool.keystore.zenoh_files",
 )
 WRITERS = ("transaction", "issuing", "lifecycle", "delivery", "authorities")
 

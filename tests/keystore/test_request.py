@@ -25,7 +25,7 @@ from sros_tool.keystore.delivery.answer import import_answer
 from sros_tool.keystore.delivery.archive import MAX_MEMBER, MAX_UNPACKED, pack, unpack
 from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import Signed, certify_requests, sign_request
-from sros_tool.keystore.history import history
+from sros_tool.keystore.describe import history
 from sros_tool.keystore.layout import SEAL, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew

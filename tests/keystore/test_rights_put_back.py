@@ -20,7 +20,7 @@ from sros_tool.keystore.delivery.signing import Signed, sign_request
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, SEAL
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy

@@ -22,8 +22,8 @@ from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.layout import ROTATION, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.lifecycle.rotation.stages import RotationStep, renew_identity_ca, rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import RotationStage, retired_key, rotation_status
+from sros_tool.keystore.lifecycle.rotate import RotationStep, renew_identity_ca, rotate_ca
+from sros_tool.keystore.lifecycle.rotation import RotationStage, retired_key, rotation_status
 from sros_tool.keystore.lifecycle.update import update_keystore
 from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.history import HistoryStatus, history
+from sros_tool.keystore.describe import HistoryStatus, history
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import RotationStage
+from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
+from sros_tool.keystore.lifecycle.rotation import RotationStage
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import common_name_of, digest

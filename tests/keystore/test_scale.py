@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.inputs import fleet_file, fleet_policy
-from sros_tool.keystore.history import HistoryStatus, history
+from sros_tool.keystore.describe import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.reader import Keystore
 from sros_tool.validity import parse_iso

@@ -16,15 +16,15 @@ import pytest
 from cryptography import x509
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore import history as history_of_keystores
+from sros_tool.keystore import describe as history_of_keystores
+from sros_tool.keystore.describe import HistoryStatus, history
 from sros_tool.keystore.expiry import Threshold, _lifetimes
-from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
+from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.parallel import map_slices

@@ -29,8 +29,8 @@ from sros_tool.keystore.lifecycle.create import (
     generate_artifacts,
 )
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import lock as locking
 from sros_tool.keystore.transaction import recovery
+from sros_tool.keystore.transaction import recovery as locking
 from sros_tool.keystore.transaction import stage as stage_of
 from sros_tool.keystore.transaction.stage import Change, Changes
 from sros_tool.keystore.transaction.transaction import Transaction

@@ -20,7 +20,7 @@ from sros_tool.keystore.lifecycle.create import (
 )
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from tests.support.harness import check_whole, policy_text, publish, snapshot, sros, topics_of

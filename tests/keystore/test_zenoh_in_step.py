@@ -13,7 +13,7 @@ from sros_tool.files import templates_dir
 from sros_tool.keystore.lifecycle.zenoh import set_zenoh
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
-from sros_tool.zenoh.network import ZenohNetwork
+from sros_tool.zenoh.configuration import ZenohNetwork
 from tests.support.harness import policy_text, publish, snapshot, sros
 
 FIRST = policy_text({"/a": publish("/x"), "/b": publish("/y")})

@@ -55,10 +55,9 @@ from sros_tool.topics import SERVICE_ENDS, dds_names
 from sros_tool.translate import governance_for, permissions_for
 from sros_tool.translate_zenoh import remote_of, stated_rights
 from sros_tool.validity import window
-from sros_tool.zenoh.access import Flow, Message
+from sros_tool.zenoh.access import Enforcement, Flow, Message, Remote
 from sros_tool.zenoh.configuration import Mode, render_configuration, render_rights
 from sros_tool.zenoh.document import parse_configuration
-from sros_tool.zenoh.enforcement import Enforcement, Remote
 
 VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 DOMAINS = (0, 7, 8, 9)

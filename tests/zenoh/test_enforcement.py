@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from sros_tool.zenoh.access import Flow, Message
+from sros_tool.zenoh.access import Enforcement, Flow, Message, Remote
 from sros_tool.zenoh.document import parse_configuration
-from sros_tool.zenoh.enforcement import Enforcement, Remote
 
 TALKER = Remote("/talker")
 

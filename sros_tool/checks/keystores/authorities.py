@@ -31,7 +31,7 @@ from sros_tool.keystore.layout import (
     key_path,
 )
 from sros_tool.keystore.loading import authority_refusals, refusals_text
-from sros_tool.keystore.recorded import RecordedRights
+from sros_tool.keystore.rights import RecordedRights
 from sros_tool.keystore.settings import edit_remedy
 from sros_tool.pki.certificates import (
     authority_text,
@@ -494,7 +494,7 @@ def shared_ca_findings(
 
 def _separation(keystore: CheckedKeystore) -> str:
     """Return what is left to do until identity CA and permissions CA have keys of their own."""
-    from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+    from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 
     try:
         stage = read_rotation(keystore.root).stage

@@ -37,14 +37,15 @@ from sros_tool.checks.keystores.issued import (
     wanted_rights,
 )
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
-from sros_tool.checks.keystores.starting import check_starting, with_causes
 from sros_tool.checks.keystores.topic_names import check_capitals, names_without_wildcards
 from sros_tool.checks.keystores.vendors import (
     REFUSED,
     SOME_REFUSE,
     asked_vendors,
+    check_starting,
     check_vendors,
     evaluate,
+    with_causes,
 )
 from sros_tool.checks.keystores.zenoh_files import check_network, check_own_zenoh
 from sros_tool.checks.kind import WARNING, Cause, Finding, some_names

@@ -17,8 +17,7 @@ from sros_tool.faults import Fault
 from sros_tool.keystore.layout import PERMISSIONS, SETTINGS, ZENOH_FILES
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.zenoh.opened import OpenedZenoh
-    from sros_tool.keystore.zenoh.wanted import Drifted
+    from sros_tool.keystore.zenoh_files import Drifted, OpenedZenoh
 
 _AGAIN = "Run `sros zenoh ROOT`, and restart the processes that it names."
 _SOURCE = "sros (docs/zenoh.md); Zenoh 1.10 verifies no signature of its configuration."
@@ -107,7 +106,7 @@ def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
         return
     if not any(os.path.lexists(enclave.folder / file) for file in ZENOH_FILES):
         return
-    from sros_tool.keystore.zenoh.opened import open_zenoh  # most keystores have no such files
+    from sros_tool.keystore.zenoh_files import open_zenoh  # most keystores have no such files
 
     yield from _of_opened(enclave, open_zenoh(enclave.folder, enclave.name, enclave.state))
 
@@ -133,7 +132,7 @@ def check_network(
     authorities = keystore.authorities.get(PERMISSIONS)
     if network is None or not authorities:
         return
-    from sros_tool.keystore.zenoh.wanted import zenoh_drift
+    from sros_tool.keystore.zenoh_files import zenoh_drift
 
     try:
         domains = keystore.opened.domains
@@ -160,8 +159,7 @@ def check_network(
 
 def _of_drift(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
     """Yield findings about a configuration that is not as it should be, with what is wrong."""
-    from sros_tool.keystore.zenoh.opened import open_zenoh
-    from sros_tool.keystore.zenoh.wanted import Drift
+    from sros_tool.keystore.zenoh_files import Drift, open_zenoh
 
     file = keystore.shown(drift.path)
     if drift.kind is Drift.STALE:

@@ -35,8 +35,7 @@ from sros_tool.runtime.environment import (
 from sros_tool.runtime.variables import DOMAIN
 from sros_tool.validity import Window
 from sros_tool.zenoh.access import Message
-from sros_tool.zenoh.configuration import Mode
-from sros_tool.zenoh.network import ZenohNetwork
+from sros_tool.zenoh.configuration import Mode, ZenohNetwork
 
 _Document = dict[str, Any]
 _Change = Callable[[_Document], None]

@@ -43,7 +43,7 @@ from sros_tool.keystore.reader import (
 )
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.keystore.zenoh.opened import open_zenoh
+from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (

@@ -32,13 +32,12 @@ from sros_tool.keystore.layout import (
     list_enclaves,
     search_enclaves,
 )
-from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave
-from sros_tool.keystore.selection import select_enclaves
+from sros_tool.keystore.selection import no_such_enclave, select_enclaves
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.keystore.zenoh.opened import open_zenoh
+from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.pki.token import read_token_file

@@ -62,7 +62,7 @@ from sros_tool.keystore.lifecycle.replaced import (
 )
 from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.recorded import EarlierRights
+from sros_tool.keystore.rights import EarlierRights
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import enclave_subject, has_unique_part, pem, validity_of
 from sros_tool.pki.certificates import subject_text as text_of

@@ -42,7 +42,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
 )
 from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
-from sros_tool.keystore.recorded import EarlierRights
+from sros_tool.keystore.rights import EarlierRights
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.parallel import Progress, tick

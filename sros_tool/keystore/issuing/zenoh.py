@@ -18,7 +18,7 @@ from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.keystore.zenoh.wanted import (
+from sros_tool.keystore.zenoh_files import (
     NO_CHANGE,
     Drift,
     Drifted,
@@ -29,7 +29,7 @@ from sros_tool.keystore.zenoh.wanted import (
     zenoh_documents,
 )
 from sros_tool.validity import iso
-from sros_tool.zenoh.network import ZenohNetwork
+from sros_tool.zenoh.configuration import ZenohNetwork
 
 
 def keep_zenoh(

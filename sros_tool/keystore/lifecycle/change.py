@@ -37,7 +37,7 @@ from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
 from sros_tool.keystore.of_ros2 import take_over
 from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore, check_domain
-from sros_tool.keystore.recorded import RecordedRights
+from sros_tool.keystore.rights import RecordedRights
 from sros_tool.keystore.settings import edit_notes
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
@@ -319,7 +319,7 @@ class KeystoreChange:
         if self.template.zenoh is None:
             return
         from sros_tool.keystore.issuing.zenoh import keep_zenoh
-        from sros_tool.keystore.zenoh.wanted import ZenohChange
+        from sros_tool.keystore.zenoh_files import ZenohChange
 
         self.zenoh = keep_zenoh(
             self.transaction,

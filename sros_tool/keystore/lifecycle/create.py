@@ -31,9 +31,9 @@ from sros_tool.keystore.ledger import certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.enclaves import write_enclaves
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights
-from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.reader import Keystore, check_domain
+from sros_tool.keystore.selection import no_such_enclave
 from sros_tool.keystore.settings import with_places, write_settings
 from sros_tool.keystore.template import Template, template_names
 from sros_tool.keystore.transaction.recovery import tidy

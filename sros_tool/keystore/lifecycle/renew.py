@@ -28,8 +28,8 @@ from sros_tool.keystore.issuing.tokens import EnclaveTokens, token_notes, token_
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_enclave, has_key
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import Superseded
-from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.recorded import EarlierRights, RecordedRights
+from sros_tool.keystore.rights import EarlierRights, RecordedRights
+from sros_tool.keystore.selection import no_such_enclave
 from sros_tool.names import check_enclave_name
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import (

@@ -30,7 +30,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.replaced import Superseded
-from sros_tool.keystore.lifecycle.rotation.state import (
+from sros_tool.keystore.lifecycle.rotation import (
     Replacement,
     RotationStage,
     crls_confusable,

@@ -22,7 +22,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
-from sros_tool.keystore.missing import no_such_enclave
+from sros_tool.keystore.selection import no_such_enclave
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import issued_by
 from sros_tool.pki.crl import REASONS

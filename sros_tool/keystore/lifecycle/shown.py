@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.lifecycle.revoke import Revocation
-    from sros_tool.keystore.lifecycle.rotation.state import (
+    from sros_tool.keystore.lifecycle.rotation import (
         AuthorityStatus,
         RotationStage,
         RotationStatus,
     )
     from sros_tool.keystore.lifecycle.update import UpdateStage
     from sros_tool.pki.crl import RevocationList
-    from sros_tool.zenoh.network import ZenohNetwork
+    from sros_tool.zenoh.configuration import ZenohNetwork
 
 Rights = Annotated[
     Sequence[ReplacedRights],

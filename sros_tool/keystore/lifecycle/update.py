@@ -67,9 +67,9 @@ from sros_tool.keystore.lifecycle.replaced import (
     replaced_rights,
     rights_text,
 )
-from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.recorded import EarlierRights, RecordedRights
+from sros_tool.keystore.rights import EarlierRights, RecordedRights
 from sros_tool.keystore.settings import (
     PresentSettings,
     edit_remedy,

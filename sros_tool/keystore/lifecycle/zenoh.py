@@ -21,7 +21,7 @@ from sros_tool.keystore.lifecycle.create import Creation, creation
 from sros_tool.keystore.lifecycle.enclaves import write_enclaves
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import EVERYTHING, NODE_BASICS
-from sros_tool.zenoh.network import ZenohNetwork
+from sros_tool.zenoh.configuration import ZenohNetwork
 
 
 def set_zenoh(

@@ -36,8 +36,7 @@ from sros_tool.keystore.layout import (
     folder_mode,
     readable_enclaves,
 )
-from sros_tool.keystore.transaction.lock import KeystoreLock, lock_new
-from sros_tool.keystore.transaction.recovery import complete, recover
+from sros_tool.keystore.transaction.recovery import KeystoreLock, complete, lock_new, recover
 from sros_tool.keystore.transaction.stage import (
     ADDED,
     ADOPT,

@@ -58,7 +58,7 @@ from sros_tool.keystore.ledger import (
 )
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import sign_list
-from sros_tool.keystore.lifecycle.rotation.state import (
+from sros_tool.keystore.lifecycle.rotation import (
     Replacement,
     Rotation,
     RotationStage,
@@ -68,7 +68,7 @@ from sros_tool.keystore.lifecycle.rotation.state import (
     retired_key,
 )
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.recorded import EarlierRights
+from sros_tool.keystore.rights import EarlierRights
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import Progress

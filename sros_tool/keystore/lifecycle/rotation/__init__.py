@@ -1,1 +1,0 @@
-"""CA rotation: the stages, and the state of a keystore in between."""
