@@ -23,7 +23,7 @@ def zenoh_files(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fi
     document, and writes files of the same sizes.
     """
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
-    from sros_tool.keystore.lifecycle.zenoh import set_zenoh
+    from sros_tool.keystore.lifecycle.update import set_zenoh
     from sros_tool.keystore.template import load_template
     from sros_tool.policy.document import read_policy
     from sros_tool.zenoh.configuration import Mode, ZenohNetwork

@@ -20,8 +20,8 @@ from sros_tool.errors import Note, UsageError
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.fleet.expansion import FleetPolicy
-    from sros_tool.keystore.authorities.keyring import Keyring
     from sros_tool.keystore.fleet_status import FleetStatus
+    from sros_tool.keystore.issuing.keyring import Keyring
     from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
@@ -566,7 +566,7 @@ def _policy(given: AnyPath | Policy) -> Policy:
 
 
 def _keyring(secrets: Secrets | None, *, encrypt: bool = False, short: bool = False) -> Keyring:
-    from sros_tool.keystore.authorities.keyring import Keyring, no_secrets
+    from sros_tool.keystore.issuing.keyring import Keyring, no_secrets
 
     return Keyring(secrets or no_secrets, encrypt=encrypt, short_passphrase=short)
 

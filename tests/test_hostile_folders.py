@@ -29,11 +29,11 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.files import _follow_own_links, replace_file, staged_file
 from sros_tool.folders import Folder
-from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.delivery import export
 from sros_tool.keystore.delivery.export import distribute
-from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.robot import create_request
 from sros_tool.keystore.delivery.signing import sign_request
+from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import LOCK, STAGE
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew

@@ -24,9 +24,8 @@ from sros_tool.errors import UsageError
 
 _MODULES = (
     *("policies", "requirements", "keystores.files", "keystores.authorities"),
-    *("keystores.enclaves", "keystores.starting", "keystores.vendors", "keystores.documents"),
-    *("keystores.topic_names", "keystores.issued", "keystores.zenoh_files", "zenoh"),
-    *("zenoh_environment", "environment", "runtime", "processes", "process_files"),
+    *("keystores.enclaves", "keystores.vendors", "keystores.documents", "keystores.topic_names"),
+    *("keystores.issued", "keystores.zenoh_files", "zenoh", "environment", "runtime", "processes"),
 )
 """The modules of checks, in the order in which their kinds are listed."""
 

@@ -1,16 +1,17 @@
-"""Checks of the runtime: environment variables, the RMW, the clock, and running processes."""
+"""Checks of the runtime (variables, RMW, clock, processes), and what changes among its findings."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
+from enum import StrEnum
 from pathlib import Path
 
 from sros_tool.checks.environment import variable_findings, zenoh_environment_findings
 from sros_tool.checks.keystores.keystore import joined
 from sros_tool.checks.kind import ERROR, Finding, FindingKind
-from sros_tool.checks.processes import process_findings
+from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
 from sros_tool.runtime.processes import RunningProcesses
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
 from sros_tool.runtime.variables import ENABLE, KEYSTORE
@@ -104,3 +105,54 @@ def _clock(state: RuntimeState) -> Iterator[Finding]:
     if written > clock + _TOLERANCE:
         text = f"the clock shows {iso(clock)}, but '{root}' was written at {iso(written)}"
         yield CLOCK_BEHIND.found("clock", text)
+
+
+class ChangeKind(StrEnum):
+    """What became of a finding."""
+
+    NEW = "new"
+    CHANGED = "changed"
+    OVER = "over"
+
+
+@dataclass(frozen=True, slots=True)
+class FindingChange:
+    """A change among the findings about processes; each is an object on a line of its own."""
+
+    time: datetime
+    """When it was seen, in UTC."""
+    change: ChangeKind
+    """What became of the finding: it is new, says something else, or is over."""
+    finding: Finding
+    """The finding."""
+
+    def __str__(self) -> str:
+        """Return a line of text."""
+        of = self.finding
+        head = f"{iso(self.time)} {self.change}: {of.subject}: {of.severity.word}: {of.kind.title}"
+        return f"{head} [{of.id}]: {of.text}"
+
+
+class FindingNews:
+    """The findings of the last time, to be compared with those of the next one."""
+
+    def __init__(self) -> None:
+        self._before: dict[tuple[str, str], Finding] = {}
+
+    def changes(self, findings: Iterable[Finding], now: datetime) -> Iterator[FindingChange]:
+        """Yield what changed since the last time; at first all findings are new.
+
+        How many processes could not be looked at changes all the time, and is reported once.
+        """
+        found: dict[tuple[str, str], Finding] = {}
+        for each in findings:
+            found.setdefault((each.id, each.subject), each)
+        before, self._before = self._before, found
+        for key, each in before.items():
+            if key not in found:
+                yield FindingChange(now, ChangeKind.OVER, each)
+        for key, each in found.items():
+            if key not in before:
+                yield FindingChange(now, ChangeKind.NEW, each)
+            elif each.text != before[key].text and each.kind is not PROCESS_NOT_SEEN:
+                yield FindingChange(now, ChangeKind.CHANGED, each)

@@ -549,7 +549,7 @@ def renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:
 
 
 def _print_markdown(chosen: ChosenFindings, _selection: FindingFilter) -> None:
-    from sros_tool.checks.markdown import findings_markdown
+    from sros_tool.checks.formats import findings_markdown
 
     echo_lines(findings_markdown(chosen, findings_summary(chosen)))
 
@@ -635,8 +635,8 @@ def _print_json(chosen: ChosenFindings, _selection: FindingFilter) -> None:
 
 
 def _print_sarif(chosen: ChosenFindings, selection: FindingFilter) -> None:
+    from sros_tool.checks.formats import sarif
     from sros_tool.checks.registry import select_kinds
-    from sros_tool.checks.sarif import sarif
 
     kinds, findings = select_kinds(selection), (*chosen.shown, *chosen.accepted)
     echo_lines(json_text(sarif(findings, kinds, version=__version__, base=Path.cwd())))
@@ -781,8 +781,8 @@ def _watch_processes(
     environment: Mapping[str, str], selection: FindingFilter, *, as_json: bool
 ) -> None:
     """Report what changes among the findings about processes, until SIGINT or SIGTERM."""
-    from sros_tool.checks.news import FindingNews
     from sros_tool.checks.processes import process_findings
+    from sros_tool.checks.runtime import FindingNews
     from sros_tool.runtime.processes import ProcessTable
 
     table, news, zone = ProcessTable(), FindingNews(), local_zone(environment)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.robots import Fleet
-    from sros_tool.keystore.authorities.keyring import Keyring
+    from sros_tool.keystore.issuing.keyring import Keyring
     from sros_tool.policy.model import Policy
 
 
@@ -573,7 +573,7 @@ def keyring(
     The defaults are $SROS_IDENTITY_KEY and $SROS_PERMISSIONS_KEY. ``encrypt`` protects new keys
     with a passphrase, which may be short with $SROS_SHORT_PASSPHRASE.
     """
-    from sros_tool.keystore.authorities.keyring import Keyring
+    from sros_tool.keystore.issuing.keyring import Keyring
 
     given = {"identity": identity, "permissions": permissions}
     places = {role: given[role] or os.environ.get(name, "") for role, name in _KEY_PLACES.items()}

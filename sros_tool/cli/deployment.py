@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
-    from sros_tool.keystore.delivery.answer import ImportedEnclave
+    from sros_tool.keystore.delivery.robot import ImportedEnclave
     from sros_tool.keystore.delivery.signing import Signed
     from sros_tool.policy.model import Policy
 
@@ -147,7 +147,7 @@ def distribute_key(
     for name in selection.names if done and not as_json else ():
         echo(f"exported enclave {name} to {where}", err=target == _STREAM)
     if as_json:
-        from sros_tool.keystore.delivery.shown import ExportedEnclaves, exported_outcomes
+        from sros_tool.keystore.delivery.export import ExportedEnclaves, exported_outcomes
 
         archive = target == _STREAM or target.name.endswith(SUFFIXES)
         folder, names = Path() if archive else target, selection.names
@@ -303,13 +303,12 @@ def create_request(
     Send the request to the keystore, where `sros sign_request` answers it; `sros import` installs
     the answer next to the key.
     """
-    from sros_tool.keystore.delivery.request import create_request as create
+    from sros_tool.keystore.delivery.robot import create_request as create
+    from sros_tool.keystore.delivery.robot import shown_request
 
     folder = folder or keystore_from_environment()
     made = create(folder, name, again=again, key=key, secrets=secrets(), dry_run=dry_run)
     if as_json:
-        from sros_tool.keystore.delivery.shown import shown_request
-
         print_json(shown_request(folder, made, again=again, dry_run=dry_run))
         return
     if dry_run:
@@ -463,7 +462,7 @@ def _show_signed(
 
     stream = answer == _STREAM
     if as_json:
-        from sros_tool.keystore.delivery.shown import shown_signed
+        from sros_tool.keystore.delivery.signing import shown_signed
 
         more = file_change(answer, existed=existed) if answer and not stream else ()
         print_changed(signed, shown_signed(signed, answer, more), restart=False)
@@ -581,8 +580,7 @@ def import_verb(
     CAs that the robot trusts: give --ca, or an attacker could replace this answer on its way.
     Later answers must come from the same CAs.
     """
-    from sros_tool.keystore.delivery.answer import import_answer
-    from sros_tool.keystore.delivery.trust import read_pin
+    from sros_tool.keystore.delivery.robot import import_answer, read_pin, shown_import
 
     folder = folder or keystore_from_environment()
     pinned = read_pin(pin) if pin is not None else frozenset[str]()
@@ -598,8 +596,6 @@ def import_verb(
     )
     shown = None
     if as_json:
-        from sros_tool.keystore.delivery.shown import shown_import
-
         shown = shown_import(done, pinned=bool(pinned))
     there = f"enclave {done.name} in '{folder}' is already up to date"
     if as_json or dry_run or not done.changes:

@@ -321,7 +321,7 @@ def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> It
 
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.authorities.keyring import Keyring
+    from sros_tool.keystore.issuing.keyring import Keyring
     from sros_tool.keystore.lifecycle.rotate import RotationStep
     from sros_tool.keystore.lifecycle.rotation import RotationStatus
     from sros_tool.keystore.reader import Keystore

@@ -301,8 +301,8 @@ class _Outputs:
         self._write(f"## Review: could not be decided\n\n{code(str(error))}\n", [])
 
     def _write(self, markdown: str, findings: Sequence[Finding]) -> None:
+        from sros_tool.checks.formats import sarif
         from sros_tool.checks.registry import FindingFilter, select_kinds
-        from sros_tool.checks.sarif import sarif
 
         if self._summary:
             _save(self._summary, markdown.encode("utf-8", "backslashreplace"))
@@ -436,7 +436,7 @@ def _by_weight(result: Review) -> list[ReviewStep]:
 
 def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     """Return what a step found as Markdown, or "" if the sentence says it all."""
-    from sros_tool.checks.markdown import findings_markdown
+    from sros_tool.checks.formats import findings_markdown
     from sros_tool.checks.registry import ChosenFindings
     from sros_tool.cli.check import findings_summary, renewal_markdown
     from sros_tool.cli.policy import access_markdown, rights_markdown

@@ -116,7 +116,7 @@ def zenoh(
     the files in step.
     """
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
-    from sros_tool.keystore.lifecycle.zenoh import set_zenoh
+    from sros_tool.keystore.lifecycle.update import set_zenoh
     from sros_tool.keystore.reader import Keystore, of_one_state
 
     if existing:

@@ -50,7 +50,7 @@ from sros_tool.demo.scenarios.model import (
 from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, DENIED_TOPIC, SERVICE
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.faults import Fault
-from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import (
     CRL,
     CRL_FILE,

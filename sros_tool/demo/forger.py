@@ -35,8 +35,8 @@ from sros_tool.dds.permissions import (
     render_permissions,
 )
 from sros_tool.errors import DocumentError, KeystoreError, UnavailableError
-from sros_tool.keystore.authorities.authority import Authorities, load_authorities
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.issuing.authority import Authorities, load_authorities
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,

@@ -30,7 +30,7 @@ from sros_tool.demo.scenarios.model import (
 from sros_tool.demo.scenarios.policies import DENIED_TOPIC
 from sros_tool.demo.scenarios.zenoh_forger import start_network, zenoh_variables
 from sros_tool.errors import SrosError
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.template import Template
 from sros_tool.runtime.environment import secured_environment

@@ -38,6 +38,7 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_URI_FILE,
     LEDGER,
+    LEDGER_HEAD,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
@@ -262,6 +263,25 @@ class Keystore:
         return any(map(self.has, (PUBLIC, PRIVATE, SETTINGS)))
 
     @_Part
+    def is_of_ros2(self) -> bool:
+        """Whether ros2/sros2 made it, and sros has written nothing to it yet.
+
+        It has neither settings nor a ledger, and its CA has no key identifier, which sros gives to
+        every CA that it makes: a keystore of sros is not taken for one of ros2/sros2 because
+        somebody removed the records of what was taken away.
+        """
+        if any(os.path.lexists(self.root / name) for name in (SETTINGS, LEDGER, LEDGER_HEAD)):
+            return False
+        try:
+            authority = self.ca_certificate(IDENTITY)
+            authority.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
+        except x509.ExtensionNotFound:
+            return True
+        except (SrosError, OSError, ValueError):
+            return False
+        return False
+
+    @_Part
     def names(self) -> tuple[str, ...]:
         """The sorted names of the enclaves; raises `KeystoreError` if one may be missing."""
         return enclave_names(self.root)
@@ -449,15 +469,8 @@ class Keystore:
 
     def check_domain(self, domain: int | None) -> None:
         """Raise `KeystoreError` if ``domain`` is given and the governance does not name it."""
-        if domain is None or domain in self.domains:
-            return
-        domains = self.domains
-        raise KeystoreError(
-            f"ROS_DOMAIN_ID is {domain}, but keystore '{self.root}' is for domain {domains} only",
-            "In any other domain, DDS refuses a node with this keystore.",
-            f"Set ROS_DOMAIN_ID to {domains}, or add the domain with `sros update_keystore "
-            f"{quote(str(self.root))} --domain {domains},{domain} --allow-looser`.",
-        )
+        if domain is not None:
+            check_domain(self.domains, domain, self.root)
 
     # ── enclaves ──
 

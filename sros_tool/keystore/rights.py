@@ -35,7 +35,6 @@ from sros_tool.keystore.layout import (
     refuse_earlier,
 )
 from sros_tool.keystore.ledger import Entry, Ledger
-from sros_tool.keystore.of_ros2 import is_of_ros2
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, as_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
@@ -497,7 +496,7 @@ class RecordedRights:
         chained = ledger.entries[ledger.unchained :]
         self._chained = {each.enclave for each in chained if each.what == "permissions"}
         # A keystore of ros2/sros2 has enclaves that no ledger records.
-        self._complete = keystore.has(SETTINGS) or not (is_of_ros2(keystore) or ledger.lines)
+        self._complete = keystore.has(SETTINGS) or not (keystore.is_of_ros2 or ledger.lines)
         self._last = {each.enclave: each for each in ledger.entries if each.what == "permissions"}
         self._certain = {each.enclave for each in ledger.certain if each.what == "permissions"}
 

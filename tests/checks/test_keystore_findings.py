@@ -13,7 +13,7 @@ import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import NOTE
-from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.lifecycle.create import create_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template

@@ -18,7 +18,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, WARNING, Finding
 from sros_tool.errors import PkiError
 from sros_tool.faults import Fault
-from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
+from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem

@@ -21,11 +21,11 @@ from sros_tool.demo.scenarios.custom import read_scenario
 from sros_tool.errors import SrosError
 from sros_tool.explain.denials import propose, read_denials
 from sros_tool.explain.log import explain_log
-from sros_tool.keystore.authorities.authority import check_imported
 from sros_tool.keystore.confirmation import keep, last_confirmation, receive
-from sros_tool.keystore.delivery.answer import import_answer
+from sros_tool.keystore.delivery.robot import import_answer
 from sros_tool.keystore.describe import describe, history
 from sros_tool.keystore.fleet_status import fleet_metrics, fleet_status
+from sros_tool.keystore.issuing.authority import check_imported
 from sros_tool.keystore.ledger import certificate_entry
 from sros_tool.keystore.lifecycle.rotation import read_rotation, rotation_status
 from sros_tool.keystore.participant import JoinContext

@@ -13,9 +13,8 @@ import pytest
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import SrosError
-from sros_tool.keystore.delivery.answer import import_answer
 from sros_tool.keystore.delivery.archive import pack, unpack
-from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.robot import create_request, import_answer
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.arrival import verify_arrival
-from sros_tool.keystore.delivery.answer import import_answer
-from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.robot import create_request, import_answer
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke

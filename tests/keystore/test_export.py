@@ -19,7 +19,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.export import ExportSelection, distribute, pack_enclaves, select
-from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.robot import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew

@@ -9,7 +9,7 @@ import pytest
 
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 from sros_tool.errors import Note
-from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.robot import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.rotate import rotate_ca

@@ -13,7 +13,7 @@ import pytest
 
 from sros_tool.cli.common import keyring
 from sros_tool.errors import KeystoreError, UsageError
-from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.reader import Keystore

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.delivery.answer import import_answer
-from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.robot import create_request, import_answer
 from sros_tool.keystore.delivery.signing import Signed, sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew

@@ -11,15 +11,13 @@ import pytest
 
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.errors import KeystoreError, PkiError
-from sros_tool.keystore.authorities import authority as authorities
-from sros_tool.keystore.authorities.authority import load_authority
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
-from sros_tool.keystore.delivery import answer
-from sros_tool.keystore.delivery.answer import import_answer, seal
+from sros_tool.keystore.delivery import robot as delivered
 from sros_tool.keystore.delivery.archive import pack, unpack
-from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.robot import create_request, import_answer, read_pin, seal
 from sros_tool.keystore.delivery.signing import sign_request
-from sros_tool.keystore.delivery.trust import read_pin
+from sros_tool.keystore.issuing import authority as authorities
+from sros_tool.keystore.issuing.authority import load_authority
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PERMISSIONS, SEAL
 from sros_tool.keystore.lifecycle.create import create_keystore
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
@@ -185,13 +183,13 @@ def test_an_answer_of_a_weak_ca_is_refused(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(KeystoreError, match="weak cryptography"):
         sign_request(home, request, now=now)
     with monkeypatch.context() as opened:
-        opened.setattr(answer, "weaknesses", lambda _: ())
+        opened.setattr(delivered, "weaknesses", lambda _: ())
         packed = sign_request(home, request, now=now).archive
     before = snapshot(robot)
     with pytest.raises(PkiError, match="CN=weak has a weak key, EC secp224r1"):
         import_answer(robot, packed, now=now)
     assert snapshot(robot) == before
-    monkeypatch.setattr(answer, "weaknesses", lambda _: ())
+    monkeypatch.setattr(delivered, "weaknesses", lambda _: ())
     import_answer(robot, packed, now=now)
     assert "CN=weak has a weak key" in sros("verify", robot).out
     assert "keystore.weak-cryptography" in sros("check", home).out

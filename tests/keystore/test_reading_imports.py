@@ -12,16 +12,13 @@ READERS = (
     "sros_tool.keystore.reader",
     "sros_tool.keystore.loading",
     "sros_tool.keystore.describe",
-    "sros_tool.keystore.rights",
-    "sros_tool.keystore.describe",
     "sros_tool.keystore.expiry",
     "sros_tool.keystore.selection",
     "sros_tool.keystore.ledger",
     "sros_tool.keystore.rights",
     "sros_tool.keystore.zenoh_files",
-    "sros_tool.keystore.zenoh_files",
 )
-WRITERS = ("transaction", "issuing", "lifecycle", "delivery", "authorities")
+WRITERS = ("transaction", "issuing", "lifecycle", "delivery")
 
 _LIST = "import sys, {0}; print(*(name for name in sys.modules if name.startswith('sros_tool')))"
 

@@ -21,9 +21,8 @@ from cryptography.x509.oid import NameOID
 
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
-from sros_tool.keystore.delivery.answer import import_answer
 from sros_tool.keystore.delivery.archive import MAX_MEMBER, MAX_UNPACKED, pack, unpack
-from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.robot import create_request, import_answer
 from sros_tool.keystore.delivery.signing import Signed, certify_requests, sign_request
 from sros_tool.keystore.describe import history
 from sros_tool.keystore.layout import SEAL, list_enclaves

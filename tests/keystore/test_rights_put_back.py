@@ -11,12 +11,11 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.authorities.authority import load_authorities
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
-from sros_tool.keystore.delivery.answer import import_answer
 from sros_tool.keystore.delivery.archive import pack, unpack
-from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.robot import create_request, import_answer
 from sros_tool.keystore.delivery.signing import Signed, sign_request
+from sros_tool.keystore.issuing.authority import load_authorities
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, SEAL
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew

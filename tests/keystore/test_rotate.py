@@ -17,8 +17,8 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.delivery.export import distribute
+from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import ROTATION, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke

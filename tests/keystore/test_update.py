@@ -18,9 +18,9 @@ from sros_tool.checks.kind import NOTE
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.files import policies_dir, templates_dir
-from sros_tool.keystore.authorities.authority import load_authorities
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.describe import history
+from sros_tool.keystore.issuing.authority import load_authorities
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import PkiError
-from sros_tool.keystore.authorities.authority import load_authority
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
-from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack, unpack
+from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
+from sros_tool.keystore.issuing.authority import load_authority
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PERMISSIONS, SEAL
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.keys import load_key

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.files import templates_dir
-from sros_tool.keystore.lifecycle.zenoh import set_zenoh
+from sros_tool.keystore.lifecycle.update import set_zenoh
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
 from sros_tool.zenoh.configuration import ZenohNetwork

@@ -8,7 +8,7 @@ import pytest
 
 from sros_tool.errors import UsageError
 from sros_tool.files import templates_dir
-from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.pki.token import TokenUri, parse_token_uri
 from tests.support.harness import sros
 

@@ -59,7 +59,6 @@ from sros_tool.keystore.layout import (
     enclave_path,
     waits_for_answer,
 )
-from sros_tool.keystore.of_ros2 import is_of_ros2
 from sros_tool.keystore.reader import Keystore, of_one_state
 from sros_tool.parallel import map_slices, tick
 from sros_tool.policy.model import Policy
@@ -265,7 +264,7 @@ _MOST_NAMED = 3
 def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list[Finding]:
     """Return the findings; those in what ros2/sros2 made get one cause, if there are several."""
     root = keystore.root
-    if is_of_ros2(keystore):
+    if keystore.is_of_ros2:
         chosen = [each for each in findings if each.kind in _OF_A_KEYSTORE]
         text = f"It has neither sros.toml nor ledger.jsonl. Found: {_kinds(chosen)}."
         return _with(

@@ -24,7 +24,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.lifecycle.zenoh import set_zenoh
+from sros_tool.keystore.lifecycle.update import set_zenoh
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import (
     OVERRIDE,

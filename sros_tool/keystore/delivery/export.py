@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
+from typing import Annotated, NamedTuple
 
 from sros_tool.errors import KeystoreError, Note
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
-from sros_tool.keystore.delivery.trust import check_same_authority
+from sros_tool.keystore.delivery.robot import check_same_authority
 from sros_tool.keystore.layout import (
     ENCLAVES,
     KEY_FILE,
@@ -32,6 +33,10 @@ from sros_tool.keystore.layout import (
     list_enclaves,
     search_enclaves,
 )
+from sros_tool.keystore.outcomes import (
+    EnclaveResult,
+    enclave_result,
+)
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave
 from sros_tool.keystore.selection import no_such_enclave, select_enclaves
@@ -41,6 +46,7 @@ from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.pki.token import read_token_file
+from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
 from sros_tool.xml import read_bytes
 
 _ARCHIVE_SUFFIXES = SUFFIXES
@@ -327,3 +333,40 @@ def _write_archive(
         with staged_file(target, data) as put_in_place:
             put_in_place()
     return (change,)
+
+
+# ── as JSON ────────────────────────────────────────────────────────────────────────────────
+
+
+class ExportedEnclaves(NamedTuple):
+    """The enclaves that were exported."""
+
+    keystore: NamedKeystore
+    dry_run: DryRun
+    target: Path
+    """TARGET, as it was named."""
+    enclaves: Sequence[
+        EnclaveResult[
+            Annotated[
+                str,
+                Words(("exported", "kept")),
+                "`exported`, or `kept` if TARGET was up to date.",
+            ]
+        ]
+    ]
+    """The exported enclaves."""
+    left_out: Sequence[str]
+    """Enclaves that fit ``--all`` or ``--match``, but whose key was made on its robot."""
+    changes: FileChanges
+    notes: Notes
+
+
+def exported_outcomes(
+    root: Path, names: Sequence[str], folder: Path, *, changed: bool
+) -> list[EnclaveResult[str]]:
+    """Return what was done with exported enclaves, which are below ``folder``."""
+    outcome = "exported" if changed else "kept"
+    return [
+        enclave_result(root, name, outcome, written=True, folder=folder / enclave_folder(name))
+        for name in names
+    ]

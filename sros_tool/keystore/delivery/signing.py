@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from cryptography import x509
 
@@ -20,9 +20,8 @@ from sros_tool.files import staged_file
 from sros_tool.fleet.enclaves import robot_of
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.folders import Folder
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack
+from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
     refuse_stale_domains,
@@ -38,6 +37,7 @@ from sros_tool.keystore.issuing.enclave import (
     shared_files,
     stated_enclave,
 )
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -60,7 +60,14 @@ from sros_tool.keystore.lifecycle.replaced import (
     lasting_text,
     replaced_rights,
 )
-from sros_tool.keystore.outcomes import KeptZenoh
+from sros_tool.keystore.lifecycle.shown import enclave_results, shown
+from sros_tool.keystore.outcomes import (
+    AuthorityFacts,
+    EnclaveResult,
+    KeptZenoh,
+    changes_below,
+    trusted_authorities,
+)
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import EarlierRights
 from sros_tool.names import check_enclave_name
@@ -71,6 +78,7 @@ from sros_tool.pki.requests import SigningRequest, key_digest, load_request
 from sros_tool.policy.model import Enclave, Policy, stated_protections
 from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.validity import iso
+from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words, shows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -541,3 +549,51 @@ def _answer_files(root: Path, issued: Issued, zenoh: KeptZenoh) -> dict[str, byt
                     "Remove the key from the file.",
                 )
     return dict(sorted(files.items()))
+
+
+# ── as JSON ────────────────────────────────────────────────────────────────────────────────
+
+
+@shows(spread=("enclave",))
+class CertifiedKey(NamedTuple):
+    """An enclave whose key was certified."""
+
+    enclave: EnclaveResult[
+        Annotated[
+            str,
+            Words(("created", "renewed", "kept")),
+            "What was done with the enclave; `kept` if its key has a certificate already.",
+        ]
+    ]
+    key_sha256: str
+    """SHA-256 of the enclave's public key (DER), in hexadecimal, to compare on both sides."""
+
+
+class SignedRequest(NamedTuple):
+    """The enclave that was certified, and the answer for its robot."""
+
+    keystore: NamedKeystore
+    dry_run: DryRun
+    answer: Path | None
+    """The file with the answer; ``-`` is standard output; null with ``--no-answer``."""
+    enclaves: Sequence[CertifiedKey]
+    """The enclave; with ``--no-answer``, all of them."""
+    authorities: Sequence[AuthorityFacts]
+    """The CAs that the robot will trust."""
+    changes: FileChanges
+    notes: Notes
+
+
+def shown_signed(
+    signed: Signed, answer: Path | None = None, more: Sequence[FileChange] = ()
+) -> SignedRequest:
+    """Return what is printed of signed requests; ``more`` are changes outside of the keystore."""
+    keys = [CertifiedKey(enclave, signed.keys[enclave.name]) for enclave in enclave_results(signed)]
+    return shown(
+        signed,
+        SignedRequest,
+        answer=answer,
+        enclaves=keys,
+        authorities=trusted_authorities(signed.identity_ca, signed.permissions_ca),
+        changes=(*changes_below(signed.root, signed.changes), *more),
+    )

@@ -1,1 +1,1 @@
-"""Issuing certificates and permissions for enclaves, and proving that permissions fit policies."""
+"""Issuing by the CAs of a keystore: their keys, what they sign, and the proof of permissions."""

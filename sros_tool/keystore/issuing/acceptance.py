@@ -26,7 +26,7 @@ from sros_tool.dds.permissions import render_permissions
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import write_new_file
-from sros_tool.keystore.authorities.authority import Authorities
+from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.issuing.enclave import default_rights
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,

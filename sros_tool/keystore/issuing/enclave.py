@@ -24,7 +24,7 @@ from sros_tool.dds.permissions import Grant, Permissions, parse_permissions, ren
 from sros_tool.dds.portable import document_notes
 from sros_tool.errors import KeystoreError, Note, PolicyError, check_meaning
 from sros_tool.files import policies_dir
-from sros_tool.keystore.authorities.authority import Authority
+from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.issuing.proof import prove
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,

@@ -8,7 +8,7 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.errors import KeystoreError, Note, PkiError, UsageError
-from sros_tool.keystore.authorities.authority import Authorities
+from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path
 from sros_tool.pki.token import (

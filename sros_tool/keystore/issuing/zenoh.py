@@ -13,7 +13,7 @@ from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import Note
-from sros_tool.keystore.authorities.authority import Authority
+from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore

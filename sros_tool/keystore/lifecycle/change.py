@@ -24,17 +24,16 @@ from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import Note
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.authorities.authority import Authorities, Authority, load_authority
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.fleet import checked_fleet, write_fleet
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
+from sros_tool.keystore.issuing.authority import Authorities, Authority, load_authority
 from sros_tool.keystore.issuing.enclave import EnclaveWriter
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import EnclaveTokens
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, check_keystore
 from sros_tool.keystore.ledger import Entry, Ledger, append
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
-from sros_tool.keystore.of_ros2 import take_over
 from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore, check_domain
 from sros_tool.keystore.rights import RecordedRights
@@ -49,6 +48,21 @@ from sros_tool.policy.model import Enclave
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
+
+
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+
+from sros_tool.errors import SrosError
+from sros_tool.keystore.layout import (
+    GOVERNANCE_P7S,
+    PERMISSIONS_FILE,
+    ROLES,
+)
+from sros_tool.keystore.ledger import certificate_entry, document_entry
+from sros_tool.keystore.settings import present_settings, write_settings
+from sros_tool.translate import protection_for
 
 Result = TypeVar("Result", bound="Changed")
 
@@ -348,7 +362,7 @@ class KeystoreChange:
         """
         if not self.entries:
             return
-        self.entries = take_over(self.transaction, self.keystore, self.now, self.entries)
+        self.entries = _take_over(self.transaction, self.keystore, self.now, self.entries)
         append(
             self.transaction,
             self.entries,
@@ -395,3 +409,55 @@ class KeystoreChange:
             "notes": tuple(self.notes),
         }
         return kind(**shared | more)
+
+
+_ADOPTED = "taken over"
+"""The ``reason`` of ledger entries for what was there before the ledger."""
+
+
+def _take_over(
+    transaction: Transaction, keystore: Keystore, now: datetime, entries: Iterable[Entry]
+) -> list[Entry]:
+    """Return ``entries``, after those of what ros2/sros2 left in a keystore; stage its settings.
+
+    The first write of sros gives such a keystore settings, with the values that are in force, and a
+    ledger that begins with what is there.  Nothing shows whether something was taken away before:
+    what is recorded is taken on trust, and the entries and the message say so.
+
+    Only certificates and permissions that the CAs of the keystore signed are recorded.  For a
+    keystore of sros, the entries are returned as they are.
+    """
+    added = list(entries)
+    if not keystore.is_of_ros2:
+        return added
+    before = list(_left_by_ros2(keystore, transaction.enclaves, now))
+    transaction.adopt()
+    if not any(each.what == "settings" for each in added):
+        before += _settings_of_ros2(transaction, keystore, now)
+    return [*before, *added]
+
+
+def _left_by_ros2(keystore: Keystore, names: Iterable[str], now: datetime) -> Iterator[Entry]:
+    authorities = dict.fromkeys(keystore.ca_certificate(role) for role in ROLES)
+    for authority in authorities:
+        yield certificate_entry(now, "ca", authority, reason=_ADOPTED)
+    with suppress(SrosError):  # a missing one is reported by the verb
+        message = keystore.read(GOVERNANCE_P7S, "governance document")
+        yield replace(document_entry(now, "governance", message), reason=_ADOPTED)
+    for name in names:
+        state = keystore.enclave(name, now=now)
+        files = {problem.file for problem in state.problems_at_home}
+        if state.certificate and "cert.pem" not in files:
+            yield certificate_entry(now, "certificate", state.certificate, name, _ADOPTED)
+        message = state.files.get(PERMISSIONS_FILE, b"")
+        if message and state.permissions_document and PERMISSIONS_FILE not in files:
+            entry = document_entry(now, "permissions", message, enclave=name)
+            yield replace(entry, reason=_ADOPTED)
+
+
+def _settings_of_ros2(
+    transaction: Transaction, keystore: Keystore, now: datetime
+) -> Iterator[Entry]:
+    present = present_settings(keystore)
+    if protection_for(present.governance):  # else settings would say another protection
+        yield write_settings(transaction, present.settings, now)

@@ -15,8 +15,6 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note, PolicyError, UsageError
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.authorities.authority import create_authorities
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
     left_enclaves,
@@ -24,7 +22,9 @@ from sros_tool.keystore.fleet import (
     refuse_stale_domains,
 )
 from sros_tool.keystore.issuing.acceptance import imported_notes
+from sros_tool.keystore.issuing.authority import create_authorities
 from sros_tool.keystore.issuing.enclave import stated_enclave
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import token_places
 from sros_tool.keystore.layout import ENCLAVES, PRIVATE, PUBLIC, is_keystore, refuse_earlier
 from sros_tool.keystore.ledger import certificate_entry

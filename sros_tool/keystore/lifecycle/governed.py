@@ -9,8 +9,8 @@ from shlex import quote
 
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.errors import KeystoreError, Note, check_meaning
-from sros_tool.keystore.authorities.authority import write_copies
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
+from sros_tool.keystore.issuing.authority import write_copies
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,

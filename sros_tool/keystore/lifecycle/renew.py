@@ -10,8 +10,6 @@ from shlex import quote
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
-from sros_tool.keystore.authorities.authority import Authorities
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.expiry import (
     Credentials,
     Threshold,
@@ -19,11 +17,13 @@ from sros_tool.keystore.expiry import (
     read_credentials,
     refuse_unreadable,
 )
+from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
     NewIdentity,
 )
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import EnclaveTokens, token_notes, token_places
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_enclave, has_key
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange

@@ -19,8 +19,8 @@ from shlex import quote
 from cryptography import x509
 
 from sros_tool.errors import KeystoreError, Note, SrosError
-from sros_tool.keystore.authorities.authority import Authority, write_bundle
-from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.issuing.authority import Authority, write_bundle
+from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import (
     CRL,
     IDENTITY,

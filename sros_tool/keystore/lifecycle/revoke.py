@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, UsageError
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     KEY_URI_FILE,

@@ -23,15 +23,15 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.fleet.enclaves import robot_of
-from sros_tool.keystore.authorities.authority import Authority, write_bundle, write_copies
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring, check_places
 from sros_tool.keystore.fleet import checked_fleet, load_fleet
 from sros_tool.keystore.fleet_status import fleet_status
+from sros_tool.keystore.issuing.authority import Authority, write_bundle, write_copies
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
     NewIdentity,
 )
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring, check_places
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,

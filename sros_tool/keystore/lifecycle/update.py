@@ -22,7 +22,6 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
-from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.comparison import (
     Effect,
     SettingChange,
@@ -43,6 +42,8 @@ from sros_tool.keystore.issuing.enclave import (
     StatedRights,
     default_rights,
 )
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.issuing.zenoh import remove_zenoh
 from sros_tool.keystore.layout import (
     GOVERNANCE_XML,
     PERMISSIONS,
@@ -58,6 +59,8 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
+from sros_tool.keystore.lifecycle.create import Creation, creation
+from sros_tool.keystore.lifecycle.enclaves import write_enclaves
 from sros_tool.keystore.lifecycle.governed import exports_note, restart_note, write_governance
 from sros_tool.keystore.lifecycle.renew import checked_rights
 from sros_tool.keystore.lifecycle.replaced import (
@@ -73,11 +76,12 @@ from sros_tool.keystore.rights import EarlierRights, RecordedRights
 from sros_tool.keystore.settings import (
     PresentSettings,
     edit_remedy,
+    found_edits,
     present_settings,
     with_places,
     write_settings,
 )
-from sros_tool.keystore.template import EVERYTHING, Template, with_values
+from sros_tool.keystore.template import EVERYTHING, NODE_BASICS, Template, with_values
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import enclave_subject, has_unique_part, same_key
 from sros_tool.policy.protection import DomainProtection, Level
@@ -92,6 +96,7 @@ from sros_tool.translate import (
 )
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
+from sros_tool.zenoh.configuration import ZenohNetwork
 
 
 class UpdateStage(StrEnum):
@@ -714,3 +719,74 @@ def trust_records(
     change.remarks.append(Note("keystore.taken-on-trust", text))
     name = change.template.name
     return change.result(KeystoreUpdate, before=name, after=name)
+
+
+def set_zenoh(
+    root: Path,
+    network: ZenohNetwork | None,
+    *,
+    now: datetime,
+    keyring: Keyring = IN_KEYSTORE,
+    dry_run: bool = False,
+) -> Creation:
+    """Give a keystore a Zenoh network, or None: its settings, and the files of all enclaves.
+
+    The enclave of the router is created if it does not exist.  Files that are as they should be,
+    with a valid signature, stay as they are.
+
+    Raises:
+        KeystoreError: files of the keystore were edited by hand, or it has no settings.
+        PolicyError: an enclave has rights that Zenoh cannot enforce.
+        UsageError: the network is not for the domains of the keystore, or the router's enclave has
+            rights of its own.
+    """
+    with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
+        change.begin_issuing(None)
+        _check_settings(change, edited=bool(change.notes))
+        template = replace(change.template, zenoh=network)
+        if network and network.router in change.names:
+            _check_router(change, network.router)
+        if template != change.template:
+            change.template = template
+            change.entries.append(write_settings(change.transaction, template, now))
+        removed = () if network else remove_zenoh(change.transaction)
+        write_enclaves(change, {})
+    change.restart = removed or change.restart
+    return creation(change, ())
+
+
+def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
+    """Raise `KeystoreError` if the settings are missing, or files were ``edited`` by hand."""
+    root, where = change.root, quote(str(change.root))
+    if not (root / SETTINGS).exists():
+        raise KeystoreError(
+            f"keystore '{root}' has no settings, as ros2/sros2 makes it",
+            "Nothing would keep the files of Zenoh in step.",
+            f"Run `sros update_keystore {where} --template sros2 --dry-run`, which shows what "
+            "settings change, and then without --dry-run.",
+        )
+    if edited:
+        edits = found_edits(change.keystore, change.governance)
+        raise KeystoreError(
+            f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
+            "Writing the settings would undo it, or carry it out unseen.",
+            f"First carry it out or undo it: {edit_remedy(root)}",
+        )
+
+
+def _check_router(change: KeystoreChange, router: str) -> None:
+    """Raise `UsageError` if the enclave of the router has permissions that a policy gave it."""
+    path = enclave_path(change.root, router) / PERMISSIONS_FILE
+    if not path.exists():
+        return
+    digest = hashlib.sha256(change.keystore.read(path, "permissions document")).hexdigest()
+    usual = {
+        default_rights(replace(change.template, default_permissions=choice), router).digest
+        for choice in (EVERYTHING, NODE_BASICS)
+    }
+    if change.recorded.policy(router, digest) not in ("", *usual):
+        raise UsageError(
+            f"the enclave {router} has rights of its own",
+            "The router passes on what all others say, so it would have the rights of all there.",
+            "Name an enclave of the router's own with --router.",
+        )

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.errors import KeystoreError, Note, PkiError, check_meaning
-from sros_tool.keystore.authorities.keyring import Keyring, check_imported_keys, check_places
+from sros_tool.keystore.issuing.keyring import Keyring, check_imported_keys, check_places
 from sros_tool.keystore.layout import (
     IDENTITY,
     PERMISSIONS,

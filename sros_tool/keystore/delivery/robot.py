@@ -1,30 +1,37 @@
-"""Answers to signing requests on the robot: verified in full, then installed atomically."""
+"""The folder of a robot: signing requests made there, the CAs it trusts, and answers installed."""
 
 from __future__ import annotations
 
 import hashlib
 import re
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from shlex import quote
+from typing import Annotated, NamedTuple
 
 from cryptography import x509
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError, UsageError
 from sros_tool.files import write_new_file
-from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
-from sros_tool.keystore.delivery.trust import check_same_authority, refuse_ca_keystore, trusted_in
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
+from sros_tool.keystore.issuing.authority import Authority
+from sros_tool.keystore.issuing.keyring import no_secrets
+from sros_tool.keystore.issuing.tokens import place_in, token_notes, token_places
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
+    IDENTITY_CA_FILE,
     KEY_FILE,
+    KEY_URI_FILE,
     OPTIONAL_FILES,
+    PRIVATE,
+    PUBLIC,
     REQUEST,
     REQUIRED_FILES,
     SEAL,
@@ -32,8 +39,16 @@ from sros_tool.keystore.layout import (
     ZENOH_SIGNED,
     enclave_folder,
     has_key,
+    refuse_earlier,
 )
 from sros_tool.keystore.lifecycle.change import Changed
+from sros_tool.keystore.lifecycle.shown import shown
+from sros_tool.keystore.outcomes import (
+    AuthorityFacts,
+    EnclaveResult,
+    changes_below,
+    trusted_authorities,
+)
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import (
     OpenedEnclave,
@@ -42,6 +57,7 @@ from sros_tool.keystore.reader import (
     weaknesses,
 )
 from sros_tool.keystore.transaction.recovery import tidy
+from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
@@ -49,14 +65,195 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     common_name_of,
     digest,
+    fingerprints,
+    load_certificates,
     subject_text,
     validity_of,
 )
 from sros_tool.pki.crl import SUPERSEDED, load_crl
-from sros_tool.pki.keys import PublicKey, load_key
-from sros_tool.pki.requests import load_request
+from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key, key_pem, load_key
+from sros_tool.pki.requests import key_digest, load_request, make_request
+from sros_tool.pki.token import (
+    Secrets,
+    TokenKey,
+    TokenUri,
+    make_enclave_key,
+    open_enclave_key,
+    token_file,
+)
 from sros_tool.validity import iso
+from sros_tool.values import DryRun, FileChanges, Notes, Words
 from sros_tool.xml import read_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Requested:
+    """A new signing request for the enclave ``name``; ``key`` is the SHA-256 of its public key.
+
+    ``token`` is the place of the key, if it is on a PKCS#11 token.
+    """
+
+    name: str
+    file: Path
+    key: str
+    changes: tuple[Change, ...]
+    token: TokenUri | None = None
+    notes: tuple[Note, ...] = ()
+
+
+def create_request(
+    folder: Path,
+    name: str,
+    *,
+    again: bool = False,
+    key: str = "",
+    secrets: Secrets = no_secrets,
+    dry_run: bool = False,
+) -> Requested:
+    """Create an enclave's private key in ``folder``, and a signing request for it.
+
+    ``folder`` becomes a keystore without CAs.  With ``again`` the request is made for the existing
+    key; a key is never replaced.  With ``key``, a ``pkcs11:`` URI, the key is on a token, where it
+    is made if it is not there, and ``folder`` gets its place; ``secrets`` is asked for the PIN.
+
+    Raises:
+        KeystoreError: the enclave has a key already (without ``again``), or a certificate without
+            a key, or ``folder`` is a keystore with CAs.
+        PkiError: the token cannot be used.
+    """
+    check_enclave_name(name)
+    place_of_key = token_places(key, [name])[name] if key else None
+    if again and place_of_key:
+        raise UsageError(
+            "--again and --key exclude each other",
+            "The request is made again for the key that the enclave has.",
+            "Leave one of them out.",
+        )
+    if not dry_run and folder.is_dir():
+        tidy(folder)
+    _refuse_ca_keystore(
+        folder, f"Make the enclave with `sros create_enclave {quote(str(folder))} {name}`."
+    )
+    place = enclave_folder(name)
+    with Transaction(folder, fresh=True, dry_run=dry_run) as transaction:
+        path = folder / place / KEY_FILE
+        on_token = folder / place / KEY_URI_FILE
+        if has_key(folder / place) and not again:
+            raise KeystoreError(
+                f"enclave {name} has a key in '{folder}' already",
+                "A key is never replaced, because its certificate would become useless.",
+                "Add --again to make the request again for this key, or choose another folder.",
+            )
+        made: PrivateKey
+        if again and on_token.exists() and not path.exists():
+            made = open_enclave_key(place_in(on_token), secrets)
+        elif again:
+            made = load_key(read_bytes(path, "private key"), f"'{path}'")
+        elif (folder / place / CERTIFICATE_FILE).exists():
+            raise KeystoreError(
+                f"enclave {name} has a certificate in '{folder}', but no key",
+                "A new key would make the certificate useless.",
+                "Restore the key, or choose another folder.",
+            )
+        elif place_of_key and dry_run:
+            transaction.write(f"{place}/{KEY_URI_FILE}", token_file(place_of_key))
+            made = generate_key()  # a dry run opens no token
+        elif place_of_key:
+            made = make_enclave_key(place_of_key, secrets)
+            remedy = "Name another object of the token."
+            KnownKeys(folder).refuse_second(made.public_key(), name, remedy)
+            transaction.write(f"{place}/{KEY_URI_FILE}", made.file)
+        else:
+            made = generate_key()
+            transaction.write(f"{place}/{KEY_FILE}", key_pem(made), private=True)
+        request = make_request(made, name)
+        # Report an unsupported kind of key here, not later at the keystore.
+        load_request(request, f"of enclave {name}")
+        transaction.write(f"{place}/{REQUEST}", request)
+        transaction.commit()
+    return Requested(
+        name,
+        folder / place / REQUEST,
+        key_digest(made.public_key()),
+        tuple(transaction.changes),
+        made.place if isinstance(made, TokenKey) else place_of_key,
+        tuple(token_notes(made)) if isinstance(made, TokenKey) else (),
+    )
+
+
+def read_pin(text: str) -> frozenset[str]:
+    """Return the SHA-256 of the pinned CAs, in lower-case hexadecimal.
+
+    ``text`` is a fingerprint or the path of a certificate file.  A fingerprint can have colons and
+    capitals, as ``openssl x509 -fingerprint -sha256`` prints it.
+
+    Raises:
+        UsageError: ``text`` is neither a fingerprint nor a certificate file.
+    """
+    plain = text.strip().rpartition("=")[2].replace(":", "").lower()
+    if re.fullmatch(r"[0-9a-f]{64}", plain):
+        return frozenset({plain})
+    path = Path(text)
+    if path.is_file():
+        return fingerprints(read_bytes(path, "certificate"))
+    raise UsageError(
+        f"{text!r} is neither a certificate file nor a SHA-256 fingerprint",
+        "A fingerprint has 64 hexadecimal digits.",
+        "Copy the fingerprint that `sros sign_request` prints, or name the CA's certificate file.",
+    )
+
+
+def _trusted_in(folder: Path, file: str) -> list[x509.Certificate]:
+    """Return the distinct certificates in all files named ``file`` of a folder's enclaves."""
+    found: dict[str, x509.Certificate] = {}
+    for path in sorted((folder / ENCLAVES).rglob(file)):
+        if path.exists():
+            found |= {digest(each): each for each in _certificates(path)}
+    return list(found.values())
+
+
+def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
+    """Refuse to mix enclaves of two keystores in one folder: they could not communicate.
+
+    Args:
+        target: the folder of a robot.
+        files: the content of the new files, by their paths relative to ``target``.
+
+    Raises:
+        KeystoreError: ``target`` holds an enclave that trusts none of the identity CAs in
+            ``files``.
+    """
+    ours: set[str] = set()
+    for path, data in files.items():
+        if path.endswith(f"/{IDENTITY_CA_FILE}"):
+            ours |= fingerprints(data)
+    for place in sorted((target / ENCLAVES).rglob(IDENTITY_CA_FILE)):
+        if f"{place.relative_to(target)}" in files or not place.exists():
+            continue
+        theirs = _certificates(place)
+        if ours.isdisjoint(map(digest, theirs)):
+            raise KeystoreError(
+                f"'{target}' holds enclaves of another keystore",
+                f"They trust {subject_text(theirs[0].subject)}, and could not communicate with the "
+                "new enclaves.",
+                "Choose another folder.",
+            )
+
+
+def _refuse_ca_keystore(folder: Path, remedy: str) -> None:
+    """Raise `KeystoreError` if ``folder`` is a keystore with CAs, not a folder of a robot."""
+    refuse_earlier(folder)
+    if (folder / PRIVATE).exists() or (folder / PUBLIC).exists():
+        raise KeystoreError(
+            f"'{folder}' is a keystore with CAs",
+            "Signing requests and their answers belong in a folder on the robot.",
+            remedy,
+        )
+
+
+def _certificates(path: Path) -> tuple[x509.Certificate, ...]:
+    return load_certificates(read_bytes(path, "certificate"), f"'{path}'")
+
 
 _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
 _REQUIRED = tuple(file for file in REQUIRED_FILES if file != KEY_FILE)
@@ -239,7 +436,7 @@ def import_answer(
     place = folder / enclave_folder(name)
     if not dry_run and folder.is_dir():
         tidy(folder)
-    refuse_ca_keystore(folder, "Name the folder in which the request was made.")
+    _refuse_ca_keystore(folder, "Name the folder in which the request was made.")
     if not has_key(place):
         raise KeystoreError(
             f"'{folder}' has no key of enclave {name}",
@@ -256,7 +453,7 @@ def import_answer(
         assert until
         _check_pinned(answer, state.identity_ca, state.permissions_ca, pinned)
         _check_key(folder, answer, key)
-        known = trusted_in(folder, "permissions_ca.cert.pem")
+        known = _trusted_in(folder, "permissions_ca.cert.pem")
         if not force:
             _check_known(folder, answer, known)
             _check_newer(place, answer, state.certificate)
@@ -404,4 +601,79 @@ def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
         return True
     raise KeystoreError(
         f"the answer for enclave {answer.name} is older than the installed one", why, remedy
+    )
+
+
+# ── as JSON ────────────────────────────────────────────────────────────────────────────────
+
+
+class RequestedEnclave(NamedTuple):
+    """An enclave with a signing request."""
+
+    name: str
+    """The enclave."""
+    outcome: Annotated[str, Words(("requested", "requested_again"))]
+    """``requested_again``: for the existing key."""
+    folder: Path
+    """The enclave's folder."""
+    request: Path
+    """The file to have signed."""
+    key_sha256: str | None
+    """SHA-256 of the enclave's public key (DER), in hexadecimal; null if a dry run made none."""
+
+
+class MadeRequest(NamedTuple):
+    """The signing request that was made."""
+
+    folder: Path
+    """DIR, as it was named."""
+    dry_run: DryRun
+    enclaves: Sequence[RequestedEnclave]
+    """The enclave."""
+    changes: FileChanges
+    notes: Notes
+
+
+def shown_request(folder: Path, made: Requested, *, again: bool, dry_run: bool) -> MadeRequest:
+    """Return what is printed of a signing request."""
+    key = made.key if again or not dry_run else None  # a dry run makes one, but does not keep it
+    outcome = "requested_again" if again else "requested"
+    enclave = RequestedEnclave(made.name, outcome, made.file.parent, made.file, key)
+    return MadeRequest(folder, dry_run, (enclave,), changes_below(folder, made.changes), made.notes)
+
+
+class ImportedAnswer(NamedTuple):
+    """The enclave that was imported."""
+
+    folder: Path
+    """DIR, as it was named."""
+    dry_run: DryRun
+    enclaves: Sequence[
+        EnclaveResult[
+            Annotated[
+                str,
+                Words(("imported", "kept")),
+                "`imported`, or `kept` if this answer was installed already.",
+            ]
+        ]
+    ]
+    """The enclave."""
+    authorities: Sequence[AuthorityFacts]
+    """The CAs that the enclave trusts."""
+    authorities_verified: bool
+    """Whether ``--ca`` or earlier answers vouch for the CAs; if not, compare their SHA-256."""
+    restart_zenoh: Sequence[str]
+    """The enclave, if its processes on Zenoh have to be restarted."""
+    changes: FileChanges
+    notes: Notes
+
+
+def shown_import(imported: ImportedEnclave, *, pinned: bool) -> ImportedAnswer:
+    """Return what is printed of an imported answer."""
+    return shown(
+        imported,
+        ImportedAnswer,
+        authorities=trusted_authorities(imported.identity_ca, imported.permissions_ca),
+        authorities_verified=pinned or not imported.first,
+        restart_zenoh=imported.restart,
     )

@@ -1,1 +1,0 @@
-"""The CAs of a keystore: creating them, opening their keys, importing existing CAs."""
