@@ -99,8 +99,7 @@ def main() -> None:
 
 def _measured(folder: Path) -> dict[str, float]:
     from sros_tool.files import policies_dir
-    from sros_tool.graph.draft import draft, write
-    from sros_tool.graph.learn import common_parts, learn
+    from sros_tool.graph.learn import common_parts, draft, learn, write
     from sros_tool.graph.observation import Observation
     from sros_tool.graph.observe import RosGraph
 
@@ -129,7 +128,7 @@ def _look() -> float:
     """Return the seconds of one look at the whole graph with rclpy in this process."""
     import rclpy
 
-    from sros_tool.graph.observer import _NODE_NAME, _Observer
+    from sros_tool.graph.observation import _NODE_NAME, _Observer
 
     rclpy.init(args=[])
     node = rclpy.create_node(_NODE_NAME, enable_rosout=False, start_parameter_services=False)

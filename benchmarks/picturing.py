@@ -20,10 +20,10 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Context, PictureSource, compose
 from sros_tool.report.folding import Folding
+from sros_tool.report.formats import render_svg
 from sros_tool.report.pages import render_page
 from sros_tool.report.picture import SourceTitle
 from sros_tool.report.sources import common_rights
-from sros_tool.report.svg import render_svg
 
 ROBOTS, PARTS, TOPICS = 10, 10, 10
 _NOW = datetime(2026, 6, 15, 12, tzinfo=UTC)

@@ -51,7 +51,7 @@ class _Channel:
 @contextmanager
 def _cyclone_channel(sends: str, hears: str) -> Iterator[_Channel]:
     from sros_tool.runtime.cyclone import Participant
-    from sros_tool.runtime.rcl_security import choose_loadable, domain_of
+    from sros_tool.runtime.variables import choose_loadable, domain_of
 
     choice = choose_loadable(os.environ)
     with Participant(domain_of(os.environ), choice.enclave) as participant:

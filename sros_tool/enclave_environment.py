@@ -475,7 +475,7 @@ def container_text(
     Args:
         root: the keystore.
         enclave: one of its enclaves, in which a process can run.
-        form: one of `sros_tool.runtime.containers.FORMS`.
+        form: one of `sros_tool.runtime.environment.CONTAINER_FORMS`.
         target: the keystore in the container and, for Compose, on the machine that runs it.
         variables: the environment of the enclave there.
         name: the name of the service or object; "" stands for one that no other enclave has.
@@ -488,7 +488,7 @@ def container_text(
     """
     from sros_tool.keystore.delivery.export import exported_files
     from sros_tool.keystore.layout import enclave_path
-    from sros_tool.runtime.containers import (
+    from sros_tool.runtime.environment import (
         COMPOSE,
         SECRET,
         Container,

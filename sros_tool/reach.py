@@ -21,11 +21,10 @@ from itertools import product
 from typing import NamedTuple
 
 from sros_tool.dds.governance import Governance
-from sros_tool.names import ACTION_SEPARATOR, READING_SERVICES, is_expression
+from sros_tool.names import ACTION_SEPARATOR, READING_SERVICES, SERVICE_ENDS, is_expression
 from sros_tool.policy.model import DENY
 from sros_tool.policy.patterns import common_name, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import Right
-from sros_tool.topics import SERVICE_ENDS
 from sros_tool.values import shows
 
 

@@ -21,11 +21,18 @@ from sros_tool.dds.permissions import (
     Rule,
     grant,
 )
-from sros_tool.names import ROS_DISCOVERY_TOPIC, expand, is_expression
+from sros_tool.names import (
+    GOAL,
+    ROS_DISCOVERY_TOPIC,
+    TOPIC_ENDS,
+    dds_names,
+    expand,
+    is_expression,
+    service_of,
+)
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Qualifier
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import Right
-from sros_tool.topics import GOAL, TOPIC_ENDS, dds_names, service_of
 from sros_tool.validity import Window
 
 if TYPE_CHECKING:

@@ -25,7 +25,6 @@ LAYERS = {
         "faults",
         "names",
         "owners",
-        "topics",
         "validity",
         "values",
         "wording",
@@ -43,7 +42,7 @@ LAYER_OF = {package: layer for layer, packages in LAYERS.items() for package in 
 
 # Where a process of its own runs the nodes of rclpy. Nothing else may need ROS.
 ROS_PACKAGES = {"graph", "demo"}
-ROS_MODULES = {"runtime/probe_child.py"}
+ROS_MODULES = {"runtime/stacks.py"}
 
 
 @cache
@@ -127,7 +126,7 @@ def test_nothing_imports_from_above_or_beside() -> None:
         ("from ..cli import program", "demo/runner.py", ["sros_tool.cli.program"]),
         ("from sros_tool import dds", "policy/model.py", ["sros_tool.dds"]),
         ("from sros_tool.pki import keys", "errors.py", ["sros_tool.pki.keys"]),
-        ("import rclpy", "runtime/stacks.py", ["rclpy"]),
+        ("import rclpy", "runtime/rmw.py", ["rclpy"]),
         ("from rclpy.node import Node", "cli/observing.py", ["rclpy"]),
     ],
 )

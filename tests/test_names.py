@@ -13,11 +13,11 @@ from sros_tool.errors import InvalidNameError
 from sros_tool.names import (
     check_enclave_name,
     check_namespace,
+    dds_names,
     expand,
     expression_problem,
     is_expression,
 )
-from sros_tool.topics import dds_names
 
 ENCLAVE = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+", re.ASCII)
 token = st.from_regex(r"\A[A-Za-z_][A-Za-z0-9_]{0,5}\Z")

@@ -12,10 +12,9 @@ from lxml import etree
 
 from sros_tool.files import policies_dir
 from sros_tool.graph.learn import PARTS
-from sros_tool.names import MAX_COMMON_NAME, expand
+from sros_tool.names import MAX_COMMON_NAME, dds_names, expand
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import DENY, Enclave, Group, Profile
-from sros_tool.topics import dds_names
 
 POLICIES = policies_dir()
 TOP_LEVEL = sorted(POLICIES.glob("*.xml"))

@@ -13,14 +13,13 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Permissions
 from sros_tool.errors import PolicyError
 from sros_tool.files import policies_dir
-from sros_tool.names import expression_problem
+from sros_tool.names import dds_names, expression_problem
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Profile, Profiles, Qualifier, Source
 from sros_tool.policy.model import DENY as DENY_
 from sros_tool.policy.model import RIGHTS as RIGHTS_OF
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, Rules
-from sros_tool.topics import dds_names
 from sros_tool.translate import permissions_for
 from sros_tool.translate_zenoh import (
     StatedRight,

@@ -126,7 +126,7 @@ VERBS: Mapping[str, str | Shapes] = {
     "metrics": "sros_tool.prometheus:KeystoreMetrics",
     "merge_policy": "sros_tool.policy.merge:MergedPolicy",
     "minimize_policy": "sros_tool.keystore.issuing.size:PolicyMinimization",
-    "generate_policy": "sros_tool.graph.draft:LearnedPolicy",
+    "generate_policy": "sros_tool.graph.learn:LearnedPolicy",
     "create_request": "sros_tool.keystore.delivery.robot:MadeRequest",
     "distribute_key": "sros_tool.keystore.delivery.export:ExportedEnclaves",
     "sign_request": "sros_tool.keystore.delivery.signing:SignedRequest",

@@ -39,6 +39,7 @@ from sros_tool.keystore.protection import contradictions
 from sros_tool.names import (
     ACTION_SERVICES,
     ACTION_TOPICS,
+    GOAL,
     NODE_SERVICES,
     PARAMETER_SERVICES,
     action_part,
@@ -60,7 +61,6 @@ from sros_tool.policy.model import (
 )
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
 from sros_tool.policy.rights import WHOLE, Right, Rules, parts, placed_rights, policy_rights
-from sros_tool.topics import GOAL
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from sros_tool.wording import first_few

@@ -56,8 +56,7 @@ from sros_tool.runtime.environment import (
     ROUTER_URI,
     SESSION_URI,
 )
-from sros_tool.runtime.process_files import ProcessEnclave
-from sros_tool.runtime.processes import Process, RunningProcesses, plain
+from sros_tool.runtime.processes import Process, ProcessEnclave, RunningProcesses, plain
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW, vendor_of
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.validity import Window, iso, parse_iso

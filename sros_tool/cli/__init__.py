@@ -2,14 +2,15 @@
 
 `program` lists the verbs; the modules of the verbs, by what they are about:
 
-- keystores: `keystore`, `inspect`, `life`, `zenoh` and `zenoh_from`
-- robots: `deployment`, `fleet`, `units`, `metrics`
-- processes: `running` (with `enclave_environment` and `containers`), `demo`
-- policies: `policy` (with `new_access`), `review`, `view`
-- robots that run: `generate_policy` and `audit` (with `observing`)
-- answers: `explain`, `check` (with `watching`)
+- keystores: `keystore`, `inspect`, `life`, `zenoh`
+- robots: `deployment`, `fleet`
+- processes: `running`, `demo`
+- policies: `policy`, `review`, `view`
+- robots that run: `observing`, `audit`
+- answers: `explain`, `check`
 
-All share `common` and `progress`.  `ros2` has the same verbs as ``ros2 security``.
+All share `common`; `changed` prints what changes a keystore.  `ros2` has the same
+verbs as ``ros2 security``.
 """
 
 from __future__ import annotations

@@ -234,7 +234,7 @@ def _enclaves(
 
 def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
     """Write the rights to add to ``patch``; return what was done, "" if there is nothing to add."""
-    from sros_tool.graph.draft import render
+    from sros_tool.graph.learn import render
 
     if patch is None or not audited.missing.profiles:
         return ""

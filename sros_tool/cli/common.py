@@ -1,4 +1,4 @@
-"""What several verbs share: options, safe output, times, secrets and logs."""
+"""What several verbs share: options, safe output, progress, times, secrets and logs."""
 
 from __future__ import annotations
 
@@ -6,22 +6,32 @@ import errno
 import os
 import re
 import select
+import signal
 import stat
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from shlex import quote
+from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from click.core import ParameterSource
 
-from sros_tool.cli.progress import paused
 from sros_tool.errors import DocumentError, PkiError, SrosError, UsageError
-from sros_tool.terminal import Coloured, ask_secret, echo, echo_lines, visible_json, visible_line
+from sros_tool.terminal import (
+    Coloured,
+    ask_secret,
+    echo,
+    echo_lines,
+    redraw,
+    visible_json,
+    visible_line,
+)
 from sros_tool.wording import counted
 
 if TYPE_CHECKING:
@@ -35,8 +45,8 @@ if TYPE_CHECKING:
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.issuing.keyring import Keyring
+    from sros_tool.parallel import Tally
     from sros_tool.policy.model import Policy
-
 
 # ── arguments ───────────────────────────────────────────────────────────────────────────
 
@@ -391,6 +401,20 @@ def check_output(output: Path, *, force: bool) -> None:
         raise UsageError(f"cannot write '{output}'", "It is a folder.", "Name a file.")
     if output.is_file() and not force:
         raise UsageError(f"'{output}' already exists", "", "Name another file, or add --force.")
+
+
+_METRICS_SUFFIX = ".prom"
+"""The only suffix of files that the textfile collector of node_exporter reads."""
+
+
+def check_metrics_file(output: Path) -> None:
+    """Raise `UsageError` for a file that node_exporter would not read."""
+    if output.suffix != _METRICS_SUFFIX and (output.is_file() or not output.exists()):
+        raise UsageError(
+            f"'{output}' does not end in {_METRICS_SUFFIX}",
+            "node_exporter would not read it.",
+            f"Name it for example '{output.with_suffix(_METRICS_SUFFIX)}'.",
+        )
 
 
 def save(output: Path, document: bytes) -> str:
@@ -819,3 +843,102 @@ def print_signed(groups: Sequence[Sequence[Finding]], files: Iterable[str]) -> N
 
 
 _MOST_SHOWN = 3
+
+
+# ── progress, on a terminal only: one line, which is erased when the work is done ───────────────
+
+
+_FIRST, _EVERY = 1.0, 0.5  # seconds
+_ESTIMATED = 3.0
+"""Seconds from which on the time that is left is shown."""
+
+
+class _Line:
+    """A line on the terminal that a timer draws again and again.
+
+    The timer is a signal: unlike a thread, it does not get in the way of the processes that are
+    forked for the work, and they do not inherit it.
+    """
+
+    def __init__(self, label: str, total: int, tally: Tally) -> None:
+        self._label, self._total, self._tally = label, total, tally
+        self._done = 0
+        self._drawn = False
+        self._began = time.monotonic()
+        self._before = signal.signal(signal.SIGALRM, self._draw)
+        signal.setitimer(signal.ITIMER_REAL, _FIRST, _EVERY)
+
+    def step(self, _name: str) -> None:
+        """Count one more item as done."""
+        self._done += 1
+
+    def pause(self) -> None:
+        """Erase the line and draw no more."""
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        if self._drawn:
+            redraw("")
+
+    def go_on(self) -> None:
+        """Draw again."""
+        signal.setitimer(signal.ITIMER_REAL, _FIRST, _EVERY)
+
+    def end(self) -> None:
+        """Erase the line for good."""
+        self.pause()
+        signal.signal(signal.SIGALRM, self._before)
+
+    def _draw(self, _number: int, _frame: FrameType | None) -> None:
+        done, total, left = self._done, self._total, None
+        if self._tally.total:
+            done, total, left = self._tally.done(), self._tally.total, self._tally.left()
+        count = f" {done} of {total}" if total and done else ""
+        seconds = time.monotonic() - self._began
+        rest = "" if left is None or seconds < _ESTIMATED else f", about {_rounded(left)} left"
+        redraw(f"{self._label}{count} ... {seconds:.0f} s{rest}")
+        self._drawn = True
+
+
+def _rounded(seconds: float) -> str:
+    """Return a time as text, in minutes from two on."""
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+
+
+_lines: list[_Line] = []
+
+
+@contextmanager
+def progress(label: str, total: int = 0) -> Iterator[Callable[[str], None] | None]:
+    """Show ``label`` and the seconds on the terminal from the first second on, until the body ends.
+
+    Args:
+        label: what is done, such as "signing".
+        total: number of items, if the body counts them with the yielded function.
+
+    Yields None where nothing is shown: standard error is no terminal.
+    """
+    on_terminal = sys.stderr is not None and sys.stderr.isatty()
+    if not on_terminal or _lines or threading.current_thread() is not threading.main_thread():
+        yield None
+        return
+    from sros_tool.parallel import tallied
+
+    with tallied() as tally:
+        line = _Line(label, total, tally)
+        _lines.append(line)
+        try:
+            yield line.step
+        finally:
+            _lines.pop()
+            line.end()
+
+
+@contextmanager
+def paused() -> Iterator[None]:
+    """Keep the terminal free for a question, such as for a passphrase."""
+    for line in _lines:
+        line.pause()
+    try:
+        yield
+    finally:
+        for line in _lines:
+            line.go_on()

@@ -28,12 +28,12 @@ from sros_tool.cli.common import (
     only_enclaves,
     print_json,
     print_notes,
+    progress,
     read_named,
     secrets,
     several_enclaves,
     split_root,
 )
-from sros_tool.cli.progress import progress
 from sros_tool.errors import UsageError
 from sros_tool.terminal import Coloured, echo, echo_bytes
 from sros_tool.values import FileChange, file_change

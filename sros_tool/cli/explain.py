@@ -24,10 +24,10 @@ from sros_tool.cli.common import (
     only_enclaves,
     print_json,
     print_notes,
+    progress,
     read_log,
     ros_domain,
 )
-from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, SrosError, UsageError
 from sros_tool.names import is_expression

@@ -11,6 +11,7 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
+    check_metrics_file,
     check_output,
     complete_file,
     complete_robot,
@@ -22,13 +23,12 @@ from sros_tool.cli.common import (
     output_option,
     print_json,
     print_notes,
+    progress,
     read_named,
     robot_option,
     save,
     split_root,
 )
-from sros_tool.cli.metrics import check_suffix
-from sros_tool.cli.progress import progress
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
 from sros_tool.values import file_change
@@ -74,7 +74,7 @@ def _inventory(root: Path | None, as_yaml: bool, as_list: bool) -> None:
     Robots are hosts and groups are groups. Variables of a host are ansible_host, ansible_user,
     sros_robot, sros_namespace and sros_domain.
     """
-    from sros_tool.fleet.inventory import inventory, script_inventory
+    from sros_tool.fleet.fleet_file import inventory, script_inventory
     from sros_tool.keystore.fleet import recorded_fleet
     from sros_tool.values import yaml_text
 
@@ -243,7 +243,7 @@ def _status(
     oldest = parse_duration(max_age) if max_age is not None else None
     if output:
         if prometheus:
-            check_suffix(output)
+            check_metrics_file(output)
         check_output(output, force=True)
     with progress("comparing"):
         found = fleet_status(root, robots)

@@ -30,11 +30,11 @@ from sros_tool.cli.common import (
     policy_for,
     print_json,
     print_signed,
+    progress,
     ros_domain,
     several_enclaves,
     split_root,
 )
-from sros_tool.cli.progress import progress
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo
 from sros_tool.wording import counted, first_few

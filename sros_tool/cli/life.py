@@ -24,10 +24,10 @@ from sros_tool.cli.common import (
     keystore_from_environment,
     now,
     print_json,
+    progress,
     several_enclaves,
     split_root,
 )
-from sros_tool.cli.progress import progress
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo
 

@@ -31,8 +31,7 @@ from sros_tool.values import FileChange, file_change
 from sros_tool.wording import counted
 
 if TYPE_CHECKING:
-    from sros_tool.graph.draft import AskingLine, Draft, LearnedPolicy
-    from sros_tool.graph.learn import Learned
+    from sros_tool.graph.learn import AskingLine, Draft, Learned, LearnedPolicy
     from sros_tool.graph.observation import Observation
     from sros_tool.graph.observe import ObserverError, RosGraph, Snapshot
     from sros_tool.policy.model import Policy
@@ -401,8 +400,16 @@ def generate_policy(
         raise UsageError("--node is for --from-log only")
     check_duration(watch, spin_time)
     from sros_tool.files import policies_dir
-    from sros_tool.graph.draft import draft, write
-    from sros_tool.graph.learn import NamedEnclaves, News, common_parts, is_tool_name, learn, listed
+    from sros_tool.graph.learn import (
+        NamedEnclaves,
+        News,
+        common_parts,
+        draft,
+        is_tool_name,
+        learn,
+        listed,
+        write,
+    )
     from sros_tool.graph.learn import enclave_per_node as name_enclaves
 
     common = common_parts(file.parent, policies_dir())
@@ -472,7 +479,7 @@ def _printed(
     plan: Draft | None, file: Path | None, learned: Learned, observation: Observation, dry_run: bool
 ) -> LearnedPolicy:
     """Return what ``--json`` prints of what was learned; without a ``plan``, no file changes."""
-    from sros_tool.graph.draft import LearnedPolicy
+    from sros_tool.graph.learn import LearnedPolicy
     from sros_tool.policy.merge import merge_notes
     from sros_tool.policy.rights import order, policy_rights
 
@@ -539,8 +546,7 @@ def _learned_from_logs(
     """Return the rights that logs ask for, and the lines that ask for them."""
     from sros_tool.explain.denials import as_learned, propose, read_denials
     from sros_tool.files import policies_dir
-    from sros_tool.graph.draft import AskingLine
-    from sros_tool.graph.learn import common_parts
+    from sros_tool.graph.learn import AskingLine, common_parts
     from sros_tool.runtime.vendor_log import plain_text
 
     denials = {log: read_denials(plain_text(_log_text(log))) for log in logs}
@@ -586,8 +592,7 @@ def _propose(
         SrosError: there is something to write that was not accepted.
     """
     from sros_tool.files import policies_dir
-    from sros_tool.graph.draft import draft, render, write
-    from sros_tool.graph.learn import common_parts
+    from sros_tool.graph.learn import common_parts, draft, render, write
     from sros_tool.graph.observation import Observation
 
     if not learned.profiles or file is None:

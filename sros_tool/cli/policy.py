@@ -24,9 +24,9 @@ from sros_tool.cli.common import (
     output_option,
     print_json,
     print_notes,
+    progress,
     save,
 )
-from sros_tool.cli.progress import progress
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import FileChange, as_plain, file_change
@@ -305,7 +305,7 @@ def _drawn_difference(
     from sros_tool.markdown import fenced
     from sros_tool.policy.patterns import Names
     from sros_tool.report.compose import Context, PictureSource, overlay
-    from sros_tool.report.dot_mermaid import render_mermaid
+    from sros_tool.report.formats import render_mermaid
     from sros_tool.report.layout import scenes_of
     from sros_tool.report.picture import SourceTitle
     from sros_tool.report.sources import common_rights

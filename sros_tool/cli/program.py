@@ -79,7 +79,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
             "check", "Find errors and weaknesses in policies, keystores, the runtime."
         ),
         "review": VerbEntry("review", "Review a change of policies and keystores in git."),
-        "metrics": VerbEntry("metrics", "Give Prometheus the expiry and findings of a keystore."),
+        "metrics": VerbEntry("check", "Give Prometheus the expiry and findings of a keystore."),
         "audit": VerbEntry("audit", "Report what a policy would deny to the running robot."),
         "doctor": VerbEntry("check", "Find out which DDS here enforces security."),
     },

@@ -20,8 +20,8 @@ from sros_tool.cli.common import (
     local_zone,
     now,
     print_json,
+    progress,
 )
-from sros_tool.cli.progress import progress
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo
 

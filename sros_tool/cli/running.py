@@ -29,14 +29,13 @@ from sros_tool.cli.common import (
     now,
     print_json,
     print_notes,
+    progress,
     several_enclaves,
     split_root,
 )
-from sros_tool.cli.progress import progress
 from sros_tool.enclave_environment import INSTALLED, RMWS, container_text, target_path
 from sros_tool.errors import Note, UnavailableError, UsageError
-from sros_tool.runtime.containers import COMPOSE, KUBERNETES, SECRET
-from sros_tool.runtime.containers import FORMS as CONTAINER_FORMS
+from sros_tool.runtime.environment import COMPOSE, CONTAINER_FORMS, KUBERNETES, SECRET
 from sros_tool.runtime.units import Job
 from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import FileChange

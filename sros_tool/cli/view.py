@@ -25,9 +25,9 @@ from sros_tool.cli.common import (
     json_text,
     now,
     print_json,
+    progress,
     save,
 )
-from sros_tool.cli.progress import progress
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo, echo_document
 from sros_tool.values import PlannedFiles, as_plain, file_change, versioned
@@ -460,10 +460,10 @@ def _rendered(
         return render_page(picture, scenes, moment, folding.picture)
     scene = next((each for each in scenes if everything and each.id == "all"), scenes[0])
     if form == "svg" and not graphviz:
-        from sros_tool.report.svg import render_svg
+        from sros_tool.report.formats import render_svg
 
         return render_svg(picture, scene)
-    from sros_tool.report.dot_mermaid import graphviz_svg, render_dot, render_mermaid
+    from sros_tool.report.formats import graphviz_svg, render_dot, render_mermaid
 
     if form == "mermaid":
         return render_mermaid(picture, scene)

@@ -23,9 +23,9 @@ from sros_tool.cli.common import (
     output_option,
     print_json,
     print_notes,
+    progress,
     save,
 )
-from sros_tool.cli.progress import progress
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.terminal import echo
 from sros_tool.values import FileChange, file_change

@@ -1,4 +1,4 @@
-"""Casting: choose enclaves of a user's keystore for the parts of a scenario.
+"""Casting: choose enclaves for the parts of a scenario, by what their signed permissions allow.
 
 The choice depends on the files of all enclaves.  An enclave that may only do what a part needs
 shows best whether more is denied, so it is preferred; and the enclave that may do most without
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from itertools import permutations
@@ -20,15 +20,7 @@ from typing import NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
-from sros_tool.dds.permissions import Grant
-from sros_tool.demo.grants import (
-    allows,
-    application_topics,
-    expressions_of,
-    is_denied,
-    is_wild,
-    may,
-)
+from sros_tool.dds.permissions import Grant, Rule, parse_permissions
 from sros_tool.demo.scenarios.attacks import (
     WIDEST,
     WIDEST_CLIENT,
@@ -60,6 +52,7 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
     PRIVATE,
     ROLES,
     ca_key,
@@ -67,9 +60,10 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import Keystore, OpenedEnclave, open_keystore
 from sros_tool.keystore.template import Template
-from sros_tool.names import ACTION_SEPARATOR
+from sros_tool.names import ACTION_SEPARATOR, NODE_SERVICES, dds_names, service_of
+from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, fingerprints
-from sros_tool.topics import dds_names, service_of
+from sros_tool.policy.patterns import matches
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
@@ -164,10 +158,10 @@ class UserKeystore(NamedTuple):
         if self.rightful(row):
             return row
         right, name = _RIGHTS[attacker.role], self.topic_of(attacker, topic)
-        expressions = expressions_of(self.grants[enclave], right, name)
+        expressions = _expressions_of(self.grants[enclave], right, name)
         if not all(expressions):
             return row
-        wild = next((f" by {expression}" for expression in expressions if is_wild(expression)), "")
+        wild = next((f" by {expression}" for expression in expressions if _is_wild(expression)), "")
         claim = row.claims[0]
         success = STATUS_OF[claim.relation, True]
         return replace(
@@ -399,9 +393,9 @@ def _best_first(
     return sorted(
         (name for name in rights if name in chosen),
         key=lambda name: (
-            is_denied(rights[name], topic),
+            _is_denied(rights[name], topic),
             name in others,
-            not may(rights[name], right, topic.removeprefix("rt"), named=True),
+            not _may(rights[name], right, topic.removeprefix("rt"), named=True),
         ),
     )
 
@@ -414,14 +408,14 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
     found: dict[str, str] = {}
     best = -1
     for server, client in permutations(rights, 2):
-        for topic in application_topics(rights[server], "publish"):
+        for topic in _application_topics(rights[server], "publish"):
             service, begin = service_of(topic)
             if begin != "rr" or ACTION_SEPARATOR in service or "parameter" in topic:
                 continue
             if not allows(rights[client], "publish", dds_names("request", service).publish[0]):
                 continue
             score = 2 * (not allows(rights[client], "publish", topic))
-            score += may(rights[client], "request", service, named=True)
+            score += _may(rights[client], "request", service, named=True)
             if score > best:
                 best, found = score, {"server": server, "client": client}
             if best == 3:
@@ -431,7 +425,7 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
 
 def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     """Return the service that the server of a cast offers and its client calls."""
-    for topic in application_topics(rights[cast["server"]], "publish"):
+    for topic in _application_topics(rights[cast["server"]], "publish"):
         name, begin = service_of(topic)
         requests = dds_names("request", name).publish[0]
         if begin == "rr" and allows(rights[cast["client"]], "publish", requests):
@@ -458,7 +452,7 @@ def _widest(
         unnamed = [
             enclave
             for enclave, grant in rights.items()
-            if not may(grant, right, name, named=True) or may(grant, right, DENIED_TOPIC)
+            if not _may(grant, right, name, named=True) or _may(grant, right, DENIED_TOPIC)
         ]
         tried = {cast[each] for each in others if each in cast}
         width = {each: _width(rights[each], right, name) for each in unnamed}
@@ -481,13 +475,13 @@ def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
     size = sum(
         len(each.topics) for rule in grant.rules for each in (*rule.publish, *rule.subscribe)
     )
-    return may(grant, right, name), may(grant, right, DENIED_TOPIC), size
+    return _may(grant, right, name), _may(grant, right, DENIED_TOPIC), size
 
 
 def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     own = [
         topic
-        for topic in application_topics(rights[cast["talker"]], "publish")
+        for topic in _application_topics(rights[cast["talker"]], "publish")
         if topic[:3] == "rt/"
     ]
     return next((t for t in own if allows(rights[cast["listener"]], "subscribe", t)), "")
@@ -499,7 +493,7 @@ def _within(short: str, long: str) -> bool:
 
 
 def _topics(rights: Mapping[str, Grant]) -> set[str]:
-    return {topic for grant in rights.values() for topic in application_topics(grant, "publish")}
+    return {topic for grant in rights.values() for topic in _application_topics(grant, "publish")}
 
 
 def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[str]]:
@@ -517,3 +511,174 @@ def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[st
         }
 
     return left_out
+
+
+_TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events", "rt/clock", "ros_discovery_info")
+_WILD = set("*?[")
+
+
+def enclave_grant(root: Path, enclave: str) -> Grant | None:
+    """Return the first grant of an enclave, or None if its permissions cannot be read."""
+    try:
+        signed = read_bytes(enclave_path(root, enclave) / PERMISSIONS_FILE, "permissions document")
+        grants = parse_permissions(smime.parse(signed).document).grants
+    except (SrosError, OSError):
+        return None
+    return grants[0] if grants else None
+
+
+def allows(grant: Grant, verb: str, topic: str) -> bool:
+    """Return whether a grant allows ``verb`` (publish or subscribe) on a DDS topic."""
+    return bool(_allowing(grant, verb, topic))
+
+
+def _allowing(grant: Grant, verb: str, topic: str) -> str:
+    """Return the expression by which a grant allows ``verb`` on a DDS topic; "" if it denies that.
+
+    The first rule that names the topic decides, as with the vendors; of its expressions the topic's
+    own name comes first.  A topic that no rule names is denied.
+    """
+    for rule in grant.rules:
+        fitting = [
+            expression for expression in _expressions(rule, verb) if matches(expression, topic)
+        ]
+        if fitting:
+            return (topic if topic in fitting else fitting[0]) if rule.allow else ""
+    return ""
+
+
+def _is_denied(grant: Grant, topic: str) -> bool:
+    """Return whether a rule denies publishing or subscribing a DDS topic."""
+    return any(
+        matches(expression, topic)
+        for rule in grant.rules
+        for verb in ("publish", "subscribe")
+        for expression in (() if rule.allow else _expressions(rule, verb))
+    )
+
+
+def _expressions_of(grant: Grant, right: str, name: str) -> tuple[str, ...]:
+    """Return the expression of `_allowing` for each DDS topic that a right on a ROS name needs."""
+    topics = dds_names(right, name)
+    return (
+        *(_allowing(grant, "publish", topic) for topic in topics.publish),
+        *(_allowing(grant, "subscribe", topic) for topic in topics.subscribe),
+    )
+
+
+def _may(grant: Grant, right: str, name: str, *, named: bool = False) -> bool:
+    """Return whether a grant allows a right on a ROS name; with ``named``, without wildcards."""
+    return all(
+        expression and not (named and _is_wild(expression))
+        for expression in _expressions_of(grant, right, name)
+    )
+
+
+def _is_wild(expression: str) -> bool:
+    """Return whether an expression has wildcards, and so can match topics that nobody named."""
+    return bool(set(expression) & _WILD)
+
+
+def _application_topics(grant: Grant, verb: str) -> Iterator[str]:
+    """Yield the application's DDS topics that a grant allows by a name without wildcards.
+
+    Topics of every node, hidden topics and topics of actions are left out.
+    """
+    for topic in _named_topics(grant, verb):
+        private = topic.startswith("rt/_") or ACTION_SEPARATOR in topic
+        if topic not in _TOPICS_OF_EVERY_NODE and not private:
+            yield topic
+
+
+def _named_topics(grant: Grant, verb: str) -> Iterator[str]:
+    """Yield the DDS topics that a grant allows by a name without wildcards."""
+    for rule in grant.rules:
+        for topic in _expressions(rule, verb) if rule.allow else ():
+            if not _is_wild(topic):
+                yield topic
+
+
+def _expressions(rule: Rule, verb: str) -> Iterator[str]:
+    for criteria in rule.publish if verb == "publish" else rule.subscribe:
+        yield from criteria.topics
+
+
+# ── names of nodes ───────────────────────────────────────────────────────────────────────────────
+
+_NODE_MARK = ("rr", f"/{NODE_SERVICES[0]}Reply")
+
+
+def is_node_allowed(grant: Grant, node: str) -> bool:
+    """Return whether a grant allows all standard services of the node ``node`` (absolute)."""
+    names = (dds_names("reply", f"{node}/{service}") for service in NODE_SERVICES)
+    return all(
+        all(allows(grant, "publish", topic) for topic in name.publish)
+        and all(allows(grant, "subscribe", topic) for topic in name.subscribe)
+        for name in names
+    )
+
+
+def nodes_named(grant: Grant) -> Iterator[str]:
+    """Yield the absolute names of the nodes whose standard services a grant names and allows."""
+    kind, service = _NODE_MARK
+    for topic in _named_topics(grant, "publish"):
+        if topic.startswith(kind) and topic.endswith(service):
+            node = topic.removeprefix(kind).removesuffix(service)
+            if is_node_allowed(grant, node):
+                yield node
+
+
+DEFAULT_NODE_NAMES: Mapping[Role, tuple[str, ...]] = {
+    Role.TALKER: ("talker",),
+    Role.LISTENER: ("listener",),
+    Role.OBSERVER: ("observer",),
+    Role.SERVER: ("server",),
+    Role.CLIENT: ("client",),
+    Role.ACTION_SERVER: ("action_server",),
+    Role.ACTION_CLIENT: ("action_client",),
+    Role.COMPOSED: ("talker", "listener", "server"),
+}
+"""The default names of the nodes of each role, in the namespace /."""
+
+
+def node_names(role: Role, grant: Grant | None) -> tuple[str, ...]:
+    """Return the absolute names of a role's nodes under a grant (None: without security).
+
+    A node keeps its default name if the grant allows it.  Otherwise it gets the most similar node
+    name in the grant; if there is no such name, it keeps its default name.
+    """
+    wanted = [f"/{name}" for name in DEFAULT_NODE_NAMES[role]]
+    if grant is None:
+        return tuple(wanted)
+    kept = {name for name in wanted if is_node_allowed(grant, name)}
+    named = [*dict.fromkeys(nodes_named(grant))]
+    free = [name for name in named if name not in kept]
+    return tuple(_names(wanted, kept, free, named))
+
+
+def _names(
+    wanted: Sequence[str], kept: set[str], free: list[str], named: Sequence[str]
+) -> Iterator[str]:
+    for name in wanted:
+        if name in kept or not named:
+            yield name
+            continue
+        # With more nodes than names, two nodes share a name: DDS allows that in a process.
+        alike = [each for each in free if name[1:] in each.lower()]
+        chosen = (alike or free or named)[0]
+        if chosen in free:
+            free.remove(chosen)
+        yield chosen
+
+
+def naming_arguments(role: Role, names: Sequence[str]) -> list[str]:
+    """Return the ``--ros-args`` that give the nodes of a role these absolute names."""
+    rules: list[str] = []
+    for default, name in zip(DEFAULT_NODE_NAMES[role], names, strict=True):
+        namespace, _, node = name.rpartition("/")
+        if node != default:
+            rules += ["-r", f"{default}:__node:={node}"]
+        if namespace:
+            # rcl looks up the namespace under the new name of the node.
+            rules += ["-r", f"{node}:__ns:={namespace}"]
+    return ["--ros-args", *rules, "--"] if rules else []

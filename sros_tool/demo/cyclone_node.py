@@ -19,10 +19,10 @@ from types import FrameType
 
 from sros_tool.demo.nodes import ROLES, Call, Hear, enclave_in, parse_options
 from sros_tool.errors import SrosError
+from sros_tool.names import dds_names
 from sros_tool.runtime.cyclone import Participant, Reader, SecurityRefusedError
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
-from sros_tool.runtime.rcl_security import choose_loadable, domain_of
-from sros_tool.topics import dds_names
+from sros_tool.runtime.variables import choose_loadable, domain_of
 
 _POLL_SECONDS = 0.02
 

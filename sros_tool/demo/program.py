@@ -30,16 +30,15 @@ from sros_tool.demo.backend import (
 )
 from sros_tool.demo.casting import CastMember, UserKeystore, open_user_keystore
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
-from sros_tool.demo.result import DemoResult, KeystoreSummary, ScenarioResult
+from sros_tool.demo.result import DemoResult, KeystoreSummary, RowResult, ScenarioResult
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.communication import ISOLATION
 from sros_tool.demo.scenarios.model import Row, Scenario, joined
 from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, check_topic
-from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import Template, load_template
+from sros_tool.names import dds_names
 from sros_tool.runtime.netns import Isolation, Progress, run_isolated, try_isolation
-from sros_tool.topics import dds_names
 from sros_tool.values import versioned
 
 _DEFAULT_DOMAIN = 80

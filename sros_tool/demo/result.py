@@ -1,19 +1,488 @@
-"""The result of a demo: what ``sros demo --json`` prints, a table, and a summary in Markdown."""
+"""The result of a demo: what each row showed, as a table, in Markdown, and for ``--json``.
+
+A row is judged from the reports of its processes.  A crash is not a refusal.  Silence counts only
+if both sides were ready, the talker sent messages, and the controls held; a refusal counts only if
+DDS Security reported it, for this topic.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Annotated, NamedTuple
 
 from sros_tool.demo.backend import CYCLONE, RCLPY, ZENOH
 from sros_tool.demo.casting import CastMember
-from sros_tool.demo.scenarios.model import RowStatus
-from sros_tool.demo.verdict import RowResult
+from sros_tool.demo.scenarios.model import (
+    STATUS_OF,
+    SUCCESSES,
+    Claim,
+    Party,
+    Relation,
+    Role,
+    Row,
+    RowStatus,
+    Wire,
+)
+from sros_tool.demo.wire import Injection, WireCount
 from sros_tool.errors import NOT_DONE
+from sros_tool.runtime.events import Event, EventKind, ProcessStage, signal_name
+from sros_tool.runtime.vendor_log import (
+    endpoint_refusal,
+    missing_security,
+    participant_refusal,
+    plain_refusal,
+)
 from sros_tool.validity import iso
 from sros_tool.values import Words, shows
+
+
+@dataclass(frozen=True)
+class PartyRecord:
+    """The record of one process after its end.
+
+    ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``through`` names the
+    library it used; ``output`` is what it printed; ``status`` is its exit status (negative for a
+    signal) if it ended before it was stopped.
+    """
+
+    text: str = ""
+    topic: str = ""
+    through: str = ""
+    events: tuple[Event, ...] = ()
+    output: str = ""
+    status: int | None = None
+
+
+@dataclass(frozen=True)
+class RowRecord:
+    """The record of a row after its end.
+
+    ``window`` has start and end of the observation (CLOCK_MONOTONIC, s), or None if a party was not
+    ready in time.  ``injected`` counts the packets that were sent again or changed; ``skipped`` is
+    why the row was not run, or "".  ``expiry`` is when the certificate of a short-lived talker
+    expires (CLOCK_MONOTONIC, s); ``memory`` counts the segments of shared memory with the text of
+    each party.  Without ``applies``, the keystore has nobody for a part of the row.
+    """
+
+    row: Row
+    domain: int
+    parties: Mapping[str, PartyRecord] = field(default_factory=dict)
+    window: tuple[float, float] | None = None
+    wire: Mapping[str, WireCount] = field(default_factory=dict)
+    injected: Injection | None = None
+    expiry: float | None = None
+    memory: Mapping[str, int] = field(default_factory=dict)
+    skipped: str = ""
+    applies: bool = True
+
+    @property
+    def seconds(self) -> float:
+        """The length of the observation."""
+        return self.window[1] - self.window[0] if self.window else 0.0
+
+
+@shows(
+    *("name", "expected", "observed", "as_expected", "mechanism", "detail", "domain", "seconds"),
+    *("attack", "defence_removed", "open_because", "remedy", "accepted", "open_here", "applies"),
+    "scenario",
+)
+@dataclass(frozen=True)
+class RowResult:
+    """A row of the result."""
+
+    name: str
+    """What was tried."""
+    expected: RowStatus
+    """The expected outcome."""
+    observed: RowStatus
+    """The observed outcome."""
+    mechanism: str
+    """Why that is expected."""
+    detail: str
+    """What was observed, with counts."""
+    domain: int
+    """The ROS domain."""
+    seconds: float = 0.0
+    """How long it was observed."""
+    attack: str = ""
+    """The attack, or an empty string."""
+    removed: str = ""
+    open_because: str = ""
+    """Why the attack is known to succeed, or an empty string."""
+    remedy: str = ""
+    """What helps against it, or an empty string."""
+    accepted: bool = False
+    """Whether `--accept-open` names it."""
+    unaccepted: bool = False
+    applies: bool = True
+    """Whether the keystore has an enclave for each part; if not, it was skipped."""
+    scenario: str = ""
+    """The scenario."""
+
+    @property
+    def defence_removed(self) -> str:
+        """The defence that is missing in this row, or an empty string."""
+        return self.removed
+
+    @property
+    def as_expected(self) -> bool:
+        """Whether they are the same, or it was skipped or accepted."""
+        expected = self.observed in (self.expected, RowStatus.SKIPPED) and not self.open_here
+        return expected or self.known_open
+
+    @property
+    def known_open(self) -> bool:
+        """Whether the row shows an attack that is known to succeed, or accepted by the user."""
+        if self.accepted and self.observed in SUCCESSES:
+            return True
+        return bool(self.open_because) and self.observed is self.expected and not self.open_here
+
+    @property
+    def open_here(self) -> bool:
+        """Whether it succeeds because of the keystore, and was not accepted."""
+        return self.unaccepted and self.observed is self.expected
+
+    @property
+    def untried(self) -> bool:
+        """Whether an attack that has to fail was not tried, and may succeed unseen.
+
+        A row without its defence, or of an attack that is known to succeed or was accepted, proves
+        nothing of a keystore; and what does not apply to it cannot succeed.
+        """
+        if self.observed is not RowStatus.SKIPPED or not self.applies or self.removed:
+            return False
+        return not self.accepted and (self.unaccepted or not self.open_because)
+
+
+class _Finding(NamedTuple):
+    """The observed status of one claim, with the evidence."""
+
+    status: RowStatus
+    detail: str
+
+
+def _undecided(why: str) -> _Finding:
+    return _Finding(RowStatus.UNDECIDED, why)
+
+
+def judge_row(record: RowRecord) -> RowResult:
+    """Return the result of a row from its record."""
+    finding = _observe(record)
+    row = record.row
+    return RowResult(
+        name=row.name,
+        expected=row.expected,
+        observed=finding.status,
+        mechanism=row.mechanism,
+        detail=finding.detail,
+        domain=record.domain,
+        seconds=round(record.seconds, 1),
+        attack=row.attack,
+        removed=row.removed,
+        open_because=row.open_because,
+        remedy=row.remedy,
+        accepted=row.accepted,
+        unaccepted=row.unaccepted,
+        applies=record.applies,
+    )
+
+
+def _observe(record: RowRecord) -> _Finding:
+    if record.skipped:
+        return _Finding(RowStatus.SKIPPED, record.skipped)
+    for party in record.row.parties:
+        lost = _lost_import(party, record.parties[party.name])
+        if lost:
+            return _Finding(RowStatus.SKIPPED, lost)
+    claims = [(claim, _judge_claim(claim, record)) for claim in record.row.claims]
+    controls = [(claim, _judge_claim(claim, record)) for claim in record.row.controls]
+    wrong = [finding for claim, finding in claims if finding.status is not claim.expected]
+    if wrong:
+        definite = wrong[0].status in STATUS_OF.values()
+        several = len(claims) > 1
+        status = RowStatus.DISTURBED if several and definite else wrong[0].status
+        return _Finding(status, wrong[0].detail)
+    for claim, finding in controls:
+        if finding.status is not claim.expected:
+            what = f"{claim.subject} {claim.relation} {claim.talker}".strip()
+            return _undecided(f"the control failed ({what}: {finding.status}, {finding.detail})")
+    details = [finding.detail for _, finding in claims]
+    details += [f"control: {finding.detail}" for _, finding in controls]
+    return _Finding(record.row.expected, "; ".join(details))
+
+
+def _lost_import(party: Party, record: PartyRecord) -> str:
+    """Return why a node could not import rclpy or an interface, or ""."""
+    if party.role in (Role.TALKER, Role.LISTENER):
+        return ""
+    failed = (
+        e.text
+        for e in record.events
+        if e.kind is EventKind.FAILED and e.stage is ProcessStage.IMPORT
+    )
+    what = "rclpy" if party.role is Role.OBSERVER else f"the {party.role}"
+    return next((f"{what} cannot be loaded here: {text}" for text in failed), "")
+
+
+class _Case:
+    """A claim with the records of its row and of the two parties that it is about."""
+
+    def __init__(self, claim: Claim, record: RowRecord) -> None:
+        self.claim, self.record = claim, record
+        self.subject = record.parties[claim.subject]
+        self.talker = record.parties.get(claim.talker, self.subject)
+
+    def result(self, holds: bool, detail: str) -> _Finding:
+        """Return what was observed: that the claim holds, or that it does not."""
+        return _Finding(STATUS_OF[self.claim.relation, holds], detail)
+
+    def sent(self, party: PartyRecord) -> list[Event]:
+        """Return what a party sent in the window."""
+        return [e for e in party.events if e.kind is EventKind.SENT and _in_window(e, self.record)]
+
+    def heard(self) -> list[Event]:
+        """Return the messages of the talker that the subject heard, at any time."""
+        return _heard_of(self.talker, self.subject)
+
+
+def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
+    for name in filter(None, (claim.subject, claim.talker)):
+        if problem := _why_not_running(name, record.parties[name]):
+            return _with_evidence(problem, claim, record)
+    if claim.relation is Relation.IS_REFUSED:
+        return _Finding(RowStatus.STARTED, f"{claim.subject} was not refused")
+    if claim.relation is Relation.STARTS:
+        return _Finding(RowStatus.STARTED, f"{claim.subject} started")
+    if record.window is None:
+        return _undecided("not all processes were ready in time")
+    return _JUDGES[claim.relation](_Case(claim, record))
+
+
+def _judge_hearing(case: _Case) -> _Finding:
+    claim, record = case.claim, case.record
+    sent = {event.text for event in case.sent(case.talker)}
+    if not sent:
+        return _undecided(f"{claim.talker} sent nothing in the window")
+    heard = case.heard()
+    if record.row.meanwhile is not None:  # what was heard before the change proves nothing
+        heard = [event for event in heard if _in_window(event, record)]
+    arrived = len(sent & {event.text for event in heard})
+    heard_of = f"{arrived} of {len(sent)} messages of the {claim.talker}"
+    return case.result(bool(heard), f"{claim.subject} heard {heard_of} in {record.seconds:.1f} s")
+
+
+def _judge_answers(case: _Case) -> _Finding:
+    claim, asked = case.claim, case.sent(case.subject)
+    if not asked:
+        return _undecided(f"{claim.subject} sent no request in the window")
+    answers = case.heard()
+    within = sum(_in_window(event, case.record) for event in answers)
+    right = f"{min(within, len(asked))} right answers from the {claim.talker}"
+    return case.result(bool(answers), f"{claim.subject} asked {len(asked)} times and got {right}")
+
+
+def _judge_execution(case: _Case) -> _Finding:
+    """Judge by the requests that reached the server: a reply may be lost after that."""
+    claim, asked = case.claim, case.sent(case.talker)
+    if not asked:
+        return _undecided(f"{claim.talker} sent no request in the window")
+    reached = case.heard()
+    number = f"{min(len(reached), len(asked))} of {len(asked)} requests of the {claim.talker}"
+    return case.result(bool(reached), f"{claim.subject} executed {number}")
+
+
+_ON_ITS_WAY = 1.0
+"""Seconds after an expiry in which a message may still arrive: certificates have whole seconds."""
+
+
+def _judge_expiry(case: _Case) -> _Finding:
+    claim, expiry, heard = case.claim, case.record.expiry, case.heard()
+    if expiry is None or not any(event.time < expiry for event in heard):
+        return _undecided(f"{claim.talker} was not heard before its certificate expired")
+    after = expiry + _ON_ITS_WAY
+    sent = [e for e in case.talker.events if e.kind is EventKind.SENT and e.time > after]
+    if not sent:
+        return _undecided(f"{claim.talker} sent nothing after its certificate had expired")
+    late = [event for event in heard if event.time > after]
+    before = f"{len(heard) - len(late)} messages of the {claim.talker} until its certificate"
+    return case.result(
+        bool(late),
+        f"{claim.subject} heard {before} expired, and {len(late)} of {len(sent)} after that",
+    )
+
+
+def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Finding:
+    """Return a refusal with the logged line that is its evidence, if the claim names one.
+
+    A process that merely gets no connection may be slow.
+    """
+    if not claim.evidence or finding.status is not RowStatus.NOT_LET_IN:
+        return finding
+    if claim.evidence in finding.detail:
+        return finding
+    outputs = [(party.name, record.parties[party.name].output) for party in record.row.parties]
+    lines = ((name, line) for name, output in outputs for line in output.splitlines())
+    found = next(((name, line) for name, line in lines if claim.evidence in line), None)
+    if found is None:
+        return _undecided(f"{finding.detail}, but nobody logged {claim.evidence!r}")
+    name, line = found
+    return _Finding(finding.status, f"{finding.detail}; {name}: {_message_of(line)}")
+
+
+def _message_of(line: str) -> str:
+    """Return the message of a line of Zenoh's log, without time, level, module and hint."""
+    message = line.partition(": ")[2].partition(" Hint: ")[0]
+    return " ".join(message.split()).rstrip(".") or line.strip()
+
+
+def _judge_replay(case: _Case) -> _Finding:
+    claim, injected = case.claim, case.record.injected
+    if injected is None or not injected.packets:
+        return _undecided("no packets of the talker were captured to send again")
+    again = sum(event.time >= injected.time for event in case.heard())
+    return case.result(
+        again > 0,
+        f"{claim.subject} heard {again} messages in {injected.packets} packets of the"
+        f" {claim.talker} that were sent again, twice, after it had left",
+    )
+
+
+def _judge_forgery(case: _Case) -> _Finding:
+    claim, talker, injected = case.claim, case.talker, case.record.injected
+    if injected is None or not injected.packets:
+        return _undecided("no packet of the talker could be changed")
+    sent = {event.text for event in talker.events if event.kind is EventKind.SENT}
+    sent.add(f"{talker.text}: {len(sent) + 1}")  # sent, and suspended before it was reported
+    believed = sum(
+        event.kind is EventKind.HEARD and event.time >= injected.time and event.text not in sent
+        for event in case.subject.events
+    )
+    return case.result(
+        believed > 0,
+        f"{claim.subject} heard {believed} messages that the {claim.talker} never sent, in"
+        f" {injected.packets} changed packets",
+    )
+
+
+def _heard_of(speaker: PartyRecord, listener: PartyRecord) -> list[Event]:
+    mark = f"{speaker.text}: "
+    return [e for e in listener.events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
+
+
+def _judge_view(case: _Case) -> _Finding:
+    claim, observer, topic = case.claim, case.subject, case.talker.topic
+    if not case.sent(case.talker):
+        return _undecided(f"{claim.talker} sent nothing in the window")
+    looks = [e for e in observer.events if e.kind is EventKind.SEEN and _in_window(e, case.record)]
+    if not looks:
+        return _undecided(f"{claim.subject} counted nothing in the window")
+    most = max(event.publishers.get(topic, 0) for event in looks)
+    publishers = f"{observer.through} counts {most} publishers on {topic}"
+    return case.result(most > 0, f"{publishers} in {len(looks)} polls")
+
+
+def _judge_wire(case: _Case) -> _Finding:
+    claim, record = case.claim, case.record
+    if claim.wire is Wire.MEMORY:
+        segments = record.memory.get(claim.subject, 0)
+        return case.result(segments > 0, f"{segments} segments of shared memory show the text")
+    count = record.wire.get(claim.subject)
+    if count is None:
+        return _undecided("no packets were captured")
+    if claim.wire is not Wire.TEXT:
+        shown = count.topics if claim.wire is Wire.TOPIC else count.certificates
+        if not shown and not count.protected:
+            return _undecided("no packets of the row were captured")
+        what = f"the {claim.wire}" if claim.wire is Wire.TOPIC else f"a {claim.wire}"
+        return case.result(shown > 0, f"{shown} packets show {what}")
+    if count.plain:
+        return case.result(True, f"{count.plain} packets show the text")
+    sent = len(case.sent(case.subject))
+    # Missing text proves something only if the messages were in the captured packets.
+    if count.protected * 2 < max(2, sent):
+        return _undecided(
+            f"only {count.protected} encrypted packets were captured for {sent} messages"
+        )
+    return case.result(False, f"0 packets show the text, {count.protected} are encrypted")
+
+
+_JUDGES: Mapping[Relation, Callable[[_Case], _Finding]] = {
+    Relation.HEARS: _judge_hearing,
+    Relation.HEARS_AGAIN: _judge_replay,
+    Relation.BELIEVES: _judge_forgery,
+    Relation.HEARS_EXPIRED: _judge_expiry,
+    Relation.IS_ANSWERED: _judge_answers,
+    Relation.EXECUTES: _judge_execution,
+    Relation.SEES: _judge_view,
+    Relation.READABLE: _judge_wire,
+}
+
+
+def _why_not_running(name: str, record: PartyRecord) -> _Finding | None:
+    """Return why a party did not run until the end of the row, or None if it did."""
+    ready = any(event.kind is EventKind.READY for event in record.events)
+    for event in record.events:
+        if event.kind is EventKind.REFUSED:
+            return _refused(name, event.stage, _own_denial(record, "") or event.text)
+        if event.kind is EventKind.FAILED:
+            return _failure(name, record, event)
+    if record.status is not None:
+        return _Finding(RowStatus.CRASHED, f"{name} {_end_of(record)}")
+    if not ready:
+        return _Finding(RowStatus.NOT_STARTED, f"{name} was not ready in time")
+    return None
+
+
+def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
+    reported = f"{event.text}\n{record.output}"
+    reason = " ".join(event.text.split())
+    if lacking := missing_security(reported):
+        return _Finding(RowStatus.NOT_STARTED, f"{name}: {lacking}")
+    if event.stage is ProcessStage.ENDPOINT and (refusal := _own_denial(record, event.text)):
+        return _refused(name, ProcessStage.ENDPOINT, refusal)
+    if event.stage in (ProcessStage.PARTICIPANT, ProcessStage.ENDPOINT):
+        # A ROS node has standard topics and services: if one is denied, it does not start.
+        refusal = participant_refusal(reported) or endpoint_refusal(reported)
+        if refusal:
+            return _refused(name, ProcessStage.PARTICIPANT, refusal)
+    return _Finding(RowStatus.CRASHED, f"{name} failed: {reason}")
+
+
+def _own_denial(record: PartyRecord, reported: str) -> str:
+    """Return the message in which DDS Security denies the party's own topic, or ""."""
+    lines = f"{record.output}\n{reported}".splitlines()
+    return endpoint_refusal("\n".join(line for line in lines if _is_about(line, record.topic)))
+
+
+def _is_about(line: str, topic: str) -> bool:
+    """Return whether a log line names that topic, or a service or action of that name."""
+    name = rf"r[tqr]{re.escape(topic)}(?:/_action/\w+)?(?:Request|Reply)?(?!\w|/)"
+    return bool(re.search(name, line)) or "not allowed by security" in line.lower()
+
+
+def _refused(name: str, stage: ProcessStage | None, reason: str) -> _Finding:
+    reason = plain_refusal(reason)
+    if stage is ProcessStage.ENDPOINT:
+        return _Finding(RowStatus.REFUSED, f"{name}: {reason}")
+    return _Finding(RowStatus.NOT_LET_IN, f"{name} was refused before it used the topic: {reason}")
+
+
+def _end_of(record: PartyRecord) -> str:
+    status = record.status or 0
+    if status < 0:
+        return f"was ended by {signal_name(-status)}"
+    last = " ".join(record.output.strip().splitlines()[-1:])
+    return f"ended by itself with status {status}. {last}".strip()
+
+
+def _in_window(event: Event, record: RowRecord) -> bool:
+    if record.window is None:
+        return False
+    start, end = record.window
+    return start <= event.time <= end
 
 
 class KeystoreSummary(NamedTuple):

@@ -25,6 +25,12 @@ from typing import NamedTuple
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.keystores import KeystoreSet
+from sros_tool.demo.result import (
+    PartyRecord,
+    RowRecord,
+    RowResult,
+    judge_row,
+)
 from sros_tool.demo.scenarios.model import (
     CALLING,
     DENIALS,
@@ -37,12 +43,6 @@ from sros_tool.demo.scenarios.model import (
     RowStatus,
     Wire,
     together,
-)
-from sros_tool.demo.verdict import (
-    PartyRecord,
-    RowRecord,
-    RowResult,
-    judge_row,
 )
 from sros_tool.demo.wire import (
     Injection,

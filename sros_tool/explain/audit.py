@@ -48,11 +48,10 @@ from sros_tool.graph.observation import (
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave, plan_enclave
 from sros_tool.keystore.rights import RightsSource
-from sros_tool.names import expand, is_expression, nodes_served
+from sros_tool.names import dds_names, expand, is_expression, nodes_served
 from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, order
-from sros_tool.topics import dds_names
 from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
 from sros_tool.wording import counted
 

@@ -16,11 +16,10 @@ from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer, GroupEdit, PolicyChange, lines_of_right
 from sros_tool.explain.evaluator import Evaluator
 from sros_tool.keystore.participant import plan_enclave
-from sros_tool.names import NODE_SERVICES, is_expression, nodes_served
+from sros_tool.names import NODE_SERVICES, dds_names, is_expression, nodes_served
 from sros_tool.policy.document import write_policy
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.rights import Right, profile_rights
-from sros_tool.topics import dds_names
 from sros_tool.translate import grant_rights
 
 _NO_RULE = frozenset({"no-rule", "default"})

@@ -35,6 +35,7 @@ from sros_tool.names import (
     is_expression,
     node_of_service,
     nodes_served,
+    service_of,
 )
 from sros_tool.policy.model import Policy
 from sros_tool.policy.patterns import covers
@@ -47,7 +48,6 @@ from sros_tool.runtime.vendor_log import (
     labelled_line,
     log_lines,
 )
-from sros_tool.topics import service_of
 
 _NEAR_LINES = 3
 """The number of lines after a denial that still belong to it."""

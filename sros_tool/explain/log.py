@@ -34,7 +34,7 @@ from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import load_rights
-from sros_tool.names import ACTION_SEPARATOR, check_enclave_name, nodes_served
+from sros_tool.names import ACTION_SEPARATOR, SERVICE_ENDS, check_enclave_name, nodes_served
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import covers
@@ -59,7 +59,6 @@ from sros_tool.runtime.vendor_log import (
     style_of,
     zenoh_text,
 )
-from sros_tool.topics import SERVICE_ENDS
 from sros_tool.translate import grant_rights
 from sros_tool.translate_from_zenoh import name_of_key
 from sros_tool.values import shows

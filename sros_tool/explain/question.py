@@ -11,10 +11,15 @@ from typing import NamedTuple
 
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.errors import UsageError
-from sros_tool.names import ROS_DISCOVERY_TOPIC, expression_problem, is_expression
+from sros_tool.names import (
+    ROS_DISCOVERY_TOPIC,
+    dds_names,
+    expression_problem,
+    is_expression,
+    service_of,
+)
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
-from sros_tool.topics import dds_names, service_of
 from sros_tool.values import shows
 
 _JOIN = "join"

@@ -1,7 +1,7 @@
 """Observe the live ROS graph through rclpy, and find the enclave of each node.
 
-`RosGraph` runs rclpy in a separate process (`sros_tool.graph.observer`); `settle`, `look_for` and
-`watch` decide for how long.  Times are in seconds; clock and source are passed in.
+`RosGraph` runs rclpy in a separate process (`observation.main`); `settle`, `look_for` and `watch`
+decide for how long.  Times are in seconds; clock and source are passed in.
 
 rclpy lists nodes with their enclaves, but without their processes; it lists endpoints with the
 names of their nodes and with their participants (processes), but without enclaves.  `resolve`
@@ -78,7 +78,7 @@ class RosGraph:
             self._process = subprocess.Popen(
                 # -P: never import modules from the current folder.
                 [
-                    *(sys.executable, "-P", "-m", "sros_tool.graph.observer"),
+                    *(sys.executable, "-P", "-m", "sros_tool.graph.observation"),
                     *(str(write_end), str(_PERIOD_SECONDS)),
                 ],
                 stdin=subprocess.PIPE,

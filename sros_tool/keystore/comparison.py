@@ -12,9 +12,8 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.errors import UsageError
 from sros_tool.keystore.template import EVERYTHING, Template
-from sros_tool.names import is_expression
+from sros_tool.names import is_expression, service_of
 from sros_tool.policy.patterns import common_name, covers, overlap
-from sros_tool.topics import service_of
 from sros_tool.validity import Span, duration_text, span_text, window
 from sros_tool.zenoh.configuration import ZenohNetwork
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
-from sros_tool.names import expand
+from sros_tool.names import ACTION_PARTS, GOAL, DdsNames, dds_names, expand
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
@@ -25,7 +25,6 @@ from sros_tool.policy.model import (
     Source,
 )
 from sros_tool.policy.patterns import ComparisonLimit, Names
-from sros_tool.topics import ACTION_PARTS, GOAL, DdsNames, dds_names
 from sros_tool.values import Words, shows
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}

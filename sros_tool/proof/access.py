@@ -16,10 +16,10 @@ from sros_tool.automata import NameSet
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
+from sros_tool.names import SERVICE_ENDS
 from sros_tool.policy.model import ALLOW
 from sros_tool.proof.places import topics_of
 from sros_tool.proof.worlds import TopicAccess, named, valid_topics
-from sros_tool.topics import SERVICE_ENDS
 from sros_tool.translate_zenoh import StatedRight
 from sros_tool.zenoh.access import Enforcement, Flow, Message, Remote
 from sros_tool.zenoh.key_expressions import names_of

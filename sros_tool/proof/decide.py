@@ -16,7 +16,7 @@ from fnmatch import fnmatchcase
 from functools import lru_cache
 
 from sros_tool.automata import NameSet, SearchLimit
-from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
+from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, is_expression, service_of
 from sros_tool.policy.model import RIGHTS
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import KIND_OF
@@ -36,7 +36,6 @@ from sros_tool.proof.requirements import (
     Widest,
 )
 from sros_tool.proof.worlds import Meeting, Topics, World, shortest, valid_topics
-from sros_tool.topics import dds_names, service_of
 
 
 @dataclass(frozen=True, slots=True)

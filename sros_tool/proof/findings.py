@@ -9,7 +9,7 @@ from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import ASSUMED, NOT_ON_ZENOH, VACUOUS, VIOLATED
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
-from sros_tool.names import action_part, is_expression
+from sros_tool.names import action_part, is_expression, service_of
 from sros_tool.policy.model import Source
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.decide import Use, Verdict, Witness, Worlds
@@ -25,7 +25,6 @@ from sros_tool.proof.requirements import (
 )
 from sros_tool.proof.system import System
 from sros_tool.proof.worlds import World
-from sros_tool.topics import service_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,10 +14,9 @@ from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass
 
 from sros_tool.automata import NameSet, SearchLimit
-from sros_tool.names import ROS_DISCOVERY_TOPIC
+from sros_tool.names import ROS_DISCOVERY_TOPIC, SERVICE_ENDS
 from sros_tool.proof.worlds import World, named
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
-from sros_tool.topics import SERVICE_ENDS
 
 _IGNORED = NameSet.union(
     named(each)

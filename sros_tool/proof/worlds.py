@@ -17,9 +17,8 @@ from types import MappingProxyType
 from sros_tool.automata import Automaton, Letters, NameSet, SearchLimit
 from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
-from sros_tool.names import is_expression
+from sros_tool.names import SERVICE_ENDS, is_expression
 from sros_tool.policy.protection import Level
-from sros_tool.topics import SERVICE_ENDS
 
 LONGEST = 255
 """Longest name of a topic in bytes: the limit of DDS in ROS 2 (rmw, validate_full_topic_name.h)."""

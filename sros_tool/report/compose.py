@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.keystore.reader import Keystore
-from sros_tool.names import ACTION_SEPARATOR, is_expression
+from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier, StatedProtection
 from sros_tool.policy.patterns import Names, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import (
@@ -45,7 +45,6 @@ from sros_tool.report.picture import (
     Validity,
     WireLevel,
 )
-from sros_tool.topics import dds_names
 from sros_tool.translate import protected_topics
 
 _OVERLAYS = {

@@ -30,7 +30,7 @@ from typing import NamedTuple
 from sros_tool.fleet.robots import Robot
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.compose import edge_order, namespace_of
-from sros_tool.report.flow_layout import HOPS, flow_scene
+from sros_tool.report.focus import HOPS, flow_scene
 from sros_tool.report.layout import Frame, Scene, scenes_of
 from sros_tool.report.picture import (
     DifferentUnit,

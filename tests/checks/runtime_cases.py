@@ -15,8 +15,14 @@ from sros_tool.checks.runtime import RuntimeState
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
-from sros_tool.runtime.process_files import FileReader, ProcessRoot
-from sros_tool.runtime.processes import Process, RunningProcesses, UnseenProcess, with_files
+from sros_tool.runtime.processes import (
+    FileReader,
+    Process,
+    ProcessRoot,
+    RunningProcesses,
+    UnseenProcess,
+    with_files,
+)
 from sros_tool.validity import parse_iso
 from tests.checks import zenoh_cases
 from tests.checks.bench import DAY, Bench

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.runtime.containers import FORMS
-from sros_tool.runtime.environment import NO_CONFIGURATION, render_refusal
+from sros_tool.runtime.environment import CONTAINER_FORMS, NO_CONFIGURATION, render_refusal
 from tests.runtime.test_containers import check
 from tests.support.children import importing
 from tests.support.harness import policy_text, publish, sros
@@ -107,7 +106,7 @@ def test_a_secret_goes_to_no_file_that_others_can_read(
     assert ("key.pem" in output.read_text()) == (not status)
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", CONTAINER_FORMS)
 @pytest.mark.parametrize(
     "words",
     [

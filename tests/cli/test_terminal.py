@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.cli import common as showing
 from sros_tool.cli import main
-from sros_tool.cli import progress as showing
 from sros_tool.parallel import map_slices, tick
 from sros_tool.terminal import Coloured, echo, echo_document
 from tests.support.harness import sros

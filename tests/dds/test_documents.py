@@ -248,7 +248,7 @@ def test_a_node_starts_without_what_it_does_not_need() -> None:
     """A demo starts dozens of them."""
     words = "import sys, sros_tool.demo.cyclone_node; print(*sys.modules)"
     found = python("-c", words).stdout.split()
-    assert "sros_tool.topics" in found
+    assert "sros_tool.names" in found
     heavy = {"http.client", "ssl", "urllib.request", "uuid", "lxml.etree", "sros_tool.translate"}
     assert heavy.isdisjoint(found)
 

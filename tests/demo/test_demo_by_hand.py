@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.demo.by_hand import HandNode, security_of
+from sros_tool.demo.backend import HandNode, security_of
 from sros_tool.demo.scenarios.model import Role
 from sros_tool.errors import SrosError, UsageError
 from tests.support.children import PATIENCE

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.demo.scenarios.custom import read_scenario
+from sros_tool.demo.scenarios import read_scenario
 from sros_tool.demo.scenarios.model import OWN, UNSECURED, Identity, Relation, Role, RowStatus
 from sros_tool.errors import DocumentError
 from tests.support.harness import policy_text, publish, sros

@@ -9,7 +9,7 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
-from sros_tool.demo.grants import (
+from sros_tool.demo.casting import (
     allows,
     is_node_allowed,
     naming_arguments,

@@ -8,9 +8,8 @@ from datetime import UTC, datetime
 
 import pytest
 
-from sros_tool.demo.result import DemoResult, ScenarioResult, demo_table, summary_page
+from sros_tool.demo.result import DemoResult, RowResult, ScenarioResult, demo_table, summary_page
 from sros_tool.demo.scenarios.model import RowStatus
-from sros_tool.demo.verdict import RowResult
 from sros_tool.report.pages import render_demo_page
 from sros_tool.values import as_plain
 

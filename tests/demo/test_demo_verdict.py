@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 import pytest
 
+from sros_tool.demo.result import PartyRecord, RowRecord, RowResult, judge_row
 from sros_tool.demo.scenarios.communication import ROWS
 from sros_tool.demo.scenarios.model import Row, RowStatus
-from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, judge_row
 from sros_tool.demo.wire import WireCount
 from sros_tool.runtime.events import Event, EventKind, ProcessStage
 from sros_tool.values import as_plain

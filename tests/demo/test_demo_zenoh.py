@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 
 from sros_tool.demo import backend, runner
-from sros_tool.demo.scenarios import choose_scenarios
-from sros_tool.demo.scenarios.model import Relation, Role, Row, RowStatus, joined, together
-from sros_tool.demo.scenarios.on_zenoh import ATTACKS, ZENOH_SCENARIOS
-from sros_tool.demo.verdict import (
+from sros_tool.demo.result import (
     PartyRecord,
     RowRecord,
     RowResult,
     judge_row,
 )
+from sros_tool.demo.scenarios import choose_scenarios
+from sros_tool.demo.scenarios.model import Relation, Role, Row, RowStatus, joined, together
+from sros_tool.demo.scenarios.on_zenoh import ATTACKS, ZENOH_SCENARIOS
 from sros_tool.demo.wire import PacketCounter, mapped_segments, shared_memory
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.runtime.events import Event, EventKind, ProcessStage

@@ -19,7 +19,7 @@ from sros_tool.explain.audit import (
     keystore_enclaves,
     policy_enclaves,
 )
-from sros_tool.graph.draft import render
+from sros_tool.graph.learn import render
 from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
 from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.lifecycle.create import generate_artifacts

@@ -14,7 +14,7 @@ from sros_tool.errors import UsageError
 from sros_tool.explain.explanation import _known_causes, remedy
 from sros_tool.explain.question import TYPES, WORDS, ask
 from sros_tool.faults import FAULTS, Fault
-from sros_tool.topics import dds_names
+from sros_tool.names import dds_names
 
 MEANT = {
     ("publish", "topic"): "publish",

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import SrosError
-from sros_tool.fleet.fleet_file import parse_fleet, read_fleet
-from sros_tool.fleet.inventory import inventory, script_inventory
+from sros_tool.fleet.fleet_file import inventory, parse_fleet, read_fleet, script_inventory
 from sros_tool.fleet.robots import Fleet
 from tests.support.long_form import sometimes
 

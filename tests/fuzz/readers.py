@@ -17,7 +17,7 @@ from sros_tool.dds.decision.documents import read_governance_as, read_permission
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import parse_permissions
-from sros_tool.demo.scenarios.custom import read_scenario
+from sros_tool.demo.scenarios import read_scenario
 from sros_tool.errors import SrosError
 from sros_tool.explain.denials import propose, read_denials
 from sros_tool.explain.log import explain_log

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
-from sros_tool.names import expand
-from sros_tool.topics import dds_names
+from sros_tool.names import dds_names, expand
 
 SERVICES = (
     "describe_parameters",

@@ -9,8 +9,7 @@ import pytest
 
 from sros_tool.errors import DocumentError, PolicyError
 from sros_tool.files import policies_dir, replace_file
-from sros_tool.graph.draft import draft, render, write
-from sros_tool.graph.learn import Learned, common_parts, learn
+from sros_tool.graph.learn import Learned, common_parts, draft, learn, render, write
 from sros_tool.graph.observation import Observation
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
@@ -129,7 +128,7 @@ def test_what_fails_at_the_last_step_leaves_nothing(
             raise OSError(28, "No space left on device", str(target))
         replace_file(target, data)
 
-    monkeypatch.setattr("sros_tool.graph.draft.replace_file", full_disk)
+    monkeypatch.setattr("sros_tool.graph.learn.replace_file", full_disk)
     with pytest.raises(OSError, match="No space"):
         save(path, MORE)
     assert {each.name for each in tmp_path.iterdir()} == ({"robot.xml"} if exists else set())
@@ -142,7 +141,7 @@ def test_a_result_that_says_something_else_is_not_written(
     """Whatever goes wrong between a value and its text, the file is not replaced by it."""
     path = tmp_path / "robot.xml"
     monkeypatch.setattr(
-        "sros_tool.graph.draft.render", lambda found: render(found).replace(b"chatter", b"*")
+        "sros_tool.graph.learn.render", lambda found: render(found).replace(b"chatter", b"*")
     )
     with pytest.raises(PolicyError, match="cannot be written"):
         save(path, ROBOT)
@@ -151,7 +150,7 @@ def test_a_result_that_says_something_else_is_not_written(
 
 def test_folders_that_were_there_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "common").mkdir()
-    monkeypatch.setattr("sros_tool.graph.draft.render", lambda _: b"<policy")
+    monkeypatch.setattr("sros_tool.graph.learn.render", lambda _: b"<policy")
     with pytest.raises(PolicyError):
         save(tmp_path / "robot.xml", ROBOT)
     assert [each.name for each in tmp_path.iterdir()] == ["common"]

@@ -32,7 +32,7 @@ from sros_tool.runtime.cyclone import DdsError, Participant, Publication, Securi
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 if try_isolation().isolated:
     enter_isolation()
-from sros_tool.runtime.rcl_security import choose_enclave, domain_of
+from sros_tool.runtime.variables import choose_enclave, domain_of
 def join():
     return Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
 def attempt(make, topic):

@@ -16,10 +16,10 @@ import pytest
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.keystores import KeystoreSet
+from sros_tool.demo.result import RowResult
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.communication import ROWS
 from sros_tool.demo.scenarios.model import UNSECURED, Row, RowStatus
-from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.runtime.cyclone import load_cyclone
 from sros_tool.runtime.netns import run_isolated, try_isolation

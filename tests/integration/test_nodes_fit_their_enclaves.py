@@ -24,7 +24,7 @@ from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, conditions
-from sros_tool.demo.grants import DEFAULT_NODE_NAMES
+from sros_tool.demo.casting import DEFAULT_NODE_NAMES
 from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
 from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.model import DENIALS, Party, Relation, Role, Row, RowStatus, Scenario
@@ -32,12 +32,11 @@ from sros_tool.files import policies_dir
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
-from sros_tool.names import NODE_SERVICES, ROS_DISCOVERY_TOPIC, expand
+from sros_tool.names import NODE_SERVICES, ROS_DISCOVERY_TOPIC, dds_names, expand
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave
-from sros_tool.topics import dds_names
 from tests.integration.test_policies_live import all_dds_endpoints, observed_in, run_script, without
 from tests.support.children import LONG
 from tests.support.long_form import ONLY_LONG, some

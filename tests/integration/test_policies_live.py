@@ -24,10 +24,9 @@ from sros_tool.files import policies_dir
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
-from sros_tool.names import ROS_DISCOVERY_TOPIC, expand
+from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Group, Policy, Profile
-from sros_tool.topics import dds_names
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from tests.support.children import python

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
+from sros_tool.names import dds_names
 from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Profiles, Qualifier
 from sros_tool.policy.rights import KIND_OF
-from sros_tool.topics import dds_names
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
 

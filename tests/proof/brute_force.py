@@ -12,7 +12,7 @@ from fnmatch import fnmatchcase
 from functools import lru_cache
 from itertools import product
 
-from sros_tool.names import READING_SERVICES
+from sros_tool.names import READING_SERVICES, dds_names
 from sros_tool.policy.model import RIGHTS
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.protection import Level
@@ -28,7 +28,6 @@ from sros_tool.proof.requirements import (
     Requirement,
     Widest,
 )
-from sros_tool.topics import dds_names
 
 LETTERS = "abc"
 LONGEST = 4

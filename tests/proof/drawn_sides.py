@@ -37,6 +37,7 @@ from sros_tool.dds.governance import (
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.errors import PolicyError
 from sros_tool.keystore.template import load_template, render_template
+from sros_tool.names import SERVICE_ENDS, dds_names
 from sros_tool.pki import smime
 from sros_tool.policy.document import write_policy
 from sros_tool.policy.model import (
@@ -51,7 +52,6 @@ from sros_tool.policy.model import (
 )
 from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import policy_rights
-from sros_tool.topics import SERVICE_ENDS, dds_names
 from sros_tool.translate import governance_for, permissions_for
 from sros_tool.translate_zenoh import remote_of, stated_rights
 from sros_tool.validity import window

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from itertools import permutations
 
-from sros_tool.names import expand
+from sros_tool.names import dds_names, expand
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
@@ -40,7 +40,6 @@ from sros_tool.proof.requirements import (
     Widest,
 )
 from sros_tool.proof.system import policy_system
-from sros_tool.topics import dds_names
 from tests.proof.brute_force import TOPICS, Finite, breaches, finite
 from tests.support.children import LONG
 

@@ -21,6 +21,7 @@ from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import MEASURED, Style
 from sros_tool.errors import DocumentError, UsageError
 from sros_tool.fleet.fleet_file import read_fleet
+from sros_tool.names import DdsNames, dds_names
 from sros_tool.policy import rights as policy_rights
 from sros_tool.policy.model import Enclave
 from sros_tool.policy.rights import PlacedRight, placed_rights
@@ -29,7 +30,6 @@ from sros_tool.proof.growth import Gain, compare_access
 from sros_tool.proof.repository import Repository
 from sros_tool.proof.sources import load_side
 from sros_tool.proof.zenoh_settings import LONE
-from sros_tool.topics import DdsNames, dds_names
 from tests.checks.bench import Bench, name_of
 from tests.proof.drawn_sides import (
     DOMAINS,

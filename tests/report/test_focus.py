@@ -15,9 +15,8 @@ from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network
 from sros_tool.report.compose import PictureSource, compose
-from sros_tool.report.dot_mermaid import render_dot, render_mermaid
-from sros_tool.report.flow_layout import flow_scene
-from sros_tool.report.focus import FocusFlow, focused
+from sros_tool.report.focus import FocusFlow, flow_scene, focused
+from sros_tool.report.formats import render_dot, render_mermaid
 from sros_tool.report.picture import Picture, SourceTitle
 from tests.report.pictures import HOSTILE, MOBILE_ROBOT, group, hostile_permissions, source_of
 from tests.support.harness import policy_text, sros

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 from lxml import etree
 
-from sros_tool.report.dot_mermaid import render_dot, render_mermaid
+from sros_tool.report.formats import render_dot, render_mermaid, render_svg
 from sros_tool.report.layout import scenes_of
-from sros_tool.report.svg import render_svg
 from tests.report.pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
 from tests.support.children import importing, python, run
 from tests.support.harness import sros

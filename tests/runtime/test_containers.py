@@ -19,19 +19,20 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator, ValidationError
 
 from sros_tool.errors import KeystoreError, UsageError
-from sros_tool.runtime.containers import (
+from sros_tool.runtime.environment import (
     COMPOSE,
-    FORMS,
+    CONTAINER_FORMS,
     KUBERNETES,
     MAX_SECRET,
     Container,
     check_name,
     object_name,
     render_container,
+    render_refusal,
     render_secret,
     secret_name,
+    secured_environment,
 )
-from sros_tool.runtime.environment import render_refusal, secured_environment
 from sros_tool.values import yaml_text
 from tests.runtime.test_environment import CONTROLS, PATHS
 
@@ -106,7 +107,7 @@ def test_a_secret_has_the_files_up_to_what_kubernetes_takes() -> None:
         render_secret("/arm", {**parts, "crl.pem": b"x"})
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", CONTAINER_FORMS)
 def test_a_refusal_fits_no_schema(form: str) -> None:
     refusal = render_refusal(form)
     with pytest.raises(Exception, match=r"refused-by-sros|apiVersion|kind"):

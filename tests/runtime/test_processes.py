@@ -12,8 +12,14 @@ import pytest
 
 from sros_tool.runtime import processes
 from sros_tool.runtime.environment import enclave_argument
-from sros_tool.runtime.process_files import FileReader, LoadedFile, ProcessRoot
-from sros_tool.runtime.processes import ProcessTable, RunningProcesses, _Stat
+from sros_tool.runtime.processes import (
+    FileReader,
+    LoadedFile,
+    ProcessRoot,
+    ProcessTable,
+    RunningProcesses,
+    _Stat,
+)
 
 NOW = datetime(2026, 11, 23, tzinfo=UTC)
 ROS = ("talker", "--ros-args")

@@ -35,11 +35,12 @@ from sros_tool.keystore.reader import OpenedEnclave
 from sros_tool.names import (
     NODE_SERVICES,
     ROS_DISCOVERY_TOPIC,
+    dds_names,
     has_type_descriptions,
     is_expression,
+    service_of,
 )
 from sros_tool.policy.patterns import common_name, overlap
-from sros_tool.topics import dds_names, service_of
 from sros_tool.wording import counted, enumerated, first_few
 
 _ENGINE = (

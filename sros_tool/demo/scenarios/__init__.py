@@ -1,9 +1,51 @@
-"""The scenarios that ship with sros, as data; `custom` reads user-defined scenarios."""
+"""The scenarios that ship with sros, and those of users.
+
+The latter are a TOML file with parties and rows, and the policy of their enclaves.
+
+::
+
+    title = "who sees the camera"
+    policy = "robot.xml"                  # relative to this file
+
+    [[party]]
+    name = "camera"
+    role = "talker"                       # a value of `sros_tool.demo.scenarios.model.Role`
+    enclave = "/arm/camera"               # without it: unsecured
+    topic = "/image"                      # or the name of a service or action
+
+    [[party]]
+    name = "spy"
+    role = "listener"
+    topic = "/image"
+
+    [[row]]
+    name = "a spy does not see the camera"
+    because = "..."                       # the reason, shown as the mechanism
+
+    [[row.claim]]
+    listener = "spy"
+    talker = "camera"
+    expected = "not heard"
+
+    [[row.control]]                       # proves that the silence is not a crash
+    listener = "viewer"
+    talker = "camera"
+    expected = "heard"
+
+``expected`` is a status of the demo's table; the keys for the parties of a claim depend on it
+(`_PARTIES`).
+``keystore = "foreign"`` gives a party the identity of another CA; ``variables`` is a table of
+environment variables, of those in `_VARIABLES`.  The name of a party is also that of its log.  A
+claim that something does not happen needs another claim or a control that something does happen.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.demo.scenarios.communication import (
@@ -13,10 +55,301 @@ from sros_tool.demo.scenarios.communication import (
     ISOLATION,
     SERVICES,
 )
-from sros_tool.demo.scenarios.custom import read_scenario
-from sros_tool.demo.scenarios.model import Scenario
+from sros_tool.demo.scenarios.model import (
+    OWN,
+    SPEAKING,
+    UNSECURED,
+    Claim,
+    Identity,
+    Party,
+    Relation,
+    Role,
+    Row,
+    RowStatus,
+    Scenario,
+    SoundKeystore,
+)
 from sros_tool.demo.scenarios.on_zenoh import ZENOH_SCENARIOS
-from sros_tool.errors import UsageError
+from sros_tool.demo.scenarios.policies import check_topic
+from sros_tool.errors import DocumentError, SrosError, UsageError
+from sros_tool.files import read_toml
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Policy
+from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
+from sros_tool.xml import read_bytes
+
+_PARTIES: Mapping[Relation, tuple[str, ...]] = {
+    Relation.HEARS: ("listener", "talker"),
+    Relation.IS_ANSWERED: ("client", "server"),
+    Relation.SEES: ("observer", "talker"),
+    Relation.READABLE: ("party",),
+    Relation.IS_REFUSED: ("party",),
+    Relation.STARTS: ("party",),
+}
+"""The keys that name the parties of a claim: first its subject, then the other party."""
+
+_CLAIMS: Mapping[str, tuple[Relation, bool]] = {
+    "heard": (Relation.HEARS, True),
+    "not heard": (Relation.HEARS, False),
+    "answered": (Relation.IS_ANSWERED, True),
+    "not answered": (Relation.IS_ANSWERED, False),
+    "visible": (Relation.SEES, True),
+    "not visible": (Relation.SEES, False),
+    "readable": (Relation.READABLE, True),
+    "not readable": (Relation.READABLE, False),
+    "refused": (Relation.IS_REFUSED, True),
+    "started": (Relation.STARTS, True),
+}
+_EXAMPLE = 'Write a table: listener = "spy", talker = "camera", expected = "not heard".'
+
+_FITTING: Mapping[str, tuple[Role, ...]] = {
+    "talker": (Role.TALKER, Role.COMPOSED),
+    "listener": (Role.LISTENER, Role.COMPOSED),
+    "observer": (Role.OBSERVER,),
+    "client": (Role.CLIENT, Role.ACTION_CLIENT),
+    "server": (Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED),
+    "party": tuple(Role),
+}
+"""The roles of a party that a key of a claim can name."""
+
+_NAMED = (Role.SERVER, Role.CLIENT, Role.ACTION_SERVER, Role.ACTION_CLIENT)
+"""The roles that need the name of their service or action."""
+
+_VARIABLES = (DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY)
+"""The variables that a party can have: others, such as LD_PRELOAD, could run code of the author."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
+"""The names of parties: those of files in one folder."""
+
+_KEYS = {
+    "": {"title", "policy", "party", "row"},
+    "party": {"name", "role", "enclave", "keystore", "topic", "variables"},
+    "row": {"name", "claim", "control", "because"},
+}
+
+
+def read_scenario(path: Path) -> Scenario:
+    """Read a scenario file.
+
+    Raises:
+        DocumentError: the file is not a valid scenario; the message has the line.
+    """
+    content = read_bytes(path, "scenario")
+    data = read_toml(content, f"the scenario '{path}'", "Correct the file.")
+    return _scenario(_Table(path, content.decode().splitlines(), "", 0, data))
+
+
+class _Table(NamedTuple):
+    """A table of a scenario file: its ``kind`` ("party"; "": top level), and its ``place``.
+
+    The place is its index among the tables of that kind, to find the line for an error.
+    """
+
+    path: Path
+    lines: Sequence[str]
+    kind: str
+    place: int
+    data: Mapping[str, Any]
+
+    def tables(self, kind: str) -> Iterator[_Table]:
+        """Yield the tables of a kind, of which there is at least one."""
+        tables = self.data.get(kind)
+        if (
+            not isinstance(tables, list)
+            or not tables
+            or not all(isinstance(table, dict) for table in tables)
+        ):
+            problem, remedy = f"the scenario needs {kind} tables", f"Write [[{kind}]] tables."
+            raise self.error(kind, problem, remedy)
+        for place, data in enumerate(tables):
+            table = self._replace(kind=kind, place=place, data=data)
+            table.check_keys()
+            yield table
+
+    def check_keys(self) -> None:
+        """Check that the table has no key that means nothing."""
+        for key in self.data:
+            if key in ("claims", "controls"):
+                problem = f"{key!r} is not a key here; write tables [[row.{key[:-1]}]]"
+                raise self.error(key, problem, _EXAMPLE)
+            if key not in _KEYS[self.kind]:
+                known = ", ".join(sorted(_KEYS[self.kind]))
+                raise self.error(key, f"{key!r} is not a key here; use one of {known}")
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Return a text of the table."""
+        value = self.data.get(key, default)
+        if not isinstance(value, str) or (default is None and not value):
+            lacks = f"the {self.kind or 'scenario'} has no {key}"
+            present = f"{key} is {value!r}, not a string"
+            raise self.error(key, present if key in self.data else lacks)
+        return value
+
+    def error(self, key: str, problem: str, remedy: str = "") -> DocumentError:
+        """Return the error about a key of the table."""
+        return DocumentError(
+            f"the scenario '{self.path}', line {self._line(key)}: {problem}", "", remedy
+        )
+
+    def _line(self, key: str) -> int:
+        """Return the line number of a key, or of the head of the table if it lacks the key."""
+        head = rf"\s*\[\[{self.kind}\]\]"
+        heads = [number for number, text in enumerate(self.lines) if re.match(head, text)]
+        start = heads[self.place] if self.kind and self.place < len(heads) else 0
+        ends = (
+            number
+            for number in range(start + 1, len(self.lines))
+            if re.match(r"\s*\[\[\s*\w+\s*\]\]", self.lines[number])
+        )
+        name = re.escape(key)
+        line = rf"\s*([\"']?{name}[\"']?\s*[=.]|\[\[row\.{name}\]\])"
+        for number in range(start, next(ends, len(self.lines))):
+            if re.match(line, self.lines[number]):
+                return number + 1
+        return start + 1
+
+
+def _scenario(table: _Table) -> Scenario:
+    table.check_keys()
+    try:
+        policy = read_policy(table.path.parent / table.text("policy"))
+    except (SrosError, ValueError) as error:  # ValueError: NUL in the file name
+        raise table.error("policy", str(error)) from error
+    parties: dict[str, Party] = {}
+    for party_table in table.tables("party"):
+        party = _party(party_table, policy)
+        file = party.name.replace(" ", "_")
+        if any(name.replace(" ", "_") == file for name in parties):
+            raise party_table.error("name", f"there are two parties {party.name!r}")
+        parties[party.name] = party
+    rows = tuple(_row(row_table, parties) for row_table in table.tables("row"))
+    title = table.text("title", table.path.stem)
+    return Scenario(table.path.stem, title, rows, policy=lambda _topic: policy)
+
+
+def _party(table: _Table, policy: Policy) -> Party:
+    name = table.text("name")
+    if not _NAME.fullmatch(name):
+        problem = f"{name!r} is not the name of a party"
+        remedy = "Use at most 64 letters, digits, blanks, '.', '_' and '-'."
+        raise table.error("name", problem, remedy)
+    roles = {role.value: role for role in Role}
+    word = table.text("role")
+    if word not in roles:
+        raise table.error("role", f"{word!r} is not a role; use one of {', '.join(roles)}")
+    role = roles[word]
+    topic = table.text("topic", "")
+    if not topic and role in _NAMED:
+        problem = f"the {word} {name!r} needs a topic: the name of its service or action"
+        raise table.error("name", problem)
+    try:
+        topic = check_topic(topic) if topic else ""
+    except SrosError as error:
+        raise table.error("topic", str(error)) from error
+    return Party(name, role, _identity(table, policy), topic)
+
+
+def _identity(table: _Table, policy: Policy) -> Identity:
+    enclave = table.text("enclave", "")
+    word = table.text("keystore", OWN)
+    keystores = {keystore.value: keystore for keystore in SoundKeystore}
+    if word not in keystores:
+        problem = f"{word!r} is not a keystore; use one of {', '.join(keystores)}"
+        raise table.error("keystore", problem)
+    if not enclave:
+        for key in ("keystore", "variables"):
+            if key in table.data:
+                problem = f"{key} needs an enclave, but this party is unsecured"
+                raise table.error(key, problem, "Give it an enclave.")
+        return UNSECURED
+    if policy.enclave(enclave) is None:
+        paths = [known.path for known in policy.enclaves]
+        close = difflib.get_close_matches(enclave, paths, n=1)
+        hint = f"; did you mean {close[0]}?" if close else f"; it has {', '.join(paths)}"
+        raise table.error("enclave", f"the policy has no enclave {enclave!r}{hint}")
+    variables = table.data.get("variables", {})
+    if not isinstance(variables, dict) or not all(
+        isinstance(value, str) for value in variables.values()
+    ):
+        raise table.error("variables", "variables is not a table of strings")
+    for variable in variables:
+        if variable not in _VARIABLES:
+            problem = f"{variable!r} is not a variable for a party; use {', '.join(_VARIABLES)}"
+            raise table.error("variables", problem)
+    return Identity(keystores[word], enclave, tuple(variables.items()))
+
+
+def _row(table: _Table, parties: Mapping[str, Party]) -> Row:
+    name = table.text("name")
+    claims = _claims(table, "claim", parties)
+    controls = _claims(table, "control", parties)
+    if not claims:
+        raise table.error("name", f"the row {name!r} has no claim", _EXAMPLE)
+    _check_controls(table, claims, controls)
+    used = {word for claim in (*claims, *controls) for word in (claim.subject, claim.talker)}
+    return Row(
+        name,
+        claims[0].expected if len(claims) == 1 else RowStatus.UNDISTURBED,
+        table.text("because", ""),
+        tuple(party for party in parties.values() if party.name in used),
+        claims,
+        controls,
+        wire=any(claim.relation is Relation.READABLE for claim in (*claims, *controls)),
+    )
+
+
+def _claims(table: _Table, key: str, parties: Mapping[str, Party]) -> tuple[Claim, ...]:
+    claims = table.data.get(key, [])
+    claims = [claims] if isinstance(claims, dict) else claims
+    if not isinstance(claims, list):
+        raise table.error(key, f"{key} is not a table", _EXAMPLE)
+    return tuple(_claim(table, key, claim, parties) for claim in claims)
+
+
+def _claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party]) -> Claim:
+    if not isinstance(claim, dict):
+        raise table.error(key, f"{claim!r} is not a table", _EXAMPLE)
+    expected = claim.get("expected")
+    if not isinstance(expected, str) or expected not in _CLAIMS:
+        problem = f"{expected!r} is not a status that can be expected"
+        if expected is None:
+            problem = f"a {key} has no expected status"
+        raise table.error(key, f"{problem}; use one of {', '.join(_CLAIMS)}")
+    relation, holds = _CLAIMS[expected]
+    sides = _PARTIES[relation]
+    if set(claim) != {*sides, "expected"}:
+        problem = f"a {key} {expected!r} needs {', '.join(sides)} and expected, and no other keys"
+        raise table.error(key, f"{problem}; it has {', '.join(claim)}")
+    names = [claim[side] for side in sides]
+    for side, name in zip(sides, names, strict=True):
+        if not isinstance(name, str) or name not in parties:
+            problem = f"there is no party {name!r}; use one of {', '.join(parties)}"
+            raise table.error(key, problem)
+        role = parties[name].role
+        if role not in (SPEAKING if relation is Relation.READABLE else _FITTING[side]):
+            problem = f"{name} is a {role}, and cannot be the {side} of status {expected!r}"
+            raise table.error(key, problem)
+    return Claim(relation, names[0], names[1] if len(names) > 1 else "", holds)
+
+
+def _check_controls(table: _Table, claims: Sequence[Claim], controls: Sequence[Claim]) -> None:
+    """Check that something works meanwhile in a row that expects silence."""
+    happening = [claim for claim in (*claims, *controls) if _happens(claim)]
+    for claim in claims:
+        heard = claim.relation is Relation.HEARS
+        if _happens(claim) or any(not heard or e.talker == claim.talker for e in happening):
+            continue
+        who = f"a listener hears {claim.talker}" if claim.talker else "something works"
+        raise table.error(
+            "claim",
+            f"no claim or control shows that {who} meanwhile: a crash would look the same",
+            "Add a control, such as a permitted listener that hears the same talker.",
+        )
+
+
+def _happens(claim: Claim) -> bool:
+    """Return whether a claim expects that something works, not silence or a refusal."""
+    return claim.holds and claim.relation is not Relation.IS_REFUSED
+
 
 SCENARIOS: tuple[Scenario, ...] = (
     ISOLATION,

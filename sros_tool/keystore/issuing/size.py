@@ -11,6 +11,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, render_permissions
 from sros_tool.fleet.expansion import FleetPolicy, written
 from sros_tool.fleet.robots import Fleet
+from sros_tool.names import dds_names
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, issue_ca, subject_text
 from sros_tool.pki.keys import generate_key
@@ -22,7 +23,6 @@ from sros_tool.policy.minimize import (
 )
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.policy.rights import Right, policy_rights
-from sros_tool.topics import dds_names
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
 from sros_tool.values import DryRun, FileChanges, Notes, shows

@@ -17,9 +17,8 @@ import time
 from collections.abc import Collection
 from typing import Any
 
-from sros_tool.names import NODE_SERVICES, expand
+from sros_tool.names import NODE_SERVICES, dds_names, expand
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
-from sros_tool.topics import dds_names
 from tests.integration.ros_nodes.run_nodes import Nodes
 
 Process = list[dict[str, Any]] | dict[str, Any]

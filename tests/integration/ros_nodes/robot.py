@@ -26,7 +26,7 @@ from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolat
 from tests.integration.ros_nodes.run_nodes import Nodes
 from tests.support.children import PATIENCE, wait_for
 
-OBSERVER = b"sros_tool.graph.observer"
+OBSERVER = b"sros_tool.graph.observation"
 
 
 def start(process: dict[str, Any]) -> Nodes:
