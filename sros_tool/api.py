@@ -277,8 +277,9 @@ def fleet_status(
         ['r8']
     """
     from sros_tool.keystore import fleet_status as status
+    from sros_tool.keystore.reader import Keystore as OpenedKeystore
 
-    found = status.fleet_status(Path(keystore), tuple(_several("robots", robots)))
+    found = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(_several("robots", robots)))
     return found.with_overdue(max_age, _moment(now)) if max_age else found
 
 

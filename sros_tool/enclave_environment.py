@@ -115,7 +115,7 @@ def loadable_environment(
     keystore = Keystore(root)
     keystore.check()
     if not has_enclave(root, name):
-        raise no_such_enclave(root, name, keystore.names)
+        raise no_such_enclave(keystore, name, keystore.names)
     folder = keystore.folder(name)
     state = keystore.enclave(name, now=now)
     domains = state.domains() if wanted is not None else state.joined_domains()

@@ -247,9 +247,12 @@ def chosen_enclaves(
     check_chosen(names, patterns, robots, every=every)
     if not (patterns or robots or every):
         return tuple(names)  # the verb says what is wrong with a name
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_enclaves
 
-    return select_enclaves(root, names, patterns, robots=robots, every=every, checked=True)
+    return select_enclaves(
+        Keystore(root), names, patterns, robots=robots, every=every, checked=True
+    )
 
 
 def output_option(help_text: str) -> Callable[[Decorated], Decorated]:
@@ -334,12 +337,13 @@ def _completions(names: Iterable[str], incomplete: str) -> list[str]:
 def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
     """Complete the robots of the given keystore's fleet."""
     from sros_tool.keystore.fleet import load_fleet
+    from sros_tool.keystore.reader import Keystore
 
     words = ctx.params.get("words") or (ctx.params.get("root") or ctx.params.get("folder"),)
     given = words[0] or os.environ.get(KEYSTORE_VARIABLE)
     fleet = None
     with suppress(SrosError):
-        fleet = load_fleet(Path(given)) if given else None
+        fleet = load_fleet(Keystore(Path(given))) if given else None
     return _completions(fleet.robots if fleet else (), incomplete)
 
 

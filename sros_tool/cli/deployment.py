@@ -239,13 +239,14 @@ def verify(
     """
     from sros_tool.checks.keystores.arrival import verify_arrival
     from sros_tool.cli.common import echo_findings, local_zone
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_enclaves
     from sros_tool.validity import iso
 
     folder = folder or keystore_from_environment()
     wanted, moment = domain_of(domain), moment_of(at)
     chosen = patterns or robots
-    only = select_enclaves(folder, (), patterns, robots=robots) if chosen else None
+    only = select_enclaves(Keystore(folder), (), patterns, robots=robots) if chosen else None
     zone = local_zone(os.environ)
     with progress("verifying"):
         arrival = verify_arrival(

@@ -661,9 +661,7 @@ def _show_who(
     keystore = Keystore(root or keystore_from_environment())
     keystore.check()
     patterns, robots = only
-    names = (
-        select_enclaves(keystore.root, (), patterns, robots=robots) if patterns or robots else None
-    )
+    names = select_enclaves(keystore, (), patterns, robots=robots) if patterns or robots else None
     decider: Decider
     if chosen:
         from sros_tool.explain.vendors import VendorOfKeystore
@@ -678,7 +676,7 @@ def _show_who(
     if as_json:
         print_json(decider.printed(everybody.question, everybody.outcomes))
     else:
-        _echo(_who_lines(everybody, load_fleet(keystore.root) if chosen else None))
+        _echo(_who_lines(everybody, load_fleet(keystore) if chosen else None))
         echo(f"decided by {decider.title}", err=True)
         if chosen and not kind and not everybody.allowed:
             hint = callable_action(decider, everybody.question)
@@ -726,6 +724,7 @@ def _show_reach(
     """
     from sros_tool.explain.asking import fleet_of
     from sros_tool.explain.reached import follow_reach
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 
     policy, fleet_file = stated
@@ -736,7 +735,7 @@ def _show_reach(
     if zenoh and policy:
         raise UsageError("--reach on Zenoh takes no --policy", "It reads the files of Zenoh.")
     if zenoh:
-        source = load_zenoh_rights(root or keystore_from_environment())
+        source = load_zenoh_rights(Keystore(root or keystore_from_environment()))
     else:
         fleet = fleet_of(fleet_file, None)
         source = load_rights(root or policy or keystore_from_environment(), fleet)

@@ -76,11 +76,12 @@ def _inventory(root: Path | None, as_yaml: bool, as_list: bool) -> None:
     """
     from sros_tool.fleet.fleet_file import inventory, script_inventory
     from sros_tool.keystore.fleet import recorded_fleet
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.values import yaml_text
 
     if as_yaml and as_list:
         raise UsageError("--yaml and --list exclude each other", "", "Choose one.")
-    recorded = recorded_fleet(root or keystore_from_environment())
+    recorded = recorded_fleet(Keystore(root or keystore_from_environment()))
     value = script_inventory(recorded) if as_list else inventory(recorded)
     echo_document(yaml_text(value) if as_yaml else f"{json_text(value)}\n")
 
@@ -148,11 +149,12 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     from sros_tool.keystore.confirmation import MAX_BYTES, KeptConfirmation, keep, receive
     from sros_tool.keystore.fleet import recorded_fleet
     from sros_tool.keystore.layout import confirmation_file
+    from sros_tool.keystore.reader import Keystore
 
     root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
     if len(rest) != 1:
         raise UsageError("fleet confirm takes a keystore and one file")
-    recorded_fleet(root).robot(robot)
+    recorded_fleet(Keystore(root)).robot(robot)
     file = PATH.convert(rest[0], None, None)
     what = "standard input" if rest[0] == "-" else f"'{file}'"
     data = read_named(file, "confirmation", most=MAX_BYTES)
@@ -233,6 +235,7 @@ def _status(
     restarted, which a confirmation does not tell.
     """
     from sros_tool.keystore.fleet_status import ComparedFleet, fleet_status
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.validity import parse_duration
 
     if as_json + prometheus + html > 1:
@@ -246,7 +249,7 @@ def _status(
             check_metrics_file(output)
         check_output(output, force=True)
     with progress("comparing"):
-        found = fleet_status(root, robots)
+        found = fleet_status(Keystore(root), robots)
     if oldest:
         found = found.with_overdue(oldest, moment)
     if as_json:

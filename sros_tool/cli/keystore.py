@@ -377,18 +377,20 @@ def list_enclaves(
         refuse_earlier(root)
         raise KeystoreError(f"'{root}' is not a valid keystore")
     if patterns or robots:
+        from sros_tool.keystore.reader import Keystore
         from sros_tool.keystore.selection import select_enclaves
 
-        names = tuple(sorted(select_enclaves(root, (), patterns, robots=robots)))
+        names = tuple(sorted(select_enclaves(Keystore(root), (), patterns, robots=robots)))
         hidden = hidden_enclaves(root)
     else:
         every = enclave_names(root, hidden=True)
         hidden = hidden_enclaves(root, every)
         names = tuple(each for each in every if "/." not in each)
     if as_json:
+        from sros_tool.keystore.reader import Keystore
         from sros_tool.keystore.selection import EnclaveList, robots_of
 
-        print_json(EnclaveList(root, names, hidden, robots_of(root, names)))
+        print_json(EnclaveList(root, names, hidden, robots_of(Keystore(root), names)))
         return
     for name in names:
         echo(name)
@@ -707,6 +709,7 @@ def update_keystore(
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.lifecycle.update import edited_settings
     from sros_tool.keystore.lifecycle.update import update_keystore as work
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.settings import present_settings
     from sros_tool.keystore.template import load_template, with_values
 
@@ -742,7 +745,7 @@ def update_keystore(
             "Copy sros.toml elsewhere, undo the edits with --discard-edits, and name the copy with "
             "--template.",
         )
-    present = present_settings(root)
+    present = present_settings(Keystore(root))
     domains = None
     if template_name is not None:
         target = load_template(template_name)

@@ -203,11 +203,12 @@ def revoke(
     accepts this delay.
     """
     from sros_tool.keystore.lifecycle.revoke import revoke as work
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_to_revoke
 
     root, given = split_root(words)
     check_chosen(given, patterns, robots, every=every)
-    names, selection_notes = select_to_revoke(root, given, patterns, robots, every=every)
+    names, selection_notes = select_to_revoke(Keystore(root), given, patterns, robots, every=every)
     words_of_rfc = reason.replace("-", "_").split("_")
     reason_text = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
     with progress("revoking"):

@@ -22,7 +22,6 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     has_enclave,
     is_keystore,
-    list_enclaves,
 )
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave_of, loaded
 from sros_tool.keystore.reader import Keystore, open_enclave
@@ -54,14 +53,14 @@ class AskingContext(NamedTuple):
         return JoinContext(domain, self.at, self.zone)
 
 
-def fleet_of(file: Path | None, root: Path | None) -> Fleet | None:
-    """Return the fleet in a file, or else that of the keystore ``root``."""
+def fleet_of(file: Path | None, keystore: Keystore | None) -> Fleet | None:
+    """Return the fleet in a file, or else that of ``keystore``."""
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.fleet import load_fleet
 
     if file:
         return read_fleet(file)
-    return load_fleet(root) if root else None
+    return load_fleet(keystore) if keystore else None
 
 
 # ── the enclave ────────────────────────────────────────────────────────────────────────────
@@ -132,14 +131,14 @@ def open_to_ask(
         PolicyError: the policy does not have it.
     """
     policy = own = None
+    keystore = Keystore(root) if root else None
     if policy_file:
         from sros_tool.fleet.expansion import read_policy_for
 
-        policy = read_policy_for(policy_file, fleet_of(asking.fleet_file, root))
+        policy = read_policy_for(policy_file, fleet_of(asking.fleet_file, keystore))
         own = policy.enclave(name)
         if own is None and not is_enclave(Path(name)):
             raise _not_in_policy(policy, name, policy_file)
-    keystore = Keystore(root) if root else None
     enclave = signed_enclave(keystore, name, asking.at, planned=own is not None)
     if enclave is None:
         assert own is not None
@@ -189,7 +188,7 @@ def signed_enclave(
         return None
     from sros_tool.keystore.selection import no_such_enclave
 
-    raise no_such_enclave(root, name, list_enclaves(root))
+    raise no_such_enclave(keystore, name, keystore.names)
 
 
 def _in_folder(folder: Path, at: datetime) -> LoadedEnclave:

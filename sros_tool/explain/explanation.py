@@ -201,9 +201,10 @@ def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:
 
 def _is_rotating(keystore: Path) -> bool:
     from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
+    from sros_tool.keystore.reader import Keystore
 
     try:
-        return read_rotation(keystore).stage is not RotationStage.NONE
+        return read_rotation(Keystore(keystore)).stage is not RotationStage.NONE
     except SrosError:
         return False
 

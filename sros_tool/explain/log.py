@@ -129,7 +129,7 @@ class SearchedKeystore:
     """A keystore in which the enclaves of peers and of nodes are looked for, each thing once."""
 
     def __init__(self, root: Path) -> None:
-        self._root = root
+        self._keystore = Keystore(root)
 
     def peer(self, guid: str) -> str:
         """Return the enclave of the participant with a GUID, as a vendor writes it, or ""."""
@@ -146,19 +146,19 @@ class SearchedKeystore:
     def rotates(self) -> bool:
         """Whether the CAs are being replaced, and the new ones have issued everything."""
         try:
-            return read_rotation(self._root).stage is RotationStage.REISSUE
+            return read_rotation(self._keystore).stage is RotationStage.REISSUE
         except SrosError:
             return False
 
     @cached_property
     def _by_identity(self) -> Mapping[str, str]:
-        return enclaves_by_identity(self._root)
+        return enclaves_by_identity(self._keystore)
 
     @cached_property
     def _by_node(self) -> Mapping[str, tuple[str, ...]]:
         found: dict[str, set[str]] = {}
         try:
-            rights = load_rights(self._root).rights
+            rights = load_rights(self._keystore).rights
         except SrosError:  # its documents do not tell
             return {}
         for right in rights:

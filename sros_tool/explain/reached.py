@@ -97,7 +97,7 @@ def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) ->
         everybody=names if of_keystore else (),
     )
     if names and enclave not in names:
-        raise no_such_enclave(source.path, enclave, names)
+        raise no_such_enclave(Keystore(source.path), enclave, names)
     if enclave not in network.enclaves:
         meant = likely_names(enclave, network.enclaves)
         raise KeystoreError(

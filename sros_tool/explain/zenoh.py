@@ -294,7 +294,7 @@ class ZenohEvaluator:
         A ``brief`` answer for a peer is by the router's file, which has the same rights.
         """
         if enclave not in self.names:
-            raise no_such_enclave(self.root, enclave, self.names)
+            raise no_such_enclave(self.keystore, enclave, self.names)
         own = self._file(enclave, self._file_of(enclave))
         found = ZenohAnswer(
             enclave,
@@ -350,7 +350,7 @@ class ZenohEvaluator:
                 return None
             domains = self.keystore.domains
             authority = self.keystore.ca_certificate(PERMISSIONS)
-            drifts, _ = zenoh_drift(self.root, network, domains, authority, self._at)
+            drifts, _ = zenoh_drift(self.keystore, network, domains, authority, self._at)
         except SrosError:
             return None
         ours = {answer.enclave, self.router.enclave}

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from cryptography import x509
 
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.reader import Keystore, as_keystore
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
@@ -135,20 +134,19 @@ def parse_threshold(text: str) -> Threshold:
     return Threshold(elapsed=int(match[1]) / 100)
 
 
-def _lifetimes(root: Path | Keystore) -> tuple[Lifetime, ...]:
+def _lifetimes(keystore: Keystore) -> tuple[Lifetime, ...]:
     """Return the lifetimes of a keystore's enclaves, sorted by name.
 
     Raises:
         KeystoreError: some enclaves cannot be read; it names all of them.
     """
-    found, unreadable = survey(root)
+    found, unreadable = survey(keystore)
     refuse_unreadable(unreadable, "read")
     return found
 
 
-def survey(root: Path | Keystore) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
+def survey(keystore: Keystore) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
     """Return the lifetimes of the readable enclaves, and the unreadable enclaves, on all cores."""
-    keystore = as_keystore(root)
     keystore.check()
 
     def read(name: str) -> Lifetime | UnreadableEnclave:
@@ -166,14 +164,14 @@ def survey(root: Path | Keystore) -> tuple[tuple[Lifetime, ...], tuple[Unreadabl
 
 
 def due_enclaves(
-    root: Path | Keystore, threshold: Threshold, moment: datetime, settings: Template
+    keystore: Keystore, threshold: Threshold, moment: datetime, settings: Template
 ) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...], int]:
     """Return the enclaves of a keystore that need to be renewed, those unreadable, and a count.
 
     Enclaves that the settings let be valid for a short time are renewed in another way.  The count
     is that of all readable enclaves.
     """
-    found, unreadable = survey(root)
+    found, unreadable = survey(keystore)
     lasting = (each for each in found if settings.longest_validity(each.name) is None)
     due = tuple(each for each in lasting if each.due(threshold, moment))
     return due, unreadable, len(found)
@@ -193,13 +191,12 @@ def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> N
         )
 
 
-def read_credentials(root: Path | Keystore, name: str) -> Credentials:
+def read_credentials(keystore: Keystore, name: str) -> Credentials:
     """Return the certificate and the grant of an enclave, without verifying them.
 
     Raises:
         KeystoreError: a file is missing or cannot be read, or no grant is for the certificate.
     """
-    keystore = as_keystore(root)
     try:
         certificate = keystore.certificate_of(name)
         subject = subject_text(certificate.subject)

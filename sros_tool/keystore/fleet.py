@@ -20,7 +20,7 @@ from sros_tool.fleet.enclaves import enclaves_of, robot_of, size_problem
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.layout import FLEET, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger
-from sros_tool.keystore.reader import Keystore, as_keystore
+from sros_tool.keystore.reader import Keystore
 from sros_tool.validity import iso
 from sros_tool.wording import first_few
 
@@ -38,13 +38,12 @@ FLEET_REMEDY = (
 _SHOWN = 5
 
 
-def load_fleet(root: Path | Keystore) -> Fleet | None:
+def load_fleet(keystore: Keystore) -> Fleet | None:
     """Return the fleet of a keystore, or None: nobody named one.
 
     Raises:
         DocumentError: the file cannot be read, or is not a fleet.
     """
-    keystore = as_keystore(root)
 
     def read() -> Fleet | None:
         data = _read(keystore)
@@ -53,13 +52,12 @@ def load_fleet(root: Path | Keystore) -> Fleet | None:
     return keystore.once("fleet", read)
 
 
-def checked_fleet(root: Path | Keystore) -> Fleet | None:
+def checked_fleet(keystore: Keystore) -> Fleet | None:
     """Return the fleet as `load_fleet`, for what is issued or sent because of it.
 
     Raises:
         KeystoreError: the file is not the one that sros wrote last.
     """
-    keystore = as_keystore(root)
     if problem := edited_fleet(keystore, keystore.ledger_with("what", "fleet")):
         raise KeystoreError(
             f"'{keystore.root / FLEET}' {problem}",
@@ -103,14 +101,13 @@ def _parse(root: Path, data: bytes) -> Fleet:
     return parse_fleet(data, f"the fleet file '{root / FLEET}'")
 
 
-def recorded_fleet(root: Path | Keystore) -> Fleet:
+def recorded_fleet(keystore: Keystore) -> Fleet:
     """Return the fleet of a keystore.
 
     Raises:
-        KeystoreError: ``root`` is no keystore, or nobody named a fleet.
+        KeystoreError: it is no keystore, or nobody named a fleet.
         DocumentError: the file cannot be read, or is not a fleet.
     """
-    keystore = as_keystore(root)
     keystore.check()
     fleet = load_fleet(keystore)
     if fleet is None:

@@ -38,7 +38,6 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     REQUIRED_FILES,
     enclave_folder,
-    enclave_names,
     has_enclave,
 )
 from sros_tool.keystore.ledger import Entry
@@ -228,19 +227,19 @@ class ComparedFleet(NamedTuple):
     status: FleetStatus
 
 
-def fleet_status(root: Path, names: Sequence[str] = ()) -> FleetStatus:
+def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
     """Return what is where, of the robots with these names, or of all.
 
     Raises:
-        KeystoreError: ``root`` is no keystore, has no fleet, or enclaves of it may be missing.
+        KeystoreError: it is no keystore, has no fleet, or enclaves of it may be missing.
         DocumentError: the fleet has no such robot.
     """
-    fleet = recorded_fleet(root)
+    root, fleet = keystore.root, recorded_fleet(keystore)
     robots = [fleet.robot(name) for name in names] or list(fleet.robots.values())
     compared = _compare_robots(root, fleet, robots)
-    stages = _Stages(root)
-    known = _Known(root, fleet, compared)
-    existing = enclave_names(root)
+    stages = _Stages(keystore)
+    known = _Known(keystore, fleet, compared)
+    existing = keystore.names
     unassigned = 0 if names else len(existing) - sum(len(each.enclaves) for each in compared)
     unrecorded = unrecorded_enclaves(fleet, existing, {each.name for each in robots})
     found = tuple(_status(each, known, stages, unrecorded[each.robot.name]) for each in compared)
@@ -401,8 +400,10 @@ class _Home:
 class _Known:
     """What the ledger tells of files that are not the present ones."""
 
-    def __init__(self, root: Path, fleet: Fleet, compared: Sequence[_ComparedRobot]) -> None:
-        self._root = root
+    def __init__(
+        self, keystore: Keystore, fleet: Fleet, compared: Sequence[_ComparedRobot]
+    ) -> None:
+        self._root = keystore.root
         self._fleet = fleet
         self._issued: dict[str, Entry] = {}
         self._revoked_serials: set[str] = set()
@@ -410,7 +411,6 @@ class _Known:
         different = [each for robot in compared for each in robot.different if each.confirmed]
         wanted = {each.confirmed for each in different}
         wanted.update(one for each in different for one in each.certificates)
-        keystore = Keystore(root)
         ledger = keystore.ledger if wanted else keystore.ledger_with("what", "revocation")
         for entry in ledger.entries:
             if entry.sha256 in wanted:
@@ -517,13 +517,12 @@ class _Stages:
     BEFORE, COMPLETE, UNKNOWN = "before", "complete", "unknown"
     ORDER = (UNKNOWN, BEFORE, "distribute", "reissue", COMPLETE)
 
-    def __init__(self, root: Path) -> None:
-        rotation = read_rotation(root)
+    def __init__(self, keystore: Keystore) -> None:
+        rotation = read_rotation(keystore)
         is_complete = rotation.stage is RotationStage.NONE
         self.at_home = self.COMPLETE if is_complete else rotation.stage.value
         self._new: dict[str, str] = {}
         self._at_home: dict[str, tuple[tuple[str, ...], str]] = {}
-        keystore = Keystore(root)
         for file, roles in keystore.authority_files.items():
             certificates = tuple(map(digest, keystore.certificates_of(file)))
             new = [each.new for each in rotation.replacements if each.file == file]

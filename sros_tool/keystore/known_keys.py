@@ -11,7 +11,6 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
-from pathlib import Path
 
 from cryptography import x509
 
@@ -23,7 +22,7 @@ from sros_tool.keystore.layout import (
     revoked_certificates,
 )
 from sros_tool.keystore.ledger import Entry
-from sros_tool.keystore.reader import Keystore, as_keystore
+from sros_tool.keystore.reader import Keystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import common_name_of, identity_of, subject_text
 from sros_tool.pki.crl import SUPERSEDED
@@ -34,8 +33,8 @@ from sros_tool.pki.requests import key_digest, load_request
 class KnownKeys:
     """The keys of a keystore, to compare with a key that is about to be certified."""
 
-    def __init__(self, root: Path | Keystore) -> None:
-        self._keystore = as_keystore(root)
+    def __init__(self, keystore: Keystore) -> None:
+        self._keystore = keystore
 
     @cached_property
     def _revocations(self) -> Sequence[Entry]:
@@ -189,13 +188,13 @@ def _digests(keystore: Keystore, name: str) -> Iterator[str]:
 # ── participants of DDS ─────────────────────────────────────────────────────────────────
 
 
-def enclaves_by_identity(root: Path | Keystore) -> dict[str, str]:
+def enclaves_by_identity(keystore: Keystore) -> dict[str, str]:
     """Map `identity_of` each certificate's subject in a keystore to its enclave.
 
     A secured participant shows this identity in its GUID.  An enclave whose certificate cannot be
     read is left out.
     """
-    keystore, enclaves = as_keystore(root), {}
+    enclaves: dict[str, str] = {}
     for name in keystore.names:
         with suppress(SrosError):
             certificate = keystore.certificate_of(name)

@@ -13,7 +13,8 @@ from cryptography import x509
 
 from sros_tool.errors import Note, SrosError
 from sros_tool.keystore.expiry import read_credentials
-from sros_tool.keystore.layout import ROLES, enclave_path
+from sros_tool.keystore.layout import ROLES
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.pki.certificates import digest, subject_text, validity_of
 from sros_tool.values import FileChange, Words
@@ -65,21 +66,21 @@ class EnclaveResult(NamedTuple, Generic[Outcome]):
 
 
 def enclave_result(
-    root: Path, name: str, outcome: str, *, written: bool, folder: Path | None = None
+    keystore: Keystore, name: str, outcome: str, *, written: bool, folder: Path | None = None
 ) -> EnclaveResult[str]:
-    """Return what was done with an enclave of the keystore ``root``, with its certificate.
+    """Return what was done with an enclave of ``keystore``, with its certificate.
 
     Args:
-        root: the keystore.
+        keystore: the keystore, opened after the change.
         name: the enclave.
         outcome: what was done with it, such as ``created``.
         written: whether its files are there; those of a dry run have no certificate yet.
         folder: where the enclave is, if it is not the one in the keystore.
     """
-    folder = folder or enclave_path(root, name)
+    folder = folder or keystore.folder(name)
     if written:
         with suppress(SrosError):  # an existing enclave that is broken was left as it is
-            issued = read_credentials(root, name)
+            issued = read_credentials(keystore, name)
             number, sha256 = issued.certificate.serial_number, digest(issued.certificate)
             until = issued.lifetime().expires()
             return EnclaveResult(name, outcome, folder, f"{number:x}", sha256, until)

@@ -527,11 +527,6 @@ def open_keystore(root: Path) -> Keystore:
     return keystore
 
 
-def as_keystore(keystore: Path | Keystore) -> Keystore:
-    """Return a keystore, opened now if it is given by its path."""
-    return keystore if isinstance(keystore, Keystore) else Keystore(keystore)
-
-
 def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
     """Raise `KeystoreError` if ``domain`` is given and not among ``domains``."""
     if domain is None or domain in domains:

@@ -35,7 +35,7 @@ from sros_tool.keystore.layout import (
     refuse_earlier,
 )
 from sros_tool.keystore.ledger import Entry, Ledger
-from sros_tool.keystore.reader import FilesReadOnce, Keystore, as_keystore
+from sros_tool.keystore.reader import FilesReadOnce, Keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
@@ -142,7 +142,7 @@ def load_rights(
     return _document_rights(path, "permissions", path)
 
 
-def load_zenoh_rights(root: Path | Keystore, *, hidden: bool = False) -> RightsSource:
+def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSource:
     """Return the rights that the Zenoh configurations of a keystore give its enclaves together.
 
     Those are of the router, and of peers, which are connected without it.  ``hidden`` is that of
@@ -152,7 +152,6 @@ def load_zenoh_rights(root: Path | Keystore, *, hidden: bool = False) -> RightsS
         KeystoreError: there is no configuration of a router, or there are several.
         DocumentError: Zenoh would not accept a configuration.
     """
-    keystore = as_keystore(root)
     root = keystore.root
     files = {name: keystore.folder(name) for name in enclave_names(root, hidden=hidden)}
     routers = [name for name, folder in files.items() if (folder / ROUTER_FILE).is_file()]
@@ -487,8 +486,7 @@ class RecordedRights:
     their rights signed again, with a new date.
     """
 
-    def __init__(self, root: Path | Keystore, ledger: Ledger | None = None) -> None:
-        keystore = as_keystore(root)
+    def __init__(self, keystore: Keystore, ledger: Ledger | None = None) -> None:
         ledger = ledger or keystore.ledger_with("what", "permissions")
         self._root = keystore.root
         self._gaps = ledger.gaps

@@ -17,11 +17,8 @@ from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_flee
 from sros_tool.keystore.layout import (
     FLEET,
     PRIVATE,
-    PUBLIC,
     REVOKED,
     SETTINGS,
-    check_keystore,
-    list_enclaves,
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import Keystore
@@ -43,9 +40,9 @@ class EnclaveList(NamedTuple):
     """The robots of those that belong to one, in a keystore with a fleet."""
 
 
-def robots_of(root: Path, names: Sequence[str]) -> dict[str, str] | None:
+def robots_of(keystore: Keystore, names: Sequence[str]) -> dict[str, str] | None:
     """Return the robots of the enclaves that belong to one; None without a fleet."""
-    fleet = load_fleet(root)
+    fleet = load_fleet(keystore)
     if fleet is None:
         return None
     owners = ((name, robot_of(fleet, name)) for name in names)
@@ -53,7 +50,7 @@ def robots_of(root: Path, names: Sequence[str]) -> dict[str, str] | None:
 
 
 def select_enclaves(
-    root: Path,
+    keystore: Keystore,
     names: Sequence[str],
     patterns: Sequence[str] = (),
     *,
@@ -72,10 +69,10 @@ def select_enclaves(
             there is none.
         DocumentError: the fleet of the keystore has no such robot; the error names near ones.
     """
-    check_keystore(root)
+    keystore.check()
     chosen = dict.fromkeys(names)
     patterns = ("*",) if every else patterns
-    existing = list_enclaves(root) if patterns else ()
+    root, existing = keystore.root, keystore.names if patterns else ()
     for pattern in patterns:
         fitting = [name for name in existing if fnmatchcase(name, pattern)]
         if not fitting:
@@ -85,11 +82,16 @@ def select_enclaves(
                 f"See `sros list_enclaves {quote(str(root))}`.",
             )
         chosen |= dict.fromkeys(fitting)
-    return tuple(chosen | dict.fromkeys(_of_robots(root, robots, checked, {})))
+    return tuple(chosen | dict.fromkeys(_of_robots(keystore, robots, checked, {})))
 
 
 def select_to_revoke(
-    root: Path, names: Sequence[str], patterns: Sequence[str], robots: Sequence[str], *, every: bool
+    keystore: Keystore,
+    names: Sequence[str],
+    patterns: Sequence[str],
+    robots: Sequence[str],
+    *,
+    every: bool,
 ) -> tuple[tuple[str, ...], tuple[Note, ...]]:
     """Return the enclaves to revoke, and notes on what the fleet does not record of ``robots``.
 
@@ -101,14 +103,14 @@ def select_to_revoke(
     """
     if not (patterns or robots or every):
         return tuple(names), ()  # the verb says what is wrong with a name
-    chosen = dict.fromkeys(select_enclaves(root, names, patterns, every=every))
+    chosen = dict.fromkeys(select_enclaves(keystore, names, patterns, every=every))
     unrecorded: dict[str, Unrecorded] = {}
-    if fleet := checked_fleet(root) if robots else None:
-        unrecorded = unrecorded_enclaves(fleet, list_enclaves(root), set(robots))
-    chosen |= dict.fromkeys(_of_robots(root, robots, True, unrecorded))
+    if fleet := checked_fleet(keystore) if robots else None:
+        unrecorded = unrecorded_enclaves(fleet, keystore.names, set(robots))
+    chosen |= dict.fromkeys(_of_robots(keystore, robots, True, unrecorded))
     below = [name for each in unrecorded.values() for name in each.below]
     left = {name for each in unrecorded.values() for name in each.naming} - chosen.keys()
-    return tuple(chosen), tuple(_unrecorded_notes(root, sorted(below), sorted(left)))
+    return tuple(chosen), tuple(_unrecorded_notes(keystore.root, sorted(below), sorted(left)))
 
 
 def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator[Note]:
@@ -132,12 +134,13 @@ def _some(names: list[str]) -> str:
 
 
 def _of_robots(
-    root: Path, robots: Sequence[str], checked: bool, unrecorded: Mapping[str, Unrecorded]
+    keystore: Keystore, robots: Sequence[str], checked: bool, unrecorded: Mapping[str, Unrecorded]
 ) -> list[str]:
     if not robots:
         return []
-    fleet = checked_fleet(root) if checked else load_fleet(root)
-    if fleet is None and not any((root / each).exists() for each in (PRIVATE, SETTINGS)):
+    root = keystore.root
+    fleet = checked_fleet(keystore) if checked else load_fleet(keystore)
+    if fleet is None and not any(map(keystore.has, (PRIVATE, SETTINGS))):
         raise KeystoreError(
             f"'{root}' is no keystore with a fleet, so it has no robot {robots[0]!r}",
             "An export for a robot has the enclaves of that robot alone, and not the fleet.",
@@ -155,7 +158,7 @@ def _of_robots(
         own = enclaves_of_robot(root, fleet, fleet.robots[name]) if name in fleet.robots else ()
         own += unrecorded[name].below if name in unrecorded else ()
         if not own:
-            if left := _named_after(root, name):
+            if left := _named_after(keystore, name):
                 raise KeystoreError(
                     f"by its fleet, keystore '{root}' has no enclave of a robot {name}",
                     f"It has {_some(left)}: perhaps the robot left the fleet, or a group.",
@@ -171,9 +174,9 @@ def _of_robots(
     return found
 
 
-def _named_after(root: Path, robot: str) -> list[str]:
+def _named_after(keystore: Keystore, robot: str) -> list[str]:
     """Return the enclaves with the name of a robot as a part of their paths."""
-    return [name for name in list_enclaves(root) if robot in name.split("/")[1:]]
+    return [name for name in keystore.names if robot in name.split("/")[1:]]
 
 
 _SHOWN = 5
@@ -185,13 +188,14 @@ _WHOLE_ALIKE = 0.9
 
 
 def no_such_enclave(
-    root: Path, name: str, there: Collection[str], *, may_create: bool = True
+    keystore: Keystore, name: str, there: Collection[str], *, may_create: bool = True
 ) -> SrosError:
     """Return the error for the missing enclave ``name``; ``there`` are the existing enclaves.
 
     Without ``may_create`` it does not advise to create the enclave.
     """
-    if revocation := _revocation(root, name):
+    root = keystore.root
+    if revocation := _revocation(keystore, name):
         return _was_revoked(root, revocation)
     what = f"enclave {name} does not exist in keystore '{root}'"
     names = sorted(there)
@@ -210,7 +214,7 @@ def no_such_enclave(
     except InvalidNameError as error:
         return error
     why = f"The keystore has {first_few(names, _SHOWN) or 'no enclave'}."
-    if not any((root / part).exists() for part in (PUBLIC, PRIVATE, SETTINGS)):
+    if not keystore.is_home:
         where = f"`sros distribute_key KEYSTORE {name} {quote(str(root))}`"
         return KeystoreError(what, why, f"If it is not a typo, export it with {where}.")
     if not may_create:
@@ -219,10 +223,10 @@ def no_such_enclave(
     return KeystoreError(what, why, f"If it is not a typo, create it with {create}.")
 
 
-def _revocation(root: Path, name: str) -> Entry | None:
+def _revocation(keystore: Keystore, name: str) -> Entry | None:
     """Return the ledger entry of an enclave's revocation; None if it has a later certificate."""
     try:
-        entries = Keystore(root).ledger_with("enclave", name).entries
+        entries = keystore.ledger_with("enclave", name).entries
     except SrosError:
         return None  # the missing enclave is the error to report here
     of_enclave = [
@@ -231,7 +235,7 @@ def _revocation(root: Path, name: str) -> Entry | None:
     if not of_enclave or of_enclave[-1].what != "revocation":
         return None
     # One revocation has an entry for each certificate; only one of them has files.
-    kept = (e for e in reversed(of_enclave) if e.serial and (root / REVOKED / e.serial).is_dir())
+    kept = (e for e in reversed(of_enclave) if e.serial and keystore.has(f"{REVOKED}/{e.serial}"))
     return next(kept, of_enclave[-1])
 
 

@@ -21,7 +21,7 @@ from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.keystore.layout import GOVERNANCE_P7S, GOVERNANCE_XML, SETTINGS
 from sros_tool.keystore.ledger import Entry, Ledger
-from sros_tool.keystore.reader import Keystore, as_keystore
+from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template, parse_template, render_template, settings_values
 from sros_tool.translate import governance_for, protection_for
 from sros_tool.validity import iso
@@ -125,14 +125,13 @@ class PresentSettings:
         return self.settings
 
 
-def present_settings(root: Path | Keystore) -> PresentSettings:
+def present_settings(keystore: Keystore) -> PresentSettings:
     """Return the settings that are in force in a keystore.
 
     Raises:
-        KeystoreError: ``root`` is no keystore, or its governance cannot be used.
+        KeystoreError: it is no keystore, or its governance cannot be used.
         DocumentError: its settings are malformed, and the ledger does not have those of before.
     """
-    keystore = as_keystore(root)
     keystore.check()
     governance = keystore.governance
     ledger = keystore.ledger_with("what", "settings")
@@ -166,12 +165,11 @@ def present_settings(root: Path | Keystore) -> PresentSettings:
 _SHOWN = 3
 
 
-def edit_notes(root: Path | Keystore, governance: Governance) -> tuple[Note, ...]:
+def edit_notes(keystore: Keystore, governance: Governance) -> tuple[Note, ...]:
     """Return a note on files that were edited by hand, for a verb that does not carry it out.
 
     ``governance`` is the signed governance of the keystore.
     """
-    keystore = as_keystore(root)
     edits = found_edits(keystore, governance)
     if not edits:
         return ()
@@ -181,9 +179,8 @@ def edit_notes(root: Path | Keystore, governance: Governance) -> tuple[Note, ...
     return (Note("keystore.edited", text),)
 
 
-def found_edits(root: Path | Keystore, governance: Governance | None) -> HandEdits:
+def found_edits(keystore: Keystore, governance: Governance | None) -> HandEdits:
     """Return what was edited in a keystore; ``governance`` is the signed one, if it is readable."""
-    keystore = as_keystore(root)
     ledger = keystore.ledger_with("what", "settings")
     return hand_edits(keystore, ledger, keystore.settings, governance)
 
@@ -198,7 +195,7 @@ def edit_remedy(root: Path | str) -> str:
 
 
 def hand_edits(
-    root: Path | Keystore,
+    keystore: Keystore,
     ledger: Ledger,
     present: Template | None,
     governance: Governance | None,
@@ -216,7 +213,7 @@ def hand_edits(
         meant = governance_for(present.protection, governance.domains().closed())
         if meant != governance:
             unsigned = tuple(_unsigned(present, recorded, settings))
-    return HandEdits(settings, _governance_edit(as_keystore(root)), unsigned)
+    return HandEdits(settings, _governance_edit(keystore), unsigned)
 
 
 def _unsigned(

@@ -31,7 +31,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.ledger import Ledger
-from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave, as_keystore
+from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave
 from sros_tool.keystore.rights import RecordedRights, joined_domains, recorded_rights
 from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
@@ -268,7 +268,7 @@ class Drifted:
 
 
 def drifted(
-    root: Path | Keystore,
+    keystore: Keystore,
     wanted: ZenohDocuments,
     authority: x509.Certificate,
     gone: Collection[str] = (),
@@ -277,7 +277,6 @@ def drifted(
 
     Those of enclaves that are ``gone`` do not count.
     """
-    keystore = as_keystore(root)
 
     def compare(paths: Sequence[str]) -> list[Drifted]:
         found = []
@@ -301,7 +300,7 @@ def drifted(
 
 
 def zenoh_drift(
-    root: Path | Keystore,
+    keystore: Keystore,
     network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,
@@ -314,13 +313,12 @@ def zenoh_drift(
     Raises:
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
     """
-    keystore = as_keystore(root)
     wanted = zenoh_documents(keystore, network, domains, authority, now)
     return drifted(keystore, wanted, authority), wanted.left_out
 
 
 def zenoh_documents(
-    root: Path | Keystore,
+    keystore: Keystore,
     network: ZenohNetwork,
     domains: DomainSet,
     authority: x509.Certificate,
@@ -334,7 +332,6 @@ def zenoh_documents(
     Without ``now``, permissions that have expired count, too.  ``existing`` are the enclaves of
     the keystore, which are looked for if they are not given.
     """
-    keystore = as_keystore(root)
     root = keystore.root
     of_network = _domains(network, domains, root)
     existing = keystore.names if existing is None else existing

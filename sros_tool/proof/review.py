@@ -752,7 +752,7 @@ class _Review:
     def _expiry(self, settings_of: Path, folder: Path) -> tuple[int, Content]:
         settings = Keystore(settings_of).template
         due, unreadable, count = due_enclaves(
-            folder, self.request.renew_within, self.request.at, settings
+            Keystore(folder), self.request.renew_within, self.request.at, settings
         )
         status = _UNDECIDED if unreadable else _FOUND if due else _OK
         return status, ExpiryCheck(due, unreadable, count)

@@ -237,7 +237,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
     )
     if not has_zenoh_files(path, hidden=True):
         return side
-    found = load_zenoh_rights(path, hidden=True)
+    found = load_zenoh_rights(keystore, hidden=True)
     for note in found.notes:
         if note.id in UNCERTAIN:
             raise DocumentError(f"'{path}' cannot be compared: {note.text.rstrip('.')}")

@@ -242,7 +242,7 @@ def _zenoh(data: bytes, place: Place) -> None:
 
 def _rotation(data: bytes, place: Place) -> None:
     place.replace("rotation.json", data)
-    read_rotation(place.keystore)
+    read_rotation(Keystore(place.keystore))
     rotation_status(place.keystore, now=NOW)
 
 
@@ -257,7 +257,7 @@ def _confirmation(data: bytes, place: Place) -> None:
     keep(place.keystore, received)
     kept = last_confirmation(place.keystore, "r7")
     assert kept and kept.confirmation == received.confirmation
-    found = fleet_status(place.keystore).with_overdue(timedelta(days=1), NOW)
+    found = fleet_status(Keystore(place.keystore)).with_overdue(timedelta(days=1), NOW)
     assert [each.robot for each in found.robots] == ["r7"]
     assert "r7" in render_metrics(fleet_metrics(found, now=NOW))
 

@@ -58,7 +58,7 @@ def see(root: Path) -> State:
         assert not path.exists() or path.stat().st_mode & 0o777 == 0o600, path
     lists = tuple(len(each.revoked) for each in Keystore(root).revocation_lists)
     on = tuple((each.state, each.enclaves) for each in rotation_status(root, now=LATER).authorities)
-    return tuple(names), str(read_rotation(root).stage), on, lists
+    return tuple(names), str(read_rotation(Keystore(root)).stage), on, lists
 
 
 def settled(root: Path) -> State:

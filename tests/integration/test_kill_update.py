@@ -49,7 +49,7 @@ def see(root: Path) -> State:
         assert state.grant
         days = (state.grant.validity.not_after - LATER).days + 1
         enclaves.append((len(state.certificate.subject.rdns), days))
-    present, crl = present_settings(root), Keystore(root).revocation_list
+    present, crl = present_settings(Keystore(root)), Keystore(root).revocation_list
     assert present.written
     rtps = present.governance.domain_access_rules[0].rtps_protection_kind
     return present.written.name, rtps, tuple(enclaves), crl.number if crl else 0
@@ -60,7 +60,7 @@ def settled(root: Path) -> State:
     assert not remains(root.parent)
     check_whole(root)
     assert not history(root, now=LATER).unexplained
-    assert not present_settings(root).edits
+    assert not present_settings(Keystore(root)).edits
     now = see(root)
     one = ("ca",) if now[0] == "sros2" else ("identity_ca", "permissions_ca")
     assert tuple(sorted(Keystore(root).authority_files)) == one

@@ -93,7 +93,7 @@ def test_which_governance_disturbs(ask: Ask, tmp_path: Path) -> None:
     questions = {}
     for number, (values, rules, domain, topic, expected) in enumerate(CHANGES.values()):
         other = copy(root, f"other{number}")
-        target = with_values(present_settings(root).settings, values, rules)
+        target = with_values(present_settings(Keystore(root)).settings, values, rules)
         domains = DomainSet.of((DOMAIN, DOMAIN), (domain, domain)) if domain else None
         update_keystore(other, target, domains, now=datetime.now(UTC), allow_looser=True)
         found = mismatch(Keystore(root).governance, Keystore(other).governance)

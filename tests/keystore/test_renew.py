@@ -134,7 +134,7 @@ def test_nothing_outlives_its_authority(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     late = NOW + timedelta(days=5 * 365 - 10)
     renew(root, ["/a"], now=late)
-    (life,) = _lifetimes(root)
+    (life,) = _lifetimes(Keystore(root))
     end = certificate(root / "public/identity_ca.cert.pem").not_valid_after_utc
     assert life.certificate.not_after == life.permissions.not_after == end
     assert not problems(root, "/a", end)
@@ -182,7 +182,7 @@ def test_what_is_no_threshold(text: str) -> None:
 )
 def test_due(threshold: str, day: int, due: bool, tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
-    (life,) = _lifetimes(root)
+    (life,) = _lifetimes(Keystore(root))
     assert life.due(parse_threshold(threshold), NOW + timedelta(days=day)) is due
 
 
@@ -191,7 +191,7 @@ def test_a_short_life_is_not_over_as_it_begins(hours: int, tmp_path: Path) -> No
     """It is back-dated by a day, which is not part of its life."""
     short = timedelta(hours=hours)
     root = made(tmp_path / "ks", "/a", certificate_validity=short, permissions_validity=short)
-    (life,) = _lifetimes(root)
+    (life,) = _lifetimes(Keystore(root))
     assert not life.due(parse_threshold("66%"), NOW)
     assert not life.due(parse_threshold("66%"), NOW + 0.6 * short)
     assert life.due(parse_threshold("66%"), NOW + 0.7 * short)
@@ -308,7 +308,7 @@ def test_every_one_that_cannot_be_renewed_is_named_at_once(tmp_path: Path) -> No
     for call in (
         lambda: renew(root, names, now=LATER),
         lambda: renew(root, now=LATER, expiring=parse_threshold("100y")),
-        lambda: _lifetimes(root),
+        lambda: _lifetimes(Keystore(root)),
     ):
         with pytest.raises(KeystoreError, match="2 enclaves cannot be re.*: /n003, /n229"):  # noqa: RUF043
             call()

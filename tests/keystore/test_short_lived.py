@@ -60,7 +60,7 @@ def test_an_enclave_lives_for_a_day_and_others_for_longer(
     root = tmp_path / "ks"
     sros("create_keystore", root, "--template", "production").ok()
     issue(root)
-    lifetimes, unreadable = survey(root)
+    lifetimes, unreadable = survey(Keystore(root))
     assert unreadable == ()
     for each in lifetimes:
         for window in (each.certificate, each.permissions):
@@ -105,7 +105,7 @@ def test_permissions_of_an_older_certificate_are_short_too(tmp_path: Path) -> No
     sros("create_enclave", root, SHORT).ok()
     settings.write_text(text)
     sros("create_permission", root, SHORT, POLICY).ok()
-    ((found,), _) = survey(root)
+    ((found,), _) = survey(Keystore(root))
     assert found.permissions.not_after - found.permissions.not_before - BACKDATE == DAY
     assert found.certificate.not_after - found.permissions.not_after > 300 * DAY
 

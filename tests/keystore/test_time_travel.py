@@ -303,7 +303,7 @@ def test_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             refresh_crl(root, now=now)
         assert not verified.problems(names, now), now
         check_history(root, now)
-        stage = read_rotation(root).stage
+        stage = read_rotation(Keystore(root)).stage
         for thief in thieves:
             why = refusal(root, thief, now)
             assert why, (thief, now)
@@ -356,7 +356,7 @@ def test_without_renewal_the_checks_of_years_would_fail(tmp_path: Path) -> None:
         assert not early.problems(["/a"], BEGIN)
         assert bool(early.problems(["/a"], now)) == bool(expected), days
         assert sorted({problem.file for problem in found}) == expected, days
-        (life,) = _lifetimes(root)
+        (life,) = _lifetimes(Keystore(root))
         assert life.due(Threshold(remaining=timedelta(0)), now) == (days > 270)
     late = BEGIN + timedelta(days=400)
     with pytest.raises(AssertionError):

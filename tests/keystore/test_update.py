@@ -78,7 +78,7 @@ def root(tmp_path: Path) -> Path:
 
 def change(root: Path, *values: tuple[str, str], **options: object) -> KeystoreUpdate:
     """Change single settings, with everything allowed."""
-    target = with_values(present_settings(root).settings, values)
+    target = with_values(present_settings(Keystore(root)).settings, values)
     return to(root, target, **options)
 
 
@@ -199,7 +199,7 @@ def test_only_what_follows_from_a_setting_changes(
 
 
 def test_short_lived_enclaves_are_issued_again_alone(root: Path) -> None:
-    settings = present_settings(root).settings
+    settings = present_settings(Keystore(root)).settings
     short = (ShortLived("/free", timedelta(days=2)),)
     done = to(root, replace(settings, short_lived=short))
     assert (done.names("renewed"), done.names("signed")) == (("/free",), ())
@@ -210,20 +210,20 @@ def test_short_lived_enclaves_are_issued_again_alone(root: Path) -> None:
 
 def test_domains(root: Path) -> None:
     with pytest.raises(UsageError, match="may also join domain 7"):
-        to(root, present_settings(root).settings, 0, 7, allow_looser=False)
-    done = to(root, present_settings(root).settings, 0, 7)
+        to(root, present_settings(Keystore(root)).settings, 0, 7, allow_looser=False)
+    done = to(root, present_settings(Keystore(root)).settings, 0, 7)
     assert done.names("signed") == ("/free", "/robot")
     for name in list_enclaves(root):
         folder = enclave_path(root, name)
         assert not open_enclave(folder, now=LATER, domain=7).problems
-    to(root, present_settings(root).settings, 7, allow_looser=False)
+    to(root, present_settings(Keystore(root)).settings, 7, allow_looser=False)
     assert open_enclave(enclave_path(root, "/robot"), now=LATER, domain=0).problems
     assert found(root) <= {"keystore.allow-everything", "enclave.long-permissions"}
 
 
 def test_rules_for_names(root: Path) -> None:
     camera = NamedValues("topic", "/camera/*", (("data", "NONE"), ("metadata", "SIGN")))
-    target = with_values(present_settings(root).settings, rules=[camera])
+    target = with_values(present_settings(Keystore(root)).settings, rules=[camera])
     done = to(root, target)
     assert "on topic /camera/*" in told(done)
     expressions = [
@@ -231,7 +231,10 @@ def test_rules_for_names(root: Path) -> None:
         for each in Keystore(root).governance.domain_access_rules[0].topic_access_rules
     ]
     assert expressions == ["rt/camera/*", "*"]
-    to(root, with_values(present_settings(root).settings, dropped=[("topic", "/camera/*")]))
+    to(
+        root,
+        with_values(present_settings(Keystore(root)).settings, dropped=[("topic", "/camera/*")]),
+    )
     assert Keystore(root).template == load_template("development")
 
 
@@ -251,7 +254,7 @@ def test_a_rule_replaces_the_one_for_the_same_names(
 ) -> None:
     for name, values in ((first, SIGNED), (second, ("data=ENCRYPT",))):
         sros("update_keystore", root, "--rule", " ".join((name, *values)), "--allow-looser").ok()
-    for settings in (Keystore(root).template, present_settings(root).settings):
+    for settings in (Keystore(root).template, present_settings(Keystore(root)).settings):
         (rule,) = settings.protection.named
         assert (str(rule), rule.protection.data) == (named, "ENCRYPT")
     assert "governance.unreachable-rule" not in found(root)
@@ -379,7 +382,7 @@ def test_another_domain_revokes_in_both_stages(root: Path) -> None:
     again = printed(first.err)
     assert {"topic /a data=NONE", "0,7", "--allow-looser", "--revoke-old"} <= set(again)
     assert "renewed /free, /robot" in sros(*again).ok().out
-    assert str(present_settings(root).domains) == "0,7"
+    assert str(present_settings(Keystore(root)).domains) == "0,7"
 
 
 def test_revoking_the_old(root: Path) -> None:
@@ -421,13 +424,13 @@ def test_one_ca_becomes_two(by_ros2: bool, tmp_path: Path) -> None:
     assert not list(root.glob("*/ca.*"))
     # The two files still hold one CA, and that is found until the permissions CA is replaced.
     assert found(root) - {"keystore.folder-open"} == {"keystore.one-authority"}
-    before = present_settings(root).settings
+    before = present_settings(Keystore(root)).settings
     command = done.remarks[-1].text.partition("`sros ")[2].partition("`")[0].split()
     sros(*command).ok()
     for _ in range(2):
         rotate_ca(root, now=LATER)
         sound(root)
-    assert present_settings(root).settings == before
+    assert present_settings(Keystore(root)).settings == before
     assert found(root) <= {"keystore.folder-open"}
 
 
@@ -458,8 +461,10 @@ def test_a_keystore_of_ros2_can_be_renewed_after_an_update(tmp_path: Path) -> No
     """With settings, every right has to be in the ledger, so all are recorded."""
     root = tmp_path / "ks"
     made_by_ros2.make(root, "/free", "/robot", now=NOW)
-    assert present_settings(root).without_settings
-    target = with_values(present_settings(root).settings, [("protection.rtps", "ENCRYPT")])
+    assert present_settings(Keystore(root)).without_settings
+    target = with_values(
+        present_settings(Keystore(root)).settings, [("protection.rtps", "ENCRYPT")]
+    )
     assert update_keystore(root, target, now=LATER).names("signed") == ("/free", "/robot")
     renew(root, ["/robot"], now=LATER)
     check_whole(root)
@@ -546,7 +551,7 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
     assert (note.id, "--take-edits" in note.text) == ("keystore.edited", True)
     (note,) = create_enclaves(root, ["/late"], now=NOW).notes
     assert note.id == "keystore.edited"
-    target, domains = edited_settings(root, present_settings(root))
+    target, domains = edited_settings(root, present_settings(Keystore(root)))
     if looser:
         with pytest.raises(UsageError, match="looser"):
             update_keystore(root, target, domains, now=LATER, replace_edits=True)
@@ -556,7 +561,7 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
         edit_again = snapshot(root)
         assert edit_again != edited
         return
-    update_keystore(root, present_settings(root).undone(), now=LATER, replace_edits=True)
+    update_keystore(root, present_settings(Keystore(root)).undone(), now=LATER, replace_edits=True)
     assert {each: (root / each).read_bytes() for each in clean} == clean
     assert finding not in found(root)
     edit(root)
@@ -647,7 +652,7 @@ def test_during_a_rotation(stages: int, root: Path) -> None:
 
 def test_settings_that_changed_meanwhile(root: Path) -> None:
     """Two changes at once: the later one would undo the first, from which it did not start."""
-    seen = present_settings(root)
+    seen = present_settings(Keystore(root))
     change(root, ("protection.rtps", "ENCRYPT"))
     state = snapshot(root)
     with pytest.raises(KeystoreError, match="have just changed"):
@@ -694,12 +699,12 @@ def test_edits_that_contradict_each_other(root: Path) -> None:
     _stronger_settings(root)
     _governance(root)
     with pytest.raises(KeystoreError, match="differ"):
-        edited_settings(root, present_settings(root))
+        edited_settings(root, present_settings(Keystore(root)))
 
 
 def test_without_an_edit_there_is_nothing_to_take(root: Path) -> None:
     with pytest.raises(KeystoreError, match=r"no file .* was edited"):
-        edited_settings(root, present_settings(root))
+        edited_settings(root, present_settings(Keystore(root)))
 
 
 def test_a_keystore_from_before_the_record(root: Path) -> None:
@@ -756,7 +761,7 @@ def test_the_options(root: Path) -> None:
         "update_keystore", root, "--domain", "0,7", "--rule",
         "topic /camera/* data=NONE metadata=SIGN", "--allow-looser",
     ).ok()  # fmt: skip
-    assert str(present_settings(root).domains) == "0,7"
+    assert str(present_settings(Keystore(root)).domains) == "0,7"
     sros("update_keystore", root, "--drop-rule", "topic /camera/*").ok()
     assert (
         Keystore(root).governance.domain_access_rules[0].topic_access_rules[0].topic_expression
@@ -794,7 +799,7 @@ def test_wrong_usage_changes_nothing(words: tuple[str, ...], root: Path) -> None
 
 def test_no_keystore(tmp_path: Path) -> None:
     with pytest.raises(SrosError):
-        present_settings(tmp_path)
+        present_settings(Keystore(tmp_path))
 
 
 def test_the_settings_are_in_the_ledger(root: Path) -> None:

@@ -497,7 +497,7 @@ def _separation(keystore: CheckedKeystore) -> str:
     from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 
     try:
-        stage = read_rotation(keystore.root).stage
+        stage = read_rotation(keystore.opened).stage
         files = keystore.opened.authority_files
     except SrosError:  # `sros rotate_ca` reports it
         return ""

@@ -24,13 +24,11 @@ from sros_tool.keystore.layout import (
     PRIVATE,
     REQUIRED_FILES,
     ZENOH_FILES,
-    check_keystore,
     check_readable,
     enclave_folder,
     enclave_path,
     has_enclave,
     key_on_robot,
-    list_enclaves,
     search_enclaves,
 )
 from sros_tool.keystore.outcomes import (
@@ -38,7 +36,7 @@ from sros_tool.keystore.outcomes import (
     enclave_result,
 )
 from sros_tool.keystore.participant import evaluated
-from sros_tool.keystore.reader import OpenedEnclave, open_enclave
+from sros_tool.keystore.reader import Keystore, OpenedEnclave, open_enclave
 from sros_tool.keystore.selection import no_such_enclave, select_enclaves
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -96,7 +94,9 @@ def select(
     """
     chosen: list[str] = []
     left_out: list[str] = []
-    for name in select_enclaves(root, names, patterns, robots=robots, every=every, checked=True):
+    for name in select_enclaves(
+        Keystore(root), names, patterns, robots=robots, every=every, checked=True
+    ):
         only_matches = name not in names and not keyless
         at_robot = only_matches and key_on_robot(enclave_path(root, name))
         (left_out if at_robot else chosen).append(name)
@@ -190,10 +190,11 @@ def exported_files(
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
     """
-    check_keystore(root)
+    keystore = Keystore(root)
+    keystore.check()
     for name in names:
         if not has_enclave(root, check_enclave_name(name)):
-            raise no_such_enclave(root, name, list_enclaves(root))
+            raise no_such_enclave(keystore, name, keystore.names)
     check_readable(root, names)
     files: dict[str, bytes] = {}
     for name in names:
@@ -365,8 +366,8 @@ def exported_outcomes(
     root: Path, names: Sequence[str], folder: Path, *, changed: bool
 ) -> list[EnclaveResult[str]]:
     """Return what was done with exported enclaves, which are below ``folder``."""
-    outcome = "exported" if changed else "kept"
+    keystore, outcome = Keystore(root), "exported" if changed else "kept"
     return [
-        enclave_result(root, name, outcome, written=True, folder=folder / enclave_folder(name))
+        enclave_result(keystore, name, outcome, written=True, folder=folder / enclave_folder(name))
         for name in names
     ]

@@ -174,7 +174,7 @@ def create_permission(
         existing = frozenset(change.names)
         for name in names:
             if name not in existing:
-                raise no_such_enclave(root, name, existing)
+                raise no_such_enclave(change.keystore, name, existing)
         stated = {each.path: each for each in policy.enclaves}
         wanted = {name: stated.get(name) or stated_enclave(policy, name) for name in names}
         _begin(change, domain, protections=stated_protections(wanted.values()))

@@ -82,7 +82,7 @@ def renew(
     with change:
         for name in names:
             if not has_enclave(root, check_enclave_name(name)):
-                raise no_such_enclave(root, name, change.names)
+                raise no_such_enclave(change.keystore, name, change.names)
         writer = change.writer(keys_on_token=bool(places))
         thresholds: dict[str, Threshold | None] = dict.fromkeys(names)
         if expiring is not None:

@@ -134,7 +134,7 @@ def _check_names(change: KeystoreChange, names: Sequence[str]) -> None:
     for name in names:
         check_enclave_name(name)
         if name not in there:
-            raise no_such_enclave(change.root, name, change.names, may_create=False)
+            raise no_such_enclave(change.keystore, name, change.names, may_create=False)
 
 
 def _move_away(change: KeystoreChange, name: str) -> Entry:

@@ -188,7 +188,7 @@ def robots_cut_off(keystore: Keystore, rotation: Rotation, to: RotationStage) ->
     if to is RotationStage.DISTRIBUTE or checked_fleet(keystore) is None:
         return ()
     stages = list(RotationStage)
-    robots = [each for each in fleet_status(keystore.root).robots if each.enclaves]
+    robots = [each for each in fleet_status(keystore).robots if each.enclaves]
     if stages.index(to) - stages.index(rotation.stage) > 1:
         return tuple(each.robot for each in robots)  # stages that no robot was ever at
     roles = {role for each in rotation.replacements for role in keystore.authority_files[each.file]}

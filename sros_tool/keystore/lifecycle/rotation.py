@@ -126,13 +126,12 @@ def retired_key(certificate: x509.Certificate) -> str:
     return f"{RETIRED}/{certificate.serial_number:x}.key.pem"
 
 
-def read_rotation(root: Path | Keystore) -> Rotation:
+def read_rotation(keystore: Keystore) -> Rotation:
     """Return the rotation that is under way, or an empty `Rotation`.
 
     Raises:
         KeystoreError: the file of the rotation is damaged, or does not fit the CA certificates.
     """
-    keystore = root if isinstance(root, Keystore) else Keystore(root)
     path = keystore.root / ROTATION
     if not path.exists():
         return Rotation()

@@ -81,8 +81,9 @@ def shown(result: Changed, form: type[Form], **more: Any) -> Form:
 
 def enclave_results(result: Changed) -> list[EnclaveResult[str]]:
     """Return what was done with enclaves; those that a dry run would write are not there yet."""
+    keystore = Keystore(result.root)
     return [
-        enclave_result(result.root, name, done, written=not result.dry_run or done == "kept")
+        enclave_result(keystore, name, done, written=not result.dry_run or done == "kept")
         for name, done in result.outcomes.items()
     ]
 
