@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import logging
 import os
 import secrets
 import stat
@@ -16,8 +15,7 @@ from typing import Any
 
 from sros_tool.errors import DocumentError
 from sros_tool.folders import Folder, make_folders, remove_folders, write_all
-
-_LOG = logging.getLogger(__name__)
+from sros_tool.terminal import log_step
 
 _MOST_LINKS = 40
 
@@ -191,7 +189,8 @@ def replace_file(path: Path, data: bytes) -> None:
     keep = state and own and (_trusted(state) or not _is_shared(target.parent))
     with staged_file(target, data, mode=0o666, like=state if keep else None) as put_in_place:
         put_in_place()
-    _LOG.info("%s '%s', %d bytes", "replaced" if state else "wrote", target, len(data))
+    done = "replaced" if state else "wrote"
+    log_step("INFO", __name__, "%s '%s', %d bytes", done, target, len(data))
 
 
 def _write_to(path: Path, state: os.stat_result, data: bytes) -> None:

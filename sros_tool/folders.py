@@ -12,7 +12,6 @@ import contextlib
 import ctypes
 import errno
 import os
-import shutil
 import stat
 import sys
 from collections.abc import Iterable, Iterator
@@ -288,6 +287,8 @@ class Folder:
 
     def remove_tree(self, path: str) -> None:
         """Remove the folder at ``path`` with everything in it; links in it are not followed."""
+        import shutil
+
         self.forget()
         parent, name = self._at(path)
         shutil.rmtree(name, dir_fd=parent)

@@ -49,6 +49,15 @@ def visible_line(text: str) -> str:
     return visible(text).replace("\n", "\\x0a")
 
 
+def log_step(level: str, module: str, text: str, *args: object) -> None:
+    """Log a step, for ``-v`` or the program that uses sros.
+
+    Who wants to see steps has loaded `logging` before, which takes a while.
+    """
+    if logging := sys.modules.get("logging"):
+        logging.getLogger(module).log(getattr(logging, level), text, *args)
+
+
 @cache
 def _escapes() -> dict[int, str]:
     escapes = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROLS}

@@ -3,21 +3,23 @@
 The second translation next to `translate`.  Key expressions, messages and tokens are those of
 rmw_zenoh (ros2/rmw_zenoh, docs/design.md).  `rights_in_rules` is the inverse for what sros writes;
 key expressions of others may stand for fewer names than its result, since a ``*`` of ROS also
-stands for parts with slashes, and never for more.
+stands for parts with slashes, and never for more.  `rights_behind` reads rules that others wrote:
+a name is given only if the rules allow every key that it stands for.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
-from sros_tool.errors import PolicyError
-from sros_tool.names import expression_problem, is_expression
-from sros_tool.policy.model import ALLOW, DENY, Enclave, Source
-from sros_tool.policy.patterns import Names, covers
-from sros_tool.policy.rights import Right, parts, placed_rights
+from sros_tool.dataclass import dataclass
+from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
+from sros_tool.names import check_enclave_name, expression_problem, is_expression
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
+from sros_tool.policy.patterns import ComparisonLimit, Names, covers
+from sros_tool.policy.rights import KIND_OF, RIGHT_ORDER, Right, folded, parts, placed_rights
 from sros_tool.policy.subtraction import (
     IN_PART,
     CannotSubtract,
@@ -29,6 +31,7 @@ from sros_tool.zenoh.access import (
     AccessControl,
     AccessRule,
     AclRule,
+    AclSubject,
     Enforcement,
     Flow,
     Message,
@@ -36,7 +39,9 @@ from sros_tool.zenoh.access import (
     in_order,
     joined,
 )
-from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical
+from sros_tool.zenoh.configuration import Mode
+from sros_tool.zenoh.document import ConfigurationDocument
+from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical, includes, intersects
 
 _ANY_TYPE = "/*/*"
 """The type and its hash, with which the keys of topics and services end: rules do not check it."""
@@ -260,9 +265,9 @@ class _Denials:
                 except CannotSubtract as error:
                     raise self._inside(name, place, error.denied, denied[0]) from None
             for each in names:
-                if number_of_chunks(each) <= most:
+                if _number_of_chunks(each) <= most:
                     found.update(chunks_of(each))
-                if number_of_chunks(each) > most or len(found) > most:
+                if _number_of_chunks(each) > most or len(found) > most:
                     raise (
                         self._inside(name, place, "", denied[0])
                         if denied
@@ -326,7 +331,7 @@ def _too_many(name: str, place: Source) -> PolicyError:
     )
 
 
-def number_of_chunks(name: str) -> int:
+def _number_of_chunks(name: str) -> int:
     """Return at least how many key expressions `chunks_of` makes: they double with each ``*``."""
     stars_within = len(re.findall(r"(?<=[^/*])\*+(?=[^/*])", name))
     return 1 << stars_within
@@ -337,7 +342,7 @@ def chunks_of(name: str) -> list[tuple[str, ...]]:
 
     ``name`` is absolute, with ``*`` and `IN_PART` as its only wildcards.  A ``*`` of a policy also
     matches "/", so it becomes ``**`` where it stands next to a slash, and two expressions within a
-    part of a name: `number_of_chunks` tells beforehand whether that is too many.
+    part of a name: `_number_of_chunks` tells beforehand whether that is too many.
     """
     if "*" not in name:
         return [tuple(name.replace(IN_PART, ANY_PART)[1:].split("/"))]
@@ -467,3 +472,315 @@ def _without_type(chunks: list[str]) -> list[str]:
     if wild:
         return chunks[:end] + wild if ANY_CHUNKS in wild else chunks[:-_TYPE_AND_HASH]
     return chunks[:-_TYPE_AND_HASH]
+
+
+# ── rules that others wrote, in ROS terms ───────────────────────────────────────────────────
+
+_BELOW_KEYS = "@adv"
+_TYPE_PARTS = ("*", "*")
+"""The type and its hash, with which the keys of topics and services end."""
+_MOST_NAMES = 65536
+_EVERY_NAME = ("*", *_TYPE_PARTS, ANY_CHUNKS)
+_DOMAIN = re.compile(r"\*|0|[1-9][0-9]{0,2}")
+"""The first part of a key of rmw_zenoh: what does not begin with a domain has no ROS name."""
+
+
+def name_of_key(key: str) -> tuple[str, str]:
+    """Return the domain and the ROS name in a key or key expression of rmw_zenoh.
+
+    The name is "" for the graph, and for what is no key of a topic or a service.
+    """
+    domain, _, rest = key.partition("/")
+    chunks = rest.partition(f"/{_BELOW_KEYS}")[0].split("/")
+    if domain.startswith("@") or len(chunks) <= len(_TYPE_PARTS):
+        return domain, ""
+    return domain, "/" + "/".join(chunks[: -len(_TYPE_PARTS)])
+
+
+@dataclass(frozen=True, slots=True)
+class _DecidingMessage:
+    """A message that a right stands or falls with, and those without which it is of no use."""
+
+    flow: Flow
+    message: Message
+    needs: tuple[tuple[Flow, Message], ...]
+
+
+_DECIDING_MESSAGES = {
+    "publish": _DecidingMessage(_IN, _M.PUT, ((_OUT, _M.DECLARE_SUBSCRIBER),)),
+    "subscribe": _DecidingMessage(_OUT, _M.PUT, ((_IN, _M.DECLARE_SUBSCRIBER),)),
+    "request": _DecidingMessage(_IN, _M.QUERY, ((_OUT, _M.REPLY),)),
+    "reply": _DecidingMessage(_OUT, _M.QUERY, ((_IN, _M.DECLARE_QUERYABLE), (_IN, _M.REPLY))),
+}
+"""The message of each right of a remote process, as the process sees it that has the rules."""
+
+
+@dataclass(frozen=True, slots=True)
+class StatedName:
+    """A right to a ROS name, perhaps with wildcards; ``lacks`` are messages that it needs too."""
+
+    right: str
+    name: str
+    domain: str
+    lacks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RightsBehindRules:
+    """What the rules allow to the processes that match a subject.
+
+    ``names`` are the common names of their certificates, None for processes of any name.  With
+    ``own`` it is what the process that has the rules may do itself, as long as it obeys them.
+    ``unsaid`` are rights and keys that no ROS name states exactly, ``denied`` are denied ones.
+    """
+
+    subject: str
+    names: tuple[str, ...] | None
+    own: bool
+    rights: tuple[StatedName, ...]
+    unsaid: tuple[tuple[str, str], ...]
+    denied: tuple[tuple[str, str], ...]
+
+
+def rights_behind(document: ConfigurationDocument) -> tuple[RightsBehindRules, ...]:
+    """Return what a configuration allows to whom, in ROS terms, in the order of its subjects.
+
+    Raises:
+        DocumentError: there are too many wildcards to compare.
+    """
+    access, limit = document.access, ComparisonLimit()
+    if not access.enabled:
+        rules = (AclRule("", True, tuple(Flow), tuple(Message), ("**",)),)
+        return (_rights("", None, False, rules, limit),)
+    own = is_self_limiting(document)
+    return tuple(
+        _rights(each.id, each.cert_common_names, own, _rules(access, each), limit)
+        for each in access.subjects
+        if access.rules_of(each.id) or access.allows_by_default
+    )
+
+
+def is_self_limiting(document: ConfigurationDocument) -> bool:
+    """Return whether a session's rules name no other process, so that they bind only itself."""
+    access = document.access
+    used = [each for each in access.subjects if access.rules_of(each.id)]
+    return (
+        document.mode is not Mode.ROUTER
+        and bool(used)
+        and not any(each.is_named() for each in used)
+    )
+
+
+def _rules(access: Enforcement, subject: AclSubject) -> tuple[AclRule, ...]:
+    rules = access.rules_of(subject.id)
+    if not access.allows_by_default:
+        return rules
+    return (*rules, AclRule("", True, tuple(Flow), tuple(Message), ("**",)))
+
+
+def _rights(
+    subject: str,
+    names: tuple[str, ...] | None,
+    own: bool,
+    rules: Sequence[AclRule],
+    limit: ComparisonLimit,
+) -> RightsBehindRules:
+    found: list[StatedName] = []
+    unsaid: list[tuple[str, str]] = []
+    denied: list[tuple[str, str]] = []
+
+    def keys(flow: Flow, message: Message, *, allows: bool = True) -> list[str]:
+        seen = flow.opposite() if own else flow
+        stated = (
+            key
+            for rule in rules
+            if rule.allows is allows and seen in rule.flows and message in rule.messages
+            for key in rule.key_expressions
+        )
+        return [each for each in dict.fromkeys(stated) if _BELOW_KEYS not in each.split("/")]
+
+    for right, place in _DECIDING_MESSAGES.items():
+        allowed = keys(place.flow, place.message)
+        taken = keys(place.flow, place.message, allows=False)
+        needed = [(message, _ByPrefix(keys(flow, message), limit)) for flow, message in place.needs]
+        names_of = _Names(allowed, taken, limit)
+        for domain, name in names_of.stated():
+            lacks = tuple(
+                message.value
+                for message, others in needed
+                if not all(others.any(key, includes) for key in _keys_of(domain, name))
+            )
+            found.append(StatedName(right, name, domain, lacks))
+        unsaid += [(right, key) for key in names_of.unsaid()]
+        denied += [(right, key) for key in taken]
+    order = sorted(found, key=lambda each: (RIGHT_ORDER[each.right], each.name, each.domain))
+    return RightsBehindRules(subject, names, own, tuple(order), tuple(unsaid), tuple(denied))
+
+
+@lru_cache(maxsize=_MOST_NAMES)
+def _keys_of(domain: str, name: str) -> tuple[str, ...]:
+    if _number_of_chunks(name) > _MOST_NAMES:
+        raise DocumentError(
+            f"the rules of Zenoh for {name} cannot be compared",
+            f"Its wildcards stand for more than {_MOST_NAMES} key expressions.",
+            "Name it with fewer wildcards.",
+        )
+    return tuple(canonical((domain, *chunks, *_TYPE_PARTS)) for chunks in chunks_of(name))
+
+
+class _ByPrefix:
+    """Expressions by their text before the first wildcard, with which what they match begins."""
+
+    def __init__(self, expressions: Iterable[str], limit: ComparisonLimit) -> None:
+        self._limit = limit
+        self._found: dict[str, list[str]] = {}
+        for each in expressions:
+            # "/**" and "/*" may stand for nothing, or for a part without the slash.
+            self._found.setdefault(each.partition("*")[0].rstrip("$/"), []).append(each)
+
+    def any(self, text: str, holds: Callable[[str, str], bool]) -> bool:
+        """Return whether ``holds`` of an expression and ``text``, for one that may match it."""
+        for end in range(len(text) + 1):
+            for each in self._found.get(text[:end], ()):
+                if holds(each, text):
+                    return True
+                self._limit.spend(len(each) + len(text))
+        return False
+
+
+class _Names:
+    """The ROS names of key expressions that are allowed, without those that are denied."""
+
+    def __init__(
+        self, allowed: Sequence[str], denied: Sequence[str], limit: ComparisonLimit
+    ) -> None:
+        self._allowed = allowed
+        self._denied = denied
+        self._limit = limit
+        self._including = _ByPrefix(allowed, limit)
+        self._said: list[str] = []
+
+    def stated(self) -> list[tuple[str, str]]:
+        """Return the domains and names, without those that others of the same domain cover."""
+        sound = dict.fromkeys(
+            (domain, name)
+            for key in self._allowed
+            for domain, name in _candidates(key)
+            if not expression_problem(name) and self._is_sound(domain, name)
+        )
+        self._said = [key for domain, name in sound for key in _keys_of(domain, name)]
+        names: dict[str, list[str]] = {}
+        for domain, name in sound:
+            names.setdefault(domain, []).extend([name] if "*" in name else [])
+        wild = {domain: _ByPrefix(of, self._limit) for domain, of in names.items()}
+        return [
+            (domain, name)
+            for domain, name in sound
+            if not wild[domain].any(name, lambda one, of: one != of and covers(one, of))
+        ]
+
+    def _is_sound(self, domain: str, name: str) -> bool:
+        return all(
+            self._including.any(key, includes)
+            and not any(intersects(each, key) for each in self._denied)
+            for key in _keys_of(domain, name)
+        )
+
+    def unsaid(self) -> list[str]:
+        """Return the key expressions that the names leave out a part of."""
+        said = _ByPrefix(dict.fromkeys(self._said), self._limit)
+        return [
+            key
+            for key in self._allowed
+            if not all(said.any(piece, includes) for piece in _pieces(key))
+        ]
+
+
+def _candidates(key: str) -> Iterator[tuple[str, str]]:
+    """Yield domains and names that may state a key expression, or a part of it."""
+    domain, *chunks = key.split("/")
+    if domain == ANY_CHUNKS:
+        domain, chunks = "*", [ANY_CHUNKS, *chunks]
+    if not _DOMAIN.fullmatch(domain) or not chunks:
+        return
+    if chunks[-1] != ANY_CHUNKS:
+        yield from ((domain, each) for each in _texts(chunks[: -len(_TYPE_PARTS)]))
+        return
+    body = chunks[:-1]
+    for dropped in range(len(_TYPE_PARTS) + 1):
+        base = body[: len(body) - dropped]
+        if dropped > len(body) or set(body[len(base) :]) - {"*"}:
+            break
+        yield from ((domain, each) for each in _texts(base))
+        yield from ((domain, f"{each}/*") for each in _texts(base) or [""])
+
+
+def _texts(chunks: Sequence[str]) -> list[str]:
+    """Return the names that chunks may be a part of: a wildcard of ROS also matches "/"."""
+    if not chunks:
+        return []
+    text = "/".join(chunks)
+    joined = text.replace("$*/**/$*", "*").replace("**/$*", "*").replace("*/**", "*")
+    apart = text.replace("**/", "")
+    found = (each.replace("$*", "*").replace("**", "*") for each in (joined, text, apart))
+    return list(dict.fromkeys(f"/{each}" for each in found))
+
+
+def _pieces(key: str) -> list[str]:
+    """Return the expressions that together match the keys of topics and services in ``key``."""
+    domain, *chunks = key.split("/")
+    if domain == ANY_CHUNKS:
+        domain, chunks = "*", [ANY_CHUNKS, *chunks]
+    if not chunks or chunks[-1] != ANY_CHUNKS:
+        return [canonical((domain, *chunks))]
+    base = chunks[:-1]
+    if tuple(base[-len(_TYPE_PARTS) :]) == _TYPE_PARTS:
+        base = base[: -len(_TYPE_PARTS)]
+    below = canonical((domain, *base, *_EVERY_NAME))
+    return [canonical((domain, *base, *_TYPE_PARTS)), below] if base else [below]
+
+
+# ── as a policy ────────────────────────────────────────────────────────────────────────────
+
+
+def enclave_of(rights: RightsBehindRules) -> tuple[str, ...]:
+    """Return the names of enclaves that a subject stands for: () if it has none.
+
+    For a session that limits itself that is the id of the subject: zenoh_security_tools takes the
+    name of the node, and the enclave of that name.
+    """
+    named = rights.names or ((f"/{rights.subject}",) if rights.own else ())
+    return tuple(each for each in named if _is_enclave(each))
+
+
+def _is_enclave(name: str) -> bool:
+    try:
+        return check_enclave_name(name) == name
+    except InvalidNameError:
+        return False
+
+
+def policy_of(found: Iterable[RightsBehindRules]) -> Policy:
+    """Return the policy that states the rights of subjects with names: all of them, or fewer.
+
+    The node of each profile is the last part of the enclave's name, as rules name no nodes; all
+    names are absolute.
+    """
+    rights: dict[str, set[Right]] = {}
+    for each in found:
+        for enclave in enclave_of(each):
+            rights.setdefault(enclave, set()).update(
+                Right(enclave, ALLOW, stated.right, stated.name) for stated in each.rights
+            )
+    return Policy(tuple(_enclave(name, folded(of)) for name, of in sorted(rights.items()) if of))
+
+
+def _enclave(name: str, rights: Iterable[Right]) -> Enclave:
+    names: dict[str, list[str]] = {}
+    for each in sorted(rights, key=lambda each: (RIGHT_ORDER[each.right], each.name)):
+        names.setdefault(each.right, []).append(each.name)
+    groups = tuple(
+        Group(KIND_OF[right], ((right, ALLOW),), tuple(of)) for right, of in names.items()
+    )
+    node = name.rpartition("/")[2] or "node"
+    return Enclave(name, (Profiles((Profile("/", node, groups),)),))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import re
 import stat
@@ -14,8 +13,7 @@ from typing import BinaryIO
 from lxml import etree
 
 from sros_tool.errors import DocumentError
-
-_LOG = logging.getLogger(__name__)
+from sros_tool.terminal import log_step
 
 MAX_BYTES = 16 * 1024 * 1024
 """Largest document that is read, in bytes."""
@@ -77,7 +75,7 @@ def read_file(
             f"the {what} '{path}' is too large",
             f"It has more than {most // 1024**2} MiB.",
         ) from OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
-    _LOG.debug("read the %s '%s', %d bytes", what, path, len(data))
+    log_step("DEBUG", __name__, "read the %s '%s', %d bytes", what, path, len(data))
     return there, data
 
 

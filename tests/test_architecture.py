@@ -21,6 +21,7 @@ PACKAGE = PROJECT / "sros_tool"
 LAYERS = {
     1: {
         "automata",
+        "dataclass",
         "errors",
         "faults",
         "names",
@@ -32,7 +33,7 @@ LAYERS = {
     | {"xml", "files", "folders", "parallel", "prometheus", "markdown", "terminal"},
     2: {"pki", "policy", "dds", "zenoh"},
     3: {"fleet", "translate", "translate_zenoh"},
-    4: {"translate_from_zenoh", "reach", "keystore", "graph", "runtime"},
+    4: {"reach", "keystore", "graph", "runtime"},
     5: {"checks", "explain", "demo", "report"},
     6: {"proof", "enclave_environment"},
     7: {"api", "cli"},

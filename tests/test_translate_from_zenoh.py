@@ -16,8 +16,13 @@ from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Rules, folded, policy_rights
-from sros_tool.translate_from_zenoh import RightsBehindRules, name_of_key, policy_of, rights_behind
-from sros_tool.translate_zenoh import remote_rights
+from sros_tool.translate_zenoh import (
+    RightsBehindRules,
+    name_of_key,
+    policy_of,
+    remote_rights,
+    rights_behind,
+)
 from sros_tool.zenoh.access import AccessControl, Flow, Message, Remote
 from sros_tool.zenoh.configuration import Configuration, Mode
 from sros_tool.zenoh.document import parse_configuration

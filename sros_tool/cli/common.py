@@ -498,16 +498,17 @@ def named_zone(name: str) -> tzinfo:
 def local_zone(environment: Mapping[str, str]) -> tzinfo:
     """Return the time zone of $TZ or /etc/localtime, or the current UTC offset as a fixed zone."""
     from datetime import UTC, datetime
-    from zoneinfo import ZoneInfo
 
     name = environment.get("TZ", "").removeprefix(":")
     if not name and _LOCALTIME.exists():
         _, found, name = str(_LOCALTIME.resolve()).partition("zoneinfo/")
         name = name if found else ""
-    try:
-        return ZoneInfo(name)
-    except (ValueError, OSError, LookupError):
-        return datetime.now().astimezone().tzinfo or UTC
+    if name:
+        from zoneinfo import ZoneInfo
+
+        with suppress(ValueError, OSError, LookupError):
+            return ZoneInfo(name)
+    return datetime.now().astimezone().tzinfo or UTC
 
 
 def enclave_environment(

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, field, fields
 from enum import StrEnum
 from typing import Any
 
 from lxml import etree
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.domain_elements import domain_lines, read_domains
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import XSI

@@ -6,10 +6,9 @@ omg_shared_ca_permissions of 20170901).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from lxml import etree
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.domain_elements import domain_lines, read_domains
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError

@@ -6,11 +6,11 @@ What ``--json`` shows of an answer are the classes here, with their docstrings.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, NamedTuple
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import DomainRule, ProtectionKind, TopicRule

@@ -7,7 +7,6 @@ repairs it.
 from __future__ import annotations
 
 import hashlib
-import logging
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -33,14 +32,15 @@ from sros_tool.keystore.layout import (
     enclave_path,
 )
 from sros_tool.keystore.participant import LoadedEnclave
-
-_LOG = logging.getLogger(__name__)
+from sros_tool.terminal import log_step
 
 
 def explain(evaluator: Evaluator, question: Question) -> Answer:
     """Return the answer with its policy lines and, for a denial, a change or remedy."""
     answer, enclave = evaluator.answer(question), evaluator.enclave
-    _LOG.info(
+    log_step(
+        "INFO",
+        __name__,
         "asked %s: %s of enclave %s: %s",
         evaluator.vendor.title,
         " ".join(filter(None, (question.word, question.name))),

@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property
 from itertools import islice
 from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, SrosError, UsageError
@@ -60,7 +61,7 @@ from sros_tool.runtime.vendor_log import (
     zenoh_text,
 )
 from sros_tool.translate import grant_rights
-from sros_tool.translate_from_zenoh import name_of_key
+from sros_tool.translate_zenoh import name_of_key
 from sros_tool.values import shows
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))

@@ -7,7 +7,7 @@ and the session itself decide on a right, in peer mode the sessions of all other
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from enum import StrEnum
 from functools import cache
@@ -15,6 +15,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal, NamedTuple
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.explain.answer import Answer, PolicyChange, StatedInPolicy

@@ -10,13 +10,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, NamedTuple
 
 from cryptography import x509
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, Note, PolicyError, SrosError
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for

@@ -6,18 +6,12 @@ import base64
 import math
 import os
 import re
-import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, rsa
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
-from cryptography.hazmat.primitives.ciphers import Cipher
-from cryptography.hazmat.primitives.ciphers.algorithms import AES
-from cryptography.hazmat.primitives.ciphers.modes import CBC
-from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
-from cryptography.hazmat.primitives.padding import PKCS7
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
@@ -60,6 +54,14 @@ def _encrypted(key: bytes, passphrase: str) -> bytes:
     `cryptography` reads this form, but writes PBKDF2 with 2048 rounds, which are soon guessed.
     Source: RFC 5958, 3; RFC 8018, 6.2 and A.4; RFC 7914, 7.
     """
+    import textwrap  # no key is written by most verbs
+
+    from cryptography.hazmat.primitives.ciphers import Cipher
+    from cryptography.hazmat.primitives.ciphers.algorithms import AES
+    from cryptography.hazmat.primitives.ciphers.modes import CBC
+    from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
+    from cryptography.hazmat.primitives.padding import PKCS7
+
     salt, start = os.urandom(16), os.urandom(16)
     secret = Scrypt(salt, 32, _N, _R, _P).derive(_as_bytes(passphrase))
     padder, encryptor = PKCS7(128).padder(), Cipher(AES(secret), CBC(start)).encryptor()

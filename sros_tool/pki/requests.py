@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 
 from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
+from sros_tool.dataclass import dataclass
 from sros_tool.errors import PkiError
 from sros_tool.pki.certificates import common_name, common_name_of, subject_text
 from sros_tool.pki.distinguished_names import reading

@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import base64
 import re
-import secrets
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import lru_cache
 from typing import TypeVar
 
@@ -23,9 +22,9 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
-from cryptography.hazmat.primitives.serialization import Encoding, pkcs7
 from cryptography.x509.oid import PublicKeyAlgorithmOID
 
+from sros_tool.dataclass import dataclass
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki.certificates import digest as fingerprint
@@ -36,7 +35,6 @@ from sros_tool.pki.kinds import ENCRYPTED_MESSAGE, SIGNED_MESSAGE, kind_of
 
 _BOM = "\ufeff".encode()
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
-_OPTIONS = (pkcs7.PKCS7Options.DetachedSignature, pkcs7.PKCS7Options.Binary)
 
 # The grammar of the MIME headers that are read: what OpenSSL's reader (asn_mime.c) and RFC 2045
 # understand in the same way.  A longer line is read by OpenSSL as several lines.
@@ -91,12 +89,17 @@ _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
 
 def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
     """Return the S/MIME message of ``document``, signed with ``key`` of ``certificate``."""
+    import secrets  # reading needs none of these, and is frequent
+
+    from cryptography.hazmat.primitives.serialization import Encoding, pkcs7
+
+    options = (pkcs7.PKCS7Options.DetachedSignature, pkcs7.PKCS7Options.Binary)
     content = _TEXT_HEADER + document.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n")
     signature = (
         pkcs7.PKCS7SignatureBuilder()
         .set_data(content)
         .add_signer(certificate, key, hashes.SHA256())
-        .sign(Encoding.DER, _OPTIONS)
+        .sign(Encoding.DER, options)
     )
     boundary = b"----" + secrets.token_hex(16).upper().encode()
     encoded = base64.encodebytes(signature).replace(b"\n", b"\r\n")

@@ -23,7 +23,7 @@ import os
 import re
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
@@ -31,8 +31,8 @@ from urllib.parse import unquote
 
 from lxml import etree
 
+from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError
-from sros_tool.files import policies_dir
 from sros_tool.names import check_enclave_name, check_namespace, expand, expression_problem
 from sros_tool.policy.model import (
     RIGHTS,
@@ -293,6 +293,8 @@ def _is_there(file: Path) -> bool:
 
 def _missing_remedy(file: Path) -> str:
     """Return how to get an included file that ships with sros, or "" for any other file."""
+    from sros_tool.files import policies_dir  # what writes files is not needed to read policies
+
     tail = file.parts[file.parts.index(COMMON) :] if COMMON in file.parts else ()
     if not tail or not policies_dir().joinpath(*tail).is_file():
         return ""

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path, PurePosixPath
 
+from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.folders import Folder
 from sros_tool.policy.document import MissingFileError, read_policy

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import lru_cache
 
 from sros_tool.automata import NameSet, SearchLimit
+from sros_tool.dataclass import dataclass
 from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, is_expression, service_of
 from sros_tool.policy.model import RIGHTS
 from sros_tool.policy.patterns import covers

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import ASSUMED, NOT_ON_ZENOH, VACUOUS, VIOLATED
+from sros_tool.dataclass import dataclass
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import action_part, is_expression, service_of
 from sros_tool.policy.model import Source

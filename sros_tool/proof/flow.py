@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator
-from dataclasses import dataclass
 
 from sros_tool.automata import NameSet, SearchLimit
+from sros_tool.dataclass import dataclass
 from sros_tool.names import ROS_DISCOVERY_TOPIC, SERVICE_ENDS
 from sros_tool.proof.worlds import World, named
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS

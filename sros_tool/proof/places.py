@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.names import is_expression

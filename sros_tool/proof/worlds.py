@@ -9,12 +9,12 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from string import ascii_letters, digits
 from types import MappingProxyType
 
 from sros_tool.automata import Automaton, Letters, NameSet, SearchLimit
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.names import SERVICE_ENDS, is_expression

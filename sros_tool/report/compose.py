@@ -10,8 +10,9 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.keystore.reader import Keystore
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
@@ -92,7 +93,10 @@ class Context:
     hosts: Mapping[str, str] = field(default_factory=dict)
 
 
-def compose(first: PictureSource, context: Context = Context()) -> Picture:
+_NO_CONTEXT = Context()
+
+
+def compose(first: PictureSource, context: Context = _NO_CONTEXT) -> Picture:
     """Return the picture of one source."""
     known = Known(first.rights)
     edges = _edges_of(first.rights, known, context.common)
@@ -101,7 +105,7 @@ def compose(first: PictureSource, context: Context = Context()) -> Picture:
 
 
 def overlay(
-    first: PictureSource, second: PictureSource, kind: str, context: Context = Context()
+    first: PictureSource, second: PictureSource, kind: str, context: Context = _NO_CONTEXT
 ) -> Picture:
     """Return the overlay of two sources; ``kind`` is a key of `_OVERLAYS`."""
     scope = first.scope if second.scope is None else second.scope

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
+from sros_tool.dataclass import dataclass
 from sros_tool.policy.model import ALLOW, Qualifier
 from sros_tool.report.picture import (
     SENDS,

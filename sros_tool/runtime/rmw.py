@@ -9,9 +9,10 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 
 RMW = "RMW_IMPLEMENTATION"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from functools import cache, cached_property
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import TypeVar
 from cryptography import x509
 
 from sros_tool.checks.kind import ERROR, FindingKind
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet
@@ -83,7 +83,7 @@ class CheckedKeystore:
     zone: tzinfo = UTC
     is_home: bool = True
     looks_like_home: bool = True
-    edits: HandEdits = HandEdits()  # noqa: RUF009 - frozen
+    edits: HandEdits = HandEdits()
     fleet: Fleet | None = None
     fleet_edited: str = ""
     distribution: str = ""

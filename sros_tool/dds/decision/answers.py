@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import TopicRule
 
 

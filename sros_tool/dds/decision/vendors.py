@@ -7,8 +7,10 @@ say.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum, StrEnum, auto
+
+from sros_tool.dataclass import dataclass
 
 
 class Style(Enum):

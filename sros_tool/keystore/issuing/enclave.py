@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import TypeVar
 
 from cryptography import x509
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions, render_permissions
 from sros_tool.dds.portable import document_notes
@@ -107,7 +108,7 @@ class Issued:
 
     issuance: Issuance
     certificate: x509.Certificate
-    permissions: Permissions = Permissions(())  # noqa: RUF009 - frozen
+    permissions: Permissions = Permissions(())
     document: bytes = b""
     short_lived: bool = False
 

@@ -6,13 +6,14 @@ import hashlib
 from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from types import MappingProxyType
 
 from cryptography import x509
 
+from sros_tool.dataclass import dataclass
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.dds.portable import name_notes
 from sros_tool.errors import KeystoreError, Note, SrosError
