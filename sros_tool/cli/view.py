@@ -6,7 +6,6 @@ import gc
 import os
 import tempfile
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +22,7 @@ from sros_tool.cli.common import (
     fleets_option,
     force_option,
     json_text,
+    local_zone,
     now,
     print_json,
     progress,
@@ -33,17 +33,10 @@ from sros_tool.terminal import echo, echo_document
 from sros_tool.values import PlannedFiles, as_plain, file_change, versioned
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterator, Mapping, Sequence
-    from datetime import datetime
+    from collections.abc import Iterator
 
     from click.shell_completion import CompletionItem
 
-    from sros_tool.checks.kind import Finding as Checked
-    from sros_tool.fleet.robots import Fleet, Robot
-    from sros_tool.keystore.reader import Keystore
-    from sros_tool.report.compose import PictureSource
-    from sros_tool.report.folding import Folding
-    from sros_tool.report.picture import Picture, PicturedFinding
 
 _FORMATS = ("html", "svg", "dot", "mermaid", "json")
 _WITH_FINDINGS = ("html", "json")
@@ -66,7 +59,7 @@ def _complete_focus(
         rights = load_rights(Path(given[0])).rights if given else frozenset()
     except (SrosError, OSError):
         return []
-    names = {each.enclave for each in rights} | {each.name for each in rights}
+    names = {right.enclave for right in rights} | {right.name for right in rights}
     return [name for name in sorted(names) if name.startswith(incomplete)]
 
 
@@ -170,7 +163,8 @@ def view(
 
     The page is one file that needs no network. No format contains keys or paths of this machine.
     """
-    from sros_tool.report.folding import Folding
+    from sros_tool.report.formats import render
+    from sros_tool.report.sources import Drawing, draw
 
     check_one_format()
     if hops and not words:
@@ -179,33 +173,32 @@ def view(
     written = _format("json" if as_json else form, output, graphviz)
     if output:
         check_output(output, force=force or dry_run)
+    drawing = Drawing(
+        sources,
+        moment,
+        local_zone(os.environ),
+        observed=observed,
+        template=template,
+        hosts=hosts,
+        fleets=fleets_of(fleet_files),
+        focus=words,
+        requirements=requirements,
+        checked=written in _WITH_FINDINGS,
+    )
     with progress("drawing"), _without_collection():
-        picture, read, robots = _picture(
-            sources,
-            observed,
-            template,
-            hosts,
-            moment,
-            fleets_of(fleet_files),
-            with_findings=written in _WITH_FINDINGS,
-        )
-        if words:
-            from sros_tool.report.focus import focused
-
-            picture = focused(picture, read, words)
-        if requirements:
-            picture = _with_requirements(
+        picture, folding = draw(drawing)
+        if written == "json":
+            document = json_text(versioned(as_plain(picture))) + "\n"
+        else:
+            document = render(
                 picture,
-                requirements,
-                sources,
-                template,
+                folding,
+                written,
                 moment,
-                fleets_of(fleet_files)[0],
-                read[0].keystore,
+                everything=everything,
+                graphviz=graphviz,
+                hops=hops,
             )
-        folding = Folding.of(picture, robots)
-        picture = replace(picture, equal=folding.equal, different=folding.different)
-        document = _rendered(picture, folding, written, everything, graphviz, moment, hops)
     if written != "json":
         for line in picture.headlines:
             echo(line, err=True)
@@ -226,6 +219,16 @@ def view(
         click.launch(output.absolute().as_uri())
 
 
+def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
+    ending = output.suffix.lower() if output else ""
+    chosen = form or _ENDINGS.get(ending, ending.removeprefix("."))
+    if chosen not in _FORMATS:
+        chosen = "html"
+    if graphviz and chosen != "svg":
+        raise UsageError("--graphviz is for SVG only", "", "Add --format svg, or leave it out.")
+    return chosen
+
+
 @contextmanager
 def _without_collection() -> Iterator[None]:
     """Do not look for cycles of objects, which takes half of the time of a large picture.
@@ -239,233 +242,3 @@ def _without_collection() -> Iterator[None]:
     finally:
         if was:
             gc.enable()
-
-
-def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
-    ending = output.suffix.lower() if output else ""
-    found = form or _ENDINGS.get(ending, ending.removeprefix("."))
-    if found not in _FORMATS:
-        found = "html"
-    if graphviz and found != "svg":
-        raise UsageError("--graphviz is for SVG only", "", "Add --format svg, or leave it out.")
-    return found
-
-
-def _picture(
-    sources: tuple[Path, ...],
-    observed: tuple[Path, ...],
-    template: str | None,
-    hosts: tuple[str, ...],
-    moment: datetime,
-    fleets: tuple[Fleet | None, Fleet | None],
-    *,
-    with_findings: bool,
-) -> tuple[Picture, Sequence[PictureSource], Mapping[str, Robot]]:
-    """Return the picture, the sources whose rights are in it, and the robots by their enclaves."""
-    from sros_tool.report.compose import Context, compose, overlay, union
-    from sros_tool.report.sources import common_rights, read_source, template_governance
-    from sros_tool.report.sources import with_findings as added
-
-    if len(sources) > 2 or (observed and len(sources) > 1):
-        raise UsageError(
-            "at most two sources can be compared",
-            "",
-            "Name one SOURCE and --observed, or two SOURCEs.",
-        )
-    read = []
-    for path, fleet in zip(sources, fleets, strict=False):
-        source = read_source(path, now=moment, fleet=fleet)
-        found = _checked(path, source, moment, fleet) if with_findings else []
-        read.append(added(source, path, found))
-    if template:
-        _check_no_governance(sources, read)
-        read = [
-            each
-            if each.governance
-            else replace(each, governance=template_governance(template, each.protections))
-            for each in read
-        ]
-    robots: dict[str, Robot] = {}
-    for path, fleet, source in zip(sources, fleets, read, strict=False):
-        robots |= _robots(path, fleet, source)
-    places = {enclave: robot.name for enclave, robot in robots.items()}
-    context = Context(common_rights(), places | _hosts(hosts))
-    if observed:
-        seen = union([read_source(path, now=moment) for path in observed])
-        return overlay(read[0], seen, "use", context), (read[0], seen), robots
-    if len(read) == 1:
-        return compose(read[0], context), read, robots
-    kinds = [each.origin.kind for each in read]
-    if kinds[1] == "observation":
-        return overlay(read[0], read[1], "use", context), read, robots
-    if kinds[0] == kinds[1]:
-        return overlay(read[0], read[1], "change", context), read, robots
-    if "zenoh" in kinds:
-        first, second = sorted(read, key=lambda each: each.origin.kind == "zenoh")
-        return overlay(first, second, "worlds", context), read, robots
-    # Drift is shown from the side of the policy, whichever was named first.
-    first, second = sorted(read, key=lambda each: each.origin.kind != "policy")
-    return overlay(first, second, "drift", context), read, robots
-
-
-def _with_requirements(
-    picture: Picture,
-    file: Path,
-    sources: tuple[Path, ...],
-    template: str | None,
-    moment: datetime,
-    fleet: Fleet | None,
-    opened: Keystore | None,
-) -> Picture:
-    """Return the picture with what breaks requirements, decided as `sros check` does."""
-    from sros_tool.cli.common import local_zone
-    from sros_tool.keystore.template import load_template
-    from sros_tool.proof.findings import assumption_text, decide_all, decided_findings
-    from sros_tool.proof.requirements import demand, read_requirements
-    from sros_tool.proof.system import load_system
-    from sros_tool.report.compose import with_requirements
-    from sros_tool.report.picture import PicturedUse, PicturedViolation, Requirements
-
-    if len(sources) > 1:
-        raise UsageError("--requirements takes one policy or keystore", "", "Draw one of them.")
-    wanted = read_requirements(file)
-    system = load_system(
-        sources[0],
-        at=moment,
-        zone=local_zone(os.environ),
-        fleet=fleet,
-        template=load_template(template) if template else None,
-        opened=opened,
-    )
-    decided = decide_all(wanted, system)
-    found = decided_findings(decided, system)
-    violations = tuple(
-        PicturedViolation(
-            _finding_text(finding, finding.subject),
-            tuple(
-                PicturedUse(step.use.enclave, *step.drawn())
-                for step in each.steps
-                if step.place and step.use.right
-            ),
-        )
-        for each, finding in zip(decided.violations, found, strict=False)
-    )
-    assumed = tuple(f"{demand(each)}: {assumption_text(name)}" for each, name in decided.assumed)
-    requirements = Requirements(len(wanted) - len(violations), violations, assumed)
-    paths = {each.path for each in picture.enclaves}
-    pictured = tuple(_pictured(each, paths) for each in found)
-    picture = replace(picture, findings=(*picture.findings, *pictured))
-    return with_requirements(picture, requirements)
-
-
-def _check_no_governance(sources: tuple[Path, ...], read: list[PictureSource]) -> None:
-    """Raise `UsageError` if a source has its own signed governance, so that no template applies."""
-    for path, each in zip(sources, read, strict=True):
-        if each.origin.kind in ("keystore", "enclave"):
-            raise UsageError(
-                f"--template does not fit '{path}'",
-                f"It is {'an' if each.origin.kind == 'enclave' else 'a'} {each.origin.kind}, which "
-                "is drawn with its own governance; a template is for policies, which have none.",
-                "Leave --template out, or name the policy alone.",
-            )
-
-
-def _checked(
-    path: Path, source: PictureSource, moment: datetime, fleet: Fleet | None
-) -> list[PicturedFinding]:
-    """Return the findings of `sros check` for a source, or none if it cannot be checked."""
-    from sros_tool.checks.policies import policy_file_findings
-    from sros_tool.checks.targets import Circumstances, path_findings
-    from sros_tool.cli.common import local_zone
-
-    at = Circumstances(moment, local_zone(os.environ), fleet=fleet)
-    if source.keystore:
-        at.opened[path] = source.keystore
-    try:
-        found = (
-            list(policy_file_findings(path, fleet=fleet, policy=source.policy))
-            if source.policy
-            else path_findings(path, at)
-        )
-    except SrosError:
-        return []
-    return [_pictured(each, {each.subject}) for each in found]
-
-
-def _pictured(finding: Checked, enclaves: Container[str]) -> PicturedFinding:
-    """Return a finding for the picture; its subject is in the text unless it is an enclave."""
-    from sros_tool.report.picture import PicturedFinding
-
-    known = finding.subject in enclaves
-    about = "" if known or finding.subject == finding.file else finding.subject
-    text = _finding_text(finding, about)
-    enclave = finding.subject if known else ""
-    return PicturedFinding(finding.id, finding.severity.word, text, finding.remedy, enclave)
-
-
-def _finding_text(finding: Checked, about: str = "") -> str:
-    """Return the text of a finding ``about`` something, with the base name of file and the line."""
-    place = f"{Path(finding.file).name}:{finding.line}" if finding.line else ""
-    return ": ".join(filter(None, (place, about, finding.text)))
-
-
-def _hosts(words: tuple[str, ...]) -> dict[str, str]:
-    found = {}
-    for word in words:
-        host, equals, enclave = word.partition("=")
-        if not equals or not host or not enclave.startswith("/"):
-            raise UsageError(
-                f"--host {word!r} is not HOST=ENCLAVE",
-                "",
-                "Write for example --host arm=/robot/arm.",
-            )
-        found[enclave.rstrip("/") or "/"] = host
-    return found
-
-
-def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str, Robot]:
-    """Map the enclaves of a source to their robots, by which they are grouped."""
-    from sros_tool.fleet.enclaves import robot_of
-    from sros_tool.fleet.expansion import FleetPolicy
-    from sros_tool.keystore.fleet import load_fleet
-    from sros_tool.policy.document import read_policy
-
-    if source.keystore:
-        fleet = load_fleet(source.keystore)
-    elif fleet and source.origin.kind == "policy":
-        written = read_policy(path, placeholders=True)
-        fleet = fleet.with_enclaves(FleetPolicy(written, fleet).patterns)
-    if fleet is None:
-        return {}
-    found = ((name, robot_of(fleet, name)) for name in {each.enclave for each in source.rights})
-    return {name: robot for name, robot in found if robot}
-
-
-def _rendered(
-    picture: Picture,
-    folding: Folding,
-    form: str,
-    everything: bool,
-    graphviz: bool,
-    moment: datetime,
-    hops: int | None,
-) -> str:
-    if form == "json":
-        return json_text(versioned(as_plain(picture))) + "\n"
-    placed = form in ("html", "svg") and not graphviz
-    scenes = folding.scenes(placed=placed, hops=hops or 0)
-    if form == "html":
-        from sros_tool.report.pages import render_page
-
-        return render_page(picture, scenes, moment, folding.picture)
-    scene = next((each for each in scenes if everything and each.id == "all"), scenes[0])
-    if form == "svg" and not graphviz:
-        from sros_tool.report.formats import render_svg
-
-        return render_svg(picture, scene)
-    from sros_tool.report.formats import graphviz_svg, render_dot, render_mermaid
-
-    if form == "mermaid":
-        return render_mermaid(picture, scene)
-    dot = render_dot(picture, scene)
-    return graphviz_svg(dot) if graphviz else dot

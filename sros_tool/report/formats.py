@@ -6,10 +6,12 @@ import re
 import subprocess
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from datetime import datetime
 from textwrap import wrap
 
 from sros_tool.errors import UnavailableError
 from sros_tool.policy.model import ALLOW
+from sros_tool.report.folding import Folding
 from sros_tool.report.layout import (
     KIND_NAMES,
     LEVEL_NAMES,
@@ -23,7 +25,7 @@ from sros_tool.report.layout import (
     Link,
     Scene,
 )
-from sros_tool.report.pages import escape
+from sros_tool.report.pages import escape, render_page
 from sros_tool.report.picture import (
     Overlay,
     OverlaySide,
@@ -374,7 +376,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
     return "\n".join((*lines, ""))
 
 
-def graphviz_svg(dot: str) -> str:
+def _graphviz_svg(dot: str) -> str:
     """Return the SVG that Graphviz draws from DOT text; `UnavailableError` without Graphviz."""
     try:
         done = subprocess.run(
@@ -517,3 +519,40 @@ def _entities(text: str) -> str:
 
 def _yaml(text: str) -> str:
     return '"' + re.sub(r"[^A-Za-z0-9 /_.,:+-]", "_", text) + '"'
+
+
+def render(
+    picture: Picture,
+    folding: Folding,
+    form: str,
+    moment: datetime,
+    *,
+    everything: bool = False,
+    graphviz: bool = False,
+    hops: int | None = None,
+) -> str:
+    """Return a picture as text in a form: html, svg, dot or mermaid.
+
+    Args:
+        picture: the picture.
+        folding: the same picture with equal units as one.
+        form: the form.
+        moment: the time that a page shows.
+        everything: also draw rights that every node needs; a page has both.
+        graphviz: let Graphviz lay out an SVG.
+        hops: how many hops from its focus are drawn.
+
+    Raises:
+        UnavailableError: Graphviz is not installed.
+    """
+    placed = form in ("html", "svg") and not graphviz
+    scenes = folding.scenes(placed=placed, hops=hops or 0)
+    if form == "html":
+        return render_page(picture, scenes, moment, folding.picture)
+    scene = next((scene for scene in scenes if everything and scene.id == "all"), scenes[0])
+    if form == "svg" and not graphviz:
+        return render_svg(picture, scene)
+    if form == "mermaid":
+        return render_mermaid(picture, scene)
+    dot = render_dot(picture, scene)
+    return _graphviz_svg(dot) if graphviz else dot

@@ -1,4 +1,4 @@
-"""Sources of pictures: policies, permissions, keystores and observations.
+"""What pictures are drawn of: policies, permissions, keystores and observations.
 
 A picture shows only the base name of a source, because paths of this machine are private.
 Enclave keys are read only to report faults such as a key that does not fit its certificate.
@@ -9,20 +9,24 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import replace
-from datetime import datetime
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from datetime import datetime, tzinfo
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cryptography import x509
 
 from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant
-from sros_tool.errors import DocumentError, SrosError
+from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import policies_dir
-from sros_tool.fleet.robots import Fleet
+from sros_tool.fleet.enclaves import robot_of
+from sros_tool.fleet.expansion import FleetPolicy
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
+from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import PUBLIC, is_keystore
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.protection import with_stated
@@ -43,15 +47,241 @@ from sros_tool.pki.keys import algorithm
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy, StatedProtection
 from sros_tool.policy.rights import Right, policy_rights
-from sros_tool.report.compose import PictureSource
-from sros_tool.report.picture import PicturedEnclave, PicturedFinding, SourceTitle, Validity
+from sros_tool.report.compose import (
+    Context,
+    PictureSource,
+    compose,
+    overlay,
+    union,
+    with_requirements,
+)
+from sros_tool.report.focus import focused
+from sros_tool.report.folding import Folding
+from sros_tool.report.picture import (
+    Picture,
+    PicturedEnclave,
+    PicturedFinding,
+    PicturedUse,
+    PicturedViolation,
+    Requirements,
+    SourceTitle,
+    Validity,
+)
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso
 from sros_tool.values import parse_json
 from sros_tool.xml import read_bytes
 
+if TYPE_CHECKING:
+    from sros_tool.checks.kind import Finding
+
 _LINK = re.compile(r"(it is a broken link) \([^)]*\)")
 _AUTHORITY_FILES = "*_ca.cert.pem"
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """What is to be drawn: one source, or two that are compared.
+
+    ``observed`` are observations of a single source; ``template`` is the keystore template whose
+    protection policies get; ``hosts`` are texts ``HOST=ENCLAVE``; ``fleets`` has the robots for the
+    placeholders of each source; ``focus`` are the names or enclaves to look at.
+    With ``checked``, the picture has the findings of ``sros check``, and with a file of
+    ``requirements`` what breaks them, for a robot in ``zone``.
+    """
+
+    sources: Sequence[Path]
+    now: datetime
+    zone: tzinfo
+    observed: Sequence[Path] = ()
+    template: str | None = None
+    hosts: Sequence[str] = ()
+    fleets: tuple[Fleet | None, Fleet | None] = (None, None)
+    focus: Sequence[str] = ()
+    requirements: Path | None = None
+    checked: bool = False
+
+
+def draw(drawing: Drawing) -> tuple[Picture, Folding]:
+    """Return the picture of a drawing, and the same picture with equal units as one.
+
+    Raises:
+        UsageError: there are too many sources, or a choice does not fit them.
+        SrosError: a source or the requirements cannot be read.
+    """
+    sources, fleets = drawing.sources, drawing.fleets
+    if len(sources) > 2 or (drawing.observed and len(sources) > 1):
+        raise UsageError(
+            "at most two sources can be compared",
+            "",
+            "Name one SOURCE and --observed, or two SOURCEs.",
+        )
+    read = [_read(path, fleet, drawing) for path, fleet in zip(sources, fleets, strict=False)]
+    if drawing.template:
+        _check_no_governance(sources, read)
+        template = drawing.template
+        read = [
+            source
+            if source.governance
+            else replace(source, governance=_template_governance(template, source.protections))
+            for source in read
+        ]
+    robots: dict[str, Robot] = {}
+    for path, fleet, source in zip(sources, fleets, read, strict=False):
+        robots |= _robots(path, fleet, source)
+    places = {enclave: robot.name for enclave, robot in robots.items()}
+    context = Context(common_rights(), places | _hosts(drawing.hosts))
+    if drawing.observed:
+        read.append(union([read_source(path, now=drawing.now) for path in drawing.observed]))
+    picture = _compared(read, context, use=bool(drawing.observed))
+    if drawing.focus:
+        picture = focused(picture, read, drawing.focus)
+    if drawing.requirements:
+        picture = _with_requirements(picture, drawing.requirements, drawing, read[0].keystore)
+    folding = Folding.of(picture, robots)
+    return replace(picture, equal=folding.equal, different=folding.different), folding
+
+
+def _compared(read: Sequence[PictureSource], context: Context, *, use: bool) -> Picture:
+    """Return the picture of a source, or of two: of ``use``, a change, two worlds or drift."""
+    if len(read) == 1:
+        return compose(read[0], context)
+    first, second = read
+    kinds = [source.origin.kind for source in read]
+    if use or kinds[1] == "observation":
+        return overlay(first, second, "use", context)
+    if kinds[0] == kinds[1]:
+        return overlay(first, second, "change", context)
+    if "zenoh" in kinds:
+        first, second = sorted(read, key=lambda source: source.origin.kind == "zenoh")
+        return overlay(first, second, "worlds", context)
+    # Drift is shown from the side of the policy, whichever was named first.
+    first, second = sorted(read, key=lambda source: source.origin.kind != "policy")
+    return overlay(first, second, "drift", context)
+
+
+def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
+    """Return a source, with the findings of ``sros check`` unless it cannot be checked."""
+    source = read_source(path, now=drawing.now, fleet=fleet)
+    if not drawing.checked:
+        return source
+    from sros_tool.checks.policies import policy_file_findings
+    from sros_tool.checks.targets import Circumstances, path_findings
+
+    at = Circumstances(drawing.now, drawing.zone, fleet=fleet)
+    if source.keystore:
+        at.opened[path] = source.keystore
+    try:
+        findings = (
+            list(policy_file_findings(path, fleet=fleet, policy=source.policy))
+            if source.policy
+            else path_findings(path, at)
+        )
+    except SrosError:
+        findings = []
+    pictured = [_pictured(finding, {finding.subject}) for finding in findings]
+    return _with_findings(source, path, pictured)
+
+
+def _check_no_governance(sources: Sequence[Path], read: Sequence[PictureSource]) -> None:
+    """Raise `UsageError` if a source has its own signed governance, so that no template applies."""
+    for path, source in zip(sources, read, strict=True):
+        kind = source.origin.kind
+        if kind in ("keystore", "enclave"):
+            raise UsageError(
+                f"--template does not fit '{path}'",
+                f"It is {'an' if kind == 'enclave' else 'a'} {kind}, which is drawn with its own "
+                "governance; a template is for policies, which have none.",
+                "Leave --template out, or name the policy alone.",
+            )
+
+
+def _hosts(words: Iterable[str]) -> dict[str, str]:
+    """Map the enclaves in texts ``HOST=ENCLAVE`` to their hosts."""
+    hosts = {}
+    for word in words:
+        host, equals, enclave = word.partition("=")
+        if not equals or not host or not enclave.startswith("/"):
+            raise UsageError(
+                f"--host {word!r} is not HOST=ENCLAVE",
+                "",
+                "Write for example --host arm=/robot/arm.",
+            )
+        hosts[enclave.rstrip("/") or "/"] = host
+    return hosts
+
+
+def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str, Robot]:
+    """Map the enclaves of a source to their robots, by which they are grouped."""
+    if source.keystore:
+        fleet = load_fleet(source.keystore)
+    elif fleet and source.origin.kind == "policy":
+        written = read_policy(path, placeholders=True)
+        fleet = fleet.with_enclaves(FleetPolicy(written, fleet).patterns)
+    if fleet is None:
+        return {}
+    names = {right.enclave for right in source.rights}
+    return {name: robot for name in names if (robot := robot_of(fleet, name))}
+
+
+def _with_requirements(
+    picture: Picture, file: Path, drawing: Drawing, opened: Keystore | None
+) -> Picture:
+    """Return the picture with what breaks requirements, decided as ``sros check`` does."""
+    from sros_tool.proof.findings import assumption_text, decide_all, decided_findings
+    from sros_tool.proof.requirements import demand, read_requirements
+    from sros_tool.proof.system import load_system
+
+    if len(drawing.sources) > 1:
+        raise UsageError("--requirements takes one policy or keystore", "", "Draw one of them.")
+    wanted = read_requirements(file)
+    system = load_system(
+        drawing.sources[0],
+        at=drawing.now,
+        zone=drawing.zone,
+        fleet=drawing.fleets[0],
+        template=load_template(drawing.template) if drawing.template else None,
+        opened=opened,
+    )
+    decided = decide_all(wanted, system)
+    findings = decided_findings(decided, system)
+    violations = tuple(
+        PicturedViolation(
+            _finding_text(finding, finding.subject),
+            tuple(
+                PicturedUse(step.use.enclave, *step.drawn())
+                for step in violation.steps
+                if step.place and step.use.right
+            ),
+        )
+        for violation, finding in zip(decided.violations, findings, strict=False)
+    )
+    assumed = tuple(
+        f"{demand(requirement)}: {assumption_text(name)}" for requirement, name in decided.assumed
+    )
+    requirements = Requirements(len(wanted) - len(violations), violations, assumed)
+    paths = {enclave.path for enclave in picture.enclaves}
+    pictured = tuple(_pictured(finding, paths) for finding in findings)
+    picture = replace(picture, findings=(*picture.findings, *pictured))
+    return with_requirements(picture, requirements)
+
+
+def _pictured(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
+    """Return a finding for the picture; its subject is in the text unless it is an enclave."""
+    known = finding.subject in enclaves
+    about = "" if known or finding.subject == finding.file else finding.subject
+    text = _finding_text(finding, about)
+    enclave = finding.subject if known else ""
+    return PicturedFinding(finding.id, finding.severity.word, text, finding.remedy, enclave)
+
+
+def _finding_text(finding: Finding, about: str = "") -> str:
+    """Return the text of a finding ``about`` something, with the base name of file and the line."""
+    place = f"{Path(finding.file).name}:{finding.line}" if finding.line else ""
+    return ": ".join(filter(None, (place, about, finding.text)))
+
+
+# ── one source ─────────────────────────────────────────────────────────────────────────────
 
 
 def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> PictureSource:
@@ -81,7 +311,7 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
         source = _with_enclave(source, path, now)
     places = _places(path)
     return replace(
-        with_findings(replace(source, findings=()), path, source.findings),
+        _with_findings(replace(source, findings=()), path, source.findings),
         enclaves=tuple(
             replace(
                 enclave, problems=tuple(_without_path(text, places) for text in enclave.problems)
@@ -91,7 +321,7 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
     )
 
 
-def with_findings(
+def _with_findings(
     source: PictureSource, path: Path, findings: Iterable[PicturedFinding]
 ) -> PictureSource:
     """Return ``source``, read from ``path``, with more findings, without the path in their texts.
@@ -120,7 +350,7 @@ def common_rights() -> tuple[Right, ...]:
     return tuple(sorted(policy_rights(policy)))
 
 
-def template_governance(choice: str, stated: Sequence[StatedProtection] = ()) -> Governance:
+def _template_governance(choice: str, stated: Sequence[StatedProtection] = ()) -> Governance:
     """Return the governance of a keystore made from the template ``choice`` and a policy.
 
     ``stated`` is what the policy says about the protection of names.
