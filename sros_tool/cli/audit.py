@@ -106,7 +106,10 @@ def audit(
     node does only later needs --watch. The default is the keystore of $ROS_SECURITY_KEYSTORE.
     """
     from sros_tool.explain import audit as audits
-    from sros_tool.runtime.variables import ENCLAVE
+    from sros_tool.fleet.fleet_file import read_fleet
+    from sros_tool.keystore.participant import JoinContext
+    from sros_tool.runtime.rmw import vendor_here
+    from sros_tool.runtime.variables import ENCLAVE, domain_from
 
     check_duration(watch, spin_time)
     source = source or keystore_from_environment()
@@ -115,7 +118,13 @@ def audit(
         raise UsageError("--force is for --patch only", "", "Leave it out.")
     if patch is not None:
         check_output(patch, force=force)
-    enclaves = _enclaves(source, fleet_file, vendor, environment)
+    everything = {**os.environ, **environment}
+    enclaves = audits.audited_enclaves(
+        source,
+        Vendor(vendor) if vendor else vendor_here(everything)[0],
+        JoinContext(domain_from(everything) or 0, now(), local_zone(os.environ)),
+        read_fleet(fleet_file) if fleet_file else None,
+    )
     observer = environment.get(ENCLAVE, "")
 
     def judge(observation: Observation) -> Audit:
@@ -187,49 +196,6 @@ _NOT_ALL = (
     "later, and --partial accepts it"
 )
 _NO_PATCH = "no patch was written: no right that could be added would allow it"
-
-
-def _enclaves(
-    source: Path, fleet_file: Path | None, vendor: str | None, environment: dict[str, str]
-) -> AuditedEnclaves:
-    """Return the enclaves of the policy or keystore at ``source``.
-
-    Raises:
-        UsageError: It is neither.
-    """
-    from sros_tool.dds.domains import DomainSet
-    from sros_tool.explain.audit import keystore_enclaves, policy_enclaves
-    from sros_tool.fleet.expansion import read_policy_for
-    from sros_tool.fleet.fleet_file import read_fleet
-    from sros_tool.keystore.layout import enclave_names
-    from sros_tool.keystore.participant import JoinContext
-    from sros_tool.keystore.rights import load_rights
-    from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
-    from sros_tool.runtime.rmw import vendor_here
-    from sros_tool.runtime.variables import domain_from
-    from sros_tool.translate import governance_for
-
-    everything = {**os.environ, **environment}
-    chosen = Vendor(vendor) if vendor else vendor_here(everything)[0]
-    domain = domain_from(everything) or 0
-    context = JoinContext(domain, now(), local_zone(os.environ))
-    fleet = read_fleet(fleet_file) if fleet_file else None
-    rights = load_rights(source, fleet)
-    if fleet and rights.kind != "policy":
-        raise UsageError(
-            "--fleet is for the placeholders of a policy", f"'{source}' is none.", "Leave it out."
-        )
-    if rights.kind == "keystore":
-        return keystore_enclaves(rights, enclave_names(source), chosen, context)
-    if rights.kind != "policy":
-        raise UsageError(
-            f"'{source}' is neither a policy nor a keystore",
-            "A robot has nodes of several enclaves.",
-            "Name the policy, or the folder of the keystore.",
-        )
-    protection = load_template(DEFAULT_TEMPLATE).protection
-    governance = governance_for(protection, DomainSet.of((domain, domain)))
-    return policy_enclaves(read_policy_for(source, fleet), governance, chosen, context)
 
 
 def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:

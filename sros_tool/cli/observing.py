@@ -391,7 +391,16 @@ def generate_policy(
             )
         if accept and file is None:
             raise UsageError("--accept is given without FILE", "", "Name the policy to change.")
-        learned, lines = _learned_from_logs(logs, file, enclave, node, present)
+        from sros_tool.explain.denials import learned_from_logs
+
+        texts = {log: _log_text(log) for log in logs}
+        learned, lines, denied = learned_from_logs(
+            texts, file=file, enclave=enclave or "", place=_place(node), present=present
+        )
+        if not learned.profiles:
+            print_notes(learned.notes)
+            unsaid = "No right can be proposed for the denials in the logs."
+            echo(unsaid if denied else "The logs report no denial.", err=True)
         return _propose(learned.flat() if flat else learned, lines, file, accept, dry_run, as_json)
     if accept:
         raise UsageError("--accept is for --from-log only")
@@ -535,48 +544,6 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
 
 
 # ── from logs ───────────────────────────────────────────────────────────────────────────
-
-
-def _learned_from_logs(
-    logs: Sequence[Path],
-    file: Path | None,
-    enclave: str | None,
-    node: str | None,
-    present: Policy | None,
-) -> tuple[Learned, list[AskingLine]]:
-    """Return the rights that logs ask for, and the lines that ask for them."""
-    from sros_tool.explain.denials import as_learned, propose, read_denials
-    from sros_tool.files import policies_dir
-    from sros_tool.graph.learn import AskingLine, common_parts
-    from sros_tool.runtime.vendor_log import plain_text
-
-    denials = {log: read_denials(plain_text(_log_text(log))) for log in logs}
-    missing = propose(each for found in denials.values() for each in found)
-    common = common_parts(file.parent if file else policies_dir(), policies_dir())
-    learned = as_learned(missing, enclave or "", _place(node), present, common)
-    asked = {profile.enclave for profile in learned.profiles}
-    lines = [
-        AskingLine(
-            log,
-            denial.line,
-            process=denial.process or None,
-            enclave=denial.enclave or enclave,
-            direction=denial.direction,
-            topic=denial.topic,
-        )
-        for log, found in denials.items()
-        for denial in found
-        if propose([denial]).rights and (denial.enclave or enclave) in asked
-    ]
-    if not learned.profiles:
-        print_notes(learned.notes)
-        echo(
-            "No right can be proposed for the denials in the logs."
-            if any(denials.values())
-            else "The logs report no denial.",
-            err=True,
-        )
-    return learned, lines
 
 
 def _propose(

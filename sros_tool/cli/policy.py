@@ -215,7 +215,7 @@ def diff_policy(
     A, a keystore that protects less gives more; as B, it lowers no protection. The last line says
     what is assumed and what is left out, such as dates.
     """
-    from sros_tool.keystore.rights import load_rights, policy_difference
+    from sros_tool.keystore.rights import compare_sources, load_rights, policy_difference
 
     check_one_format()
     form = "json" if as_json else form
@@ -224,24 +224,24 @@ def diff_policy(
     with progress("reading"):
         fleets = fleets_of(fleet_files)
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])
-    scope, difference, protections = _compared(first, second)
+    compared = compare_sources(first, second)
+    difference, protections = compared.rights, compared.protections
     if form == "json":
-        print_json(policy_difference(first, second, difference, protections))
+        print_json(policy_difference(first, second, compared))
     elif form == "markdown":
         echo_lines(rights_markdown(first, second))
     else:
-        for line in _difference_lines(difference, first.fleet, second.fleet):
+        lines = _difference_lines(difference, first.fleet, second.fleet)
+        for line in (*lines, *_protection_lines(protections)):
             echo(line)
-        for sign, each in protections:
-            echo(f"{sign} {each.enclave} protect {each} with {each.word}")
         count = len(difference.only_first) + len(difference.only_second)
-        of = f" of {', '.join(sorted(scope))}" if scope else ""
+        of = f" of {', '.join(sorted(compared.scope))}" if compared.scope else ""
         differ = f"1 right{of} differs" if count == 1 else f"{count} rights{of} differ"
         echo(differ if count else f"the rights{of} are the same", err=True)
         if protections:
             echo("what the policies say about protection differs", err=True)
     print_notes((*first.notes, *second.notes))
-    return 0 if not difference and not protections and first.sound and second.sound else 1
+    return 0 if not compared and first.sound and second.sound else 1
 
 
 _MOST_LINES, _MOST_PICTURE, _MOST_LINKS = 12_000, 25_000, 250
@@ -251,38 +251,18 @@ A comment on GitHub has at most 65,536 characters; Mermaid draws at most 50,000,
 """
 
 
-def _compared(
-    first: RightsSource, second: RightsSource
-) -> tuple[frozenset[str] | None, RightsDifference, list[tuple[str, StatedProtection]]]:
-    """Return the enclaves that are compared (None for all), and what differs."""
-    from sros_tool.policy.rights import compare
-
-    scope = None
-    if first.scope is None or second.scope is None:
-        scope = second.scope if first.scope is None else first.scope
-    difference = compare(first.rights, second.rights, scope)
-    return scope, difference, _protection_differences(first, second)
-
-
 def rights_markdown(first: RightsSource, second: RightsSource) -> str:
     """Return how rights differ as Markdown, with a picture."""
-    _, difference, protections = _compared(first, second)
-    drawn = _drawn_difference(first, second, difference)
-    return _difference_markdown(first, second, difference, protections, drawn)
+    from sros_tool.keystore.rights import compare_sources
+    from sros_tool.markdown import bounded, code, fenced, plain
+    from sros_tool.report.sources import drawn_difference
 
-
-def _difference_markdown(
-    first: RightsSource,
-    second: RightsSource,
-    difference: RightsDifference,
-    protections: Sequence[tuple[str, StatedProtection]],
-    drawn: str,
-) -> str:
-    """Return a difference as Markdown: what is added and removed, and the picture ``drawn``."""
-    from sros_tool.markdown import bounded, code, plain
-
-    lines = _difference_lines(difference, first.fleet, second.fleet)
-    lines += [f"{sign} {e.enclave} protect {e} with {e.word}" for sign, e in protections]
+    compared = compare_sources(first, second)
+    drawn = drawn_difference(
+        first, second, compared.rights, letters=_MOST_PICTURE, arrows=_MOST_LINKS
+    )
+    lines = _difference_lines(compared.rights, first.fleet, second.fleet)
+    lines += _protection_lines(compared.protections)
     parts = []
     rest = "which `sros diff_policy` shows"
     for sign, title in (("+", "added"), ("-", "removed")):
@@ -295,52 +275,20 @@ def _difference_markdown(
         parts += ["**Notes**", bounded(map(code, notes), 4000, rest)]
     differ = "1 difference" if len(lines) == 1 else f"{len(lines)} differences"
     title = f"### Rights: {plain(differ if lines else 'no difference')}"
-    return "\n\n".join((title, *parts, *([drawn] if drawn and lines else []))) + "\n"
+    if lines and drawn is None:
+        parts.append(
+            "The picture is too large for a comment: `sros view BEFORE AFTER -o change.html`"
+        )
+    elif lines and drawn:
+        parts.append(fenced(drawn, "mermaid"))
+    return "\n\n".join((title, *parts)) + "\n"
 
 
-def _drawn_difference(
-    first: RightsSource, second: RightsSource, difference: RightsDifference
-) -> str:
-    """Return the picture of what differs, with who else uses these names, as Markdown, or ""."""
-    from sros_tool.markdown import fenced
-    from sros_tool.policy.patterns import Names
-    from sros_tool.report.compose import Context, PictureSource, overlay
-    from sros_tool.report.formats import render_mermaid
-    from sros_tool.report.layout import scenes_of
-    from sros_tool.report.picture import SourceTitle
-    from sros_tool.report.sources import common_rights
-
-    if first.kind != second.kind or not difference:
-        return ""
-    changed: dict[str, set[str]] = {}
-    for right in (*difference.only_first, *difference.only_second):
-        changed.setdefault(right.kind, set()).add(right.name)
-    names = {kind: Names(sorted(members)) for kind, members in changed.items()}
-
-    def side(title: str, of: RightsSource) -> PictureSource:
-        used = (e for e in of.rights if e.kind in names and names[e.kind].meets(e.name))
-        return PictureSource(SourceTitle(title, of.kind), frozenset(used), scope=of.scope)
-
-    context = Context(common_rights())
-    picture = overlay(side("before", first), side("after", second), "change", context)
-    scenes = scenes_of(picture, placed=False)
-    scene = next((each for each in scenes if each.id == "all"), scenes[0])
-    text = render_mermaid(picture, scene)
-    if len(text) > _MOST_PICTURE or len(scene.links) > _MOST_LINKS:
-        return "The picture is too large for a comment: `sros view BEFORE AFTER -o change.html`"
-    return fenced(text, "mermaid")
-
-
-def _protection_differences(
-    first: RightsSource, second: RightsSource
-) -> list[tuple[str, StatedProtection]]:
-    """Return what only one of two policies says about protection, with "-" or "+"."""
-    if first.protections is None or second.protections is None:
-        return []
-    one, other = set(first.protections), set(second.protections)
-    differences = [("-", protection) for protection in first.protections if protection not in other]
-    differences += [("+", protection) for protection in second.protections if protection not in one]
-    return sorted(differences, key=lambda line: (line[1].enclave, line[1].name, line[0] == "+"))
+def _protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> list[str]:
+    return [
+        f"{sign} {stated.enclave} protect {stated} with {stated.word}"
+        for sign, stated in protections
+    ]
 
 
 def _difference_lines(

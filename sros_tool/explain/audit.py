@@ -23,10 +23,13 @@ from typing import Annotated, NamedTuple
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
-from sros_tool.errors import Note, PolicyError
+from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.question import Part, Question
+from sros_tool.fleet.expansion import read_policy_for
+from sros_tool.fleet.robots import Fleet
 from sros_tool.graph.learn import (
     UNSHOWN,
     Learned,
@@ -46,13 +49,15 @@ from sros_tool.graph.observation import (
     ObservedNode,
     make_observation,
 )
-from sros_tool.keystore.layout import enclave_path
+from sros_tool.keystore.layout import enclave_names, enclave_path
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave, plan_enclave
-from sros_tool.keystore.rights import RightsSource
+from sros_tool.keystore.rights import RightsSource, load_rights
+from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
 from sros_tool.names import dds_names, expand, is_expression, nodes_served
 from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, order
+from sros_tool.translate import governance_for
 from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
 from sros_tool.wording import counted
 
@@ -125,6 +130,35 @@ class AuditedEnclaves:
             loaded = self.load(enclave)
             self._evaluators[enclave] = Evaluator(self.vendor, loaded, self.context)
         return self._evaluators[enclave]
+
+
+def audited_enclaves(
+    path: Path, vendor: Vendor, context: JoinContext, fleet: Fleet | None = None
+) -> AuditedEnclaves:
+    """Return the enclaves of the policy or keystore at ``path``, as a vendor decides for them.
+
+    A policy counts as signed with the governance of the default template; ``fleet`` has the robots
+    that its placeholders stand for.
+
+    Raises:
+        UsageError: it is neither, or the fleet is for a keystore.
+    """
+    rights = load_rights(path, fleet)
+    if fleet and rights.kind != "policy":
+        raise UsageError(
+            "--fleet is for the placeholders of a policy", f"'{path}' is none.", "Leave it out."
+        )
+    if rights.kind == "keystore":
+        return keystore_enclaves(rights, enclave_names(path), vendor, context)
+    if rights.kind != "policy":
+        raise UsageError(
+            f"'{path}' is neither a policy nor a keystore",
+            "A robot has nodes of several enclaves.",
+            "Name the policy, or the folder of the keystore.",
+        )
+    protection = load_template(DEFAULT_TEMPLATE).protection
+    governance = governance_for(protection, DomainSet.of((context.domain, context.domain)))
+    return policy_enclaves(read_policy_for(path, fleet), governance, vendor, context)
 
 
 def policy_enclaves(

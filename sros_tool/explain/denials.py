@@ -13,16 +13,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import field, replace
+from pathlib import Path
 
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, UsageError
+from sros_tool.files import policies_dir
 from sros_tool.graph.learn import (
+    AskingLine,
     CommonParts,
     Learned,
     LearnedProfile,
     NodeRight,
     RightsFound,
+    common_parts,
     groups_of,
 )
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
@@ -48,6 +52,7 @@ from sros_tool.runtime.vendor_log import (
     denied_topic,
     labelled_line,
     log_lines,
+    plain_text,
 )
 
 _NEAR_LINES = 3
@@ -224,6 +229,44 @@ _SEVERAL = Note(
 
 _NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
 """Common parts, the widest first: a node that lacks one right of a part probably lacks all."""
+
+
+def learned_from_logs(
+    logs: Mapping[Path, str],
+    *,
+    file: Path | None,
+    enclave: str,
+    place: tuple[str, str] | None,
+    present: Policy | None,
+) -> tuple[Learned, list[AskingLine], bool]:
+    """Return the rights that logs ask for, the lines that ask, and whether the logs deny anything.
+
+    Args:
+        logs: the texts of the logs by their paths.
+        file: the policy to which the rights are to be added, for the paths of common parts.
+        enclave: the enclave of processes whose log does not tell it, or "".
+        place: namespace and name of the node whose profile gets them, if it is named.
+        present: the content of ``file``, if it exists.
+    """
+    denials = {log: read_denials(plain_text(text)) for log, text in logs.items()}
+    missing = propose(denial for denied in denials.values() for denial in denied)
+    common = common_parts(file.parent if file else policies_dir(), policies_dir())
+    learned = as_learned(missing, enclave, place, present, common)
+    asked = {profile.enclave for profile in learned.profiles}
+    lines = [
+        AskingLine(
+            log,
+            denial.line,
+            process=denial.process or None,
+            enclave=denial.enclave or enclave or None,
+            direction=denial.direction,
+            topic=denial.topic,
+        )
+        for log, denied in denials.items()
+        for denial in denied
+        if propose([denial]).rights and (denial.enclave or enclave) in asked
+    ]
+    return learned, lines, any(denials.values())
 
 
 def as_learned(

@@ -48,7 +48,7 @@ from sros_tool.policy.model import (
     StatedProtection,
     stated_protections,
 )
-from sros_tool.policy.rights import Right, RightsDifference, parts, policy_rights
+from sros_tool.policy.rights import Right, RightsDifference, compare, parts, policy_rights
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh import StatedRight, rights_in_rules
 from sros_tool.values import Words, shows
@@ -446,25 +446,59 @@ class PolicyDifference(NamedTuple):
     """Protection that only one of two policies demands."""
 
 
+class SourcesDifference(NamedTuple):
+    """What differs between two sources of rights; false if nothing does."""
+
+    scope: frozenset[str] | None
+    """The enclaves that were compared; None for all."""
+    rights: RightsDifference
+    protections: Sequence[tuple[str, StatedProtection]]
+    """What only one of two policies says about protection, with "-" for the first or "+"."""
+
+    def __bool__(self) -> bool:
+        return bool(self.rights or self.protections)
+
+
+def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDifference:
+    """Return what differs; if one of both is only for some enclaves, these are compared."""
+    scope = None
+    if first.scope is None or second.scope is None:
+        scope = second.scope if first.scope is None else first.scope
+    return SourcesDifference(
+        scope,
+        compare(first.rights, second.rights, scope),
+        _protection_differences(first, second),
+    )
+
+
+def _protection_differences(
+    first: RightsSource, second: RightsSource
+) -> list[tuple[str, StatedProtection]]:
+    """Return what only one of two policies says about protection, with "-" or "+"."""
+    if first.protections is None or second.protections is None:
+        return []
+    one, other = set(first.protections), set(second.protections)
+    differences = [("-", protection) for protection in first.protections if protection not in other]
+    differences += [("+", protection) for protection in second.protections if protection not in one]
+    return sorted(differences, key=lambda line: (line[1].enclave, line[1].name, line[0] == "+"))
+
+
 _SIDES = {"-": "a", "+": "b"}
 
 
 def policy_difference(
-    first: RightsSource,
-    second: RightsSource,
-    difference: RightsDifference,
-    protections: Sequence[tuple[str, StatedProtection]],
+    first: RightsSource, second: RightsSource, compared: SourcesDifference
 ) -> PolicyDifference:
-    """Return what is printed of a comparison; ``protections`` have "-" or "+" for their side."""
+    """Return what is printed of a comparison."""
     return PolicyDifference(
-        not difference and not protections,
+        not compared,
         first,
         second,
         [
-            DifferentRight(_SIDES[sign], right, difference.covered.get(right, ()))
-            for sign, right in difference.lines()
+            DifferentRight(_SIDES[sign], right, compared.rights.covered.get(right, ()))
+            for sign, right in compared.rights.lines()
         ],
-        [DifferentProtection(_SIDES[sign], stated) for sign, stated in protections],
+        [DifferentProtection(_SIDES[sign], stated) for sign, stated in compared.protections],
     )
 
 

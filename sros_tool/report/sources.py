@@ -35,7 +35,7 @@ from sros_tool.keystore.reader import (
     OpenedEnclave,
     open_enclave,
 )
-from sros_tool.keystore.rights import is_zenoh, load_rights
+from sros_tool.keystore.rights import RightsSource, is_zenoh, load_rights
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import (
     authority_text,
@@ -46,7 +46,8 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.keys import algorithm
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy, StatedProtection
-from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.policy.patterns import Names
+from sros_tool.policy.rights import Right, RightsDifference, policy_rights
 from sros_tool.report.compose import (
     Context,
     PictureSource,
@@ -57,6 +58,8 @@ from sros_tool.report.compose import (
 )
 from sros_tool.report.focus import focused
 from sros_tool.report.folding import Folding
+from sros_tool.report.formats import render_mermaid
+from sros_tool.report.layout import scenes_of
 from sros_tool.report.picture import (
     Picture,
     PicturedEnclave,
@@ -181,6 +184,41 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
         findings = []
     pictured = [_pictured(finding, {finding.subject}) for finding in findings]
     return _with_findings(source, path, pictured)
+
+
+def drawn_difference(
+    first: RightsSource,
+    second: RightsSource,
+    difference: RightsDifference,
+    *,
+    letters: int,
+    arrows: int,
+) -> str | None:
+    """Return what differs, with who else uses these names, in Mermaid; "" if it cannot be drawn.
+
+    Returns None if the picture has more than so many ``letters`` or ``arrows``.
+    """
+    if first.kind != second.kind or not difference:
+        return ""
+    changed: dict[str, set[str]] = {}
+    for right in (*difference.only_first, *difference.only_second):
+        changed.setdefault(right.kind, set()).add(right.name)
+    names = {kind: Names(sorted(members)) for kind, members in changed.items()}
+
+    def side(title: str, source: RightsSource) -> PictureSource:
+        used = frozenset(
+            right
+            for right in source.rights
+            if right.kind in names and names[right.kind].meets(right.name)
+        )
+        return PictureSource(SourceTitle(title, source.kind), used, scope=source.scope)
+
+    context = Context(common_rights())
+    picture = overlay(side("before", first), side("after", second), "change", context)
+    scenes = scenes_of(picture, placed=False)
+    scene = next((scene for scene in scenes if scene.id == "all"), scenes[0])
+    text = render_mermaid(picture, scene)
+    return None if len(text) > letters or len(scene.links) > arrows else text
 
 
 def _check_no_governance(sources: Sequence[Path], read: Sequence[PictureSource]) -> None:
