@@ -17,11 +17,12 @@ _MOST = 20_000  # characters: a comment on GitHub has at most 65,536
 _SIGNS = {"error": "🔴", "warning": "🟠", "note": "🔵"}
 
 
-def findings_markdown(chosen: ChosenFindings, summary: str) -> str:
-    """Return the findings under a heading; ``summary`` counts them in words."""
+def findings_markdown(chosen: ChosenFindings) -> str:
+    """Return the findings under a heading that counts them in words."""
     rest = "which `sros check` shows"
     listed = bounded(map(_item, by_cause(chosen.shown)), _MOST, rest)
-    return "\n\n".join(part for part in (f"### Findings: {plain(summary)}", listed) if part) + "\n"
+    title = f"### Findings: {plain(chosen.summary())}"
+    return "\n\n".join(part for part in (title, listed) if part) + "\n"
 
 
 def _item(findings: Sequence[Finding]) -> str:

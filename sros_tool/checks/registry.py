@@ -22,6 +22,7 @@ from sros_tool.checks.kind import (
 )
 from sros_tool.dataclass import dataclass
 from sros_tool.errors import UsageError
+from sros_tool.wording import counted
 
 _MODULES = (
     *("policies", "requirements", "keystores.files", "keystores.authorities"),
@@ -119,6 +120,18 @@ class ChosenFindings:
         """Return the number of shown findings of each severity, the worst first."""
         severities = [finding.severity for finding in self.shown]
         return {str(level): severities.count(level) for level in (ERROR, WARNING, NOTE)}
+
+    def summary(self) -> str:
+        """Return the number of findings, in words."""
+        counts = [counted(number, word) for word, number in self.numbers().items() if number]
+        hidden = self.hidden
+        unseen = f" (not shown: {counted(hidden, 'note')}, --severity note)" if hidden else ""
+        if not self.accepted:
+            return f"{', '.join(counts) or 'nothing found'}{unseen}"
+        number = counted(len(self.accepted), "weakness", "weaknesses")
+        first = f"{', '.join(counts)}, and" if counts else "nothing found but"
+        accepted = f"{number} that the template accepts (--strict makes them count)"
+        return f"{first} {accepted}{unseen}"
 
     def fails(self, level: Severity) -> bool:
         """Return whether a finding of at least this severity is shown."""

@@ -556,7 +556,7 @@ def renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:
 def _print_markdown(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     from sros_tool.checks.formats import findings_markdown
 
-    echo_lines(findings_markdown(chosen, findings_summary(chosen)))
+    echo_lines(findings_markdown(chosen))
 
 
 def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
@@ -616,21 +616,7 @@ def _print_text(chosen: ChosenFindings, fleet: Fleet | None = None) -> None:
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
         echo(f"accepted by the {choice}: {kinds_text}")
-    echo(findings_summary(chosen), err=True)
-
-
-def findings_summary(chosen: ChosenFindings) -> str:
-    """Return the number of findings, in words."""
-    counts = chosen.numbers()
-    counted = [f"{number} {word}{'s' * (number != 1)}" for word, number in counts.items() if number]
-    number = chosen.hidden
-    hidden = f" (not shown: {number} note{'s' * (number != 1)}, --severity note)" if number else ""
-    number = len(chosen.accepted)
-    if not number:
-        return f"{', '.join(counted) or 'nothing found'}{hidden}"
-    accepted = f"{number} weakness{'es' * (number != 1)} that the template accepts"
-    first = f"{', '.join(counted)}, and" if counted else "nothing found but"
-    return f"{first} {accepted} (--strict makes them count){hidden}"
+    echo(chosen.summary(), err=True)
 
 
 def _print_json(chosen: ChosenFindings, _selection: FindingFilter) -> None:

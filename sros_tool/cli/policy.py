@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from shlex import quote
@@ -27,20 +26,18 @@ from sros_tool.cli.common import (
     progress,
     save,
 )
-from sros_tool.errors import Note, PolicyError, UsageError
+from sros_tool.errors import PolicyError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import FileChange, as_plain, file_change
 from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
-    from sros_tool.errors import Note
     from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.issuing.size import MinimizedEnclave
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.merge import Merged
-    from sros_tool.policy.minimize import MinimizedPolicy
-    from sros_tool.policy.model import Group, Policy, StatedProtection
-    from sros_tool.policy.rights import Right, RightsDifference
+    from sros_tool.policy.model import StatedProtection
+    from sros_tool.policy.rights import RightsDifference
     from sros_tool.proof.growth import Gain, Growth, NewReach
     from sros_tool.proof.sources import AccessSource
 
@@ -379,42 +376,17 @@ def minimize_policy(
     With --fleet, what was observed of some robots stays for all robots of the same enclave, and
     sizes are those of the robot with the longest name.
     """
-    from sros_tool.fleet import expansion as of_fleet
-    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.fleet.expansion import as_written
     from sros_tool.fleet.fleet_file import read_fleet
-    from sros_tool.keystore.issuing.size import PolicyMinimization, minimized_enclaves
-    from sros_tool.keystore.rights import load_rights
-    from sros_tool.policy.document import read_policy, write_policy
-    from sros_tool.policy.minimize import minimize
+    from sros_tool.keystore.issuing.size import PolicyMinimization, minimized_policy
 
     if output:
         check_output(output, force=force)
     fleet = read_fleet(fleet_file) if fleet_file else None
-    given = read_policy(policy, placeholders=fleet is not None)
-    sources = [load_rights(path, fleet) for path in observed]
-    used = seen = frozenset(right for source in sources for right in source.rights)
-    notes = [note for source in sources for note in source.notes]
-    robots = FleetPolicy(given, fleet) if fleet else None
-    if robots:
-        seen = of_fleet.with_placeholders(robots, used)
-        notes += _robot_notes(of_fleet.unobserved_robots(robots, used))
-    stated = of_fleet.absolute(given)
-    result = minimize(stated, seen, () if strict else _node_basics())
-    if robots:
-        of_fleet.check_narrowed(robots, result, used)
-    notes += _scope_notes(given, result, seen)
-    measured = minimized_enclaves(stated, result, seen, fleet)
-    narrowed = of_fleet.written(result.policy)
-    document = write_policy(narrowed)
-    again = read_policy(output, document, placeholders=fleet is not None) if output else narrowed
-    if again != narrowed:
-        raise PolicyError(
-            "the narrowed policy changes when it is written and read again",
-            "Nothing was written.",
-            "This is a defect of sros: please report it with the policy.",
-        )
+    minimized = minimized_policy(policy, observed, fleet, strict=strict, output=output)
+    measured, notes = minimized.enclaves, minimized.notes
     changes = file_change(output, existed=output.exists()) if output else ()
-    saved = save(output, document) if output and not dry_run else ""
+    saved = save(output, minimized.document) if output and not dry_run else ""
     if as_json:
         kept = output if not dry_run else None
         plain = as_plain(PolicyMinimization(policy, kept, measured, dry_run, changes, notes))
@@ -422,45 +394,12 @@ def minimize_policy(
     else:
         for enclave in measured:
             for line in _use_lines(enclave):
-                echo(of_fleet.as_written(line))
+                echo(as_written(line))
     print_notes(notes)
     if output and dry_run:
         echo(f"would {'replace' if output.exists() else 'write'} {output}", err=as_json)
     if saved:
         echo(saved, err=True)
-
-
-def _node_basics() -> Sequence[Group]:
-    """Return the rights that every node needs, as groups of a profile."""
-    from sros_tool.files import policies_dir
-    from sros_tool.policy.document import read_policy
-
-    basics = read_policy(policies_dir() / "defaults" / "node_basics.xml")
-    return [
-        group for enclave in basics.enclaves for p in enclave.all_profiles() for group in p.groups
-    ]
-
-
-def _robot_notes(unobserved: dict[str, list[str]]) -> Iterator[Note]:
-    for path, robots in unobserved.items():
-        text = (
-            f"{path} was never observed for {first_few(robots, _SHOWN)}: what only these "
-            "use is removed, too."
-        )
-        yield Note("minimize.robot-never-observed", text)
-
-
-def _scope_notes(given: Policy, result: MinimizedPolicy, seen: frozenset[Right]) -> Iterator[Note]:
-    unseen = [use.enclave for use in result.uses if not use.observed_at_all]
-    if unseen:
-        text = f"never observed, and therefore not changed: {', '.join(unseen)}."
-        yield Note("minimize.enclave-never-observed", text)
-    unknown = sorted(
-        {right.enclave for right in seen} - {enclave.path for enclave in given.enclaves}
-    )
-    if unknown:
-        text = f"observed, but not in the policy: {', '.join(unknown)}."
-        yield Note("minimize.enclave-not-in-policy", text)
 
 
 def _ratio_text(ratio: float | None) -> str:
@@ -611,41 +550,16 @@ def policies(
 
 def _copy(source: Path, target: Path, *, as_json: bool, dry_run: bool) -> None:
     """Copy the shipped policies, or the common parts to a folder ``common``, to a folder."""
-    from sros_tool.files import new_files, write_new_folder
     from sros_tool.keystore.layout import is_keystore
-    from sros_tool.policy.document import COMMON, CopiedPolicies
-    from sros_tool.xml import read_bytes
+    from sros_tool.policy.document import COMMON, CopiedPolicies, copy_policies
 
-    what = "policies"
-    if target.absolute().name == COMMON:
-        source, what = source / COMMON, "common parts of policies"
-    shipped = (each for each in sorted(source.rglob("*")) if each.is_file())
-    files = {str(each.relative_to(source)): read_bytes(each, "file") for each in shipped}
-    exists = os.path.lexists(target)
-    if exists and not target.is_dir():
-        raise UsageError(f"'{target}' is no folder", "", "Name a new folder, or an existing one.")
     if is_keystore(target):
         raise UsageError(f"'{target}' already exists, as a keystore", "", "Name another folder.")
-    present = [each for each in files if os.path.lexists(target / each)]
-    for each in present:
-        path = target / each
-        if not path.is_file() or read_bytes(path, "file") != files[each]:
-            raise UsageError(
-                f"'{path}' differs from the file that ships with sros",
-                "What exists is not replaced, and nothing was copied.",
-                "Name another folder, or move the file away.",
-            )
-    missing = {each: data for each, data in files.items() if each not in present}
-    if missing and not dry_run:
-        if exists:
-            with new_files(target, missing):
-                pass
-        else:
-            write_new_folder(target, missing)
+    changes = copy_policies(source, target, dry_run=dry_run)
+    what = "common parts of policies" if target.absolute().name == COMMON else "policies"
     if as_json:
-        changes = [FileChange("create", str(target / each)) for each in missing]
         print_json(CopiedPolicies(target, dry_run, changes, ()))
-    elif not missing:
+    elif not changes:
         echo(f"nothing to copy: '{target}' has the {what}")
     else:
         echo(f"{'would copy' if dry_run else 'copied'} the {what} to '{target}'")
@@ -664,10 +578,9 @@ def _convert(
     from sros_tool.files import policies_dir
     from sros_tool.policy.document import (
         PrintedConversion,
+        checked_text,
         convert_policy,
-        read_policy,
         with_node_rights,
-        write_policy,
     )
 
     if output:
@@ -676,13 +589,7 @@ def _convert(
     policy = converted.policy
     if complete:
         policy = with_node_rights(policy, policies_dir())
-    document = write_policy(policy)
-    if read_policy(output or earlier, document) != policy:
-        raise PolicyError(
-            "the converted policy changes when it is written and read again",
-            "Nothing was written.",
-            "This is a defect of sros: please report it with the policy.",
-        )
+    document = checked_text(policy, output or earlier, "converted")
     names = ", ".join(each.path for each in policy.enclaves)
     changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, document) if output and not dry_run else ""

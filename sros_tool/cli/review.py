@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from sros_tool.proof.repository import Repository
     from sros_tool.proof.review import Review, ReviewRequest, ReviewStep
 
-_NO_BASE = "none"
-_FIRST_PARENT = "^1"
 _MOST = 60_000
 """Characters of the Markdown: a comment on GitHub has at most 65,536."""
 _SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
@@ -210,8 +208,8 @@ def review(
     try:
         request = ReviewRequest(
             repository,
-            _base_commit(repository, base, remote),
-            _head_commit(repository, head),
+            repository.base_commit(base, remote),
+            repository.head_commit(head),
             policies,
             requirement_files,
             checked_path(fleet) if fleet else "",
@@ -243,7 +241,7 @@ def review(
                 result.head,
                 result.status,
                 steps,
-                findings=[result.shown_finding(each) for each in _all(result)],
+                findings=[result.shown_finding(each) for each in result.findings],
                 left_out=result.left_out,
             )
         )
@@ -251,23 +249,6 @@ def review(
         for line in _text(result):
             echo(line)
     return result.status
-
-
-def _base_commit(repository: Repository, name: str, remote: str | None) -> str:
-    """Return the commit of BASE, fetched if it has to be, or "" for none."""
-    if name == _NO_BASE:
-        return ""
-    if (merge := name.removesuffix(_FIRST_PARENT)) != name:
-        if remote:
-            repository.fetch_missing(merge, remote)
-        name = repository.merged_into(merge)
-    if remote and not name.startswith("refs/") and len(name) in (40, 64):
-        repository.fetch_missing(name, remote)
-    return repository.exact_commit(name)
-
-
-def _head_commit(repository: Repository, name: str) -> str:
-    return repository.commit(name) if name == "HEAD" else repository.exact_commit(name)
 
 
 # ── output ──────────────────────────────────────────────────────────────────────────────
@@ -288,7 +269,7 @@ class _Outputs:
 
     def write(self, result: Review, request: ReviewRequest) -> None:
         """Write the result."""
-        self._write(_markdown(result, request), [result.shown_finding(e) for e in _all(result)])
+        self._write(_markdown(result, request), [result.shown_finding(e) for e in result.findings])
 
     def write_unfinished(self) -> None:
         """Write what counts if the review is ended from outside, such as by a limit of time."""
@@ -334,19 +315,9 @@ def _save(file: Path, data: bytes) -> None:
         put_in_place()
 
 
-def _all(result: Review) -> list[Finding]:
-    """Return the findings on HEAD."""
-    from sros_tool.checks.registry import ChosenFindings
-
-    found = (each.content for each in result.steps)
-    chosen = [each for each in found if isinstance(each, ChosenFindings)]
-    return list(dict.fromkeys(f for each in chosen for f in (*each.shown, *each.accepted)))
-
-
 def _sentence(result: Review, step: ReviewStep) -> str:
     """Return what a step found, in one clause."""
     from sros_tool.checks.registry import ChosenFindings
-    from sros_tool.cli.check import findings_summary
     from sros_tool.cli.policy import access_summary
     from sros_tool.proof.review import (
         AccessChange,
@@ -358,14 +329,14 @@ def _sentence(result: Review, step: ReviewStep) -> str:
 
     match step.content:
         case ChosenFindings() as chosen:
-            return findings_summary(chosen)
+            return chosen.summary()
         case AccessChange(growth=growth):
             return access_summary(growth)
         case RightsChange():
             return "the rights that are written differ"
         case DroppedRequirements(count=count, chosen=chosen):
             dropped = "1 requirement" if count == 1 else f"{count} requirements"
-            return f"{dropped} dropped or changed, decided as before: {findings_summary(chosen)}"
+            return f"{dropped} dropped or changed, decided as before: {chosen.summary()}"
         case ExpiryCheck(due=due, unreadable=unreadable, count=count):
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
             return f"{len(due)} of {count} enclaves need to be renewed{unread}"
@@ -438,7 +409,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     """Return what a step found as Markdown, or "" if the sentence says it all."""
     from sros_tool.checks.formats import findings_markdown
     from sros_tool.checks.registry import ChosenFindings
-    from sros_tool.cli.check import findings_summary, renewal_markdown
+    from sros_tool.cli.check import renewal_markdown
     from sros_tool.cli.policy import access_markdown, rights_markdown
     from sros_tool.keystore.expiry import describe_lifetime
     from sros_tool.markdown import bounded, code
@@ -453,7 +424,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     def findings(chosen: ChosenFindings) -> str:
         shown = tuple(map(result.shown_finding, chosen.shown))
         chosen = ChosenFindings(shown, chosen.accepted, chosen.hidden)
-        return findings_markdown(chosen, findings_summary(chosen))
+        return findings_markdown(chosen)
 
     rest = "which `sros review` prints"
     match step.content:

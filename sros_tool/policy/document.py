@@ -32,7 +32,7 @@ from urllib.parse import unquote
 from lxml import etree
 
 from sros_tool.dataclass import dataclass
-from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError
+from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError, UsageError
 from sros_tool.names import check_enclave_name, check_namespace, expand, expression_problem
 from sros_tool.policy.model import (
     RIGHTS,
@@ -55,7 +55,7 @@ from sros_tool.policy.placeholders import (
     sample,
 )
 from sros_tool.policy.protection import PROTECT, Level
-from sros_tool.values import DryRun, FileChanges, Notes, shows
+from sros_tool.values import DryRun, FileChange, FileChanges, Notes, shows
 from sros_tool.xml import parse, read_bytes, serialize, tag_of
 
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
@@ -814,6 +814,42 @@ class CopiedPolicies(NamedTuple):
     notes: Notes
 
 
+def copy_policies(source: Path, target: Path, *, dry_run: bool = False) -> list[FileChange]:
+    """Copy the policies in a folder, or their common parts to a folder ``common``; return the new.
+
+    Files that are there stay as they are.
+
+    Raises:
+        UsageError: ``target`` is no folder, or a file in it differs; then nothing is copied.
+    """
+    from sros_tool.files import new_files, write_new_folder
+
+    if target.absolute().name == COMMON:
+        source = source / COMMON
+    shipped = (file for file in sorted(source.rglob("*")) if file.is_file())
+    files = {str(file.relative_to(source)): read_bytes(file, "file") for file in shipped}
+    exists = os.path.lexists(target)
+    if exists and not target.is_dir():
+        raise UsageError(f"'{target}' is no folder", "", "Name a new folder, or an existing one.")
+    present = [name for name in files if os.path.lexists(target / name)]
+    for name in present:
+        path = target / name
+        if not path.is_file() or read_bytes(path, "file") != files[name]:
+            raise UsageError(
+                f"'{path}' differs from the file that ships with sros",
+                "What exists is not replaced, and nothing was copied.",
+                "Name another folder, or move the file away.",
+            )
+    missing = {name: data for name, data in files.items() if name not in present}
+    if missing and not dry_run:
+        if exists:
+            with new_files(target, missing):
+                pass
+        else:
+            write_new_folder(target, missing)
+    return [FileChange("create", str(target / name)) for name in missing]
+
+
 def convert_policy(path: Path) -> ConvertedPolicy:
     """Return the policy in a file of version 0.1.0, with an enclave for each node.
 
@@ -987,6 +1023,30 @@ def write_policy(policy: Policy) -> bytes:
         last.tail, element.tail = profiles.text, last.tail
         profiles.append(element)
     return serialize(root, indent=False)
+
+
+def checked_text(
+    policy: Policy, output: Path | None, what: str, *, placeholders: bool = False
+) -> bytes:
+    """Return the document of a policy that is read as the same policy where it is written.
+
+    Args:
+        policy: the policy.
+        output: where it is going to be written; None if it is not.
+        what: how the policy came about, such as "narrowed".
+        placeholders: whether names may have placeholders of a fleet.
+
+    Raises:
+        PolicyError: it would be read as another one.
+    """
+    document = write_policy(policy)
+    if output and read_policy(output, document, placeholders=placeholders) != policy:
+        raise PolicyError(
+            f"the {what} policy changes when it is written and read again",
+            "Nothing was written.",
+            "This is a defect of sros: please report it with the policy.",
+        )
+    return document
 
 
 def _write_profile(

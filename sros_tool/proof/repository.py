@@ -55,6 +55,8 @@ _ELSEWHERE = (
 """Variables that would have git read another repository than that of its folder."""
 _OF_SETTINGS = ("HOME", "XDG_CONFIG_HOME", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM")
 """Variables that say where git reads settings outside of the repository."""
+_NO_BASE = "none"
+_FIRST_PARENT = "^1"
 _HASH = re.compile(r"[0-9a-f]{40}(?:[0-9a-f]{24})?\Z")
 _ABBREVIATED = re.compile(r"[0-9a-fA-F]{4,64}\Z")
 _NO_REFERENCE = re.compile(r"[\x00-\x20\x7f*?\[\\~^:]|\A-|\A\Z")
@@ -220,6 +222,26 @@ class Repository:
         head = self._objects([commit])[commit][1].partition(b"\n\n")[0]
         lines = head.decode(errors="replace").split("\n")
         return tuple(each.removeprefix("parent ") for each in lines if each.startswith("parent "))
+
+    def base_commit(self, name: str, remote: str | None) -> str:
+        """Return the full id of the commit to compare with, or "" for the name ``none``.
+
+        The name is that of `exact_commit`, or of a merge commit and ``^1``.  With a ``remote``, a
+        commit that is not there is fetched.
+        """
+        if name == _NO_BASE:
+            return ""
+        if (merge := name.removesuffix(_FIRST_PARENT)) != name:
+            if remote:
+                self.fetch_missing(merge, remote)
+            name = self.merged_into(merge)
+        if remote and not name.startswith("refs/") and len(name) in (40, 64):
+            self.fetch_missing(name, remote)
+        return self.exact_commit(name)
+
+    def head_commit(self, name: str) -> str:
+        """Return the full id of the commit to look at; the name is ``HEAD``, or an exact one."""
+        return self.commit(name) if name == "HEAD" else self.exact_commit(name)
 
     def merged_into(self, merge: str) -> str:
         """Return the id of the first parent of a merge commit: what its others were merged into.

@@ -181,6 +181,12 @@ class Review:
         """The worst status of all steps."""
         return max((each.status for each in self.steps), default=_OK)
 
+    @property
+    def findings(self) -> list[Finding]:
+        """The findings on HEAD."""
+        chosen = [step.content for step in self.steps if isinstance(step.content, ChosenFindings)]
+        return list(dict.fromkeys(f for each in chosen for f in (*each.shown, *each.accepted)))
+
     def shown(self, text: str) -> str:
         """Return a text with the paths of files as the repository has them."""
         base = f"git:{self.base[:12]}:"
