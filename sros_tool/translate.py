@@ -36,7 +36,7 @@ from sros_tool.policy.rights import Right
 from sros_tool.validity import Window
 
 if TYPE_CHECKING:
-    from sros_tool.policy.protection import DomainProtection, TopicProtection
+    from sros_tool.policy.model import DomainProtection, TopicProtection
 
 # ── ROS → DDS ──────────────────────────────────────────────────────────────────────────────
 
@@ -206,7 +206,7 @@ def protection_for(governance: Governance) -> DomainProtection | None:
     None means that the document protects a DDS topic without a ROS name, half of a service, or
     single domains in different ways, which no settings of a keystore can state.
     """
-    from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
+    from sros_tool.policy.model import DomainProtection, NamedProtection, TopicProtection
 
     if len(governance.domain_access_rules) != 1:
         return None
@@ -240,7 +240,7 @@ def protection_for(governance: Governance) -> DomainProtection | None:
 
 def _terms(rule: DomainRule | TopicRule) -> dict[str, Any]:
     """Map the fields of a protection to the values of a rule, as `_values` does backwards."""
-    from sros_tool.policy.protection import Level
+    from sros_tool.policy.model import Level
 
     chosen = {each: getattr(rule, each.name) for each in attributes(type(rule))}
     return {

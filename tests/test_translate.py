@@ -20,14 +20,21 @@ from sros_tool.dds.governance import DomainRule, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Permissions, Rule
 from sros_tool.keystore.issuing.proof import example_topics
 from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
-from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Group, Profile, Profiles, Qualifier
-from sros_tool.policy.patterns import covers
-from sros_tool.policy.protection import (
+from sros_tool.policy.model import (
+    ALLOW,
+    DENY,
+    RIGHTS,
     DomainProtection,
+    Enclave,
+    Group,
     Level,
     NamedProtection,
+    Profile,
+    Profiles,
+    Qualifier,
     TopicProtection,
 )
+from sros_tool.policy.patterns import covers
 from sros_tool.translate import governance_for, needed_expressions, permissions_for, ros_rights
 from sros_tool.validity import window
 

@@ -86,7 +86,7 @@ VERBS: Mapping[str, str | Shapes] = {
             "--vendor zenoh": "sros_tool.explain.zenoh:ZenohExplanation",
             "--who": "sros_tool.explain.vendors:WhoByVendor",
             "--who --vendor zenoh": "sros_tool.explain.zenoh:WhoOnZenoh",
-            "--reach": "sros_tool.explain.reached:FollowedReach",
+            "--reach": "sros_tool.explain.who:FollowedReach",
             "--log": "sros_tool.explain.log:ExplainedLog",
         },
     ),

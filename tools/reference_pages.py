@@ -12,7 +12,7 @@ import click
 
 from sros_tool.checks.registry import all_kinds
 from sros_tool.keystore.template import load_template, settings_values, template_names
-from sros_tool.policy.protection import Level
+from sros_tool.policy.model import Level
 from sros_tool.runtime.vendor_log import LOG_TEXTS
 from tools.steps import CHECKOUT
 from tools.template_keys import ABOUT, KEYS, Key, without

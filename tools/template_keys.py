@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from sros_tool.errors import SrosError
 from sros_tool.keystore.template import EVERYTHING, NODE_BASICS, parse_template, settings_values
-from sros_tool.policy.protection import Level
+from sros_tool.policy.model import Level
 from sros_tool.zenoh.configuration import Mode
 
 _DATA_LEVELS = (Level.NONE, Level.SIGN, Level.ENCRYPT)

@@ -29,8 +29,13 @@ from sros_tool.checks.kind import (
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
-from sros_tool.dds.portable import mistaken_names, outside, some_pairs
+from sros_tool.dds.permissions import (
+    MAX_SIGNED_BYTES,
+    Permissions,
+    mistaken_names,
+    outside,
+    some_pairs,
+)
 from sros_tool.errors import DocumentError, Note, PolicyError, SrosError
 from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
@@ -956,7 +961,7 @@ class _IncludeGraph:
             return None  # it stands in <metadata>, or in a fallback that was not needed
 
 
-# ── names that are nearly equal ───────────────────────────────────────────────────────────
+# ── names that are nearly equal ────────────────────────────────────────────────────────────
 
 
 _PARTS = re.compile(r"([/_])")

@@ -27,7 +27,7 @@ from sros_tool.checks.environment import (
 )
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dataclass import dataclass
-from sros_tool.dds.decision.moments import read_moment
+from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import Moments, Vendor
 from sros_tool.dds.permissions import Grant, parse_permissions
 from sros_tool.errors import SrosError
@@ -803,7 +803,7 @@ def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
         yield PROCESS_NOT_SEEN.found("processes", "; ".join(reasons))
 
 
-# ── metrics ───────────────────────────────────────────────────────────────────────────────
+# ── metrics ────────────────────────────────────────────────────────────────────────────────
 
 
 def runtime_metrics(

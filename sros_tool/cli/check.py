@@ -371,7 +371,7 @@ def _system(
 
 
 def _suggested(system: System) -> str:
-    from sros_tool.proof.suggest import render_requirements, suggest
+    from sros_tool.proof.findings import render_requirements, suggest
 
     return render_requirements(suggest(system.rights, system.worlds), system.file)
 
@@ -757,7 +757,7 @@ def _report_sections(
     }
 
 
-# ── check runtime --watch ─────────────────────────────────────────────────────────────────────
+# ── check runtime --watch ──────────────────────────────────────────────────────────────────
 
 
 _SECONDS = 2.0

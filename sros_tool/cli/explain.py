@@ -42,9 +42,8 @@ if TYPE_CHECKING:
     from sros_tool.explain.asking import AskedEnclave, AskingContext
     from sros_tool.explain.log import LogFinding
     from sros_tool.explain.question import Question
-    from sros_tool.explain.reached import FollowedReach
     from sros_tool.explain.vendors import VendorComparison, VendorExplanation, ZenohBeside
-    from sros_tool.explain.who import Decider, Everybody
+    from sros_tool.explain.who import Decider, Everybody, FollowedReach
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation
     from sros_tool.fleet.robots import Fleet
     from sros_tool.policy.model import Source
@@ -723,7 +722,7 @@ def _show_reach(
     ``stated`` are the files of a policy and of its fleet.
     """
     from sros_tool.explain.asking import fleet_of
-    from sros_tool.explain.reached import follow_reach
+    from sros_tool.explain.who import follow_reach
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 

@@ -15,9 +15,8 @@ from typing import Any
 from lxml import etree
 
 from sros_tool.dataclass import dataclass
-from sros_tool.dds.domain_elements import domain_lines, read_domains
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import XSI
+from sros_tool.dds.permissions import XSI, domain_lines, read_domains
 from sros_tool.errors import DocumentError
 from sros_tool.xml import escape, parse, require_child, tag_of
 
@@ -46,7 +45,7 @@ class Attribute:
     order of the schema and of the fields.  So a new attribute needs only a new field.
 
     ``name`` is the name of the element and of the field; ``term`` is the field of
-    `sros_tool.policy.protection` that it is translated from.  ``values`` are the allowed values.
+    `sros_tool.policy.model` that it is translated from.  ``values`` are the allowed values.
     ``open`` is the value that protects nothing; ``portable`` protects, and all vendors enforce it
     alike.  ``default`` is the value if a document lacks the element; None if the schema requires
     the element.

@@ -57,7 +57,7 @@ from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, pem, validity_of
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
-from sros_tool.policy.protection import Level, TopicProtection
+from sros_tool.policy.model import Level, TopicProtection
 from sros_tool.validity import Window
 
 _DAY, _MINUTE = timedelta(days=1), timedelta(minutes=1)

@@ -26,7 +26,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import Note, PolicyError, UsageError
-from sros_tool.explain.evaluator import Evaluator
+from sros_tool.explain.answer import Evaluator
 from sros_tool.explain.question import Part, Question
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
@@ -64,7 +64,7 @@ from sros_tool.wording import counted
 _DENY_RULE = "deny-rule"
 _USE = "use"
 
-# ── the enclaves to audit ────────────────────────────────────────────────────────────────────
+# ── the enclaves to audit ──────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +198,7 @@ def keystore_enclaves(
     return AuditedEnclaves("keystore", EnclaveNodes(nodes), load, vendor, context)
 
 
-# ── the audit ────────────────────────────────────────────────────────────────────────────────
+# ── the audit ──────────────────────────────────────────────────────────────────────────────
 
 
 @shows(spread=("right",))

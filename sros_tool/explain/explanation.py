@@ -1,5 +1,8 @@
 """Explain an answer: the lines of the policy behind it, and what to do about a denial.
 
+The smallest change of the policy adds a right only if no right covers the question, and removes a
+denial only if it prevents the answer "allowed"; the decision engine checks it before it is shown.
+
 Where the policy is not the cause, a command in a remedy works on a keystore with that fault, and
 repairs it.
 """
@@ -7,15 +10,28 @@ repairs it.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 
+from lxml import etree
+
+from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import SrosError
-from sros_tool.explain.answer import Answer, Provenance, deciding_lines, recorded_policy
-from sros_tool.explain.evaluator import Evaluator
+from sros_tool.explain.answer import (
+    Answer,
+    Evaluator,
+    GroupEdit,
+    PolicyChange,
+    Provenance,
+    deciding_lines,
+    lines_of_right,
+    recorded_policy,
+)
 from sros_tool.explain.question import Question
 from sros_tool.faults import FAULTS, REPLACE, Fault
 from sros_tool.keystore.layout import (
@@ -31,7 +47,10 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     enclave_path,
 )
-from sros_tool.keystore.participant import LoadedEnclave
+from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
+from sros_tool.names import NODE_SERVICES, is_expression, nodes_served
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
+from sros_tool.policy.rights import Right, profile_rights
 from sros_tool.terminal import log_step
 
 
@@ -98,9 +117,8 @@ def _states_policy(enclave: LoadedEnclave) -> bool:
 
 def _changed(evaluator: Evaluator, answer: Answer) -> Answer | None:
     """Return the answer with the change of the policy that would allow it, or None."""
-    from sros_tool.explain.change import smallest_change  # an allowed question needs none
 
-    change = smallest_change(evaluator, answer)
+    change = _smallest_change(evaluator, answer)
     if change is None:
         return None
     if change.add or change.lift:
@@ -231,3 +249,183 @@ def _has_authorities(keystore: Path) -> bool:
 def _known_causes() -> frozenset[str]:
     """Return the fault ids and decision reasons that have a remedy."""
     return frozenset((*FAULTS, *_BY_REASON))
+
+
+# ── the smallest change of a policy ────────────────────────────────────────────────────────
+
+_NO_RULE = frozenset({"no-rule", "default"})
+
+
+def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None:
+    """Return the change that makes the evaluator's vendor allow a denied question.
+
+    It starts from the policy of the enclave or, if that is not known, from the rights in its
+    permissions.  Returns None if no policy could allow the question.
+    """
+    enclave, question = evaluator.enclave, answer.question
+    if not question.right:
+        return None
+    try:
+        governance = enclave.plain_governance or parse_governance(enclave.governance)
+    except SrosError:
+        return None
+    wanted = question.allowed(enclave.name)
+    present = _present_rights(enclave.policy, enclave.name, answer)
+    add: list[Right] = []
+    lift: list[Right] = []
+    while True:
+        planned = plan_enclave(
+            policy_of(enclave.name, present), governance, at=evaluator.context.at
+        )
+        tried = Evaluator(evaluator.vendor, planned, evaluator.context).answer(question)
+        if tried.allowed:
+            return PolicyChange(
+                tuple(add),
+                tuple(lift),
+                _addition(add[0], _places(enclave.policy, answer)) if add else "",
+                tuple(_edits(lift, enclave.policy)) if enclave.policy else (),
+            )
+        if tried.reason in _NO_RULE and wanted not in present:
+            present.add(wanted)
+            add.append(wanted)
+            continue
+        blocking = _blocking(present, tried) if tried.reason == "deny-rule" else []
+        if not blocking:
+            return None
+        present.difference_update(blocking)
+        lift += sorted(blocking)
+
+
+def policy_of(name: str, rights: Iterable[Right]) -> Enclave:
+    """Return the policy of an enclave with a single nameless node that has these rights."""
+    groups = tuple(
+        Group(right.kind, ((right.right, right.qualifier),), (right.name,))
+        for right in sorted(rights)
+    )
+    return Enclave(name, (Profiles((Profile("/", "", groups),)),))
+
+
+def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Right]:
+    """Return the present rights of an enclave, except those that no policy can state."""
+    found: Iterable[Right] = ()
+    if policy:
+        found = (r for each in policy.all_profiles() for r in profile_rights(name, each))
+    elif answer.grant:
+        found = _granted(name, answer)
+    return {right for right in found if right.kind != "dds"}
+
+
+def _blocking(rights: Iterable[Right], answer: Answer) -> list[Right]:
+    """Return the denials that the deciding expression of an answer comes from.
+
+    Denials of the other direction count only if there is no other: Cyclone DDS denies a whole topic
+    because of a denial in either direction.
+    """
+    expression = answer.decision.expression or ""
+    publishes = answer.part is not None and answer.part.verb is AccessVerb.PUBLISH
+    own: list[Right] = []
+    other: list[Right] = []
+    for right in rights:
+        if right.qualifier is DENY:
+            names = right.topics
+            if expression in (names.publish if publishes else names.subscribe):
+                own.append(right)
+            elif expression in names.publish + names.subscribe:
+                other.append(right)
+    return own or other
+
+
+_ANY_NODE = ("/", "*")
+"""Namespace and name of a profile for any node: DDS decides by the enclave alone."""
+
+
+def _addition(right: Right, places: Iterable[tuple[str, str]]) -> str:
+    """Return a policy with one right, in the profile of the node that it belongs to.
+
+    It belongs to the node with the longest namespace around the right's name, of ``places``
+    (namespace and name of nodes).  Without any, no name of a node is invented.
+    """
+    known = list(places)
+    fitting = [each for each in known if right.name.startswith(each[0].rstrip("/") + "/")]
+    ns, node = max(fitting or known, key=lambda each: len(each[0]), default=_ANY_NODE)
+    group = Group(right.kind, ((right.right, right.qualifier),), (right.name,))
+    enclave = Enclave(right.enclave, (Profiles((Profile(ns, node, (group,)),)),))
+    from sros_tool.policy.document import write_policy  # an allowed question needs none
+
+    return write_policy(Policy((enclave,))).decode().rstrip()
+
+
+def _places(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, str]]:
+    """Yield namespace and name of an enclave's nodes.
+
+    Without its policy, these are the nodes whose standard services its permissions allow.
+    """
+    if policy:
+        yield from ((each.ns, each.node) for each in policy.all_profiles())
+        return
+    for node in nodes_served((each.right, each.name) for each in _granted("", answer)):
+        ns, _, name = node.rpartition("/")
+        yield ns or "/", name
+
+
+def _granted(name: str, answer: Answer) -> Iterator[Right]:
+    """Yield the rights in the grant of an enclave."""
+    from sros_tool.translate import grant_rights  # an allowed question needs none
+
+    if answer.grant:
+        yield from grant_rights(name, answer.grant)
+
+
+_ALIKE = 0.9
+"""The lowest similarity (`difflib`) of a typo in a ROS name."""
+
+
+def likely_names(answer: Answer) -> tuple[str, ...]:
+    """Return at most three names of the same right that the denied name of a question may mean.
+
+    For a standard service of a node, these are the services of the enclave's nodes; for any other
+    name, those with the same last part, as a forgotten remapping leaves it, and else those that are
+    spelled almost alike.
+    """
+    question, enclave = answer.question, answer.enclave
+    names = {
+        each.name
+        for each in _present_rights(enclave.policy, enclave.name, answer)
+        if (each.right, each.qualifier) == (question.right, ALLOW) and not is_expression(each.name)
+    } - {question.name}
+    last = question.name.rpartition("/")[2]
+    same = sorted(each for each in names if each.rpartition("/")[2] == last)
+    if (question.type == "service" and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
+        return tuple(same) if len(same) <= _SHOWN else ()
+    from difflib import get_close_matches  # for this alone, which is asked last
+
+    return tuple(get_close_matches(question.name, sorted(names), n=_SHOWN, cutoff=_ALIKE))
+
+
+_SHOWN = 3
+"""The number of names that are proposed at most."""
+
+
+def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
+    """Yield a replacement without these denials for each group that contains one."""
+    groups: dict[Source, Group] = {}
+    lifted: dict[Source, set[tuple[str, str]]] = {}
+    for right in lift:
+        for line in lines_of_right(policy, right):
+            groups[line.group.source] = line.group
+            lifted.setdefault(line.group.source, set()).add((line.name, line.right))
+    for source, group in groups.items():
+        kept: dict[tuple[tuple[str, str], ...], list[str]] = {}
+        for name in group.names:
+            rights = tuple(each for each in group.rights if (name, each[0]) not in lifted[source])
+            if rights:
+                kept.setdefault(rights, []).append(name)
+        yield GroupEdit(source, "\n".join(_xml(group.kind, *each) for each in kept.items()))
+
+
+def _xml(kind: str, rights: tuple[tuple[str, str], ...], names: list[str]) -> str:
+    element = etree.Element(kind, dict(rights))
+    for name in names:
+        etree.SubElement(element, kind.removesuffix("s")).text = name
+    etree.indent(element, space="  ")
+    return etree.tostring(element, encoding="unicode")

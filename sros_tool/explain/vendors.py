@@ -8,12 +8,10 @@ from typing import NamedTuple
 from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.vendors import NEWEST, Vendor
 from sros_tool.errors import Note, SrosError
-from sros_tool.explain.answer import Answer, OutcomeWord, Provenance, ReasonWord
+from sros_tool.explain.answer import Answer, Evaluator, OutcomeWord, Provenance, ReasonWord
 from sros_tool.explain.asking import Asked, AskedEnclave, AskingContext, ZenohInBrief, meant
-from sros_tool.explain.evaluator import Evaluator
-from sros_tool.explain.explanation import explain
+from sros_tool.explain.explanation import explain, likely_names
 from sros_tool.explain.question import Question, ask
-from sros_tool.explain.who import of_each
 from sros_tool.keystore.layout import (
     SETTINGS,
     ZENOH_SIGNED,
@@ -170,8 +168,6 @@ def _other_name(answer: Answer) -> Iterator[Note]:
     """Yield a note with the names that may be meant, if the enclave has rights to such names."""
     if answer.allowed or answer.problems or not answer.question.right:
         return
-    from sros_tool.explain.change import likely_names
-
     if names := likely_names(answer):
         text = f"the enclave may {answer.question.word} {' and '.join(names)}: perhaps that is "
         yield Note("explain.likely-name", f"{text}meant.")
@@ -282,6 +278,7 @@ class VendorOfKeystore(NamedTuple):
 
     def outcomes(self, question: Question) -> tuple[VendorOutcome, ...]:
         """Return the outcome for each enclave, sorted by name."""
+        from sros_tool.explain.who import of_each  # a question about one enclave needs none
 
         def outcome(name: str) -> VendorOutcome:
             enclave = load_enclave_of(self.keystore, name, at=self.asking.at)

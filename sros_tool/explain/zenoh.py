@@ -18,12 +18,10 @@ from typing import Annotated, Literal, NamedTuple
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
-from sros_tool.explain.answer import Answer, PolicyChange, StatedInPolicy
+from sros_tool.explain.answer import Answer, Evaluator, PolicyChange, StatedInPolicy
 from sros_tool.explain.asking import Asked, AskedEnclave, AskingContext, ZenohInBrief, meant
-from sros_tool.explain.evaluator import Evaluator
 from sros_tool.explain.explanation import explain
 from sros_tool.explain.question import Question
-from sros_tool.explain.who import of_each
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY_CA_FILE,
@@ -577,6 +575,7 @@ class ZenohOfKeystore:
 
     def outcomes(self, question: Question) -> tuple[ZenohAnswer, ...]:
         """Return the answer for each enclave, without whom it reaches; brief for peers."""
+        from sros_tool.explain.who import of_each  # a question about one enclave needs none
 
         def answer(name: str) -> ZenohAnswer:
             return self._evaluator.answer(name, question, reach=False, brief=True)

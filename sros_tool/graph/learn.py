@@ -24,8 +24,7 @@ from typing import Annotated, NamedTuple
 
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Criteria, Rule
-from sros_tool.dds.portable import name_notes
+from sros_tool.dds.permissions import Criteria, Rule, name_notes
 from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError
 from sros_tool.files import new_files, replace_file
 from sros_tool.graph.observation import (
@@ -272,7 +271,7 @@ def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, .
     return tuple(groups)
 
 
-# ── names ───────────────────────────────────────────────────────────────────────────────
+# ── names ──────────────────────────────────────────────────────────────────────────────────
 
 
 _CHANGING = (
@@ -328,7 +327,7 @@ def written(fqn: str, ns: str, node: str) -> str:
     return rest
 
 
-# ── common parts ────────────────────────────────────────────────────────────────────────
+# ── common parts ───────────────────────────────────────────────────────────────────────────
 
 
 PARTS = (
@@ -446,7 +445,7 @@ def _needed_files(root: Path, part: str) -> dict[str, bytes]:
     return found
 
 
-# ── notes and news ──────────────────────────────────────────────────────────────────────
+# ── notes and news ─────────────────────────────────────────────────────────────────────────
 
 
 _SHOWN = 5
@@ -800,7 +799,7 @@ def _check(plan: Draft) -> None:
     )
 
 
-# ── text ────────────────────────────────────────────────────────────────────────────────
+# ── text ───────────────────────────────────────────────────────────────────────────────────
 
 
 def render(learned: Learned) -> bytes:

@@ -24,10 +24,15 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import Keystore
 from sros_tool.parallel import map_slices
-from sros_tool.pki.certificates import common_name_of, identity_of, subject_text
+from sros_tool.pki.certificates import (
+    common_name_of,
+    identity_of,
+    key_digest,
+    load_request,
+    subject_text,
+)
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
-from sros_tool.pki.requests import key_digest, load_request
 
 
 class KnownKeys:
@@ -185,7 +190,7 @@ def _digests(keystore: Keystore, name: str) -> Iterator[str]:
         return  # a damaged file, which no DDS loads; `sros check` reports it
 
 
-# ── participants of DDS ─────────────────────────────────────────────────────────────────
+# ── participants of DDS ────────────────────────────────────────────────────────────────────
 
 
 def enclaves_by_identity(keystore: Keystore) -> dict[str, str]:

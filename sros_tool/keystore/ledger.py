@@ -149,7 +149,7 @@ def certificate_entry(
     now: datetime, what: str, certificate: x509.Certificate, enclave: str = "", reason: str = ""
 ) -> Entry:
     """Return the entry of an issued certificate; ``what`` is ca or certificate."""
-    from sros_tool.pki.requests import key_digest  # only writing needs it
+    from sros_tool.pki.certificates import key_digest  # only writing needs it
 
     validity = validity_of(certificate)
     return Entry(

@@ -12,9 +12,14 @@ from dataclasses import replace
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
 from sros_tool.errors import PolicyError
 from sros_tool.names import ACTION_PARTS
-from sros_tool.policy.model import StatedProtection
+from sros_tool.policy.model import (
+    DomainProtection,
+    Level,
+    NamedProtection,
+    StatedProtection,
+    TopicProtection,
+)
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers
-from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.translate import governance_for, protected_topics
 

@@ -79,7 +79,7 @@ from sros_tool.pki.crl import (
     signed_by,
 )
 from sros_tool.pki.keys import is_key_for_pss, load_any_key
-from sros_tool.pki.kinds import XML, kind_of
+from sros_tool.pki.pem import XML, kind_of
 from sros_tool.pki.token import TokenUri, read_token_file
 from sros_tool.validity import Window, iso
 from sros_tool.values import shows
@@ -1020,7 +1020,7 @@ class _EnclaveFiles:
             self._add(name, text, Fault.PERMISSIONS_DOMAIN)
 
 
-# ── reading one state while another process writes ────────────────────────────────────────
+# ── reading one state while another process writes ─────────────────────────────────────────
 
 
 _MOST_READS = 5

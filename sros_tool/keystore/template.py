@@ -18,8 +18,8 @@ from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import parse_toml, read_toml, templates_dir
 from sros_tool.names import check_enclave_name, expand, expression_problem
 from sros_tool.pki.token import refuse_pin
+from sros_tool.policy.model import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.policy.patterns import covers, matches
-from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.validity import Span, duration_text, parse_duration, parse_span, span_text
 from sros_tool.xml import read_bytes
 

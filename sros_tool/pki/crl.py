@@ -35,7 +35,7 @@ from sros_tool.pki.distinguished_names import (
     same_name,
 )
 from sros_tool.pki.keys import PrivateKey
-from sros_tool.pki.kinds import kind_of
+from sros_tool.pki.pem import kind_of
 from sros_tool.pki.tolerant import ContradictoryPoint
 from sros_tool.validity import iso
 
@@ -285,7 +285,7 @@ def _revoked(entry: x509.RevokedCertificate) -> Revoked:
     return Revoked(entry.serial_number, entry.revocation_date_utc, reason)
 
 
-# ── verification with lists (x509_vfy.c) ──────────────────────────────────────────────────────
+# ── verification with lists (x509_vfy.c) ───────────────────────────────────────────────────
 
 
 Lists = Sequence[x509.CertificateRevocationList]

@@ -31,7 +31,7 @@ from sros_tool.pki.certificates import digest as fingerprint
 from sros_tool.pki.certificates import load_der_certificate
 from sros_tool.pki.distinguished_names import canonical_der, canonical_issuer, read_name_der
 from sros_tool.pki.keys import PrivateKey
-from sros_tool.pki.kinds import ENCRYPTED_MESSAGE, SIGNED_MESSAGE, kind_of
+from sros_tool.pki.pem import ENCRYPTED_MESSAGE, SIGNED_MESSAGE, kind_of
 
 _BOM = "\ufeff".encode()
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"

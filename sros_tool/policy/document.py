@@ -35,10 +35,12 @@ from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError, UsageError
 from sros_tool.names import check_enclave_name, check_namespace, expand, expression_problem
 from sros_tool.policy.model import (
+    PROTECT,
     RIGHTS,
     VERSION,
     Enclave,
     Group,
+    Level,
     Policy,
     Profile,
     Profiles,
@@ -54,7 +56,6 @@ from sros_tool.policy.placeholders import (
     parts_of,
     sample,
 )
-from sros_tool.policy.protection import PROTECT, Level
 from sros_tool.values import DryRun, FileChange, FileChanges, Notes, shows
 from sros_tool.xml import parse, read_bytes, serialize, tag_of
 
@@ -1065,7 +1066,7 @@ def _write_profile(
                 yield item, group.protect
 
 
-# ── folders of policies ───────────────────────────────────────────────────────────────────────
+# ── folders of policies ────────────────────────────────────────────────────────────────────
 
 
 _MOST_FILES = 10_000

@@ -25,8 +25,7 @@ from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, Note, PolicyError
 from sros_tool.names import check_namespace, expand
 from sros_tool.policy.document import instruction_text, read_policy
-from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier, stated_protections
-from sros_tool.policy.protection import Level
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Level, Policy, Qualifier, stated_protections
 from sros_tool.policy.rights import (
     RIGHT_ORDER,
     GroupRights,
@@ -170,7 +169,7 @@ def _entry_order(entry: AddedName) -> tuple[int, GroupRights, str]:
     return RIGHT_ORDER[entry.rights[0][0]], entry.rights, entry.name
 
 
-# ── notes ────────────────────────────────────────────────────────────────────────────────
+# ── notes ──────────────────────────────────────────────────────────────────────────────────
 
 
 def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
@@ -469,7 +468,7 @@ def _profile(place: ProfileKey, entries: Sequence[AddedName]) -> _New:
     return _New(f'profile ns="{place.ns}" node="{place.node}"', children=_groups(entries))
 
 
-# ── positions ────────────────────────────────────────────────────────────────────────────
+# ── positions ──────────────────────────────────────────────────────────────────────────────
 
 
 class _Editor:

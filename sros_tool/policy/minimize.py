@@ -25,6 +25,7 @@ from sros_tool.policy.model import (
     DENY,
     Enclave,
     Group,
+    Level,
     Policy,
     Profile,
     Qualifier,
@@ -32,7 +33,6 @@ from sros_tool.policy.model import (
     with_groups,
 )
 from sros_tool.policy.patterns import Names, compiled, covers, literal_prefix, matches
-from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import (
     KIND_OF,
     GroupRights,

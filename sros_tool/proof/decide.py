@@ -9,18 +9,17 @@ This module reads no files.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from functools import lru_cache
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.dataclass import dataclass
-from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, is_expression, service_of
+from sros_tool.names import ROS_DISCOVERY_TOPIC, SERVICE_ENDS, dds_names, is_expression, service_of
 from sros_tool.policy.model import RIGHTS
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import KIND_OF
-from sros_tool.proof.flow import TopicHop, shortest_chain
 from sros_tool.proof.requirements import (
     EXCEPT,
     Apart,
@@ -35,7 +34,8 @@ from sros_tool.proof.requirements import (
     RightNames,
     Widest,
 )
-from sros_tool.proof.worlds import Meeting, Topics, World, shortest, valid_topics
+from sros_tool.proof.worlds import Meeting, Topics, World, named, shortest, valid_topics
+from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
 
 
 @dataclass(frozen=True, slots=True)
@@ -472,7 +472,7 @@ def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness 
     inside = [each for each in world.enclaves if each not in through]
     sources = [each for each in inside if _match(requirement.sources, each)]
     targets = {each for each in inside if _match(requirement.targets, each)}
-    chain = shortest_chain(world, sources, targets, through, limit)
+    chain = _shortest_chain(world, sources, targets, through, limit)
     if not chain:
         return None
     return Witness(tuple(use for hop in chain for use in _uses(hop)))
@@ -582,3 +582,122 @@ def _anybody(world: World, parts: Iterable[_Part], name: str, limit: SearchLimit
         ):
             return True
     return False
+
+
+# ── the flow of information ────────────────────────────────────────────────────────────────
+
+_IGNORED = NameSet.union(
+    named(each)
+    for each in (
+        ROS_DISCOVERY_TOPIC,
+        *(f"rt{name}" for name in OF_EVERY_NODE),
+        *(f"rq/{name.lstrip('/')}{SERVICE_ENDS['rq']}" for name in QUESTIONS),
+    )
+)
+"""Topics that are no hops."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicHop:
+    """A flow of information from enclave ``source`` to enclave ``target`` by a DDS topic."""
+
+    source: str
+    target: str
+    topic: str
+
+
+_Chain = tuple[TopicHop, ...]
+
+
+def _shortest_chain(
+    world: World,
+    sources: Iterable[str],
+    targets: Container[str],
+    without: Container[str],
+    limit: SearchLimit,
+) -> _Chain:
+    """Return a chain with the fewest hops from a source to another enclave in ``targets``, or ().
+
+    No chain leads through the enclaves ``without``.
+    """
+    starts = list(sources)
+    # A target can be a source, too, and must be reached from another one: so two are kept.
+    most = 2 if any(each in targets for each in starts) else 1
+    origins: dict[str, set[str]] = {each: {each} for each in starts}
+    used: dict[str, set[str]] = {}
+    queue: deque[tuple[str, str, _Chain]] = deque((each, each, ()) for each in starts)
+    flow = _Flow(world, limit)
+    while queue:
+        here, origin, chain = queue.popleft()
+
+        def is_new(enclave: str, origin: str = origin) -> bool:
+            there = origins.get(enclave, ())
+            return enclave not in without and origin not in there and len(there) < most
+
+        def is_unused(topic: str, origin: str = origin) -> bool:
+            by = used.setdefault(topic, set())
+            fresh = origin not in by and len(by) < most
+            by.add(origin)
+            return fresh
+
+        for topic, target in flow.hops(here, is_unused, is_new):
+            longer = (*chain, TopicHop(here, target, topic))
+            if target in targets:
+                return longer
+            origins.setdefault(target, set()).add(origin)
+            queue.append((target, origin, longer))
+    return ()
+
+
+def influencers(world: World, limit: SearchLimit) -> dict[str, set[str]]:
+    """Map each enclave that others influence directly to these."""
+    found: dict[str, set[str]] = {}
+    flow = _Flow(world, limit)
+    for enclave in world.enclaves:
+
+        def is_new(target: str, source: str = enclave) -> bool:
+            return source not in found.get(target, ())
+
+        for _, target in flow.hops(enclave, lambda _: True, is_new):
+            found.setdefault(target, set()).add(enclave)
+    return found
+
+
+class _Flow:
+    """The hops of a world; what is shared by wildcards is searched once for each pair."""
+
+    def __init__(self, world: World, limit: SearchLimit) -> None:
+        self._world = world
+        self._limit = limit
+
+    def hops(
+        self,
+        enclave: str,
+        is_unused: Callable[[str], bool],
+        is_new: Callable[[str], bool],
+    ) -> Iterator[tuple[str, str]]:
+        """Yield topic and reader for the hops from an enclave to those that are new.
+
+        Exact topics come first, each only if it is unused.
+        """
+        written = self._world.side(True).of[enclave] - _IGNORED
+        around = written.around()
+        for topic in sorted(around.exact if around else (), key=_plain_first):
+            if topic in written and is_unused(topic):
+                for reader in self._world.readers_of(topic):
+                    if reader != enclave and is_new(reader):
+                        yield topic, reader
+        if around is not None and not around.automata:
+            return
+        for reader in self._world.side(False).perhaps_meeting(
+            around.automata if around else None, self._limit
+        ):
+            if reader != enclave and is_new(reader):
+                shared = self._world.shared(enclave, reader, written, self._limit)
+                if shared:
+                    yield shared, reader
+
+
+def _plain_first(topic: str) -> tuple[bool, bool, int, str]:
+    """Return a sort key: topics before services, and /rosout last."""
+    return topic == "rt/rosout", not topic.startswith("rt/"), len(topic), topic

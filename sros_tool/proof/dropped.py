@@ -12,8 +12,8 @@ from dataclasses import replace
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import DROPPED
 from sros_tool.dataclass import dataclass
+from sros_tool.policy.model import Level
 from sros_tool.policy.patterns import covers, overlap
-from sros_tool.policy.protection import Level
 from sros_tool.proof.requirements import (
     EXCEPT,
     Apart,

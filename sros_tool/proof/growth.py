@@ -20,13 +20,13 @@ from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.expressions import names_of
-from sros_tool.dds.decision.matching import ExpressionIndex, matches
-from sros_tool.dds.decision.subjects import (
+from sros_tool.dds.decision.grants import (
     ComparisonCrash,
     also_fitting,
     certified_text,
     same_subject,
 )
+from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
@@ -37,11 +37,10 @@ from sros_tool.keystore.rights import SourceKind
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.rights import KIND_OF, Right
-from sros_tool.proof.access import domains_of, enforced_access, is_enforced
 from sros_tool.proof.assumptions import assumptions, completed, domains_of_robots, left_out
 from sros_tool.proof.protection import contradiction, less_protection
 from sros_tool.proof.sources import AT, AccessSource
-from sros_tool.proof.worlds import ROS_TOPICS
+from sros_tool.proof.worlds import ROS_TOPICS, domains_of, enforced_access, is_enforced
 from sros_tool.proof.zenoh_settings import unknown_settings
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
 from sros_tool.translate import grant_rights

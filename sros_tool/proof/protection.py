@@ -26,8 +26,7 @@ from sros_tool.keystore.comparison import (
 )
 from sros_tool.keystore.protection import contradictions
 from sros_tool.keystore.template import load_template
-from sros_tool.policy.model import StatedProtection
-from sros_tool.policy.protection import DomainProtection, Level
+from sros_tool.policy.model import DomainProtection, Level, StatedProtection
 from sros_tool.proof.sources import AT, KEYSTORE_ITSELF, AccessSource, Trust
 from sros_tool.proof.worlds import ROS_TOPICS, named, valid_topics
 from sros_tool.proof.zenoh_settings import looser_settings

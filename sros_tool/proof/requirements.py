@@ -23,8 +23,7 @@ from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError
 from sros_tool.files import read_toml
 from sros_tool.names import expression_problem, is_expression
-from sros_tool.policy.model import RIGHTS, Source
-from sros_tool.policy.protection import Level
+from sros_tool.policy.model import RIGHTS, Level, Source
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes

@@ -34,11 +34,8 @@ from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.proof.commit_files import CommitFiles
-from sros_tool.proof.dropped import dropped_findings, dropped_requirements
-from sros_tool.proof.findings import requirement_findings
-from sros_tool.proof.growth import Growth, compare_access
-from sros_tool.proof.policy_parts import (
+from sros_tool.proof.commit_files import (
+    CommitFiles,
     includes_files,
     is_whole_policy,
     may_be_policy,
@@ -46,6 +43,9 @@ from sros_tool.proof.policy_parts import (
     used_whole,
     users_of,
 )
+from sros_tool.proof.dropped import dropped_findings, dropped_requirements
+from sros_tool.proof.findings import requirement_findings
+from sros_tool.proof.growth import Growth, compare_access
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import Requirement, read_requirements
 from sros_tool.proof.sources import AccessSource, load_policies, load_side

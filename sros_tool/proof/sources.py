@@ -45,12 +45,12 @@ from sros_tool.pki.certificates import (
     common_name,
     common_name_of,
     fingerprints,
+    key_digest,
     load_certificate,
     load_certificates,
     subject_text,
 )
 from sros_tool.pki.crl import embedded_lists, load_crl, names_issuers, refusal_of, signed_by
-from sros_tool.pki.requests import key_digest
 from sros_tool.policy.document import PolicyFiles, policy_files, read_policy, refuse_fallbacks
 from sros_tool.policy.model import Enclave, Policy, Source, StatedProtection, stated_protections
 from sros_tool.policy.rights import Right, placed_rights, policy_rights

@@ -15,13 +15,14 @@ from sros_tool.automata import NameSet
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb
-from sros_tool.dds.decision.subjects import also_fitting
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.grants import also_fitting
+from sros_tool.dds.decision.matching import matches
+from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.explain.evaluator import Evaluator
+from sros_tool.explain.answer import Evaluator
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (
@@ -40,20 +41,32 @@ from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.document import refuse_fallbacks
-from sros_tool.policy.model import ALLOW, Policy, Source, StatedProtection, stated_protections
-from sros_tool.policy.protection import PROTECT, Level
-from sros_tool.policy.rights import Right, policy_rights
-from sros_tool.proof.access import (
+from sros_tool.policy.model import (
+    ALLOW,
+    PROTECT,
+    Enclave,
+    Level,
+    Policy,
+    Source,
+    StatedProtection,
+    stated_protections,
+)
+from sros_tool.policy.rights import Right, placed_rights, policy_rights
+from sros_tool.proof.decide import Use
+from sros_tool.proof.sources import UNCERTAIN
+from sros_tool.proof.worlds import (
+    LONGEST,
+    TopicAccess,
+    World,
     dds_access,
     domains_of,
     enforced_access,
     is_enforced,
+    named,
     ros_access,
+    topics_of,
     zenoh_message,
 )
-from sros_tool.proof.places import Place, Places, topics_of
-from sros_tool.proof.sources import UNCERTAIN
-from sros_tool.proof.worlds import LONGEST, TopicAccess, World, named
 from sros_tool.translate import governance_for, permissions_for, protected_topics
 from sros_tool.translate_zenoh import remote_rights, stated_rights
 from sros_tool.validity import window
@@ -461,3 +474,58 @@ def _enforced(
         confirm=confirm,
         stated={name: stated.get(name, nothing) for name in names},
     )
+
+
+# ── where rights are stated ────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A right as it is stated somewhere; without a line, in the permissions of an enclave."""
+
+    right: Right
+    source: Source
+
+
+class Places:
+    """Where rights are stated, to find the one that lets an enclave use a topic."""
+
+    def __init__(self, stated: Mapping[str, Iterable[Place]]) -> None:
+        """Take the rights of each enclave."""
+        self._stated = stated
+        self._by_enclave: dict[str, list[tuple[bool, str, Place]]] = {}
+
+    @classmethod
+    def of_policy(cls, policy: Policy) -> Places:
+        """Return the places in a policy, with their lines."""
+        return cls({each.path: _Lazy(each) for each in policy.enclaves})
+
+    def find(self, use: Use) -> Place | None:
+        """Return the right that states a use: one without wildcards if there is one."""
+        topics = self._by_enclave.get(use.enclave)
+        if topics is None:
+            found = self._stated.get(use.enclave, ())
+            topics = self._by_enclave[use.enclave] = [
+                (*topic, place) for place in found for topic in topics_of(place.right)
+            ]
+        best = None
+        for writes, topic, place in topics:
+            if writes is not use.writes:
+                continue
+            if topic == use.topic:
+                return place
+            if best is None and is_expression(topic) and matches(Style.FNMATCH, topic, use.topic):
+                best = place
+        return best
+
+
+class _Lazy:
+    """The rights that an enclave of a policy is allowed, each time they are asked for."""
+
+    def __init__(self, enclave: Enclave) -> None:
+        self._enclave = enclave
+
+    def __iter__(self) -> Iterator[Place]:
+        for placed in placed_rights(self._enclave):
+            if placed.right.qualifier is ALLOW:
+                yield Place(placed.right, placed.source)

@@ -15,9 +15,8 @@ from cryptography import x509
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import pem
+from sros_tool.pki.certificates import make_request, pem
 from sros_tool.pki.keys import key_pem
-from sros_tool.pki.requests import make_request
 from tests.checks.bench import Bench, name_of, new_key
 from tests.checks.keystore_cases import IS_CA
 from tests.support.harness import sros

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from sros_tool.dds.decision.access import holds_for
 from sros_tool.dds.decision.answers import Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.moments import read_moment
-from sros_tool.dds.decision.subjects import same_subject
+from sros_tool.dds.decision.grants import read_moment, same_subject
 from sros_tool.dds.decision.vendors import Moments, OpenRange, Subjects, Vendor
 from sros_tool.dds.domains import DomainRange, DomainSet
 from tests.dds.decision_documents import allow, governance, grant, permissions, publish

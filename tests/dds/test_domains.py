@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
-from sros_tool.dds.domain_elements import domain_lines, read_domains
 from sros_tool.dds.domains import MAX_DOMAIN, DomainRange, DomainSet
+from sros_tool.dds.permissions import domain_lines, read_domains
 from sros_tool.errors import DocumentError, UsageError
 
 pairs = st.tuples(st.integers(0, MAX_DOMAIN), st.integers(0, MAX_DOMAIN)).map(

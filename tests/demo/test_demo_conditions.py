@@ -10,7 +10,7 @@ from sros_tool.demo.backend import Backend, conditions
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.demo.scenarios.model import Condition, RowStatus
 from sros_tool.keystore.template import Template, load_template
-from sros_tool.policy.protection import Level, NamedProtection, TopicProtection
+from sros_tool.policy.model import Level, NamedProtection, TopicProtection
 
 OPEN = {
     RowStatus.HEARD,

@@ -12,7 +12,7 @@ import pytest
 
 from sros_tool.cli.common import now
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.explain.evaluator import Evaluator
+from sros_tool.explain.answer import Evaluator
 from sros_tool.explain.question import Part, Question, ask
 from sros_tool.files import policies_dir
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts

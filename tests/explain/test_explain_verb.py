@@ -66,10 +66,10 @@ def test_a_question_loads_only_what_answers_it(whole: Path) -> None:
     assert not set(names.split()).intersection(
         f"sros_tool.{each}"
         for each in (
-            "explain.change",
-            "explain.reached",
+            "explain.who",
             "explain.zenoh",
             "keystore.transaction",
+            "reach",
             "runtime.stacks",
         )
     )

@@ -41,14 +41,15 @@ from sros_tool.pki.certificates import (
     digest,
     enclave_subject,
     issued_by,
+    key_digest,
     load_certificates,
+    load_request,
     pem,
     subject_text,
 )
 from sros_tool.pki.chains import Checks, chain_fault
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.pki.keys import load_key
-from sros_tool.pki.requests import key_digest, load_request
 from sros_tool.policy.document import convert_policy, read_policy, write_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.prometheus import render_metrics

@@ -14,7 +14,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.explain.evaluator import Evaluator
+from sros_tool.explain.answer import Evaluator
 from sros_tool.explain.question import ask as question
 from sros_tool.keystore.participant import JoinContext, load_enclave
 from tests.checks.bench import SECRET, Bench

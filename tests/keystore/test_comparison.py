@@ -26,7 +26,7 @@ from sros_tool.keystore.template import (
     template_names,
     with_values,
 )
-from sros_tool.policy.protection import Level
+from sros_tool.policy.model import Level
 from sros_tool.translate import governance_for, protection_for
 from sros_tool.zenoh.configuration import Mode, ZenohNetwork
 

@@ -13,8 +13,7 @@ from sros_tool.keystore.protection import less_protected
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import stated_protections
-from sros_tool.policy.protection import Level
+from sros_tool.policy.model import Level, stated_protections
 from sros_tool.translate import governance_for
 from tests.support.harness import check_whole, snapshot, sros
 

@@ -16,8 +16,8 @@ from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
+from sros_tool.pki.certificates import make_request
 from sros_tool.pki.keys import load_key
-from sros_tool.pki.requests import make_request
 from tests.support.harness import certificate, snapshot
 
 NOW = datetime.now(UTC) + timedelta(hours=1)  # later than the keystore that is copied

@@ -15,9 +15,15 @@ from sros_tool.keystore.protection import (
     less_protected,
     with_stated,
 )
-from sros_tool.policy.model import Source, StatedProtection
+from sros_tool.policy.model import (
+    DomainProtection,
+    Level,
+    NamedProtection,
+    Source,
+    StatedProtection,
+    TopicProtection,
+)
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.translate import protected_topics
 
 KINDS = ("topics", "services", "actions")

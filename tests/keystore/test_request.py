@@ -31,9 +31,8 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
-from sros_tool.pki.certificates import common_name
+from sros_tool.pki.certificates import common_name, key_digest, load_request, make_request
 from sros_tool.pki.keys import generate_key
-from sros_tool.pki.requests import key_digest, load_request, make_request
 from sros_tool.policy.document import read_policy
 from tests.support.children import run
 from tests.support.harness import certificate, policy_text, publish, remains, snapshot, topics_of

@@ -22,7 +22,7 @@ from sros_tool.keystore.template import (
     render_template,
     template_names,
 )
-from sros_tool.policy.protection import (
+from sros_tool.policy.model import (
     DomainProtection,
     Level,
     NamedProtection,

@@ -18,10 +18,15 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 
 from sros_tool.errors import PkiError, UsageError
-from sros_tool.pki.certificates import load_certificate, load_certificates, pem
+from sros_tool.pki.certificates import (
+    load_certificate,
+    load_certificates,
+    load_request,
+    make_request,
+    pem,
+)
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import generate_key, key_pem, load_key
-from sros_tool.pki.requests import load_request, make_request
 from sros_tool.pki.tolerant import is_tolerated
 from sros_tool.validity import iso, parse_iso, window
 from tests.fuzz.mutations import BIT_STRING, Value, decoded

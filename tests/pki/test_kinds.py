@@ -12,7 +12,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.pki.crl import read_list
 from sros_tool.pki.keys import load_key
-from sros_tool.pki.kinds import kind_of
+from sros_tool.pki.pem import kind_of
 
 _MADE = {
     "certificate in DER": "x509 -in ca.pem -outform DER",

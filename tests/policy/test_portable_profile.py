@@ -16,8 +16,7 @@ from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import render_governance
-from sros_tool.dds.permissions import render_permissions
-from sros_tool.dds.portable import Meets, outside
+from sros_tool.dds.permissions import Meets, outside, render_permissions
 from sros_tool.keystore.template import load_template, template_names
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.policy.patterns import Names

@@ -13,9 +13,8 @@ from functools import lru_cache
 from itertools import product
 
 from sros_tool.names import READING_SERVICES, dds_names
-from sros_tool.policy.model import RIGHTS
+from sros_tool.policy.model import RIGHTS, Level
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.protection import Level
 from sros_tool.proof.requirements import (
     Apart,
     AtMost,

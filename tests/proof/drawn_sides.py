@@ -45,12 +45,12 @@ from sros_tool.policy.model import (
     RIGHTS,
     Enclave,
     Group,
+    Level,
     Policy,
     Profile,
     Profiles,
     Qualifier,
 )
-from sros_tool.policy.protection import Level
 from sros_tool.policy.rights import policy_rights
 from sros_tool.translate import governance_for, permissions_for
 from sros_tool.translate_zenoh import remote_of, stated_rights

@@ -14,16 +14,17 @@ from sros_tool.names import dds_names, expand
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
+    PROTECT,
     RIGHTS,
     Enclave,
     Group,
+    Level,
     Policy,
     Profile,
     Profiles,
     Source,
 )
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.protection import PROTECT, Level
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.decide import Witness, decide
 from sros_tool.proof.dropped import dropped_requirements

@@ -10,9 +10,9 @@ from sros_tool.automata import NameSet
 from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.errors import DocumentError
-from sros_tool.policy.model import ALLOW, Source
-from sros_tool.policy.protection import Level
+from sros_tool.policy.model import ALLOW, Level, Source
 from sros_tool.policy.rights import Right
+from sros_tool.proof.findings import render_requirements, suggest
 from sros_tool.proof.requirements import (
     Apart,
     AtMost,
@@ -27,7 +27,6 @@ from sros_tool.proof.requirements import (
     parse_requirements,
     read_requirements,
 )
-from sros_tool.proof.suggest import render_requirements, suggest
 from sros_tool.proof.worlds import TopicAccess, World
 
 EVERY_KIND = """\

@@ -10,7 +10,7 @@ import pytest
 from sros_tool.dds.domains import DomainSet
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.minimize import minimize
-from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
+from sros_tool.policy.model import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.report.compose import Context, compose, group_of, overlay, protection_of
 from sros_tool.report.picture import OverlaySide
 from sros_tool.report.picture import WireLevel as Shown

@@ -18,12 +18,11 @@ from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import check_topic_names
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.dataclass import dataclass
-from sros_tool.dds.decision.moments import read_moment
+from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, Moments, Vendor
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
-from sros_tool.dds.permissions import Criteria, Grant, Rule
-from sros_tool.dds.portable import outside
+from sros_tool.dds.permissions import Criteria, Grant, Rule, outside
 from sros_tool.errors import SrosError
 from sros_tool.keystore.fleet import EnclaveDomains
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_XML

@@ -16,8 +16,7 @@ from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import parse_governance
-from sros_tool.dds.permissions import Grant
-from sros_tool.dds.portable import mistaken_names, some_pairs
+from sros_tool.dds.permissions import Grant, mistaken_names, some_pairs
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
     CRL_FILE,

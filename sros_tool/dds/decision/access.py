@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
+from sros_tool.dds.decision.grants import ComparisonCrash, certified_text, read_moment, same_subject
 from sros_tool.dds.decision.matching import ExpressionIndex, matches
-from sros_tool.dds.decision.moments import read_moment
-from sros_tool.dds.decision.subjects import ComparisonCrash, certified_text, same_subject
 from sros_tool.dds.decision.vendors import (
     DenyPartitions,
     Moments,

@@ -68,13 +68,15 @@ from sros_tool.pki.certificates import (
     common_name_of,
     digest,
     fingerprints,
+    key_digest,
     load_certificates,
+    load_request,
+    make_request,
     subject_text,
     validity_of,
 )
 from sros_tool.pki.crl import SUPERSEDED, load_crl
 from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key, key_pem, load_key
-from sros_tool.pki.requests import key_digest, load_request, make_request
 from sros_tool.pki.token import (
     Secrets,
     TokenKey,

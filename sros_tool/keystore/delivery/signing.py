@@ -14,7 +14,7 @@ from cryptography import x509
 
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.dds.portable import name_notes
+from sros_tool.dds.permissions import name_notes
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.fleet.enclaves import robot_of
@@ -71,10 +71,17 @@ from sros_tool.keystore.outcomes import (
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import EarlierRights
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import enclave_subject, has_unique_part, pem, validity_of
+from sros_tool.pki.certificates import (
+    SigningRequest,
+    enclave_subject,
+    has_unique_part,
+    key_digest,
+    load_request,
+    pem,
+    validity_of,
+)
 from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import holds_private_key, load_key
-from sros_tool.pki.requests import SigningRequest, key_digest, load_request
 from sros_tool.policy.model import Enclave, Policy, stated_protections
 from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.validity import iso

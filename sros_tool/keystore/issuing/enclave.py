@@ -21,8 +21,13 @@ from cryptography import x509
 
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Grant, Permissions, parse_permissions, render_permissions
-from sros_tool.dds.portable import document_notes
+from sros_tool.dds.permissions import (
+    Grant,
+    Permissions,
+    document_notes,
+    parse_permissions,
+    render_permissions,
+)
 from sros_tool.errors import KeystoreError, Note, PolicyError, check_meaning
 from sros_tool.files import policies_dir
 from sros_tool.keystore.issuing.authority import Authority
@@ -60,7 +65,7 @@ Result = TypeVar("Result")
 _NOTED_LOSS = 0.01
 
 
-# ── certificates and permissions to issue ────────────────────────────────────────────────
+# ── certificates and permissions to issue ──────────────────────────────────────────────────
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +137,7 @@ class Issued:
             yield from document_notes(name, self.permissions, len(self.document))
 
 
-# ── issuing ──────────────────────────────────────────────────────────────────────────────
+# ── issuing ────────────────────────────────────────────────────────────────────────────────
 
 
 class EnclaveWriter:
@@ -339,7 +344,7 @@ def _early_expiry(
     )
 
 
-# ── rights and shared files ──────────────────────────────────────────────────────────────
+# ── rights and shared files ────────────────────────────────────────────────────────────────
 
 
 def stated_enclave(policy: Policy, name: str) -> Enclave:

@@ -14,8 +14,7 @@ from types import MappingProxyType
 from cryptography import x509
 
 from sros_tool.dataclass import dataclass
-from sros_tool.dds.permissions import parse_permissions
-from sros_tool.dds.portable import name_notes
+from sros_tool.dds.permissions import name_notes, parse_permissions
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.keystore.fleet import EnclaveDomains
 from sros_tool.keystore.issuing.enclave import (

@@ -24,8 +24,7 @@ from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.protection import less_protected, with_stated
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import Template
-from sros_tool.policy.model import StatedProtection
-from sros_tool.policy.protection import Level
+from sros_tool.policy.model import Level, StatedProtection
 from sros_tool.translate import governance_for
 from sros_tool.wording import first_few
 

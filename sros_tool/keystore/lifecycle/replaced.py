@@ -21,8 +21,7 @@ from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
 from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.reader import Keystore
-from sros_tool.pki.certificates import subject_text, validity_of
-from sros_tool.pki.requests import key_digest
+from sros_tool.pki.certificates import key_digest, subject_text, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, compare
 from sros_tool.translate import grant_rights

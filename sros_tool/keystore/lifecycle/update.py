@@ -85,7 +85,7 @@ from sros_tool.keystore.settings import (
 from sros_tool.keystore.template import EVERYTHING, NODE_BASICS, Template, with_values
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import enclave_subject, has_unique_part, same_key
-from sros_tool.policy.protection import DomainProtection, Level
+from sros_tool.policy.model import DomainProtection, Level
 from sros_tool.policy.rights import compare
 from sros_tool.translate import (
     allows_everything,
@@ -662,7 +662,7 @@ class _Updater:
         return f"`{command} --next` goes on with the rotation that is under way"
 
 
-# ── rights that only an old ledger has ───────────────────────────────────────────────────
+# ── rights that only an old ledger has ─────────────────────────────────────────────────────
 
 
 def trust_records(
