@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from xml.etree import ElementTree
@@ -25,6 +25,9 @@ LONG = "--long"
 
 WITH_DDS = ("tests/integration", "tests/explain")
 """The folders with tests that start DDS processes; pytest imports only these for them."""
+
+COLLECT = ["-m", "pytest", "--collect-only", "-qq"]
+"""pytest compiles the tests for its messages; once, before five processes would do it each."""
 
 LINT = {
     "ruff check": ["-m", "ruff", "check", "--quiet"],
@@ -69,7 +72,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         name: ["-m", "pytest", *words, f"--junit-xml={reports[name]}"]
         for name, words in parts.items()
     }
-    results = _run_together(steps, "tests", env)
+    results = _run_together(steps, "tests", env, first=COLLECT)
     for name in parts:
         if results[name] == _NOTHING_COLLECTED:
             results[name] = 0
@@ -80,18 +83,34 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
 
 
 def _run_together(
-    steps: Mapping[str, list[str]], shown: str, env: Mapping[str, str]
+    steps: Mapping[str, list[str]],
+    shown: str,
+    env: Mapping[str, str],
+    *,
+    first: Sequence[str] = (),
 ) -> dict[str, int]:
-    """Run steps at the same time; show the output of one as it comes, and of the others later."""
+    """Run steps at the same time; show the output of one as it comes, and of the others later.
+
+    What is to be done ``first`` is done before the tests begin, beside the other steps.
+    """
     with ExitStack() as running:
         # The step with direct output is started last, and usually ends first.
-        order = sorted(steps, key=lambda name: name == shown)
-        begun = {
-            name: running.enter_context(_Step(name, steps[name], env, aside=name != shown))
-            for name in order
-        }
+        order = sorted(steps, key=lambda name: (name not in LINT, name == shown))
+        begun = {}
+        for name in order:
+            if first and name not in LINT:
+                _quietly(first, env)
+                first = ()
+            step = _Step(name, steps[name], env, aside=name != shown)
+            begun[name] = running.enter_context(step)
         ended = {name: begun[name].end() for name in reversed(order)}
     return {name: ended[name] for name in steps}
+
+
+def _quietly(words: Sequence[str], env: Mapping[str, str]) -> None:
+    """Run Python without output; what fails is shown by the steps that follow."""
+    nowhere = subprocess.DEVNULL
+    subprocess.run([PYTHON, *words], cwd=CHECKOUT, env=env, stdout=nowhere, stderr=nowhere)
 
 
 def _conclude(results: Mapping[str, int], counts: Counter[str], started: float) -> int:
