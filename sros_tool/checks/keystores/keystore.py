@@ -36,7 +36,7 @@ from sros_tool.checks.keystores.issued import (
     summary_of,
     wanted_rights,
 )
-from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
+from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import check_capitals, names_without_wildcards
 from sros_tool.checks.keystores.vendors import (
     REFUSED,
@@ -101,8 +101,9 @@ def keystore_findings(
     Raises:
         KeystoreError: it is no keystore.
     """
+    opened.check()
     root = opened.root
-    keystore = read_keystore(
+    keystore = CheckedKeystore(
         opened,
         now=now,
         zone=zone,

@@ -1,10 +1,11 @@
-"""A keystore opened for checks: its readable parts, and the unreadable ones."""
+"""A view of a keystore for checks: its readable parts, and the unreadable ones."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import field
 from datetime import UTC, datetime, tzinfo
 from functools import cache, cached_property
 from pathlib import Path
@@ -56,37 +57,112 @@ class UnreadablePart:
     error: SrosError
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class CheckedKeystore:
-    """A keystore, or the part of one that was exported for a robot, as it is checked.
+    """A view of a keystore, or of the part of one that was exported for a robot, for its checks.
 
-    ``settings`` are None if ros2/sros2 made it.  ``authorities`` maps a role to the certificates of
-    its CA file, the issuing one first.  ``governance`` is the signed document that its enclaves
-    share, or b"".  ``is_home`` is false on a robot, where no CA key may be;
-    ``looks_like_home`` is true there, too, of what has the folders of a keystore.  ``policies`` are
-    compared with its permissions; ``zone`` is the time zone of the host on which its enclaves run.
-    ``edits`` are what somebody edited by hand; ``fleet`` are its robots, and ``fleet_edited`` says
-    how the file of them was, as a clause.  ``distribution`` is the ROS 2 distribution of the nodes;
-    "" is the latest.
+    A part that exists and cannot be read is as if it were not there, and one of ``unread``.
+
+    Args:
+        opened: the keystore, or an export of it.
+        now: the moment to check for.
+        zone: the time zone of the host on which its enclaves run.
+        policies: policies with which its permissions are compared.
+        on_robot: whether it is on a robot, where no CA key may be, even if it contains some.
+        distribution: the ROS 2 distribution of its nodes; "" is the latest.
     """
 
     opened: Keystore
     now: datetime
-    names: tuple[str, ...]
-    settings: Template | None
-    authorities: dict[str, tuple[x509.Certificate, ...]]
-    crl: RevocationList | None
-    ledger: Ledger
-    governance: bytes = b""
-    unread: tuple[UnreadablePart, ...] = ()
-    policies: tuple[Policy, ...] = ()
     zone: tzinfo = UTC
-    is_home: bool = True
-    looks_like_home: bool = True
-    edits: HandEdits = HandEdits()
-    fleet: Fleet | None = None
-    fleet_edited: str = ""
+    policies: tuple[Policy, ...] = ()
+    on_robot: bool = False
     distribution: str = ""
+    _unread: dict[str, UnreadablePart] = field(default_factory=dict)
+
+    def _part(self, path: str, read: Callable[[], _Part], otherwise: _Part) -> _Part:
+        try:
+            return read()
+        except SrosError as error:
+            self._unread[path] = UnreadablePart(path, error)
+        except OSError as error:
+            why = SrosError(f"'{path}' cannot be read", f"{error.strerror}.")
+            self._unread[path] = UnreadablePart(path, why)
+        return otherwise
+
+    @property
+    def unread(self) -> tuple[UnreadablePart, ...]:
+        """The parts that cannot be read."""
+        _ = self.settings, self.ledger, self.crl, self.authorities
+        _ = self.governance, self.fleet, self.fleet_edited
+        return tuple(self._unread.values())
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Its enclaves; `check_files` reports folders that cannot be read."""
+        return search_enclaves(self.root)[0]
+
+    @cached_property
+    def settings(self) -> Template | None:
+        """The settings; None if ros2/sros2 made it."""
+        return self._part(SETTINGS, lambda: self.opened.settings, None)
+
+    @cached_property
+    def ledger(self) -> Ledger:
+        """The ledger of all issued files."""
+        return self._part(LEDGER, lambda: self.opened.ledger, Ledger())
+
+    @cached_property
+    def crl(self) -> RevocationList | None:
+        """The revocation list of the identity CA."""
+        return self._part(CRL, lambda: self.opened.revocation_list, None)
+
+    @cached_property
+    def authorities(self) -> dict[str, tuple[x509.Certificate, ...]]:
+        """The certificates of the CA file of each role, the issuing one first."""
+
+        def chain(role: str) -> tuple[x509.Certificate, ...]:
+            return self._part(ca_certificate(role), lambda: self.opened.authority(role), ())
+
+        return {role: certificates for role in ROLES if (certificates := chain(role))}
+
+    @cached_property
+    def governance(self) -> bytes:
+        """The signed document that its enclaves share, or b""."""
+        there = (self.root / GOVERNANCE_P7S).is_file()
+
+        def read() -> bytes:
+            return self.opened.read(GOVERNANCE_P7S, "governance document") if there else b""
+
+        return self._part(GOVERNANCE_P7S, read, b"")
+
+    @cached_property
+    def edits(self) -> HandEdits:
+        """What somebody edited by hand."""
+        signed: Governance | None = None
+        with suppress(SrosError):  # what is wrong with it is a finding of each enclave
+            signed = self.opened.governance
+        return hand_edits(self.opened, self.ledger, self.settings, signed)
+
+    @cached_property
+    def fleet(self) -> Fleet | None:
+        """Its robots, if somebody named them."""
+        return self._part(FLEET, lambda: load_fleet(self.opened), None)
+
+    @cached_property
+    def fleet_edited(self) -> str:
+        """How the file of the fleet is not the one that sros wrote, as a clause, or ""."""
+        return self._part(FLEET, lambda: edited_fleet(self.opened, self.ledger), "")
+
+    @property
+    def looks_like_home(self) -> bool:
+        """Whether it has the folders of a keystore with CAs, wherever it is."""
+        return self.opened.is_home
+
+    @property
+    def is_home(self) -> bool:
+        """Whether it is a keystore with CAs, and not on a robot."""
+        return self.looks_like_home and not self.on_robot
 
     @property
     def root(self) -> Path:
@@ -151,77 +227,3 @@ class CheckedEnclave:
     def file(self, name: str) -> str:
         """Return the path of one of its files."""
         return f"{self.folder}/{name}"
-
-
-def read_keystore(
-    keystore: Keystore,
-    *,
-    now: datetime,
-    zone: tzinfo = UTC,
-    policies: tuple[Policy, ...] = (),
-    on_robot: bool = False,
-    distribution: str = "",
-) -> CheckedKeystore:
-    """Return the readable parts of a keystore, and the list of unreadable ones.
-
-    Args:
-        keystore: the keystore, or an export of it.
-        now: the moment to check for.
-        zone: the time zone of the host on which its enclaves run.
-        policies: policies with which its permissions are compared.
-        on_robot: whether it is on a robot, even if it contains CA keys.
-        distribution: the ROS 2 distribution of its nodes; "" is the latest.
-
-    Raises:
-        KeystoreError: it is no keystore.
-    """
-    keystore.check()
-    root = keystore.root
-    unread: list[UnreadablePart] = []
-
-    def part(path: str, read: Callable[[], _Part], otherwise: _Part) -> _Part:
-        try:
-            return read()
-        except SrosError as error:
-            unread.append(UnreadablePart(path, error))
-        except OSError as error:
-            why = SrosError(f"'{path}' cannot be read", f"{error.strerror}.")
-            unread.append(UnreadablePart(path, why))
-        return otherwise
-
-    def authority(role: str) -> tuple[x509.Certificate, ...]:
-        return part(ca_certificate(role), lambda: keystore.authority(role), ())
-
-    settings = part(SETTINGS, lambda: keystore.settings, None)
-    ledger = part(LEDGER, lambda: keystore.ledger, Ledger())
-    crl = part(CRL, lambda: keystore.revocation_list, None)
-    authorities = {role: chain for role in ROLES if (chain := authority(role))}
-    signed = root / GOVERNANCE_P7S
-    governance = part(
-        GOVERNANCE_P7S,
-        lambda: keystore.read(signed, "governance document") if signed.is_file() else b"",
-        b"",
-    )
-    signed_governance: Governance | None = None
-    with suppress(SrosError):  # what is wrong with it is a finding of each enclave
-        signed_governance = keystore.governance
-    edits = hand_edits(keystore, ledger, settings, signed_governance)
-    return CheckedKeystore(
-        keystore,
-        now,
-        search_enclaves(root)[0],  # `check_files` reports folders that cannot be read
-        settings,
-        authorities,
-        crl,
-        ledger,
-        governance,
-        tuple(unread),
-        policies,
-        zone,
-        keystore.is_home and not on_robot,
-        keystore.is_home,
-        edits,
-        part(FLEET, lambda: load_fleet(keystore), None),
-        part(FLEET, lambda: edited_fleet(keystore, ledger), ""),
-        distribution,
-    )
