@@ -18,11 +18,8 @@ from sros_tool.values import Words, as_plain, shows
 from tools.json_page import SCHEMAS
 from tools.json_schemas import object_schema, schemas, text_of
 
-BY_HAND = {
-    "confirmation.json",
-    "inspect.json",
-}
-"""The schemas that no type makes: the confirmation, which robots write, and verbs not done yet."""
+BY_HAND = {"confirmation.json"}
+"""The schema that no type makes: the confirmation, which robots write."""
 
 Shape = TypeVar("Shape")
 

@@ -45,6 +45,7 @@ class Shapes(NamedTuple):
 
 
 _LIFECYCLE = "sros_tool.keystore.lifecycle.shown"
+_DESCRIBE = "sros_tool.keystore.describe"
 
 SHARED_PARTS: dict[str, str] = {
     "change": "sros_tool.values:FileChange",
@@ -113,6 +114,21 @@ VERBS: Mapping[str, str | Shapes] = {
         },
     ),
     "list_enclaves": "sros_tool.keystore.selection:EnclaveList",
+    "inspect": Shapes(
+        "What is in a keystore, an enclave or a file.",
+        {
+            "a keystore": f"{_DESCRIBE}:DescribedKeystore",
+            "the folder of an enclave": f"{_DESCRIBE}:DescribedEnclave",
+            "certificates": f"{_DESCRIBE}:DescribedCertificates",
+            "a revocation list": f"{_DESCRIBE}:DescribedList",
+            "a private key": f"{_DESCRIBE}:DescribedKey",
+            "key on a token": f"{_DESCRIBE}:DescribedToken",
+            "permissions": f"{_DESCRIBE}:DescribedPermissions",
+            "governance": f"{_DESCRIBE}:DescribedGovernance",
+            "a Zenoh configuration": f"{_DESCRIBE}:DescribedConfiguration",
+            "--history": f"{_DESCRIBE}:History",
+        },
+    ),
     "env": "sros_tool.runtime.environment:PrintedEnvironment",
     "zenoh": Shapes(
         "The configurations of Zenoh of a keystore's enclaves, or an existing one.",

@@ -2,15 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sros_tool.cli.common import PATH, json_option, now, print_json
 from sros_tool.terminal import echo
-from sros_tool.values import as_plain
+from sros_tool.validity import iso
+from sros_tool.wording import counted
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.describe import (
+        AuthorityFile,
+        CertificateFacts,
+        DescribedCertificates,
+        DescribedConfiguration,
+        DescribedEnclave,
+        DescribedGovernance,
+        DescribedKey,
+        DescribedKeystore,
+        DescribedList,
+        DescribedPermissions,
+        DescribedToken,
+        GrantFacts,
+        ListFacts,
+        RemoteFacts,
+        RightNames,
+        SignatureFacts,
+        TokenPlace,
+        UnreadableFile,
+    )
 
 _INDENT = "  "
 
@@ -54,30 +78,30 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
     missing from the keystore's ledger, or lines of the ledger are missing or were changed.
     """
     from sros_tool.errors import DocumentError, UsageError
-    from sros_tool.keystore.describe import describe
+    from sros_tool.keystore.describe import describe, problems_of
 
     if not path.exists():
         raise DocumentError(f"'{path}' does not exist")
     if history:
         return _show_history(path, as_json)
     described = describe(path, now=now(), authority=authority)
-    if authority and "signed" not in described:
+    signature = getattr(described, "signature", None)
+    if authority and signature is None:
         raise UsageError(
-            f"--ca verifies a signed document, and '{path}' is of the kind {described['kind']}",
+            f"--ca verifies a signed document, and '{path}' is of the kind {described.kind}",
             "",
             "Leave --ca out, or name a governance.p7s, permissions.p7s or session.p7s.",
         )
     if as_json:
         print_json(described)
     else:
-        for line in _TEXT[described["kind"]](described):
+        for line in _TEXT[described.kind](described):
             echo(line)
-    zenoh = described.get("zenoh") or described
-    if zenoh.get("problems"):
+    if problems_of(described):
         return 1
-    if described.get("signed") is False:  # documents in clear, such as governance.xml, exist
+    if signature and not signature.signed:  # documents in clear, such as governance.xml, exist
         return 1 if authority or path.suffix == ".p7s" else 0
-    return 1 if described.get("problems") or described.get("signature_verified") is False else 0
+    return 1 if signature and signature.signature_verified is False else 0
 
 
 def _show_history(root: Path, as_json: bool) -> int:
@@ -85,20 +109,9 @@ def _show_history(root: Path, as_json: bool) -> int:
 
     found = history(root, now=now())
     if as_json:
-        print_json(
-            {
-                "kind": "history",
-                "path": str(root),
-                "entries": [
-                    {**as_plain(item.entry), "status": item.status, "path": item.path}
-                    for item in found.items
-                ],
-                "unexplained": list(found.unexplained),
-                "gaps": list(found.gaps),
-            }
-        )
+        print_json(found)
     else:
-        for item in found.items:
+        for item in found.entries:
             entry = item.entry
             until = f"until {entry.not_after}" if entry.not_after else ""
             named = f" (SHA-256 {entry.sha256[:8]})" if entry.what == "ca" else ""
@@ -114,245 +127,262 @@ def _show_history(root: Path, as_json: bool) -> int:
     return 1 if found.unexplained or found.gaps else 0
 
 
-def _keystore(d: dict[str, Any]) -> Iterator[str]:
-    template = d["template"]
-    yield f"keystore {d['path']}, " + (
+def _keystore(keystore: DescribedKeystore) -> Iterator[str]:
+    from sros_tool.keystore.describe import UnreadableFile
+
+    template = keystore.template
+    yield f"keystore {keystore.path}, " + (
         f"template {template}" if template else "no template: not made by sros, or an export"
     )
-    for role, authority in d["authorities"].items():
-        if "error" in authority:
-            yield f"  {role} CA: {authority['error']}"
-            continue
-        key = "key here" if authority["key_present"] else "key elsewhere"
+    for role, authority in keystore.authorities.items():
+        yield from _authority(role, authority)
+    if isinstance(keystore.governance, UnreadableFile):
+        yield f"  governance: {keystore.governance.error}"
+    elif keystore.governance:
+        yield from _indented(_domain_rules(keystore.governance))
+    if network := keystore.zenoh:
         yield (
-            f"  {role} CA {_named(authority)}, {authority['key']}, {key}, "
-            f"valid until {authority['not_after']}"
+            f"  Zenoh in {network.mode} mode: router {network.router} at "
+            f"{', '.join(network.endpoints)}"
         )
-        for other in authority.get("further", ()):
-            yield (
-                f"    next to it {_named(other)}, {other['key']}, "
-                f"valid until {other['not_after']}, serial {other['serial']}"
-            )
-        if "crl" in authority:
-            yield from _indented(_indented(_list(authority["crl"])))
-    if d["governance"]:
-        if "error" in d["governance"]:
-            yield f"  governance: {d['governance']['error']}"
-        else:
-            yield from _indented(_governance(d["governance"]))
-    if network := d["zenoh"]:
-        yield (
-            f"  Zenoh in {network['mode']} mode: router {network['router']} at "
-            f"{', '.join(network['endpoints'])}"
-        )
-    if d["ledger"]:
-        yield f"  LEDGER DAMAGED: {'; '.join(d['ledger'])}"
-    yield f"  {len(d['enclaves'])} enclave{'' if len(d['enclaves']) == 1 else 's'}"
-    for enclave in d["enclaves"]:
-        until = enclave["expires"]
-        state = "loadable" if enclave["loadable"] else "NOT LOADABLE"
-        if enclave["key_on_robot"] and not enclave["problems"]:
+    if keystore.ledger:
+        yield f"  LEDGER DAMAGED: {'; '.join(keystore.ledger)}"
+    yield f"  {counted(len(keystore.enclaves), 'enclave')}"
+    for enclave in keystore.enclaves:
+        facts = enclave.facts
+        state = "loadable" if facts.loadable else "NOT LOADABLE"
+        if enclave.key_on_robot and not facts.problems:
             state = "key on its robot"
-        elif enclave["token"]:
-            state += f", key on the token {enclave['token']['token']}"
-        yield f"    {enclave['name']}  {state}, expires {until or 'at an unknown time'}"
-        for problem in enclave["problems"]:
+        elif facts.token:
+            state += f", key on the token {facts.token.token}"
+        yield f"    {enclave.name}  {state}, expires {_moment(facts.expires)}"
+        for problem in facts.problems:
             yield f"      {problem}"
-    for problem in d["unreadable"]:
+    for problem in keystore.unreadable:
         yield f"    {problem}"
 
 
-def _named(d: dict[str, Any], key: str = "") -> str:
+def _authority(role: str, authority: AuthorityFile | UnreadableFile) -> Iterator[str]:
+    from sros_tool.keystore.describe import UnreadableFile
+
+    if isinstance(authority, UnreadableFile):
+        yield f"  {role} CA: {authority.error}"
+        return
+    first = authority.file.first
+    key = "key here" if authority.key_present else "key elsewhere"
+    yield (
+        f"  {role} CA {_named(first.subject, first.sha256)}, {first.key}, {key}, "
+        f"valid until {iso(first.not_after)}"
+    )
+    for other in authority.file.further or ():
+        yield (
+            f"    next to it {_named(other.subject, other.sha256)}, {other.key}, "
+            f"valid until {iso(other.not_after)}, serial {other.serial}"
+        )
+    if crl := authority.file.crl:
+        yield f"    {_list(crl)}"
+
+
+def _named(subject: str | None, sha256: str | None) -> str:
     """Return the subject of a CA with the first digits of its SHA-256, as `authority_text` does."""
-    subject, sha256 = d[key or "subject"], d[f"{key}_sha256" if key else "sha256"]
     return f"{subject} (SHA-256 {sha256[:8]})" if sha256 else str(subject)
 
 
-def _enclave(d: dict[str, Any]) -> Iterator[str]:
-    yield f"enclave {d['path']}: {'loadable' if d['loadable'] else 'NOT LOADABLE'}"
-    for problem in d["problems"]:
+def _moment(moment: datetime | None) -> str:
+    return iso(moment) if moment else "at an unknown time"
+
+
+def _enclave(enclave: DescribedEnclave) -> Iterator[str]:
+    facts = enclave.facts
+    yield f"enclave {enclave.path}: {'loadable' if facts.loadable else 'NOT LOADABLE'}"
+    for problem in facts.problems:
         yield f"  {problem}"
-    yield f"  subject {d['subject']}, expires {d['expires'] or 'at an unknown time'}"
-    identity, permissions = _named(d, "identity_ca"), _named(d, "permissions_ca")
+    yield f"  subject {facts.subject}, expires {_moment(facts.expires)}"
+    identity = _named(facts.identity_ca, facts.identity_ca_sha256)
+    permissions = _named(facts.permissions_ca, facts.permissions_ca_sha256)
     yield f"  identity CA {identity}, permissions CA {permissions}"
-    yield f"  domains {d['domains']}"
-    if token := d["token"]:
-        yield f"  {_place(token)}"
-    for grant in d["permissions"] or ():
+    yield f"  domains {facts.domains}"
+    if facts.token:
+        yield f"  {_place(facts.token)}"
+    for grant in facts.permissions or ():
         yield from _indented(_grant(grant))
-    if zenoh := d["zenoh"]:
-        yield f"  Zenoh: {', '.join(each['file'] for each in zenoh['files']) or 'NOT USABLE'}"
-        for problem in zenoh["problems"]:
+    if zenoh := enclave.zenoh:
+        yield f"  Zenoh: {', '.join(each.file for each in zenoh.files) or 'NOT USABLE'}"
+        for problem in zenoh.problems:
             yield f"    {problem}"
 
 
-def _certificate(d: dict[str, Any]) -> Iterator[str]:
-    kind = "CA certificate" if d["is_ca"] else "certificate"
-    yield f"{kind} {d['path']}"
-    yield from _indented(_facts(d))
-    for other in d.get("further", ()):
+def _certificates(described: DescribedCertificates) -> Iterator[str]:
+    file = described.file
+    yield f"{'CA certificate' if file.first.is_ca else 'certificate'} {described.path}"
+    yield from _indented(_certificate(file.first))
+    for other in file.further or ():
         yield "next to it, in the same file"
-        yield from _indented(_facts(other))
-    if "crl" in d:
-        yield from _list(d["crl"])
+        yield from _indented(_certificate(other))
+    if file.crl:
+        yield _list(file.crl)
 
 
-def _facts(d: dict[str, Any]) -> Iterator[str]:
-    yield f"subject {d['subject']}"
-    yield f"issuer {d['issuer']}"
-    yield f"serial {d['serial']}"
-    yield f"{d['key']}, signed with {d['signature']}"
-    valid = "valid now" if d["valid_now"] else "NOT VALID NOW"
-    yield f"from {d['not_before']} to {d['not_after']}: {valid}"
-    yield f"SHA-256 {d['sha256']}"
+def _certificate(certificate: CertificateFacts) -> Iterator[str]:
+    yield f"subject {certificate.subject}"
+    yield f"issuer {certificate.issuer}"
+    yield f"serial {certificate.serial}"
+    yield f"{certificate.key}, signed with {certificate.signature}"
+    valid = "valid now" if certificate.valid_now else "NOT VALID NOW"
+    yield f"from {iso(certificate.not_before)} to {iso(certificate.not_after)}: {valid}"
+    yield f"SHA-256 {certificate.sha256}"
 
 
-def _revocation_list(d: dict[str, Any]) -> Iterator[str]:
-    yield from _list(d)
-    for serial in d["revoked"]:
+def _revocation_list(described: DescribedList) -> Iterator[str]:
+    yield _list(described.facts)
+    for serial in described.facts.revoked:
         yield f"  {serial}"
 
 
-def _list(d: dict[str, Any]) -> Iterator[str]:
-    valid = "" if d["valid_now"] else ": NOT VALID NOW"
-    yield (
-        f"revocation list {d['number']} of {d['issuer']}, until {d['not_after']}{valid}, "
-        f"{len(d['revoked'])} revoked"
+def _list(crl: ListFacts) -> str:
+    valid = "" if crl.valid_now else ": NOT VALID NOW"
+    return (
+        f"revocation list {crl.number} of {crl.issuer}, until {iso(crl.not_after)}{valid}, "
+        f"{len(crl.revoked)} revoked"
     )
 
 
-def _key(d: dict[str, Any]) -> Iterator[str]:
-    yield f"private key {d['path']}: {d['algorithm']}, mode {d['mode']}"
-    if d["mode"] not in ("0600", "0400"):
+def _key(key: DescribedKey) -> Iterator[str]:
+    yield f"private key {key.path}: {key.algorithm}, mode {key.mode}"
+    if key.mode not in ("0600", "0400"):
         yield "  others can read it: chmod 600"
 
 
-def _place(d: dict[str, Any]) -> str:
-    pin = f", PIN in {d['pin_source']}" if d["pin_source"] else ""
-    return f"key {d['object']} on the token {d['token']}{pin}"
+def _place(place: TokenPlace) -> str:
+    pin = f", PIN in {place.pin_source}" if place.pin_source else ""
+    return f"key {place.object} on the token {place.token}{pin}"
 
 
-def _key_on_token(d: dict[str, Any]) -> Iterator[str]:
-    yield f"{d['path']}: {_place(d)}"
+def _token(described: DescribedToken) -> Iterator[str]:
+    yield f"{described.path}: {_place(described.place)}"
 
 
-def _permissions(d: dict[str, Any]) -> Iterator[str]:
-    yield f"permissions {d['path']}"
-    yield from _indented(_signature(d))
-    for grant in d["grants"]:
+def _permissions(permissions: DescribedPermissions) -> Iterator[str]:
+    yield f"permissions {permissions.path}"
+    yield from _indented(_signature(permissions.signature))
+    for grant in permissions.grants:
         yield from _indented(_grant(grant))
 
 
-def _governance_file(d: dict[str, Any]) -> Iterator[str]:
-    yield f"governance {d['path']}"
-    yield from _indented(_signature(d))
-    yield from _indented(_governance(d))
+def _governance(governance: DescribedGovernance) -> Iterator[str]:
+    yield f"governance {governance.path}"
+    yield from _indented(_signature(governance.signature))
+    yield from _indented(_domain_rules(governance))
 
 
-def _zenoh_configuration(d: dict[str, Any]) -> Iterator[str]:
-    yield f"Zenoh configuration {d['path']}"
-    yield from _indented(_signature(d))
-    for problem in d["problems"]:
+def _configuration(described: DescribedConfiguration) -> Iterator[str]:
+    yield f"Zenoh configuration {described.path}"
+    yield from _indented(_signature(described.signature))
+    for problem in described.problems:
         yield f"  {problem}"
-    if not d["made_by_sros"]:
+    if not described.made_by_sros:
         yield "  not as sros writes it: see `sros check` of the file"
     places = [
-        f"{word} {', '.join(d[key])}"
-        for word, key in (("listens at", "listen"), ("connects to", "connect"))
-        if d[key]
+        f"{word} {', '.join(endpoints)}"
+        for word, endpoints in (
+            ("listens at", described.listen),
+            ("connects to", described.connect),
+        )
+        if endpoints
     ]
-    yield f"  {d['mode']}, {', '.join(places) or 'without an endpoint'}"
-    access = d["access_control"]
-    state = "" if access["enabled"] else "OFF: "
+    yield f"  {described.mode}, {', '.join(places) or 'without an endpoint'}"
+    access = described.access_control
+    state = "" if access.enabled else "OFF: "
     yield (
-        f"  access control: {state}{_counted(access['rules'], 'rule')} for "
-        f"{_counted(access['subjects'], 'subject')}, everything else: {access['default'].upper()}"
+        f"  access control: {state}{counted(access.rules, 'rule')} for "
+        f"{counted(access.subjects, 'subject')}, everything else: {access.default.upper()}"
     )
-    if d["domains"]:
-        yield f"  domain {', '.join(map(str, d['domains']))}"
-    for each in d["rights"]:
-        yield from _indented(_remote(each))
+    if described.domains:
+        yield f"  domain {', '.join(map(str, described.domains))}"
+    for remote in described.rights:
+        yield from _indented(_remote(remote))
 
 
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
-
-
-def _remote(d: dict[str, Any]) -> Iterator[str]:
-    if d["own_rights_by_router"]:
-        yield f"through the router {d['enclave']} this enclave may"
-        for kind, rights in sorted(d["may"].items()):
-            for right, names in rights.items():
-                yield f"  {right} {kind}: {', '.join(names)}"
+def _remote(remote: RemoteFacts) -> Iterator[str]:
+    if remote.own_rights_by_router:
+        yield f"through the router {remote.enclave} this enclave may"
+        yield from _indented(_rights(remote.may))
         return
     counts = [
-        f"{right} {_counted(len(names), kind.removesuffix('s'))}"
-        for kind, rights in sorted(d["may"].items())
+        f"{right} {counted(len(names), kind.removesuffix('s'))}"
+        for kind, rights in sorted(remote.may.items())
         for right, names in rights.items()
     ]
-    yield f"processes of {d['enclave']} may {', '.join(counts) or 'only see the graph'}"
+    yield f"processes of {remote.enclave} may {', '.join(counts) or 'only see the graph'}"
 
 
-def _signature(d: dict[str, Any]) -> Iterator[str]:
-    if not d["signed"]:
+def _rights(table: RightNames) -> Iterator[str]:
+    for kind, rights in sorted(table.items()):
+        for right, names in rights.items():
+            yield f"{right} {kind}: {', '.join(names)}"
+
+
+def _signature(signature: SignatureFacts) -> Iterator[str]:
+    signer = signature.signer
+    if signer is None:
         yield "not signed"
         return
     verified = {True: "signature verified", False: "SIGNATURE NOT VERIFIED", None: "not verified"}
     yield (
-        f"signed by {_named(d, 'signer')}, {d['digest']}, {d['bytes']} bytes: "
-        f"{verified[d['signature_verified']]}"
+        f"signed by {_named(signer.signer, signer.signer_sha256)}, {signer.digest}, "
+        f"{signer.bytes} bytes: {verified[signature.signature_verified]}"
     )
-    if d["signature_problem"]:
-        yield f"  {d['signature_problem']}"
+    if signer.signature_problem:
+        yield f"  {signer.signature_problem}"
 
 
-def _grant(grant: dict[str, Any]) -> Iterator[str]:
-    yield f"grant {grant['name']} for {grant['subject']}"
-    expired = "" if grant.get("valid_now", True) else ": NOT VALID NOW"
-    yield f"  valid from {grant['not_before']} to {grant['not_after']}{expired}"
-    for rule in grant["rules"]:
-        where = f" in partitions {', '.join(rule['partitions'])}" if rule["partitions"] else ""
-        yield f"  {rule['qualifier']} in domain {rule['domains']}{where}"
-        for kind, rights in sorted(rule["rights"].items()):
-            for right, names in rights.items():
-                yield f"    {right} {kind}: {', '.join(names)}"
-    yield f"  everything else: {grant['default']}"
+def _grant(grant: GrantFacts) -> Iterator[str]:
+    yield f"grant {grant.name} for {grant.subject}"
+    expired = ": NOT VALID NOW" if grant.valid_now is False else ""
+    yield f"  valid from {grant.not_before} to {grant.not_after}{expired}"
+    for rule in grant.rules:
+        where = f" in partitions {', '.join(rule.partitions)}" if rule.partitions else ""
+        yield f"  {rule.qualifier} in domain {rule.domains}{where}"
+        yield from _indented(_indented(_rights(rule.rights)))
+    yield f"  everything else: {grant.default}"
 
 
-def _governance(d: dict[str, Any]) -> Iterator[str]:
-    for rule in d["domain_rules"]:
-        yield f"governance of domain {rule['domains']}"
+def _domain_rules(governance: DescribedGovernance) -> Iterator[str]:
+    for described in governance.domain_rules:
+        rule = described.rule
+        yield f"governance of domain {described.domains}"
         yield (
-            f"  rtps {rule['rtps_protection_kind']}, discovery "
-            f"{rule['discovery_protection_kind']}, liveliness "
-            f"{rule['liveliness_protection_kind']}"
+            f"  rtps {rule.rtps_protection_kind}, discovery {rule.discovery_protection_kind}, "
+            f"liveliness {rule.liveliness_protection_kind}"
         )
-        joins = "checked" if rule["enable_join_access_control"] else "NOT CHECKED"
-        strangers = "ALLOWED" if rule["allow_unauthenticated_participants"] else "refused"
+        joins = "checked" if rule.enable_join_access_control else "NOT CHECKED"
+        strangers = "ALLOWED" if rule.allow_unauthenticated_participants else "refused"
         yield f"  permission to join {joins}, unauthenticated participants {strangers}"
-        for topic in rule["topic_rules"]:
-            checks = [
-                word for word in ("read", "write") if not topic[f"enable_{word}_access_control"]
-            ]
-            unchecked = f", {' and '.join(checks)} NOT CHECKED" if checks else ""
+        for topic in described.topic_rules:
+            open_to_all = {
+                "read": not topic.enable_read_access_control,
+                "write": not topic.enable_write_access_control,
+            }
+            words = [word for word, unchecked in open_to_all.items() if unchecked]
+            unchecked = f", {' and '.join(words)} NOT CHECKED" if words else ""
             yield (
-                f"  topics {topic['topic_expression']}: data {topic['data_protection_kind']}, "
-                f"metadata {topic['metadata_protection_kind']}{unchecked}"
+                f"  topics {topic.topic_expression}: data {topic.data_protection_kind}, "
+                f"metadata {topic.metadata_protection_kind}{unchecked}"
             )
 
 
-def _indented(lines: Iterator[str]) -> Iterator[str]:
+def _indented(lines: Iterable[str]) -> Iterator[str]:
     return (_INDENT + line for line in lines)
 
 
-_TEXT = {
+_TEXT: dict[str, Callable[[Any], Iterator[str]]] = {
     "keystore": _keystore,
     "enclave": _enclave,
-    "certificate": _certificate,
+    "certificate": _certificates,
     "private key": _key,
-    "key on a token": _key_on_token,
+    "key on a token": _token,
     "revocation list": _revocation_list,
     "permissions": _permissions,
-    "governance": _governance_file,
-    "Zenoh configuration": _zenoh_configuration,
+    "governance": _governance,
+    "Zenoh configuration": _configuration,
 }

@@ -18,6 +18,7 @@ from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import XSI, domain_lines, read_domains
 from sros_tool.errors import DocumentError
+from sros_tool.values import shows
 from sros_tool.xml import escape, parse, require_child, tag_of
 
 _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd"
@@ -85,14 +86,28 @@ class TopicRule:
     """The protection of the topics that match an expression."""
 
     topic_expression: str
+    """The DDS topics that it is for."""
     enable_discovery_protection: bool = field(metadata=_flag("discovery"))
+    """Whether discovery of the topic is protected."""
     enable_liveliness_protection: bool = field(metadata=_flag("liveliness"))
+    """Whether its liveliness is protected."""
     enable_read_access_control: bool = field(metadata=_flag("read_access_control"))
+    """Whether permissions decide who may read."""
     enable_write_access_control: bool = field(metadata=_flag("write_access_control"))
+    """Whether permissions decide who may write."""
     metadata_protection_kind: ProtectionKind = field(metadata=_kind("metadata"))
+    """Protection of submessages, as in DDS-Security 1.1."""
     data_protection_kind: ProtectionKind = field(metadata=_kind("data", _DATA_KINDS))
+    """Protection of the payload: ``NONE``, ``SIGN`` or ``ENCRYPT``."""
 
 
+@shows(
+    "allow_unauthenticated_participants",
+    "enable_join_access_control",
+    "discovery_protection_kind",
+    "liveliness_protection_kind",
+    "rtps_protection_kind",
+)
 @dataclass(frozen=True, slots=True)
 class DomainRule:
     """The protection of some domains; the first topic rule that matches a topic decides."""
@@ -101,10 +116,15 @@ class DomainRule:
     allow_unauthenticated_participants: bool = field(
         metadata=_flag("allow_unauthenticated_participants", protects=False)
     )
+    """Whether participants without a certificate are let in."""
     enable_join_access_control: bool = field(metadata=_flag("join_access_control"))
+    """Whether permissions decide who may join."""
     discovery_protection_kind: ProtectionKind = field(metadata=_kind("discovery"))
+    """Protection of discovery, as in DDS-Security 1.1."""
     liveliness_protection_kind: ProtectionKind = field(metadata=_kind("liveliness"))
+    """Protection of liveliness messages, as in DDS-Security 1.1."""
     rtps_protection_kind: ProtectionKind = field(metadata=_kind("rtps"))
+    """Protection of whole RTPS messages, as in DDS-Security 1.1."""
     topic_access_rules: tuple[TopicRule, ...]
 
 
@@ -126,12 +146,6 @@ _ATTRIBUTES: dict[type, tuple[Attribute, ...]] = {
 def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
     """Return the attributes of domain rules or of topic rules, in the order of the schema."""
     return _ATTRIBUTES[rule]
-
-
-def values_of(rule: DomainRule | TopicRule) -> dict[str, bool | str]:
-    """Map the names of a rule's attributes to their values, protection kinds as text."""
-    values = ((each.name, getattr(rule, each.name)) for each in attributes(type(rule)))
-    return {name: value if isinstance(value, bool) else str(value) for name, value in values}
 
 
 def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:

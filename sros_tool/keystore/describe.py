@@ -5,17 +5,16 @@ from __future__ import annotations
 import binascii
 import hashlib
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal, NamedTuple
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
-from sros_tool.dds.governance import Governance, parse_governance, values_of
+from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.layout import (
@@ -33,7 +32,6 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     ca_key,
     enclave_folder,
-    enclave_path,
     is_keystore,
     list_enclaves,
     permissions_ca_for,
@@ -43,7 +41,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import GAP, Entry
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
-from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave, open_enclave
+from sros_tool.keystore.reader import FilesReadOnce, Keystore, open_enclave
 from sros_tool.keystore.zenoh_files import OpenedZenoh, ZenohFault, open_zenoh
 from sros_tool.pki.certificates import (
     common_name_of,
@@ -57,16 +55,421 @@ from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
 from sros_tool.pki.keys import algorithm, holds_private_key, load_key
 from sros_tool.pki.token import TokenUri, read_token_file
 from sros_tool.policy.rights import KIND_OF
-from sros_tool.translate import RosRight, ros_rights
+from sros_tool.translate import ros_rights
 from sros_tool.translate_zenoh import domains_of, stated_names
 from sros_tool.validity import iso
+from sros_tool.values import Words, shows
 from sros_tool.xml import parse, read_bytes
-from sros_tool.zenoh.access import AccessRule
 from sros_tool.zenoh.configuration import Configuration, Mode, ZenohNetwork, parse_rendered
 from sros_tool.zenoh.document import parse_configuration
 
-Description = dict[str, Any]
 _JSON = (".json5", ".json")
+
+NamedPath = Annotated[Path, "PATH, as it was named."]
+Problems = Annotated[Sequence[str], "What keeps a process from running in it."]
+
+
+# ── what is described, and its JSON ────────────────────────────────────────────────────────
+
+
+class CertificateFacts(NamedTuple):
+    """A certificate: the parts that matter to DDS Security."""
+
+    subject: str
+    """Its subject."""
+    issuer: str
+    """The subject of its issuer."""
+    serial: str
+    """Its serial number, in hexadecimal."""
+    is_ca: bool
+    """Whether it is the certificate of a CA."""
+    key: str
+    """The kind of its key, such as ``EC secp256r1``."""
+    signature: str
+    """The hash of its signature, such as ``sha256``."""
+    sha256: str
+    """SHA-256 of the certificate (DER), in hexadecimal."""
+    not_before: datetime
+    """Begin of its validity, in UTC."""
+    not_after: datetime
+    """End of its validity, in UTC."""
+    valid_now: bool
+    """Whether it is valid now."""
+
+
+class ListFacts(NamedTuple):
+    """A revocation list; with an expired one DDS refuses all certificates of its CA."""
+
+    issuer: str
+    """The CA that signed it."""
+    number: int
+    """Its number; each new list has a higher one."""
+    not_before: datetime
+    """Begin of its validity, in UTC."""
+    not_after: datetime
+    """End of its validity, in UTC."""
+    valid_now: bool
+    """Whether it is valid now."""
+    revoked: Sequence[str]
+    """Serial numbers of the revoked certificates, in hexadecimal."""
+
+
+@shows(spread=("first",), optional=("further", "crl"))
+class CertificateFile(NamedTuple):
+    """The certificates in a PEM file."""
+
+    first: CertificateFacts
+    """The first certificate."""
+    further: Sequence[CertificateFacts] | None
+    """The other certificates in the file: the chain, or the other CA during a rotation."""
+    crl: ListFacts | None
+    """The revocation list in the file, if there is one."""
+
+
+@shows(spread=("file",))
+class AuthorityFile(NamedTuple):
+    """A CA certificate."""
+
+    file: CertificateFile
+    """Its file."""
+    key_present: bool
+    """Whether its private key is in the keystore."""
+
+
+class UnreadableFile(NamedTuple):
+    """A file that cannot be read."""
+
+    error: str
+    """Why it cannot be read."""
+
+
+class TokenPlace(NamedTuple):
+    """The place of a key on a PKCS#11 token."""
+
+    token: str
+    """Label of the token."""
+    object: str
+    """Label of the key."""
+    pin_source: str | None
+    """File with the PIN, or null."""
+
+
+RightNames = Mapping[str, Mapping[str, Sequence[str]]]
+"""Names by kind and right, such as ``{"topics": {"publish": ["/chatter"]}}``."""
+
+
+class RuleFacts(NamedTuple):
+    """A rule."""
+
+    qualifier: Annotated[str, Words(("ALLOW", "DENY"))]
+    """Whether it allows or denies."""
+    domains: str
+    """The domains that it is for."""
+    rights: RightNames
+    """Names by kind (``topics``, ``services``, ``actions``, ``dds``) and by right, such as
+    ``publish``."""
+    partitions: Sequence[str]
+    """The partitions that it is for."""
+
+
+@shows(optional=("valid_now",))
+class GrantFacts(NamedTuple):
+    """A grant of permissions."""
+
+    name: str
+    """Its name."""
+    subject: str
+    """The subject that it is for."""
+    not_before: str
+    """Begin of its validity, as it is written."""
+    not_after: str
+    """End of its validity, as it is written."""
+    valid_now: bool | None
+    """Whether it is valid now."""
+    rules: Sequence[RuleFacts]
+    """Its rules, in order."""
+    default: Annotated[str, Words(("ALLOW", "DENY"))]
+    """What decides if no rule matches."""
+
+
+class EnclaveFacts(NamedTuple):
+    """An enclave."""
+
+    loadable: bool
+    """Whether a process can run in it now."""
+    problems: Problems
+    subject: str | None
+    """Subject of its certificate, or null."""
+    valid_until: datetime | None
+    """Expiry of its certificate, in UTC, or null."""
+    expires: datetime | None
+    """First expiry of its certificates and permissions, in UTC, or null."""
+    identity_ca: str | None
+    """Subject of the identity CA that it trusts, or null."""
+    identity_ca_sha256: str | None
+    """SHA-256 of the certificate of that CA, or null."""
+    permissions_ca: str | None
+    """Subject of the permissions CA that it trusts, or null."""
+    permissions_ca_sha256: str | None
+    """SHA-256 of the certificate of that CA, or null."""
+    domains: str | None
+    """The ROS domains of its governance, or null."""
+    token: TokenPlace | None
+    """The place of its key on a PKCS#11 token, or null for a key in a file."""
+    permissions: Sequence[GrantFacts] | None
+    """The grants in its permissions, or null."""
+    permissions_bytes: int | None
+    """Size of permissions.p7s in bytes, or null."""
+
+
+@shows(spread=("facts",))
+class KeystoreEnclave(NamedTuple):
+    """An enclave."""
+
+    name: str
+    """The enclave."""
+    key_on_robot: bool
+    """Whether its key was made on its robot and is not here."""
+    facts: EnclaveFacts
+    """What is known of it."""
+
+
+class ZenohFileFacts(NamedTuple):
+    """A configuration."""
+
+    file: str
+    """Its name, such as ``session.json5``."""
+    mode: Mode
+    """How the process takes part in the network."""
+
+
+class ZenohFiles(NamedTuple):
+    """The Zenoh configurations of an enclave."""
+
+    files: Sequence[ZenohFileFacts]
+    """Those that are signed."""
+    problems: Annotated[Sequence[str], "What keeps a process of rmw_zenoh_cpp from running in it."]
+
+
+class NetworkFacts(NamedTuple):
+    """A Zenoh network."""
+
+    router: str
+    """The enclave of the router."""
+    endpoints: Sequence[str]
+    """Where sessions connect to the router, as HOST:PORT."""
+    listen: Sequence[str]
+    """Where the router listens, as HOST:PORT."""
+    mode: Mode
+    """Whether sessions also connect to each other (``peer``), or only to the router."""
+
+
+class SignerFacts(NamedTuple):
+    """A signature."""
+
+    signer: str | None
+    """Subject of the signer's certificate, or null."""
+    signer_sha256: str | None
+    """SHA-256 of that certificate, or null."""
+    digest: str
+    """The hash of the signature, such as ``sha256``."""
+    bytes: int
+    """Size of the signed document in bytes."""
+    signature_problem: str
+    """Why it is not valid, or an empty string."""
+
+
+@shows(spread=("signer",))
+class SignatureFacts(NamedTuple):
+    """Whether a document is signed, and by whom."""
+
+    signed: bool
+    """Whether the document is signed."""
+    signature_verified: bool | None
+    """Whether the signature is valid; null if no permissions CA is known."""
+    signer: SignerFacts | None
+    """By whom."""
+
+
+@shows(spread=("rule",))
+class DomainRuleFacts(NamedTuple):
+    """A domain rule."""
+
+    domains: str
+    """The domains that it is for."""
+    rule: DomainRule
+    """Its attributes."""
+    topic_rules: Sequence[TopicRule]
+    """Its topic rules; the first that matches counts."""
+
+
+class AccessControlFacts(NamedTuple):
+    """Access control of Zenoh."""
+
+    enabled: bool
+    """Whether it is on."""
+    default: Annotated[str, Words(("allow", "deny"))]
+    """What no rule decides is allowed or denied."""
+    rules: int
+    """Number of its rules."""
+    subjects: int
+    """Number of its subjects."""
+
+
+class RemoteFacts(NamedTuple):
+    """The rights of an enclave."""
+
+    enclave: str
+    """The enclave."""
+    own_rights_by_router: bool
+    """Whether it is the router of a client, and ``may`` is what the client may do through it."""
+    may: RightNames
+    """Names by kind (``topics``, ``services``) and by right, such as ``publish``; with wildcards,
+    as Zenoh writes them."""
+
+
+class DescribedKeystore(NamedTuple):
+    """A keystore."""
+
+    path: NamedPath
+    template: str | None
+    """Name of the template in its settings, or null."""
+    ledger: Sequence[str]
+    """Faults of the ledger."""
+    authorities: Mapping[str, AuthorityFile | UnreadableFile]
+    """Its CAs, by role (``identity``, ``permissions``)."""
+    governance: DescribedGovernance | UnreadableFile | None
+    """Its governance, or null."""
+    zenoh: NetworkFacts | None
+    """Its Zenoh network, by its settings; null without one."""
+    enclaves: Sequence[KeystoreEnclave]
+    """Its enclaves."""
+    unreadable: Sequence[str]
+    """Folders that cannot be read, and why."""
+    problems: Sequence[str]
+    """All problems; if there are any, the exit status is 1."""
+    kind: Annotated[Literal["keystore"], "What PATH is."] = "keystore"
+
+
+@shows(spread=("facts",))
+class DescribedEnclave(NamedTuple):
+    """An enclave."""
+
+    path: NamedPath
+    facts: EnclaveFacts
+    """What is known of it."""
+    zenoh: ZenohFiles | None
+    """Its Zenoh configurations, or null."""
+    kind: Annotated[Literal["enclave"], "What PATH is."] = "enclave"
+
+
+@shows(spread=("file",))
+class DescribedCertificates(NamedTuple):
+    """A file of certificates."""
+
+    path: NamedPath
+    file: CertificateFile
+    """Its content."""
+    kind: Annotated[Literal["certificate"], "What PATH is."] = "certificate"
+
+
+@shows(spread=("facts",))
+class DescribedList(NamedTuple):
+    """A revocation list."""
+
+    path: NamedPath
+    facts: ListFacts
+    """Its content."""
+    kind: Annotated[Literal["revocation list"], "What PATH is."] = "revocation list"
+
+
+class DescribedKey(NamedTuple):
+    """A private key."""
+
+    path: NamedPath
+    algorithm: str
+    """Its kind, such as ``EC secp256r1``."""
+    mode: str
+    """Permission bits of the file, in octal."""
+    kind: Annotated[Literal["private key"], "What PATH is."] = "private key"
+
+
+@shows(spread=("place",))
+class DescribedToken(NamedTuple):
+    """The place of a key on a PKCS#11 token."""
+
+    path: NamedPath
+    place: TokenPlace
+    """The place."""
+    kind: Annotated[Literal["key on a token"], "What PATH is."] = "key on a token"
+
+
+@shows(spread=("signature",))
+class DescribedPermissions(NamedTuple):
+    """Permissions, signed or not."""
+
+    path: NamedPath
+    grants: Sequence[GrantFacts]
+    """Its grants."""
+    signature: SignatureFacts
+    """Its signature."""
+    kind: Annotated[Literal["permissions"], "What PATH is."] = "permissions"
+
+
+@shows(spread=("signature",))
+class DescribedGovernance(NamedTuple):
+    """Governance, signed or not."""
+
+    path: NamedPath
+    domain_rules: Sequence[DomainRuleFacts]
+    """The domain rules of the governance."""
+    signature: SignatureFacts
+    """Its signature."""
+    kind: Annotated[Literal["governance"], "What PATH is."] = "governance"
+
+
+@shows(spread=("signature",))
+class DescribedConfiguration(NamedTuple):
+    """A configuration of a Zenoh process, signed or not."""
+
+    path: NamedPath
+    mode: Mode
+    """How the process takes part in the network."""
+    connect: Sequence[str]
+    """Where it connects, such as ``tls/localhost:7447``."""
+    listen: Sequence[str]
+    """Where it listens."""
+    access_control: AccessControlFacts
+    """Its access control."""
+    made_by_sros: bool
+    """Whether it is exactly as sros writes it."""
+    domains: Sequence[int]
+    """The ROS domains that its rules are for; empty if it is not by sros."""
+    rights: Sequence[RemoteFacts]
+    """What the processes of each enclave may do; empty if it is not by sros."""
+    problems: Sequence[str]
+    """How it does not fit its signature or its enclave."""
+    signature: SignatureFacts
+    """Its signature."""
+    kind: Annotated[Literal["Zenoh configuration"], "What PATH is."] = "Zenoh configuration"
+
+
+Described = (
+    DescribedKeystore
+    | DescribedEnclave
+    | DescribedCertificates
+    | DescribedList
+    | DescribedKey
+    | DescribedToken
+    | DescribedPermissions
+    | DescribedGovernance
+    | DescribedConfiguration
+)
+
+_NOT_SIGNED = SignatureFacts(signed=False, signature_verified=False, signer=None)
+
+
+# ── describing ─────────────────────────────────────────────────────────────────────────────
 
 
 def describe(
@@ -75,11 +478,8 @@ def describe(
     now: datetime,
     authority: Path | None = None,
     files: FilesReadOnce | None = None,
-) -> Description:
-    """Describe the content of ``path`` as a JSON value; ``kind`` selects the other fields.
-
-    Kinds: keystore, enclave, certificate, revocation list, private key, permissions, governance,
-    Zenoh configuration.
+) -> Described:
+    """Describe the content of ``path``.
 
     Args:
         path: a keystore, the folder of an enclave, or a file of one.
@@ -95,15 +495,11 @@ def describe(
     if path.is_dir():
         if is_keystore(path):
             return _keystore(path, now)
-        if any((path / name).exists() for name in ("cert.pem", "permissions.p7s", KEY_URI_FILE)):
-            return {
-                "kind": "enclave",
-                "path": str(path),
-                **_describe_enclave(
-                    evaluated("", path, open_enclave(path, now=now, files=files), at=now)
-                ),
-                **_zenoh(path, now),
-            }
+        of_enclave = (CERTIFICATE_FILE, PERMISSIONS_FILE, KEY_URI_FILE)
+        if any((path / name).exists() for name in of_enclave):
+            state = open_enclave(path, now=now, files=files)
+            facts = _enclave_facts(evaluated("", path, state, at=now))
+            return DescribedEnclave(path, facts, _zenoh(path, now))
         refuse_earlier(path)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
@@ -111,239 +507,210 @@ def describe(
         )
     data = files.read(path, "file")
     try:
-        return {"path": str(path), **_file(path, data, now, authority, files)}
+        return _file(path, data, now, authority, files)
     except SrosError as error:
         raise DocumentError(f"'{path}' cannot be read: {error.what}", error.why) from error
 
 
+def problems_of(described: Described) -> Sequence[str]:
+    """Return what is wrong with a keystore, an enclave or a Zenoh configuration."""
+    if isinstance(described, DescribedEnclave):
+        zenoh = described.zenoh
+        return (*described.facts.problems, *(zenoh.problems if zenoh else ()))
+    if isinstance(described, (DescribedKeystore, DescribedConfiguration)):
+        return described.problems
+    return ()
+
+
 def _file(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
-) -> Description:
+) -> Described:
     """Describe a file; its content decides the kind, not its name."""
     if b"-----BEGIN CERTIFICATE-----" in data:
-        return {"kind": "certificate", **_certificates(data, "in it", now)}
+        return DescribedCertificates(path, _certificates(data, "in it", now))
     if CRL_MARK in data:
-        return {"kind": "revocation list", **_revocation_list(load_crl(data, "in it"), now)}
+        return DescribedList(path, _revocation_list(load_crl(data, "in it"), now))
     if path.name == KEY_URI_FILE:
-        return {"kind": "key on a token", **_token(read_token_file(data))}
+        return DescribedToken(path, _token(read_token_file(data)))
     if holds_private_key(data):
         mode = path.stat().st_mode & 0o777
-        key = load_key(data, "in it")
-        return {"kind": "private key", "algorithm": algorithm(key), "mode": f"{mode:04o}"}
+        return DescribedKey(path, algorithm(load_key(data, "in it")), f"{mode:04o}")
     if b"multipart/signed" in data[:1000].lower():
-        return _signed(path, data, now, authority, files)
+        signed = files.signed(data)
+        signature = _signature(path, data, now, authority, files)
+        if signed.document.lstrip()[:1] == b"<":
+            return _document(path, signed.document, signature, now)
+        return _configuration(path, signed.text, signature, now)
     if data.lstrip()[:1] == b"<":
-        return {**_document(data, now), "signed": False, "signature_verified": False}
+        return _document(path, data, _NOT_SIGNED, now)
     if path.suffix in _JSON or data.lstrip()[:1] == b"{":
-        return _configuration(path, data, now, authority, files)
+        return _configuration(
+            path, data, _signature_next_to(path, data, now, authority, files), now
+        )
     raise DocumentError(
         "it is neither a PEM certificate, revocation list or key, nor a signed document, nor XML, "
         "nor a Zenoh configuration",
     )
 
 
-def _configuration(
-    path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
-) -> Description:
-    """Describe a Zenoh configuration, with the signature of the same document next to it."""
-    described = _describe_configuration(data)
-    signature: Description = {"signed": False, "signature_verified": False}
-    signed = path.with_name(ZENOH_SIGNED.get(path.name, path.name))
-    if signed != path and signed.exists():
-        message = files.read(signed, "signed document")
-        signature = _signature(signed, message, now, authority, files)
-        if files.signed(message).text != data:
-            problem = f"it is not the document that was signed in {signed.name}"
-            signature |= {"signature_verified": False, "signature_problem": problem}
-    return {**described, "problems": _content_problems(path, now), **signature}
-
-
-def _keystore(root: Path, now: datetime) -> Description:
+def _keystore(root: Path, now: datetime) -> DescribedKeystore:
     keystore = Keystore(root)
     settings = keystore.settings
-    authorities: Description = {}
+    authorities: dict[str, AuthorityFile | UnreadableFile] = {}
     for role in ROLES:
         path = root / ca_certificate(role)
         if not path.exists():
             continue
         try:
-            authorities[role] = {
-                **_certificates(keystore.read(path, "file"), f"'{path}'", now),
-                "key_present": (root / ca_key(role)).exists(),
-            }
+            file = _certificates(keystore.read(path, "file"), f"'{path}'", now)
+            authorities[role] = AuthorityFile(file, (root / ca_key(role)).exists())
         except SrosError as error:
-            authorities[role] = {"error": str(error)}
+            authorities[role] = UnreadableFile(str(error))
     names, unread = search_enclaves(root)
-    enclaves = [
-        _enclave(enclave_path(root, name), name, keystore.enclave(name, now=now), now)
-        for name in names
-    ]
-    governance: Description | None = None
-    if (root / GOVERNANCE_P7S).exists():
-        try:
-            governance = describe(root / GOVERNANCE_P7S, now=now, files=keystore.files)
-        except SrosError as error:
-            governance = {"error": str(error)}
-        if governance.get("kind", "governance") != "governance":
-            governance = {"error": f"it is a {governance['kind']} document"}
-    problems = [f"{e['name']}: {problem}" for e in enclaves for problem in e["problems"]]
+    enclaves = [_enclave(keystore, name, now) for name in names]
+    governance = _governance_of(keystore, now)
+    problems = [f"{each.name}: {problem}" for each in enclaves for problem in each.facts.problems]
     unreadable = [f"'{each.path}' cannot be read: {each.why}" for each in unread]
     problems += unreadable
-    problems += [f"{role} CA: {a['error']}" for role, a in authorities.items() if "error" in a]
-    if governance and "error" in governance:
-        problems.append(f"governance: {governance['error']}")
+    for role, authority in authorities.items():
+        if isinstance(authority, UnreadableFile):
+            problems.append(f"{role} CA: {authority.error}")
+    if isinstance(governance, UnreadableFile):
+        problems.append(f"governance: {governance.error}")
     try:
         gaps = list(keystore.ledger.gaps)
     except SrosError as error:
         gaps = [str(error)]
     problems += [f"ledger: {gap}" for gap in gaps]
-    return {
-        "kind": "keystore",
-        "path": str(root),
-        "template": settings.name if settings else None,
-        "ledger": gaps,
-        "authorities": authorities,
-        "governance": governance,
-        "zenoh": _network(settings.zenoh) if settings and settings.zenoh else None,
-        "enclaves": enclaves,
-        "unreadable": unreadable,
-        "problems": problems,
-    }
+    return DescribedKeystore(
+        path=root,
+        template=settings.name if settings else None,
+        ledger=gaps,
+        authorities=authorities,
+        governance=governance,
+        zenoh=_network(settings.zenoh) if settings and settings.zenoh else None,
+        enclaves=enclaves,
+        unreadable=unreadable,
+        problems=problems,
+    )
 
 
-def _network(network: ZenohNetwork) -> Description:
-    return {
-        "router": network.router,
-        "endpoints": list(network.endpoints),
-        "listen": list(network.listening()),
-        "mode": network.mode.value,
-    }
+def _governance_of(
+    keystore: Keystore, now: datetime
+) -> DescribedGovernance | UnreadableFile | None:
+    """Describe the governance that the enclaves of a keystore share, if there is one."""
+    if not keystore.has(GOVERNANCE_P7S):
+        return None
+    try:
+        described = describe(keystore.root / GOVERNANCE_P7S, now=now, files=keystore.files)
+    except SrosError as error:
+        return UnreadableFile(str(error))
+    if isinstance(described, DescribedGovernance):
+        return described
+    return UnreadableFile(f"it is a {described.kind} document")
 
 
-def _zenoh(folder: Path, now: datetime) -> Description:
+def _network(network: ZenohNetwork) -> NetworkFacts:
+    return NetworkFacts(network.router, network.endpoints, network.listening(), network.mode)
+
+
+def _zenoh(folder: Path, now: datetime) -> ZenohFiles | None:
     """Describe the Zenoh configurations of an enclave: the files, and what is wrong with them."""
     opened = _opened_at(folder, now)
     if opened is None or not opened.files:
-        return {"zenoh": None}
-    return {
-        "zenoh": {
-            "files": [
-                {"file": file, "mode": opened.configurations[file].mode.value}
-                for file in opened.files
-                if file in opened.configurations
-            ],
-            "problems": [str(each) for each in opened.problems],
-        }
-    }
+        return None
+    modes = {file: each.mode for file, each in opened.configurations.items()}
+    return ZenohFiles(
+        [ZenohFileFacts(file, modes[file]) for file in opened.files if file in modes],
+        [str(each) for each in opened.problems],
+    )
 
 
-def _enclave(folder: Path, name: str, state: OpenedEnclave, now: datetime) -> Description:
+def _enclave(keystore: Keystore, name: str, now: datetime) -> KeystoreEnclave:
     """Describe an enclave of a keystore; a key that stays on its robot is not a problem there."""
-    evaluation = evaluated(name, folder, state, at=now)
+    state = keystore.enclave(name, now=now)
+    evaluation = evaluated(name, keystore.folder(name), state, at=now)
     problems = [*evaluation.problems, *evaluation.for_some(state.problems)]
-    described = {**_describe_enclave(evaluation), "problems": problems}
-    return {"name": name, "key_on_robot": state.key_on_robot, **described}
+    facts = _enclave_facts(evaluation)._replace(problems=problems)
+    return KeystoreEnclave(name, state.key_on_robot, facts)
 
 
-def _describe_enclave(evaluation: EvaluatedEnclave) -> Description:
+def _enclave_facts(evaluation: EvaluatedEnclave) -> EnclaveFacts:
     """Describe an enclave; ``loadable`` says whether a process can run in it now."""
     state = evaluation.state
-    domains = state.domains()
-    problems = list(evaluation.problems_here)
-    return {
-        "loadable": not problems,
-        "problems": problems,
-        "subject": state.subject or None,
-        "valid_until": iso(validity_of(state.certificate).not_after) if state.certificate else None,
-        "expires": iso(until) if (until := state.valid_until()) else None,
-        **_authority("identity_ca", state.identity_ca),
-        **_authority("permissions_ca", state.permissions_ca),
-        "domains": str(domains) if domains else None,
-        "token": _token(state.token) if state.token else None,
-        "permissions": _permissions(state.permissions) if state.permissions else None,
-        "permissions_bytes": state.permissions_bytes,
-    }
+    domains, problems = state.domains(), list(evaluation.problems_here)
+    identity, identity_sha256 = _subject_and_digest(state.identity_ca)
+    permissions, permissions_sha256 = _subject_and_digest(state.permissions_ca)
+    return EnclaveFacts(
+        loadable=not problems,
+        problems=problems,
+        subject=state.subject or None,
+        valid_until=validity_of(state.certificate).not_after if state.certificate else None,
+        expires=state.valid_until(),
+        identity_ca=identity,
+        identity_ca_sha256=identity_sha256,
+        permissions_ca=permissions,
+        permissions_ca_sha256=permissions_sha256,
+        domains=str(domains) if domains else None,
+        token=_token(state.token) if state.token else None,
+        permissions=_grants(state.permissions) if state.permissions else None,
+        permissions_bytes=state.permissions_bytes,
+    )
 
 
-def _token(place: TokenUri) -> Description:
-    """Describe the place of a key on a token."""
-    return {
-        "token": place.token,
-        "object": place.object,
-        "pin_source": place.pin_source or None,
-    }
+def _token(place: TokenUri) -> TokenPlace:
+    return TokenPlace(place.token, place.object, place.pin_source or None)
 
 
-def _authority(key: str, certificate: x509.Certificate | None) -> Description:
-    """Return the subject of a CA as ``key``, and its SHA-256, since two CAs can have one name."""
-    return {
-        key: subject_text(certificate.subject) if certificate else None,
-        f"{key}_sha256": digest(certificate) if certificate else None,
-    }
+def _subject_and_digest(certificate: x509.Certificate | None) -> tuple[str | None, str | None]:
+    """Return the subject of a CA, and its SHA-256, since two CAs can have one name."""
+    return (subject_text(certificate.subject), digest(certificate)) if certificate else (None, None)
 
 
-def _describe_certificate(certificate: x509.Certificate, now: datetime) -> Description:
-    """Describe the parts of a certificate that matter to DDS Security."""
+def _certificate(certificate: x509.Certificate, now: datetime) -> CertificateFacts:
     validity = validity_of(certificate)
     try:
         is_ca = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     except x509.ExtensionNotFound:
         is_ca = False
     signature = certificate.signature_hash_algorithm
-    return {
-        "subject": subject_text(certificate.subject),
-        "issuer": subject_text(certificate.issuer),
-        "serial": f"{certificate.serial_number:x}",
-        "is_ca": is_ca,
-        "key": algorithm(certificate.public_key()),
-        "signature": str(signature.name) if signature else "none",
-        "sha256": digest(certificate),
-        "not_before": iso(validity.not_before),
-        "not_after": iso(validity.not_after),
-        "valid_now": validity.contains(now),
-    }
+    return CertificateFacts(
+        subject=subject_text(certificate.subject),
+        issuer=subject_text(certificate.issuer),
+        serial=f"{certificate.serial_number:x}",
+        is_ca=is_ca,
+        key=algorithm(certificate.public_key()),
+        signature=str(signature.name) if signature else "none",
+        sha256=digest(certificate),
+        not_before=validity.not_before,
+        not_after=validity.not_after,
+        valid_now=validity.contains(now),
+    )
 
 
-def _certificates(data: bytes, name: str, now: datetime) -> Description:
-    """Describe the first certificate of a PEM file, its "further" certificates, and its "crl"."""
-    certificate, *further = load_certificates(data, name)
-    described = _describe_certificate(certificate, now)
-    if further:  # the chain of a CA, or the other CA during a rotation
-        described["further"] = [_describe_certificate(each, now) for each in further]
-    if CRL_MARK in data:
-        described["crl"] = _revocation_list(load_crl(data, name), now)
-    return described
+def _certificates(data: bytes, name: str, now: datetime) -> CertificateFile:
+    """Describe the certificates of a PEM file, and the revocation list after them."""
+    first, *further = (_certificate(each, now) for each in load_certificates(data, name))
+    crl = _revocation_list(load_crl(data, name), now) if CRL_MARK in data else None
+    return CertificateFile(first, further or None, crl)
 
 
-def _revocation_list(crl: RevocationList, now: datetime) -> Description:
-    """Describe a revocation list; with an expired one DDS refuses all certificates of its CA."""
-    return {
-        "issuer": subject_text(crl.list.issuer),
-        "number": crl.number,
-        "not_before": iso(crl.this_update),
-        "not_after": iso(crl.next_update),
-        "valid_now": crl.this_update <= now <= crl.next_update,
-        "revoked": [f"{each.serial:x}" for each in crl.revoked],
-    }
-
-
-def _signed(
-    path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
-) -> Description:
-    signed = files.signed(data)
-    signature = _signature(path, data, now, authority, files)
-    if signed.document.lstrip()[:1] == b"<":
-        return {**_document(signed.document, now), **signature}
-    described = _describe_configuration(signed.text)
-    return {**described, "problems": _content_problems(path, now), **signature}
+def _revocation_list(crl: RevocationList, now: datetime) -> ListFacts:
+    return ListFacts(
+        issuer=subject_text(crl.list.issuer),
+        number=crl.number,
+        not_before=crl.this_update,
+        not_after=crl.next_update,
+        valid_now=crl.this_update <= now <= crl.next_update,
+        revoked=[f"{each.serial:x}" for each in crl.revoked],
+    )
 
 
 def _signature(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
-) -> Description:
+) -> SignatureFacts:
     """Describe the signature of the signed document ``data`` at ``path``."""
     signed = files.signed(data)
-    signer = signed.signer()
     found = authority or permissions_ca_for(path)
     reason = "no permissions CA certificate is next to it; name one with --ca"
     verified: bool | None = None
@@ -355,74 +722,72 @@ def _signature(
         except SrosError as error:
             reason = str(error)
         verified = not reason
-    return {
-        "signed": True,
-        **_authority("signer", signer),
-        "digest": signed.digest,
-        "bytes": len(data),
-        "signature_verified": verified,
-        "signature_problem": reason,
-    }
+    subject, sha256 = _subject_and_digest(signed.signer())
+    signer = SignerFacts(subject, sha256, signed.digest, len(data), reason)
+    return SignatureFacts(signed=True, signature_verified=verified, signer=signer)
 
 
-def _document(document: bytes, now: datetime) -> Description:
-    root = parse(document, "its content")
-    if root.find("domain_access_rules") is not None:
-        return {"kind": "governance", **_governance(parse_governance(document, "its content"))}
-    permissions = parse_permissions(document, "its content")
-    return {"kind": "permissions", "grants": _permissions(permissions, now)}
+def _signature_next_to(
+    path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
+) -> SignatureFacts:
+    """Describe the signature of a Zenoh configuration: of the same document next to it."""
+    signed = path.with_name(ZENOH_SIGNED.get(path.name, path.name))
+    if signed == path or not signed.exists():
+        return _NOT_SIGNED
+    message = files.read(signed, "signed document")
+    signature = _signature(signed, message, now, authority, files)
+    if files.signed(message).text == data or signature.signer is None:
+        return signature
+    problem = f"it is not the document that was signed in {signed.name}"
+    signer = signature.signer._replace(signature_problem=problem)
+    return signature._replace(signature_verified=False, signer=signer)
 
 
-def _permissions(permissions: Permissions, now: datetime | None = None) -> list[Description]:
+def _document(
+    path: Path, document: bytes, signature: SignatureFacts, now: datetime
+) -> DescribedPermissions | DescribedGovernance:
+    if parse(document, "its content").find("domain_access_rules") is None:
+        permissions = parse_permissions(document, "its content")
+        return DescribedPermissions(path, _grants(permissions, now), signature)
+    rules = [
+        DomainRuleFacts(str(rule.domains), rule, rule.topic_access_rules)
+        for rule in parse_governance(document, "its content").domain_access_rules
+    ]
+    return DescribedGovernance(path, rules, signature)
+
+
+def _grants(permissions: Permissions, now: datetime | None = None) -> list[GrantFacts]:
     return [_grant(grant, now) for grant in permissions.grants]
 
 
-def _grant(grant: Grant, now: datetime | None) -> Description:
-    described: Description = {
-        "name": grant.name,
-        "subject": grant.subject,
-        "not_before": grant.not_before,
-        "not_after": grant.not_after,
-    }
-    if now is not None:
-        described["valid_now"] = grant.validity.contains(now)
-    described["rules"] = [
-        {
-            "qualifier": "ALLOW" if rule.allow else "DENY",
-            "domains": str(rule.domains),
-            "rights": _rights(ros_rights(rule)),
-            "partitions": sorted(
-                {p for c in (*rule.publish, *rule.subscribe) for p in c.partitions}
-            ),
-        }
-        for rule in grant.rules
-    ]
-    described["default"] = "ALLOW" if grant.default_allow else "DENY"
-    return described
+def _grant(grant: Grant, now: datetime | None) -> GrantFacts:
+    return GrantFacts(
+        name=grant.name,
+        subject=grant.subject,
+        not_before=grant.not_before,
+        not_after=grant.not_after,
+        valid_now=grant.validity.contains(now) if now else None,
+        rules=[
+            RuleFacts(
+                qualifier="ALLOW" if rule.allow else "DENY",
+                domains=str(rule.domains),
+                rights=_by_kind((each.kind, each.right, each.name) for each in ros_rights(rule)),
+                partitions=sorted(
+                    {p for c in (*rule.publish, *rule.subscribe) for p in c.partitions}
+                ),
+            )
+            for rule in grant.rules
+        ],
+        default="ALLOW" if grant.default_allow else "DENY",
+    )
 
 
-def _rights(rights: Iterable[RosRight]) -> Description:
-    """Map ROS names by kind and right, such as ``{"topics": {"publish": ["/chatter"]}}``."""
-    table: Description = {}
-    for right in rights:
-        table.setdefault(right.kind, {}).setdefault(right.right, []).append(right.name)
+def _by_kind(rights: Iterable[tuple[str, str, str]]) -> RightNames:
+    """Map the names of rights, given by kind, right and name, by kind and right."""
+    table: dict[str, dict[str, list[str]]] = {}
+    for kind, right, name in rights:
+        table.setdefault(kind, {}).setdefault(right, []).append(name)
     return table
-
-
-def _governance(governance: Governance) -> Description:
-    return {
-        "domain_rules": [
-            {
-                "domains": str(rule.domains),
-                **values_of(rule),
-                "topic_rules": [
-                    {"topic_expression": topic.topic_expression, **values_of(topic)}
-                    for topic in rule.topic_access_rules
-                ],
-            }
-            for rule in governance.domain_access_rules
-        ]
-    }
 
 
 # ── configurations of Zenoh ───────────────────────────────────────────────────────────────
@@ -436,57 +801,51 @@ _ABOUT_THE_CONTENT = (
 )
 
 
-def _describe_configuration(document: bytes) -> dict[str, Any]:
+def _configuration(
+    path: Path, document: bytes, signature: SignatureFacts, now: datetime
+) -> DescribedConfiguration:
     """Describe any Zenoh configuration; ``rights`` only of one that sros wrote.
 
     Raises:
         DocumentError: Zenoh would not accept it.
     """
-    found = parse_configuration(document, "its content")
+    read = parse_configuration(document, "its content")
     own: Configuration | None = None
     with suppress(SrosError):
         own = parse_rendered(document, "its content")
-    access = found.access
-    return {
-        "kind": "Zenoh configuration",
-        "mode": found.mode.value,
-        "connect": [each.text for each in found.connect],
-        "listen": [each.text for each in found.listen],
-        "access_control": {
-            "enabled": access.enabled,
-            "default": "allow" if access.allows_by_default else "deny",
-            "rules": len(access.rules),
-            "subjects": len(access.subjects),
-        },
-        "made_by_sros": own is not None,
-        "domains": sorted(domains_of(own.access_control)) if own else [],
-        "rights": _remote_rights(own) if own else [],
-    }
+    access = read.access
+    return DescribedConfiguration(
+        path=path,
+        mode=read.mode,
+        connect=[each.text for each in read.connect],
+        listen=[each.text for each in read.listen],
+        access_control=AccessControlFacts(
+            enabled=access.enabled,
+            default="allow" if access.allows_by_default else "deny",
+            rules=len(access.rules),
+            subjects=len(access.subjects),
+        ),
+        made_by_sros=own is not None,
+        domains=sorted(domains_of(own.access_control)) if own else [],
+        rights=_remote_rights(own) if own else [],
+        problems=_content_problems(path, now),
+        signature=signature,
+    )
 
 
-def _remote_rights(configuration: Configuration) -> list[dict[str, Any]]:
+def _remote_rights(configuration: Configuration) -> list[RemoteFacts]:
     """Return what each remote enclave may do here, and whether it is as the router of a session.
 
     The router of a session in client mode may send what the session may get, and the reverse: its
     entry shows the rights of the session's own enclave.
     """
     is_client = configuration.mode is Mode.CLIENT
-    return [
-        {
-            "enclave": each.common_name,
-            "own_rights_by_router": is_client,
-            "may": _names(rule.mirrored() if is_client else rule for rule in each.rules),
-        }
-        for each in configuration.access_control.remotes
-    ]
-
-
-def _names(rules: Iterable[AccessRule]) -> dict[str, dict[str, list[str]]]:
-    """Map the names that rules allow, by kind and right, as descriptions of permissions do."""
-    table: dict[str, dict[str, list[str]]] = {}
-    for right, name in stated_names(rules):
-        table.setdefault(KIND_OF[right], {}).setdefault(right, []).append(name)
-    return table
+    remotes = []
+    for remote in configuration.access_control.remotes:
+        rules = (rule.mirrored() if is_client else rule for rule in remote.rules)
+        may = _by_kind((KIND_OF[right], right, name) for right, name in stated_names(rules))
+        remotes.append(RemoteFacts(remote.common_name, is_client, may))
+    return remotes
 
 
 def _opened_at(folder: Path, now: datetime) -> OpenedZenoh | None:
@@ -519,6 +878,9 @@ _ISSUED = (CERTIFICATE_FILE, PERMISSIONS_FILE)
 _PEM = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----\n?", re.DOTALL)
 
 
+# ── the history ────────────────────────────────────────────────────────────────────────────
+
+
 class HistoryStatus(StrEnum):
     """The state of an issued certificate or document."""
 
@@ -538,25 +900,29 @@ class HistoryStatus(StrEnum):
     """It went to a robot; the keystore keeps no copy."""
 
 
-@dataclass(frozen=True, slots=True)
-class HistoryItem:
-    """An entry of the ledger, its state, and the path of its file (or "")."""
+@shows(spread=("entry",))
+class HistoryItem(NamedTuple):
+    """An entry of the ledger, and what became of it."""
 
     entry: Entry
+    """The entry."""
     status: HistoryStatus
+    """What became of it."""
     path: str
+    """Its file in the keystore, or an empty string."""
 
 
-@dataclass(frozen=True, slots=True)
-class History:
-    """All entries of the ledger, oldest first, and the paths of files without an entry.
+class History(NamedTuple):
+    """Everything that a keystore ever issued."""
 
-    ``gaps`` are sentences about lines of the ledger that are missing, changed or unreadable.
-    """
-
-    items: tuple[HistoryItem, ...]
+    path: NamedPath
+    entries: tuple[HistoryItem, ...]
+    """The entries of the ledger, oldest first."""
     unexplained: tuple[str, ...]
+    """Files that the ledger does not have."""
     gaps: tuple[str, ...]
+    """Faults of the ledger: lines that are missing, changed or unreadable."""
+    kind: Annotated[Literal["history"], "What PATH is."] = "history"
 
 
 def history(root: Path, *, now: datetime) -> History:
@@ -592,6 +958,7 @@ def history(root: Path, *, now: datetime) -> History:
     found = {**retired, **revoked_files, **issued}
     places = {**found, **settings}
     return History(
+        root,
         tuple(
             HistoryItem(entry, status(entry), (places.get(entry.sha256) or [""])[0])
             for entry in entries

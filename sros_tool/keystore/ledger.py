@@ -55,30 +55,39 @@ SAME_KEY = "same key"
 class Entry:
     """A line of the ledger: a certificate or document that was issued, or a revocation.
 
-    ``what`` is ca, certificate, permissions, governance, crl, revocation, answer (the signed list
-    of the files sent to a robot), settings (of the keystore, with the whole TOML text in
-    ``settings``), or gap (``reason`` says what was wrong with the lines up to ``number``).
-    ``sha256`` is the hash of a certificate's DER or of a document's bytes; ``serial`` is
-    hexadecimal; ``policy`` is the SHA-256 of the policy file, with its includes, that permissions
-    were made from; the ``number`` of an answer orders it.  ``key`` is the SHA-256 of the public key
-    of a certificate (its DER SubjectPublicKeyInfo), or of the key that was revoked with a
-    certificate.  Times are ISO 8601 in UTC.
+    Times are ISO 8601 in UTC; what does not apply is an empty string.
     """
 
     time: str
+    """When it was made, in UTC."""
     what: str
+    """What was issued or done: ``ca``, ``certificate``, ``permissions``, ``governance``, ``crl``,
+    ``revocation``, ``answer`` (the signed list of the files sent to a robot), ``settings`` (of the
+    keystore), ``fleet``, or ``gap``: lines before were missing or changed."""
     enclave: str = ""
+    """The enclave, or an empty string; so for all that follow."""
     subject: str = ""
+    """Subject of the certificate."""
     serial: str = ""
+    """Serial number, in hexadecimal."""
     sha256: str = ""
+    """SHA-256 of the certificate (DER), or of the document."""
     not_before: str = ""
+    """Begin of its validity, in UTC."""
     not_after: str = ""
+    """End of its validity, in UTC."""
     policy: str = ""
+    """SHA-256 of the policy that permissions were made from, with its includes."""
     reason: str = ""
+    """Reason of a revocation, or what is wrong with a gap."""
     key: str = ""
+    """SHA-256 of the public key (DER) of the certificate, or of the one that was revoked."""
     number: int = 0
+    """Number of an answer, which orders it, or the last line of a gap; else 0."""
     settings: str = ""
+    """The settings of the keystore, as TOML."""
     previous: str = ""
+    """SHA-256 of the line before."""
 
 
 @dataclass(frozen=True, slots=True)

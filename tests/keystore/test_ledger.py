@@ -157,7 +157,7 @@ def test_a_keystore_without_a_ledger_gets_one(tmp_path: Path) -> None:
 
 def statuses(root: Path, now: datetime) -> dict[tuple[str, str], list[str]]:
     found: dict[tuple[str, str], list[str]] = {}
-    for item in history(root, now=now).items:
+    for item in history(root, now=now).entries:
         found.setdefault((item.entry.what, item.entry.enclave), []).append(str(item.status))
     return found
 
@@ -185,7 +185,7 @@ def test_every_item_has_its_status(tmp_path: Path) -> None:
     assert found["permissions", "/a"] == ["expired", "current"]
     assert found["permissions", "/c"] == ["expired"]
     assert found["certificate", "/a"] == ["superseded", "current"]
-    paths = {item.path for item in history(root, now=end).items}
+    paths = {item.path for item in history(root, now=end).entries}
     assert "enclaves/a/cert.pem" in paths
     assert any(path.startswith("revoked/") for path in paths)
 

@@ -75,7 +75,7 @@ def test_renewing(new_key: bool, root: Path) -> None:
     check(root, "/a", "/b/c", "/d")
     # The ledger begins with what was there, taken on trust.
     found = history(root, now=NOW)
-    assert {item.entry.enclave for item in found.items} == {"", "/a", "/b/c", "/d"}
+    assert {item.entry.enclave for item in found.entries} == {"", "/a", "/b/c", "/d"}
     assert found.unexplained == ()
 
 
@@ -197,7 +197,7 @@ def test_revoking(root: Path, tmp_path: Path) -> None:
     sros("crl", root, "--refresh").ok()
     check(root, "/a", "/b/c")
     assert len(Keystore(root).revocation_lists[0].revoked) == 1
-    revoked = {each.entry.what for each in history(root, now=NOW).items if each.entry.serial}
+    revoked = {each.entry.what for each in history(root, now=NOW).entries if each.entry.serial}
     assert revoked == {"revocation", "certificate", "ca"}
 
 
@@ -220,7 +220,7 @@ def test_rotating_with_a_revocation_in_every_stage(root: Path) -> None:
     assert (root / "private/ca.key.pem").stat().st_mode & 0o777 == 0o600
     found = history(root, now=NOW)
     assert found.unexplained == ()
-    assert {each.status for each in found.items if each.entry.what == "ca"} == {
+    assert {each.status for each in found.entries if each.entry.what == "ca"} == {
         HistoryStatus.CURRENT,
         HistoryStatus.RETIRED,
     }

@@ -37,7 +37,7 @@ def standing(root: Path) -> dict[str, tuple[HistoryStatus, str]]:
     assert not found.unexplained
     return {
         item.entry.sha256: (item.status, item.path)
-        for item in found.items
+        for item in found.entries
         if item.entry.what in ("ca", "crl")
     }
 
@@ -55,10 +55,10 @@ def test_the_history_knows_both_cas_and_their_lists(root: Path) -> None:
             if stage is RotationStage.RETIRE:
                 expected = (HistoryStatus.RETIRED, f"retired/{first.serial_number:x}.cert.pem")
             assert standing(root)[digest(first)] == expected
-        lists = [each for each in history(root, now=NOW).items if each.entry.what == "crl"]
+        lists = [each for each in history(root, now=NOW).entries if each.entry.what == "crl"]
         current = [each for each in lists if each.status is HistoryStatus.CURRENT]
         assert len(current) == (1 if stage is RotationStage.RETIRE else 2)
-    gone = [each for each in history(root, now=NOW).items if each.entry.enclave == "/c"]
+    gone = [each for each in history(root, now=NOW).entries if each.entry.enclave == "/c"]
     # Its permissions were put away with its certificate; the new CA's list names neither.
     assert Counter(each.status for each in gone) == {HistoryStatus.REVOKED: 3}
 

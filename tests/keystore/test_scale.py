@@ -111,5 +111,5 @@ def test_revoking_a_robot_and_renewing_the_others(root: Path) -> None:
     assert all((root / f"enclaves{name}/cert.pem").read_bytes() != before[name] for name in rest)
     made = history(root, now=parse_iso(Keystore(root).ledger.entries[-1].time))
     assert (made.gaps, made.unexplained) == ((), ())
-    current = [e for e in made.items if e.status is HistoryStatus.CURRENT and e.entry.enclave]
+    current = [e for e in made.entries if e.status is HistoryStatus.CURRENT and e.entry.enclave]
     assert len(current) == 2 * len(rest)

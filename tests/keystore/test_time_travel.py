@@ -175,7 +175,7 @@ def check_history(root: Path, now: datetime) -> dict[str, int]:
     found = history(root, now=now)
     assert not found.unexplained
     counts = dict.fromkeys(HistoryStatus, 0)
-    for item in found.items:
+    for item in found.entries:
         counts[item.status] += 1
         if item.path.startswith("retired/"):
             assert item.status is HistoryStatus.RETIRED
