@@ -246,11 +246,6 @@ def _has_authorities(keystore: Path) -> bool:
     return (keystore / PRIVATE).is_dir() or (keystore / LEDGER).is_file()
 
 
-def _known_causes() -> frozenset[str]:
-    """Return the fault ids and decision reasons that have a remedy."""
-    return frozenset((*FAULTS, *_BY_REASON))
-
-
 # ── the smallest change of a policy ────────────────────────────────────────────────────────
 
 _NO_RULE = frozenset({"no-rule", "default"})
@@ -397,6 +392,8 @@ def likely_names(answer: Answer) -> tuple[str, ...]:
     same = sorted(each for each in names if each.rpartition("/")[2] == last)
     if (question.type == "service" and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
         return tuple(same) if len(same) <= _SHOWN else ()
+    if not names:
+        return ()
     from difflib import get_close_matches  # for this alone, which is asked last
 
     return tuple(get_close_matches(question.name, sorted(names), n=_SHOWN, cutoff=_ALIKE))

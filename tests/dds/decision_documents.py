@@ -1,8 +1,13 @@
-"""Small governance and permissions documents for the tests of decisions."""
+"""Small governance and permissions documents for the tests of decisions, and what they give."""
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
+
+from sros_tool.dds.decision.access import Access, GovernedDomain
+from sros_tool.dds.decision.answers import Refusal
+from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
+from sros_tool.dds.decision.vendors import Vendor
 
 NOW = datetime(2026, 6, 15, 12, 0, tzinfo=UTC)
 SUBJECT = "CN=/t"
@@ -80,3 +85,24 @@ def grant(
 def permissions(*grants: str) -> bytes:
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <dds><permissions>{"".join(grants)}</permissions></dds>""".encode()
+
+
+def access_of(
+    vendor: Vendor,
+    governance_xml: bytes,
+    permissions_xml: bytes,
+    subject: str = SUBJECT,
+    *,
+    domain: int,
+    at: datetime,
+    zone: tzinfo = UTC,
+) -> Access | Refusal:
+    """Return the access control by two documents as ``vendor`` reads them, or its refusal."""
+    read = read_governance_as(vendor, governance_xml)
+    if isinstance(read, Refusal):
+        return read
+    permissions_read = read_permissions_as(vendor, permissions_xml)
+    if isinstance(permissions_read, Refusal):
+        return permissions_read
+    governed = GovernedDomain(vendor, read, domain)
+    return Access(governed, permissions_read, subject, at=at, zone=zone)

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb, Refusal
 from sros_tool.dds.decision.vendors import Vendor
-from tests.dds.decision_documents import NOW
+from tests.dds.decision_documents import NOW, access_of
 from tests.dds.drawn_words import (
     DOMAINS,
     NEAR,
@@ -54,7 +54,7 @@ class Case:
 
     def access(self, vendor: Vendor) -> Access | Refusal:
         """Return what a vendor makes of the documents."""
-        return Access.of_documents(
+        return access_of(
             vendor,
             self.governance_xml,
             self.permissions_xml,

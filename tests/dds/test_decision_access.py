@@ -10,6 +10,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import (
     NOW,
     SUBJECT,
+    access_of,
     allow,
     deny,
     governance,
@@ -24,7 +25,7 @@ VENDORS = list(Vendor)
 
 
 def access(vendor: Vendor, perms: bytes, govern: bytes = governance(), domain: int = 42) -> Access:
-    found = Access.of_documents(vendor, govern, perms, SUBJECT, domain=domain, at=NOW)
+    found = access_of(vendor, govern, perms, SUBJECT, domain=domain, at=NOW)
     assert isinstance(found, Access), found
     return found
 

@@ -10,6 +10,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import (
     NOW,
     SUBJECT,
+    access_of,
     allow,
     governance,
     grant,
@@ -29,7 +30,7 @@ def outcome(
     topic: str,
     verb: AccessVerb = AccessVerb.PUBLISH,
 ) -> Outcome:
-    found = Access.of_documents(vendor, govern, perms, SUBJECT, domain=42, at=NOW)
+    found = access_of(vendor, govern, perms, SUBJECT, domain=42, at=NOW)
     assert isinstance(found, Access), found
     return found.decide(verb, topic).outcome
 
@@ -74,7 +75,7 @@ def test_a_grant_without_rules_before_one_that_allows_joining() -> None:
     free = free.replace("<metadata_protection_kind>ENCRYPT", "<metadata_protection_kind>NONE")
     free = free.replace("<enable_discovery_protection>true", "<enable_discovery_protection>false")
     govern = governance(free, rtps="NONE")
-    found = Access.of_documents(Vendor.CYCLONE, govern, perms, SUBJECT, domain=42, at=NOW)
+    found = access_of(Vendor.CYCLONE, govern, perms, SUBJECT, domain=42, at=NOW)
     assert isinstance(found, Access)
     assert found.join().outcome is Outcome.PEER_DENIES
     assert found.publish("rt/a").outcome is Outcome.DENIED
@@ -87,7 +88,7 @@ def test_a_date_that_cannot_be_read_in_any_grant() -> None:
     """Fast DDS reads all dates first; Cyclone DDS only those of the grant that it takes."""
     broken = grant(allow(publish("*")), subject="CN=/other", begin="tomorrow")
     perms = permissions(grant(allow(publish("*"))), broken)
-    fast = Access.of_documents(Vendor.FAST_2_9, governance(), perms, SUBJECT, domain=42, at=NOW)
+    fast = access_of(Vendor.FAST_2_9, governance(), perms, SUBJECT, domain=42, at=NOW)
     assert isinstance(fast, Access)
     assert fast.join().reason == "malformed"
     assert outcome(Vendor.CYCLONE, perms, governance(), "rt/a") is Outcome.ALLOWED

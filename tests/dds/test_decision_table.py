@@ -12,11 +12,11 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
 from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import (
     NOW,
+    access_of,
     allow,
     criteria,
     deny,
@@ -430,7 +430,7 @@ ASKED = (Vendor.STANDARD, Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE)
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 @pytest.mark.parametrize("vendor", ASKED)
 def test_row(row: Row, vendor: Vendor) -> None:
-    found = Access.of_documents(
+    found = access_of(
         vendor,
         row.governance,
         row.permissions,

@@ -11,11 +11,13 @@ import pytest
 import sros_tool.dds.decision as decision
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.errors import UsageError
-from sros_tool.explain.explanation import _known_causes, remedy
+from sros_tool.explain.explanation import _BY_REASON, remedy
 from sros_tool.explain.question import TYPES, WORDS, ask
 from sros_tool.faults import FAULTS, Fault
 from sros_tool.names import dds_names
 
+KNOWN_CAUSES = frozenset((*FAULTS, *_BY_REASON))
+"""The ids of faults, and the reasons of decisions, that have a remedy."""
 MEANT = {
     ("publish", "topic"): "publish",
     ("subscribe", "topic"): "subscribe",
@@ -71,7 +73,7 @@ def sources(module: object) -> str:
 
 def test_every_fault_of_an_enclave_has_a_remedy() -> None:
     assert {"key-mismatch", "crl-expired", "revoked", "file-missing"} <= set(FAULTS)
-    assert set(FAULTS) <= _known_causes()
+    assert set(FAULTS) <= KNOWN_CAUSES
     assert all(remedy(fault, "ks", "/a") for fault in Fault)
 
 
@@ -82,13 +84,13 @@ def test_every_reason_of_a_decision_is_of_the_policy_or_has_a_remedy() -> None:
         sources(decision),
     )
     assert {"no-grant", "expired", "domain-not-in-governance"} <= set(found)
-    assert set(found) - of_the_policy <= _known_causes()
+    assert set(found) - of_the_policy <= KNOWN_CAUSES
 
 
 def test_remedies_name_the_keystore_and_the_enclave() -> None:
     assert remedy("expired", "ks", "/a") == "Renew it: `sros renew ks /a`."
     assert remedy("no-rule", "ks", "/a") == ""
-    for word in _known_causes():
+    for word in KNOWN_CAUSES:
         assert "{" not in remedy(word, "ks", "/a")
 
 

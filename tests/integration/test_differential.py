@@ -19,9 +19,9 @@ from zoneinfo import ZoneInfo
 import pytest
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
-from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
 from sros_tool.dds.decision.vendors import Vendor, VendorTraits
+from tests.dds.decision_documents import access_of
 from tests.dds.drawn_documents import documents
 from tests.integration.drawn_cases import cases as drawn_cases
 from tests.integration.fastdds import fastdds_vendor
@@ -236,7 +236,7 @@ EXPECTED = {
 
 def disagreements(vendor: Vendor, case: Case, reply: Reply, at: datetime) -> Iterator[str]:
     """Where the engine says something else than the vendor did."""
-    access = Access.of_documents(
+    access = access_of(
         vendor,
         case.governance,
         case.permissions,

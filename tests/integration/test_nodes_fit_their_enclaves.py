@@ -37,6 +37,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave
+from tests.dds.decision_documents import access_of as access_of_documents
 from tests.integration.test_policies_live import all_dds_endpoints, observed_in, run_script, without
 from tests.support.children import LONG
 from tests.support.long_form import ONLY_LONG, some
@@ -76,7 +77,7 @@ def access_of(root: Path, enclave: str) -> Access:
     )
     certificate = load_certificate((folder / "cert.pem").read_bytes(), enclave)
     subject, now = subject_text(certificate.subject), datetime.now(UTC)
-    access = Access.of_documents(
+    access = access_of_documents(
         Vendor.FAST, governance, permissions, subject, domain=DOMAIN, at=now
     )
     assert isinstance(access, Access), access

@@ -14,11 +14,10 @@ from cryptography import x509
 from cryptography.x509.name import _ASN1Type
 from cryptography.x509.oid import NameOID
 
-from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.pki.certificates import subject_text
-from tests.dds.decision_documents import allow, grant, permissions, publish, subscribe
+from tests.dds.decision_documents import access_of, allow, grant, permissions, publish, subscribe
 from tests.dds.signer_rows import REFUSED, YES, Made, write_enclave
 from tests.dds.signer_rows import Row as Files
 from tests.integration.fastdds import fastdds_vendor
@@ -136,7 +135,7 @@ def test_every_row(asked: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("vendor", [Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE])
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 def test_the_engine_says_what_the_rows_say(row: Row, vendor: Vendor) -> None:
-    access = Access.of_documents(
+    access = access_of(
         vendor,
         OPEN,
         row.permissions(),

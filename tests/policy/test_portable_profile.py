@@ -22,6 +22,7 @@ from sros_tool.policy.model import Enclave, Policy
 from sros_tool.policy.patterns import Names
 from sros_tool.translate import governance_for, permissions_for
 from sros_tool.validity import window
+from tests.dds.decision_documents import access_of
 from tests.policy.drawn_policies import EVERYTHING, PATHS, policies
 
 NOW = datetime(2026, 7, 1, tzinfo=UTC)
@@ -45,7 +46,7 @@ def test_vendors_agree(policy: Policy, template: str, zone: int) -> None:
         if any(found != "portable.character-set" for found, _ in outside(permissions, 0, _meets)):
             continue
         answers = [
-            Access.of_documents(
+            access_of(
                 vendor,
                 governance,
                 render_permissions(permissions),

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome, Refusal
-from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.grants import ComparisonCrash, certified_text, read_moment, same_subject
 from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.vendors import (
@@ -511,28 +510,6 @@ class Access:
             return
         self._grant = chosen
         self._prepare(permissions.grants[chosen])
-
-    @classmethod
-    def of_documents(
-        cls,
-        vendor: Vendor,
-        governance_xml: bytes,
-        permissions_xml: bytes,
-        subject: str,
-        *,
-        domain: int,
-        at: datetime,
-        zone: tzinfo = UTC,
-    ) -> Access | Refusal:
-        """Return the access control by two documents as ``vendor`` reads them, or its refusal."""
-        governance = read_governance_as(vendor, governance_xml)
-        if isinstance(governance, Refusal):
-            return governance
-        permissions = read_permissions_as(vendor, permissions_xml)
-        if isinstance(permissions, Refusal):
-            return permissions
-        governed = GovernedDomain(vendor, governance, domain)
-        return cls(governed, permissions, subject, at=at, zone=zone)
 
     def decide(
         self, verb: AccessVerb, topic: str = "", partitions: tuple[str, ...] = ()

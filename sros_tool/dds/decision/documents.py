@@ -7,9 +7,7 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import TypeVar
 
-from sros_tool.dds.decision import elements
 from sros_tool.dds.decision.answers import Refusal
-from sros_tool.dds.decision.elements import UnreadableError
 from sros_tool.dds.decision.vendors import DocumentReader, Vendor
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import (
@@ -20,7 +18,7 @@ from sros_tool.dds.governance import (
     parse_governance,
     render_governance,
 )
-from sros_tool.dds.permissions import Permissions, parse_permissions, render_permissions
+from sros_tool.dds.permissions import Permissions, render_permissions
 from sros_tool.errors import DocumentError
 
 _Document = TypeVar("_Document", Governance, Permissions)
@@ -39,17 +37,9 @@ def _readers(
             from sros_tool.dds.decision import cyclone
 
             return cyclone.read_governance, cyclone.read_permissions
-    return _standard_governance, _standard_permissions
+    from sros_tool.dds.decision import elements
 
-
-def _standard_governance(xml: bytes) -> Governance:
-    elements.check_governance(xml)
-    return parse_governance(xml, "governance")
-
-
-def _standard_permissions(xml: bytes) -> Permissions:
-    elements.check_permissions(xml)
-    return parse_permissions(xml, "permissions")
+    return elements.read_governance, elements.read_permissions
 
 
 def read_governance_as(vendor: Vendor, xml: bytes) -> Governance | Refusal:
@@ -65,6 +55,8 @@ def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
 def _read(
     vendor: Vendor, what: str, read: Callable[[bytes], _Document], xml: bytes
 ) -> _Document | Refusal:
+    from sros_tool.dds.decision.elements import UnreadableError
+
     try:
         return read(xml)
     except UnreadableError as error:

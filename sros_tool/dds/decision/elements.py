@@ -1,4 +1,4 @@
-"""XML elements as the vendors' parsers see them, and a check by the schemas of the standard.
+"""XML elements as the vendors' parsers see them, and documents read by the schemas of the standard.
 
 Source: DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_ca_governance of
 20170901.
@@ -14,7 +14,14 @@ from lxml import etree
 
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import Outcome, Refusal
-from sros_tool.dds.governance import DomainRule, TopicRule, attributes
+from sros_tool.dds.governance import (
+    DomainRule,
+    Governance,
+    TopicRule,
+    attributes,
+    parse_governance,
+)
+from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.xml import tag_of
 
 
@@ -113,14 +120,16 @@ _TEXTS = {
 _EVERYWHERE = "{http://www.w3.org/2001/XMLSchema-instance}"
 
 
-def check_permissions(xml: bytes) -> None:
-    """Check ``xml`` by the permissions schema; raise `UnreadableError` if it is not valid."""
+def read_permissions(xml: bytes) -> Permissions:
+    """Return the permissions in ``xml``; raise `UnreadableError` if they do not fit the schema."""
     _check(_root(xml), "dds", _PERMISSIONS)
+    return parse_permissions(xml, "permissions")
 
 
-def check_governance(xml: bytes) -> None:
-    """Check ``xml`` by the governance schema; raise `UnreadableError` if it is not valid."""
+def read_governance(xml: bytes) -> Governance:
+    """Return the governance in ``xml``; raise `UnreadableError` if it does not fit the schema."""
     _check(_root(xml), "dds", _GOVERNANCE)
+    return parse_governance(xml, "governance")
 
 
 def _root(xml: bytes) -> etree._Element:
