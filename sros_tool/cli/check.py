@@ -47,6 +47,7 @@ from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines, visible, visible_json
 from sros_tool.values import file_change, shows, versioned
+from sros_tool.wording import counted
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -588,7 +589,7 @@ def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Findi
     for (first, _), *others in found.values():
         robots = [robot for _, robot in others]
         more = ", ..." if len(robots) > _MOST_ROBOTS else ""
-        count = f"{len(robots)} more robot{'s' * (len(robots) > 1)}"
+        count = counted(len(robots), "more robot")
         named = f"the same for {count}: {', '.join(robots[:_MOST_ROBOTS])}{more}"
         yield first, named if robots else ""
 

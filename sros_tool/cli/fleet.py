@@ -32,6 +32,7 @@ from sros_tool.cli.common import (
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
 from sros_tool.values import file_change
+from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -183,8 +184,8 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     else:
         done = "would keep" if dry_run else "kept"
         echo(
-            f"{done} what {robot} has: {_number(len(confirmation.files), 'file')} of "
-            f"{_number(len(enclaves), 'enclave')}"
+            f"{done} what {robot} has: {counted(len(confirmation.files), 'file')} of "
+            f"{counted(len(enclaves), 'enclave')}"
         )
     print_notes(notes)
 
@@ -249,31 +250,31 @@ def _status(
             check_metrics_file(output)
         check_output(output, force=True)
     with progress("comparing"):
-        found = fleet_status(Keystore(root), robots)
+        status = fleet_status(Keystore(root), robots)
     if oldest:
-        found = found.with_overdue(oldest, moment)
+        status = status.with_overdue(oldest, moment)
     if as_json:
-        print_json(ComparedFleet(moment, found))
-        return 0 if found.complete else 1
+        print_json(ComparedFleet(moment, status))
+        return 0 if status.complete else 1
     if prometheus:
         from sros_tool.keystore.fleet_status import fleet_metrics
         from sros_tool.prometheus import render_metrics
 
-        text = render_metrics(fleet_metrics(found, now=moment))
+        text = render_metrics(fleet_metrics(status, now=moment))
     elif html:
         from sros_tool.report.pages import render_fleet_page
         from sros_tool.values import as_plain
 
-        text = render_fleet_page(as_plain(ComparedFleet(moment, found)))
+        text = render_fleet_page(as_plain(ComparedFleet(moment, status)))
     else:
-        text = "".join(f"{visible_line(line)}\n" for line in _lines(found, moment, robots))
+        text = "".join(f"{visible_line(line)}\n" for line in _lines(status, moment, robots))
     if output and not dry_run:
         echo(save(output, text.encode()), err=True)
     elif output:
         echo(f"would {'replace' if output.exists() else 'create'} {output}")
     else:
         echo_document(text)
-    return 0 if found.complete else 1
+    return 0 if status.complete else 1
 
 
 _WORDS = {
@@ -290,52 +291,57 @@ _MOST_LINES, _MOST_GROUPS = 50, 3
 """How many files of a robot are listed, and how many groups or unrecorded enclaves."""
 
 
-def _lines(found: FleetStatus, moment: datetime, robots: Sequence[str]) -> Iterator[str]:
+def _lines(status: FleetStatus, moment: datetime, robots: Sequence[str]) -> Iterator[str]:
     """Yield the numbers first, then the robots that need something, or those that were named."""
-    counts = ", ".join(f"{number} {_word(state)}" for state, number in found.counts.items())
-    yield f"{_number(len(found.robots), 'robot')}: {counts}"
-    if found.stage != "complete":
-        behind = sum(each.stage != found.stage for each in found.robots if each.enclaves)
-        yield f"CA rotation: {found.stage}; {_number(behind, 'robot')} not there yet"
-    if found.overdue:
-        yield f"{_number(len(found.overdue), 'robot')} confirmed too long ago"
-    if found.unassigned:
-        whom = "it" if found.unassigned == 1 else "them"
-        yield f"{_number(found.unassigned, 'enclave')} of no robot: nothing is known of {whom}"
+    counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
+    yield f"{counted(len(status.robots), 'robot')}: {counts}"
+    if status.stage != "complete":
+        behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
+        yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"
+    if status.overdue:
+        yield f"{counted(len(status.overdue), 'robot')} confirmed too long ago"
+    if status.unassigned:
+        whom = "it" if status.unassigned == 1 else "them"
+        yield f"{counted(status.unassigned, 'enclave')} of no robot: nothing is known of {whom}"
     rows = [("robot", "state", "confirmed", "what")]
     rows += [
-        (each.robot, _word(each.state), _age(each, moment), "; ".join(_summary(each, found.stage)))
-        for each in found.robots
+        (
+            robot.robot,
+            _word(robot.state),
+            _age(robot, moment),
+            "; ".join(_summary(robot, status.stage)),
+        )
+        for robot in status.robots
         if robots
-        or each.state not in ("current", "none")
-        or each.notes
-        or each.robot in found.overdue
+        or robot.state not in ("current", "none")
+        or robot.notes
+        or robot.robot in status.overdue
     ]
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     for row in rows if len(rows) > 1 else ():
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=False))
         yield "  ".join((*cells, row[3])).rstrip()
-    for each in found.robots if robots else ():
-        yield from _details(each)
+    for robot in status.robots if robots else ():
+        yield from _details(robot)
 
 
 def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     """Yield what a robot has that it should not have, the worst first."""
     if robot.state == "never":
-        yield _number(robot.enclaves, "enclave")
+        yield counted(robot.enclaves, "enclave")
     if robot.revoked:
-        yield f"{_number(len(robot.revoked), 'enclave')} revoked"
+        yield f"{counted(len(robot.revoked), 'enclave')} revoked"
     foreign = Counter(
-        each.robot or each.enclave for each in robot.pending if each.state == "another"
+        file.robot or file.enclave for file in robot.pending if file.state == "another"
     )
     for whose, number in foreign.items():
-        yield f"{_number(number, 'file')} of {whose}"
-    if revoked := sum(each.state == "revoked" for each in robot.pending):
-        yield f"{_number(revoked, 'revoked file')}"
+        yield f"{counted(number, 'file')} of {whose}"
+    if revoked := sum(file.state == "revoked" for file in robot.pending):
+        yield f"{counted(revoked, 'revoked file')}"
     groups: dict[tuple[str, str], Counter[str]] = {}
-    for each in robot.pending:
-        if each.state not in ("another", "revoked"):
-            groups.setdefault((each.state, each.since), Counter())[each.kind] += 1
+    for file in robot.pending:
+        if file.state not in ("another", "revoked"):
+            groups.setdefault((file.state, file.since), Counter())[file.kind] += 1
     for (state, since), kinds in list(groups.items())[:_MOST_GROUPS]:
         named = (kind if number == 1 else _several(number, kind) for kind, number in kinds.items())
         yield f"{state} {', '.join(named)}{f' of {since}' if since else ''}"
@@ -357,18 +363,18 @@ def _details(robot: RobotStatus) -> Iterator[str]:
     yield f"{robot.robot}:"
     where = ("in its folder", "elsewhere, with its name in the path")
     for names, place in zip(robot.others, where, strict=True):
-        others = f" and {len(names) - _MOST_GROUPS} more, see --json"
+        see = ", see --json" if len(names) > _MOST_GROUPS else ""
         if names:
             yield (
-                f"  {_number(len(names), 'enclave')} that the fleet does not record {place}: "
-                f"{', '.join(names[:_MOST_GROUPS])}{others if len(names) > _MOST_GROUPS else ''}"
+                f"  {counted(len(names), 'enclave')} that the fleet does not record {place}: "
+                f"{first_few(names, _MOST_GROUPS)}{see}"
             )
     for kind, states in robot.files.items():
         yield f"  {kind:14} {', '.join(f'{number} {state}' for state, number in states.items())}"
-    for each in robot.pending[:_MOST_LINES]:
-        issued = f" of {each.since}" if each.since else ""
-        whose = f" of {each.robot or each.enclave}" if each.enclave else ""
-        yield f"  {each.action} {each.path}: {each.state}{issued}{whose}"
+    for file in robot.pending[:_MOST_LINES]:
+        issued = f" of {file.since}" if file.since else ""
+        whose = f" of {file.robot or file.enclave}" if file.enclave else ""
+        yield f"  {file.action} {file.path}: {file.state}{issued}{whose}"
     if (more := len(robot.pending) - _MOST_LINES) > 0:
         yield f"  and {more} more, see --json"
 
@@ -381,7 +387,3 @@ def _age(robot: RobotStatus, moment: datetime) -> str:
 
 def _word(state: str) -> str:
     return _WORDS.get(state, state)
-
-
-def _number(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"

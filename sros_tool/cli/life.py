@@ -30,6 +30,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo
+from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
@@ -560,11 +561,7 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
     if isinstance(unconfirmed, str):
         echo(f"which robots confirmed this stage is unknown: {unconfirmed}")
     elif unconfirmed:
-        more = len(unconfirmed) - _MOST_ROBOTS
-        echo(
-            f"not confirmed by {', '.join(unconfirmed[:_MOST_ROBOTS])}"
-            f"{f' and {more} more' if more > 0 else ''}: see `sros fleet status`"
-        )
+        echo(f"not confirmed by {first_few(unconfirmed, _MOST_ROBOTS)}: see `sros fleet status`")
     for remark in status.remarks:
         echo(remark)
 

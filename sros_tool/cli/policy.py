@@ -29,7 +29,7 @@ from sros_tool.cli.common import (
 from sros_tool.errors import PolicyError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import FileChange, as_plain, file_change
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
     from sros_tool.fleet.robots import Fleet
@@ -130,7 +130,7 @@ def _print_added(merged: Merged) -> None:
     if not count:
         echo("no right was missing", err=True)
         return
-    echo(f"added {count} right{'s' if count > 1 else ''}", err=True)
+    echo(f"added {counted(count, 'right')}", err=True)
     for right in merged.added:
         echo(f"  {right}", err=True)
 
@@ -270,8 +270,8 @@ def rights_markdown(first: RightsSource, second: RightsSource) -> str:
     notes = [f"{note.id}: {note.text}" for note in (*first.notes, *second.notes)]
     if notes:
         parts += ["**Notes**", bounded(map(code, notes), 4000, rest)]
-    differ = "1 difference" if len(lines) == 1 else f"{len(lines)} differences"
-    title = f"### Rights: {plain(differ if lines else 'no difference')}"
+    differ = counted(len(lines), "difference") if lines else "no difference"
+    title = f"### Rights: {plain(differ)}"
     if lines and drawn is None:
         parts.append(
             "The picture is too large for a comment: `sros view BEFORE AFTER -o change.html`"
@@ -608,8 +608,7 @@ def _convert(
         )
     elif output is None and not dry_run:
         echo_document(document)
-    count = len(policy.enclaves)
-    what = f"{count} node{'s' * (count != 1)} of '{earlier}' to enclaves: {names}"
+    what = f"{counted(len(policy.enclaves), 'node')} of '{earlier}' to enclaves: {names}"
     if dry_run and not as_json:
         echo(f"would convert {what}")
         if output:

@@ -24,6 +24,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo
+from sros_tool.wording import counted
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -335,7 +336,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
         case RightsChange():
             return "the rights that are written differ"
         case DroppedRequirements(count=count, chosen=chosen):
-            dropped = "1 requirement" if count == 1 else f"{count} requirements"
+            dropped = counted(count, "requirement")
             return f"{dropped} dropped or changed, decided as before: {chosen.summary()}"
         case ExpiryCheck(due=due, unreadable=unreadable, count=count):
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
@@ -360,7 +361,7 @@ def _verdict(result: Review) -> str:
     """Return the result in one sentence, with what it leaves out."""
     counts = [sum(each.status == status for each in result.steps) for status in (1, 2)]
     words = [
-        f"{count} step{'s' * (count > 1)} {word}"
+        f"{counted(count, 'step')} {word}"
         for count, word in zip(counts, ("failed", "could not be decided"), strict=True)
         if count
     ]

@@ -7,10 +7,11 @@ the same attack succeeds without that defence: an attack that never works would 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from sros_tool.demo import forger
-from sros_tool.demo.forger import Undefended
+from sros_tool.demo.forger import Forge, Undefended
 from sros_tool.demo.scenarios.model import (
     FOREIGN,
     OWN,
@@ -463,106 +464,89 @@ _NETWORK_ROWS: tuple[Row, ...] = (
 
 # ── by an enclave that tries more than its permissions allow ───────────────────────────────
 
-_GUEST_MAY_DO_EVERYTHING = Identity(Undefended(forger.guest_may_do_everything), "guest")
-_LEAST_PRIVILEGE = "least privilege"
 _NOT_ALLOWED = "its signed permissions do not allow the topic"
 _OTHER_DIRECTION = "its signed permissions allow the topic only in the other direction"
+_NEITHER_ALLOWED = "its signed permissions allow neither the request nor the reply"
 _EVERY_TOPIC = "permissions for * allow every topic"
 _BOTH_DIRECTIONS = "permissions for * allow both directions"
 
+
+def _trespass(
+    kind: Callable[..., Row],
+    attack: str,
+    part: str,
+    mechanism: str,
+    forge: Forge,
+    opened: str,
+) -> tuple[Row, ...]:
+    """Return the rows of an enclave that tries what it may not, and of one with wide permissions.
+
+    ``forge`` gives the enclave in that ``part`` the permissions, and ``opened`` says what they
+    allow.
+    """
+    given = " that it was not given" if attack.startswith("an enclave ") else ""
+    done = RowStatus.ANSWERED if kind in (_calling, _posing_as_server) else RowStatus.HEARD
+    return tries(
+        attack,
+        kind(f"{attack}{given}", Identity(OWN, part), RowStatus.REFUSED, mechanism),
+        kind(
+            f"{attack}, wildcard permissions",
+            Identity(Undefended(forge), part),
+            done,
+            opened,
+            removed="least privilege",
+        ),
+    )
+
+
 _RIGHTS_ROWS: tuple[Row, ...] = (
-    *tries(
+    *_trespass(
+        _injection,
         "an enclave publishes a topic",
-        _injection(
-            "an enclave publishes a topic that it was not given",
-            Identity(OWN, "guest"),
-            RowStatus.REFUSED,
-            _NOT_ALLOWED,
-        ),
-        _injection(
-            "an enclave publishes a topic, wildcard permissions",
-            _GUEST_MAY_DO_EVERYTHING,
-            RowStatus.HEARD,
-            _EVERY_TOPIC,
-            removed=_LEAST_PRIVILEGE,
-        ),
+        "guest",
+        _NOT_ALLOWED,
+        forger.guest_may_do_everything,
+        _EVERY_TOPIC,
     ),
-    *tries(
+    *_trespass(
+        _listening,
         "an enclave hears a topic",
-        _listening(
-            "an enclave hears a topic that it was not given",
-            Identity(OWN, "guest"),
-            RowStatus.REFUSED,
-            _NOT_ALLOWED,
-        ),
-        _listening(
-            "an enclave hears a topic, wildcard permissions",
-            _GUEST_MAY_DO_EVERYTHING,
-            RowStatus.HEARD,
-            _EVERY_TOPIC,
-            removed=_LEAST_PRIVILEGE,
-        ),
+        "guest",
+        _NOT_ALLOWED,
+        forger.guest_may_do_everything,
+        _EVERY_TOPIC,
     ),
-    *tries(
+    *_trespass(
+        _injection,
         "a listener publishes",
-        _injection(
-            "a listener publishes",
-            Identity(OWN, "listener"),
-            RowStatus.REFUSED,
-            _OTHER_DIRECTION,
-        ),
-        _injection(
-            "a listener publishes, wildcard permissions",
-            Identity(Undefended(forger.listener_may_do_everything), "listener"),
-            RowStatus.HEARD,
-            _BOTH_DIRECTIONS,
-            removed=_LEAST_PRIVILEGE,
-        ),
+        "listener",
+        _OTHER_DIRECTION,
+        forger.listener_may_do_everything,
+        _BOTH_DIRECTIONS,
     ),
-    *tries(
+    *_trespass(
+        _listening,
         "a talker listens",
-        _listening(
-            "a talker listens", Identity(OWN, "talker"), RowStatus.REFUSED, _OTHER_DIRECTION
-        ),
-        _listening(
-            "a talker listens, wildcard permissions",
-            Identity(Undefended(forger.talker_may_do_everything), "talker"),
-            RowStatus.HEARD,
-            _BOTH_DIRECTIONS,
-            removed=_LEAST_PRIVILEGE,
-        ),
+        "talker",
+        _OTHER_DIRECTION,
+        forger.talker_may_do_everything,
+        _BOTH_DIRECTIONS,
     ),
-    *tries(
+    *_trespass(
+        _calling,
         "an enclave calls a service",
-        _calling(
-            "an enclave calls a service that it was not given",
-            Identity(OWN, "guest"),
-            RowStatus.REFUSED,
-            "its signed permissions allow neither the request nor the reply",
-        ),
-        _calling(
-            "an enclave calls a service, wildcard permissions",
-            _GUEST_MAY_DO_EVERYTHING,
-            RowStatus.ANSWERED,
-            "permissions for * allow every service",
-            removed=_LEAST_PRIVILEGE,
-        ),
+        "guest",
+        _NEITHER_ALLOWED,
+        forger.guest_may_do_everything,
+        "permissions for * allow every service",
     ),
-    *tries(
+    *_trespass(
+        _posing_as_server,
         "a client poses as the server",
-        _posing_as_server(
-            "a client poses as the server",
-            Identity(OWN, "client"),
-            RowStatus.REFUSED,
-            "its signed permissions allow requests, not replies",
-        ),
-        _posing_as_server(
-            "a client poses as the server, wildcard permissions",
-            Identity(Undefended(forger.client_may_do_everything), "client"),
-            RowStatus.ANSWERED,
-            "permissions for * allow replies as well",
-            removed=_LEAST_PRIVILEGE,
-        ),
+        "client",
+        "its signed permissions allow requests, not replies",
+        forger.client_may_do_everything,
+        "permissions for * allow replies as well",
     ),
     *tries(
         "an enclave without a policy",
@@ -590,50 +574,44 @@ _RIGHTS_ROWS: tuple[Row, ...] = (
 
 WIDEST_PUBLISHER, WIDEST_SUBSCRIBER = "widest publisher", "widest subscriber"
 WIDEST_CLIENT, WIDEST_SERVER = "widest client", "widest server"
-WIDEST: dict[str, Row] = dict(
-    zip(
-        (WIDEST_PUBLISHER, WIDEST_SUBSCRIBER, WIDEST_CLIENT, WIDEST_SERVER),
-        (
-            *tries(
-                "an enclave publishes a topic",
-                _injection(
-                    "the widest enclave publishes a topic that it was not given",
-                    Identity(OWN, WIDEST_PUBLISHER),
-                    RowStatus.REFUSED,
-                    _NOT_ALLOWED,
-                ),
-            ),
-            *tries(
-                "an enclave hears a topic",
-                _listening(
-                    "the widest enclave hears a topic that it was not given",
-                    Identity(OWN, WIDEST_SUBSCRIBER),
-                    RowStatus.REFUSED,
-                    _NOT_ALLOWED,
-                ),
-            ),
-            *tries(
-                "an enclave calls a service",
-                _calling(
-                    "the widest enclave calls a service that it was not given",
-                    Identity(OWN, WIDEST_CLIENT),
-                    RowStatus.REFUSED,
-                    "its signed permissions allow neither the request nor the reply",
-                ),
-            ),
-            *tries(
-                "a client poses as the server",
-                _posing_as_server(
-                    "the widest enclave poses as the server",
-                    Identity(OWN, WIDEST_SERVER),
-                    RowStatus.REFUSED,
-                    "its signed permissions do not allow replies",
-                ),
-            ),
-        ),
-        strict=True,
-    )
+_OF_THE_WIDEST: tuple[tuple[str, Callable[..., Row], str, str, str], ...] = (
+    (
+        WIDEST_PUBLISHER,
+        _injection,
+        "an enclave publishes a topic",
+        "publishes a topic that it was not given",
+        _NOT_ALLOWED,
+    ),
+    (
+        WIDEST_SUBSCRIBER,
+        _listening,
+        "an enclave hears a topic",
+        "hears a topic that it was not given",
+        _NOT_ALLOWED,
+    ),
+    (
+        WIDEST_CLIENT,
+        _calling,
+        "an enclave calls a service",
+        "calls a service that it was not given",
+        _NEITHER_ALLOWED,
+    ),
+    (
+        WIDEST_SERVER,
+        _posing_as_server,
+        "a client poses as the server",
+        "poses as the server",
+        "its signed permissions do not allow replies",
+    ),
 )
+WIDEST: dict[str, Row] = {
+    part: row
+    for part, kind, attack, does, mechanism in _OF_THE_WIDEST
+    for row in tries(
+        attack,
+        kind(f"the widest enclave {does}", Identity(OWN, part), RowStatus.REFUSED, mechanism),
+    )
+}
 """The attack of the enclave with the widest permissions, by its part, in a keystore of a user."""
 
 
