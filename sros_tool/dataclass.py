@@ -2,16 +2,14 @@
 
 `dataclasses.dataclass` compiles six methods for each class, which takes more than half a
 millisecond; a verb imports up to a hundred and thirty classes, and makes values of few of them.
-Here comparison, hash and text need nothing compiled, and ``__init__`` is compiled when the first
-value is made.  Everything else is as in `dataclasses`, whose `field`, `fields` and `replace` work
-with these classes.
+Here each method is compiled when it is called first.  Everything else is as in `dataclasses`, whose
+`field`, `fields` and `replace` work with these classes.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from operator import attrgetter, ge, gt, le, lt
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -36,9 +34,13 @@ else:
                 init=False, repr=False, eq=False, slots=slots, kw_only=kw_only
             )
             cls = define_fields(cls)
-            methods = {"__init__": _compiled_when_called(cls, frozen), "__repr__": _text}
+            methods: dict[str, Any] = {"__repr__": _text}
+            methods["__init__"] = _compiled_when_called(cls, "__init__", frozen)
             if eq:
-                methods |= _comparison(cls, order=order, hashable=frozen)
+                methods["__eq__"] = _compiled_when_called(cls, "__eq__")
+                methods["__hash__"] = _compiled_when_called(cls, "__hash__") if frozen else None
+            for name in _ORDER if order else ():
+                methods[name] = _compiled_when_called(cls, name)
             if frozen:
                 methods |= {"__setattr__": _refuse_change, "__delattr__": _refuse_change}
                 if slots:
@@ -51,74 +53,60 @@ else:
         return define if cls is None else define(cls)
 
 
-def _compiled_when_called(cls: Any, frozen: bool) -> Callable[..., None]:
-    """Return an ``__init__`` that replaces itself by a compiled one."""
+_ORDER = {"__lt__": "<", "__le__": "<=", "__gt__": ">", "__ge__": ">="}
+_COMPARISONS = {"__eq__": "==", **_ORDER}
 
-    def compile_and_call(self: Any, *args: Any, **kwargs: Any) -> None:
-        cls.__init__ = _init(cls, frozen)
-        cls.__init__(self, *args, **kwargs)
+
+def _compiled_when_called(cls: Any, name: str, frozen: bool = False) -> Callable[..., Any]:
+    """Return a method that replaces itself by a compiled one."""
+
+    def compile_and_call(self: Any, *args: Any, **kwargs: Any) -> Any:
+        names: dict[str, Any] = {}
+        source = _init(cls, frozen, names) if name == "__init__" else _comparison(cls, name)
+        exec(source, names)  # noqa: S102  only names of fields are in it
+        names[name].__qualname__ = f"{cls.__qualname__}.{name}"
+        setattr(cls, name, names[name])
+        return names[name](self, *args, **kwargs)
 
     return compile_and_call
 
 
-def _init(cls: Any, frozen: bool) -> Callable[..., None]:
-    """Compile ``__init__`` for the fields of a class."""
-    names: dict[str, Any] = {"_set": object.__setattr__, "_MISSING": dataclasses.MISSING}
+def _init(cls: Any, frozen: bool, names: dict[str, Any]) -> str:
+    """Return ``__init__`` for the fields of a class, and put the defaults into ``names``."""
+    names |= {"_dataclass_set": object.__setattr__, "_dataclass_missing": dataclasses.MISSING}
+    assign = "_dataclass_set(self, {0!r}, {1})" if frozen else "self.{0} = {1}"
     positional, lines = ["self"], []
     keywords: list[str] = []
     for each in dataclasses.fields(cls):
-        name, value, default = each.name, each.name, ""
+        parameter = value = each.name
+        given = f"_default_{each.name}"
         if each.default is not dataclasses.MISSING:
-            names[f"_{name}"] = each.default
-            default = f"=_{name}"
+            names[given] = each.default
+            parameter += f"={given}"
         elif each.default_factory is not dataclasses.MISSING:
-            names[f"_{name}"] = each.default_factory
-            default, value = "=_MISSING", f"_{name}() if {name} is _MISSING else {name}"
-        (keywords if each.kw_only else positional).append(name + default)
-        lines.append(f"_set(self, {name!r}, {value})" if frozen else f"self.{name} = {value}")
+            names[given] = each.default_factory
+            parameter += "=_dataclass_missing"
+            value = f"{given}() if {each.name} is _dataclass_missing else {each.name}"
+        (keywords if each.kw_only else positional).append(parameter)
+        lines.append(assign.format(each.name, value))
     if hasattr(cls, "__post_init__"):
         lines.append("self.__post_init__()")
     parameters = ", ".join([*positional, *(["*", *keywords] if keywords else [])])
-    source = f"def __init__({parameters}):\n  " + "\n  ".join(lines or ["pass"])
-    exec(source, names)  # noqa: S102  only names of fields are in it
-    method: Callable[..., None] = names["__init__"]
-    method.__qualname__ = f"{cls.__qualname__}.__init__"
-    return method
+    return f"def __init__({parameters}):\n  " + "\n  ".join(lines or ["pass"])
 
 
-def _comparison(cls: Any, *, order: bool, hashable: bool) -> dict[str, Any]:
-    """Return the methods that compare values of a class by its fields."""
+def _comparison(cls: Any, name: str) -> str:
+    """Return a method that compares values of a class by its fields, or hashes them."""
     compared = [each.name for each in dataclasses.fields(cls) if each.compare]
-    key: Callable[[Any], Any] = attrgetter(*compared) if compared else _nothing
-
-    def equal(self: Any, other: object) -> Any:
-        return key(self) == key(other) if _alike(self, other) else NotImplemented
-
-    def hashed(self: Any) -> int:
-        return hash(key(self))
-
-    methods: dict[str, Any] = {"__eq__": equal, "__hash__": hashed if hashable else None}
-    for test in (lt, le, gt, ge) if order else ():
-        methods[f"__{test.__name__}__"] = _ordering(test, key)
-    return methods
-
-
-def _ordering(
-    test: Callable[[Any, Any], bool], key: Callable[[Any], Any]
-) -> Callable[[Any, object], Any]:
-    def compare(self: Any, other: object) -> Any:
-        return test(key(self), key(other)) if _alike(self, other) else NotImplemented
-
-    return compare
-
-
-def _alike(one: object, other: object) -> bool:
-    """Return whether two values are of the same class: others are not compared."""
-    return one.__class__ is other.__class__
-
-
-def _nothing(_value: object) -> tuple[()]:
-    return ()
+    own, others = ("".join(f"{of}.{each}, " for each in compared) for of in ("self", "other"))
+    if name == "__hash__":
+        return f"def __hash__(self):\n  return hash(({own}))"
+    return (
+        f"def {name}(self, other):\n"
+        "  if other.__class__ is not self.__class__:\n"
+        "    return NotImplemented\n"
+        f"  return ({own}) {_COMPARISONS[name]} ({others})"
+    )
 
 
 def _text(self: Any) -> str:
