@@ -22,6 +22,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     save,
+    verb,
 )
 from sros_tool.cli.observing import (
     Watching,
@@ -42,25 +43,7 @@ if TYPE_CHECKING:
     from sros_tool.graph.observation import Observation
 
 
-@click.command(
-    "audit",
-    cls=Watching,
-    epilog="""\b
-Example:
-  $ sros audit robot.xml
-  /talker publish topic /status (/talker): no rule allows publish rt/status
-  1 right would be denied of 2 nodes with 47 endpoints, on Fast DDS 2.14
-  $ sros audit robot.xml --watch 1h --patch missing.xml
-  watching for 3600 s, or until Ctrl-C; then the result is shown
-  denied: /talker publish topic /status (/talker): no rule allows ...
-  ...
-  wrote 'missing.xml'; add it: sros merge_policy robot.xml missing.xml ...
-  $ sros merge_policy robot.xml missing.xml --in-place
-
-Exit status: 0 if nothing would be denied and every node of POLICY or KEYSTORE was seen; 1 if
-something would be denied or, without --partial, was not seen or not judged; 2 if nothing could be
-asked.""",
-)
+@verb("audit", cls=Watching)
 @click.argument("source", metavar="[POLICY|KEYSTORE]", type=PATH, required=False)
 @observing_options("Observe a robot that is secured already, in this enclave.")
 @click.option(
@@ -104,6 +87,21 @@ def audit(
     every endpoint as the DDS vendor would. A node is looked up in the enclave that the graph shows,
     or else in the enclave whose profiles name it. Observes until the graph stops changing; what a
     node does only later needs --watch. The default is the keystore of $ROS_SECURITY_KEYSTORE.
+
+    Example:
+      $ sros audit robot.xml
+      /talker publish topic /status (/talker): no rule allows publish rt/status
+      1 right would be denied of 2 nodes with 47 endpoints, on Fast DDS 2.14
+      $ sros audit robot.xml --watch 1h --patch missing.xml
+      watching for 3600 s, or until Ctrl-C; then the result is shown
+      denied: /talker publish topic /status (/talker): no rule allows ...
+      ...
+      wrote 'missing.xml'; add it: sros merge_policy robot.xml missing.xml ...
+      $ sros merge_policy robot.xml missing.xml --in-place
+
+    Exit status: 0 if nothing would be denied and every node of POLICY or KEYSTORE was seen; 1 if
+    something would be denied or, without --partial, was not seen or not judged; 2 if nothing could
+    be asked.
     """
     from sros_tool.explain import audit as audits
     from sros_tool.fleet.fleet_file import read_fleet

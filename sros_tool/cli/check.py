@@ -42,6 +42,7 @@ from sros_tool.cli.common import (
     progress,
     save,
     taken_secrets,
+    verb,
 )
 from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
@@ -70,27 +71,7 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     return [each for each in all_kinds() if each.startswith(incomplete)]
 
 
-@click.command(
-    "check",
-    epilog="""\b
-Example:
-  $ sros check robot.xml keystore
-  robot.xml:12: error: a node that may not publish /rosout [policy.no-rosout]
-      /talker: node /talker may not publish /rosout
-      Allow <topics publish="ALLOW"><topic>/rosout</topic></topics>. ...
-  1 error
-  $ sros check keystore --policy robot.xml --sarif > findings.sarif
-  $ sros check --needs-renewal 30d keystore || \\
-        sros renew keystore --all-expiring 30d
-  $ sros check robot.xml --suggest > robot.requirements.toml
-  $ sros check robot.xml --requirements robot.requirements.toml
-
-Findings that the keystore's template accepts count as notes and share one line; with --strict,
-for example in CI, they count like all others. Where security is not enabled at all, `check runtime`
-shows a note, which counts with --fail-on note. Exit status: 1 if a finding of the --fail-on
-severity or higher is shown, 2 if the only ones are about processes that could not be looked at,
-else 0.""",
-)
+@verb("check")
 @click.argument("targets", metavar="[policy|keystore|runtime] [PATH]...", nargs=-1, type=PATH)
 @click.option("--list", "as_list", is_flag=True, help="List all kinds of findings.")
 @click.option(
@@ -223,11 +204,29 @@ def check(
     as_sarif: bool,
     needs_renewal: str | None,
 ) -> int:
-    """Find errors and weaknesses in policies, keystores and the runtime.
+    r"""Find errors and weaknesses in policies, keystores and the runtime.
 
     PATH is a policy, a folder of policies, a keystore or an enclave. Its type is detected, unless
     the first word is `policy` or `keystore`. Without PATH, the keystore of $ROS_SECURITY_KEYSTORE
     and the runtime are checked. The runtime is the environment and the processes of this machine.
+
+    Example:
+      $ sros check robot.xml keystore
+      robot.xml:12: error: a node that may not publish /rosout [policy.no-rosout]
+          /talker: node /talker may not publish /rosout
+          Allow <topics publish="ALLOW"><topic>/rosout</topic></topics>. ...
+      1 error
+      $ sros check keystore --policy robot.xml --sarif > findings.sarif
+      $ sros check --needs-renewal 30d keystore || \
+            sros renew keystore --all-expiring 30d
+      $ sros check robot.xml --suggest > robot.requirements.toml
+      $ sros check robot.xml --requirements robot.requirements.toml
+
+    Findings that the keystore's template accepts count as notes and share one line; with --strict,
+    for example in CI, they count like all others. Where security is not enabled at all,
+    `check runtime` shows a note, which counts with --fail-on note. Exit status: 1 if a finding of
+    the --fail-on severity or higher is shown, 2 if the only ones are about processes that could
+    not be looked at, else 0.
     """
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
@@ -667,24 +666,7 @@ _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
 """The function that prints findings, for each value of --format."""
 
 
-@click.command(
-    "doctor",
-    epilog="""\b
-Example:
-  $ sros doctor
-  rclpy with rmw_fastrtps_cpp  does not enforce   Fast DDS 2.14.5
-      a secured participant fails: RCLError: error creating node: This Fast
-      DDS version doesn't have the security libraries
-  Cyclone DDS (libddsc)        enforces security  Cyclone DDS 0.10.2
-      with an enclave made by sros, it created the allowed writer on /chatter
-      and refused the denied writer and reader on /sros_not_allowed: ...
-  DDS Security can be enforced here, by Cyclone DDS (libddsc), but NOT by ROS
-  nodes: rmw_fastrtps_cpp does not enforce it. The ROS 2 packages of ...
-  $ sros doctor --report support.md
-
-Exit status: 1 if the RMW that ROS nodes use here does not enforce security (without
-any RMW: if nothing here does), or if a finding is an error; else 0.""",
-)
+@verb("doctor")
 @click.option(
     "--report",
     "report",
@@ -701,6 +683,21 @@ def doctor(report: Path | None, force: bool, as_json: bool) -> None:
     Each one is tried in a separate process, in a temporary enclave: its name and version do not
     show whether it was built with security. Also reports the findings of `sros check runtime`,
     such as misspelt ROS_SECURITY_* values, missing files or a wrong clock.
+
+    Example:
+      $ sros doctor
+      rclpy with rmw_fastrtps_cpp  does not enforce   Fast DDS 2.14.5
+          a secured participant fails: RCLError: error creating node: This Fast
+          DDS version doesn't have the security libraries
+      Cyclone DDS (libddsc)        enforces security  Cyclone DDS 0.10.2
+          with an enclave made by sros, it created the allowed writer on /chatter
+          and refused the denied writer and reader on /sros_not_allowed: ...
+      DDS Security can be enforced here, by Cyclone DDS (libddsc), but NOT by ROS
+      nodes: rmw_fastrtps_cpp does not enforce it. The ROS 2 packages of ...
+      $ sros doctor --report support.md
+
+    Exit status: 1 if the RMW that ROS nodes use here does not enforce security (without
+    any RMW: if nothing here does), or if a finding is an error; else 0.
     """
     from sros_tool.checks.kind import ERROR, WARNING
     from sros_tool.demo.doctor import diagnosis_text, examine, security_provider, support_report
@@ -802,17 +799,7 @@ def _watch_processes(
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-@click.command(
-    "metrics",
-    epilog="""\b
-Example:
-  $ sros metrics keystore -o /var/lib/prometheus/node-exporter/sros.prom
-  $ sros metrics keystore | grep earliest
-  sros_earliest_expiry_timestamp_seconds{keystore="/home/robot/keystore",...
-
-The exit status is 0 whatever is found. If the keystore cannot be examined it is
-2 and FILE stays as it is: alert also on an old sros_examined_timestamp_seconds.""",
-)
+@verb("metrics")
 @click.argument("root", metavar="[ROOT]", type=PATH, required=False)
 @output_option("Replace FILE at once, which ends in .prom, instead of printing.")
 @click.option(
@@ -846,6 +833,14 @@ def metrics(
 
     ROOT is a keystore, or an export on a robot. The text is for the textfile collector of
     node_exporter.
+
+    Example:
+      $ sros metrics keystore -o /var/lib/prometheus/node-exporter/sros.prom
+      $ sros metrics keystore | grep earliest
+      sros_earliest_expiry_timestamp_seconds{keystore="/home/robot/keystore",...
+
+    The exit status is 0 whatever is found. If the keystore cannot be examined it is
+    2 and FILE stays as it is: alert also on an old sros_examined_timestamp_seconds.
     """
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.keystores.metrics import keystore_metrics

@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from inspect import cleandoc
 from pathlib import Path
 from shlex import quote
 from types import FrameType
@@ -263,7 +264,25 @@ def output_option(help_text: str) -> Callable[[Decorated], Decorated]:
 force_option = click.option("--force", is_flag=True, help="Replace FILE if it exists.")
 
 
-class SeveralValues(click.Command):
+class Verb(click.Command):
+    """A command whose help is the docstring of its function, with an example at its end.
+
+    The example begins with ``Example``, and is shown as it is written.
+    """
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        text, mark, example = cleandoc(more.get("help") or "").partition("\n\nExample")
+        if mark:
+            more |= {"help": text, "epilog": f"\b\nExample{example}"}
+        super().__init__(*arguments, **more)
+
+
+def verb(name: str, cls: type[Verb] = Verb) -> Callable[[Callable[..., Any]], Verb]:
+    """Return a decorator that makes a verb of a function."""
+    return click.command(name, cls)
+
+
+class SeveralValues(Verb):
     """A command in which ``-e A B -e C`` means A, B and C, as users of ros2/sros2 write it.
 
     ``several`` are the options that take several values.

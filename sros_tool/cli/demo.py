@@ -20,6 +20,7 @@ from sros_tool.cli.common import (
     json_option,
     now,
     print_json,
+    verb,
 )
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo, echo_lines
@@ -40,34 +41,7 @@ def _complete_scenario(
     return [name for name in names if name.startswith(incomplete)]
 
 
-@click.command(
-    "demo",
-    epilog="""\b
-Example:
-  $ sros demo --topic /camera/image
-  Cyclone DDS 0.10.2, topic /camera/image, in a separate network namespace
-        what was tried                        expected      observed
-  ok    secured talker to secured listener    heard         heard
-        secured listener heard 49 of 50 messages of the secured talker ...
-  ok    secured talker to unsecured listener  not heard     not heard
-        unsecured listener heard 0 of 50 messages of the secured talker ...
-  ...
-  11 of 11 rows as expected.
-  $ sros demo --scenario attacks --keystore ~/robot --summary attacks.md
-  $ sros demo --scenario governance
-  $ sros demo --scenario all
-  $ sros demo --backend zenoh --summary zenoh.md
-  $ sros run keystore /talker_listener/talker -- sros demo talker
-  talker on Cyclone DDS, topic /chatter, domain 0: secured, in the enclave ...
-  ready
-  sent   Hello World: 1
-
-Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1.
-A row marked "open" shows an attack that is known to succeed, and counts as expected. OPEN
-marks an attack that succeeds because of your own keystore (--keystore), and would fail with
-narrow permissions and the template production: the exit status is 1 unless --accept-open
-names the row. With --keystore it is 2 if an attack could not be tried that has to fail.""",
-)
+@verb("demo")
 @click.argument("role", required=False, type=click.Choice(["talker", "listener", "router"]))
 @click.option(
     "--backend",
@@ -175,6 +149,31 @@ def demo(
     With a ROLE, it is one node instead, in the environment that is there, until Ctrl-C: a talker or
     a listener on Cyclone DDS (or rclpy, or Zenoh, which also needs a router), to see by hand who
     hears whom. It says at once whether it is secured. Only --backend and --topic go with it.
+
+    Example:
+      $ sros demo --topic /camera/image
+      Cyclone DDS 0.10.2, topic /camera/image, in a separate network namespace
+            what was tried                        expected      observed
+      ok    secured talker to secured listener    heard         heard
+            secured listener heard 49 of 50 messages of the secured talker ...
+      ok    secured talker to unsecured listener  not heard     not heard
+            unsecured listener heard 0 of 50 messages of the secured talker ...
+      ...
+      11 of 11 rows as expected.
+      $ sros demo --scenario attacks --keystore ~/robot --summary attacks.md
+      $ sros demo --scenario governance
+      $ sros demo --scenario all
+      $ sros demo --backend zenoh --summary zenoh.md
+      $ sros run keystore /talker_listener/talker -- sros demo talker
+      talker on Cyclone DDS, topic /chatter, domain 0: secured, in the enclave ...
+      ready
+      sent   Hello World: 1
+
+    Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1.
+    A row marked "open" shows an attack that is known to succeed, and counts as expected. OPEN
+    marks an attack that succeeds because of your own keystore (--keystore), and would fail with
+    narrow permissions and the template production: the exit status is 1 unless --accept-open
+    names the row. With --keystore it is 2 if an attack could not be tried that has to fail.
     """
     if role is not None:
         _run_by_hand(ctx, role, backend, topic)

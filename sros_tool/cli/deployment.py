@@ -33,6 +33,7 @@ from sros_tool.cli.common import (
     secrets,
     several_enclaves,
     split_root,
+    verb,
 )
 from sros_tool.errors import UsageError
 from sros_tool.terminal import Coloured, echo, echo_bytes
@@ -52,19 +53,7 @@ _STREAM = Path("-")
 """The file argument that means standard input or output."""
 
 
-@click.command(
-    "distribute_key",
-    epilog="""\b
-Example:
-  $ sros distribute_key keystore /talker talker.tar.gz
-  exported enclave /talker to 'talker.tar.gz'
-  $ tar -xzf talker.tar.gz -C /etc/robot/keystore      # on the robot
-  $ sros distribute_key keystore --match '/arm/*' - | \\
-        ssh robot tar -xz -C robot
-  exported enclave /arm/gripper to standard output
-  exported enclave /arm/wrist to standard output
-  left out enclave /arm/camera: its key was made on its robot""",
-)
+@verb("distribute_key")
 @click.argument(
     "words",
     metavar="[ROOT] [NAME...] TARGET",
@@ -91,9 +80,19 @@ def distribute_key(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Export the enclaves NAME... to TARGET: a folder, a .tar.gz, or - for standard output.
+    r"""Export the enclaves NAME... to TARGET: a folder, a .tar.gz, or - for standard output.
 
     TARGET becomes a keystore with only these enclaves: files instead of links, and no CA key.
+
+    Example:
+      $ sros distribute_key keystore /talker talker.tar.gz
+      exported enclave /talker to 'talker.tar.gz'
+      $ tar -xzf talker.tar.gz -C /etc/robot/keystore      # on the robot
+      $ sros distribute_key keystore --match '/arm/*' - | \
+            ssh robot tar -xz -C robot
+      exported enclave /arm/gripper to standard output
+      exported enclave /arm/wrist to standard output
+      left out enclave /arm/camera: its key was made on its robot
     """
     from sros_tool.keystore.delivery.archive import SUFFIXES
     from sros_tool.keystore.delivery.export import distribute, pack_enclaves, select
@@ -198,20 +197,7 @@ def _refuse_terminal() -> None:
         )
 
 
-@click.command(
-    "verify",
-    epilog="""\b
-Example:
-  $ sros verify robot
-  /arm/camera  loadable in domain 0 until 2027-05-20T07:45:12Z
-  /arm/gripper  loadable in domain 0 until 2027-05-20T07:45:12Z
-  /arm/wrist  NOT LOADABLE
-  robot/enclaves/arm/wrist/key.pem: error: a private key that others can ...
-      its mode is 0644
-      Run `chmod 600 robot/enclaves/arm/wrist/key.pem`.
-  ...
-  $ sros verify robot --at 2027-06-01 || echo 'renew before June'""",
-)
+@verb("verify")
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
 @click.option("--domain", metavar="ID", help="Also check whether enclaves may join this domain.")
 @click.option(
@@ -236,6 +222,17 @@ def verify(
     Checks that enclaves are complete, consistent, valid and loadable, that only the owner can read
     their keys, that no CA key was exported, and that all enclaves trust the same CAs. The exit
     status is 0 if there are no findings.
+
+    Example:
+      $ sros verify robot
+      /arm/camera  loadable in domain 0 until 2027-05-20T07:45:12Z
+      /arm/gripper  loadable in domain 0 until 2027-05-20T07:45:12Z
+      /arm/wrist  NOT LOADABLE
+      robot/enclaves/arm/wrist/key.pem: error: a private key that others can ...
+          its mode is 0644
+          Run `chmod 600 robot/enclaves/arm/wrist/key.pem`.
+      ...
+      $ sros verify robot --at 2027-06-01 || echo 'renew before June'
     """
     from sros_tool.checks.keystores.arrival import verify_arrival
     from sros_tool.cli.common import echo_findings, local_zone
@@ -276,17 +273,7 @@ def verify(
     return 1 if arrival.findings else 0
 
 
-@click.command(
-    "create_request",
-    epilog="""\b
-Example:
-  $ sros create_request /arm/camera robot
-  made the key of enclave /arm/camera, which stays in 'robot'
-    its SHA-256 is 6f5bbd292e91c5d0fbf579aa0d036ac044cdd9788c6efdbc730a...
-    have 'robot/enclaves/arm/camera/request.pem' signed: sros sign_request
-  $ ssh robot cat robot/enclaves/arm/camera/request.pem |   # or in one step
-        sros sign_request keystore - | ssh robot sros import - robot""",
-)
+@verb("create_request")
 @click.argument("name")
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
 @click.option("--again", is_flag=True, help="Make the request again, for the existing key.")
@@ -303,6 +290,14 @@ def create_request(
 
     Send the request to the keystore, where `sros sign_request` answers it; `sros import` installs
     the answer next to the key.
+
+    Example:
+      $ sros create_request /arm/camera robot
+      made the key of enclave /arm/camera, which stays in 'robot'
+        its SHA-256 is 6f5bbd292e91c5d0fbf579aa0d036ac044cdd9788c6efdbc730a...
+        have 'robot/enclaves/arm/camera/request.pem' signed: sros sign_request
+      $ ssh robot cat robot/enclaves/arm/camera/request.pem |   # or in one step
+            sros sign_request keystore - | ssh robot sros import - robot
     """
     from sros_tool.keystore.delivery.robot import create_request as create
     from sros_tool.keystore.delivery.robot import shown_request
@@ -329,18 +324,7 @@ def create_request(
     print_notes(made.notes)
 
 
-@click.command(
-    "sign_request",
-    epilog="""\b
-Example:
-  $ sros sign_request keystore request.pem -p camera.xml
-  signed the request of enclave /arm/camera for the key 6f5bbd292e91c5d0...
-    the robot will trust CN=sros identity CA 4f122aed, SHA-256 5fe417aa...
-    and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af...
-    send 'request.answer.tar.gz' to the robot: sros import ...
-  $ sros sign_request keystore keystore/enclaves/arm/camera/request.pem \\
-        --renew -o camera.tgz""",
-)
+@verb("sign_request")
 @click.argument(
     "words",
     metavar="[ROOT] REQUEST",
@@ -400,12 +384,21 @@ def sign_request(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """At the keystore: certify the key in REQUEST (or -), and sign the enclave's permissions.
+    r"""At the keystore: certify the key in REQUEST (or -), and sign the enclave's permissions.
 
     The answer is one .tar.gz for `sros import` on the robot.  It contains certificate,
     permissions, governance, the certificates of the CAs and revocation lists, and no secret.  The
     keystore then contains the enclave, without its private key.  Compare the key's SHA-256 with the
     one that the robot printed.
+
+    Example:
+      $ sros sign_request keystore request.pem -p camera.xml
+      signed the request of enclave /arm/camera for the key 6f5bbd292e91c5d0...
+        the robot will trust CN=sros identity CA 4f122aed, SHA-256 5fe417aa...
+        and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af...
+        send 'request.answer.tar.gz' to the robot: sros import ...
+      $ sros sign_request keystore keystore/enclaves/arm/camera/request.pem \
+            --renew -o camera.tgz
     """
     from sros_tool.keystore.delivery.signing import sign_request as sign
     from sros_tool.runtime.variables import domain_from
@@ -540,18 +533,7 @@ def _certify(
     _show_signed(done, None, as_json=as_json)
 
 
-@click.command(
-    "import",
-    epilog="""\b
-Example:
-  $ sros import request.answer.tar.gz robot
-  imported enclave /arm/camera, which can run until 2027-05-20T07:45:12Z
-    it trusts CN=sros identity CA 4f122aed, SHA-256 5fe417aa...
-    and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af...
-    compare both with the output of sign_request, or use --ca: ...
-  $ sros import request.answer.tar.gz robot --ca e15ab4af9ee8c94bd8a5e4c6c1...
-  $ sros run robot /arm/camera -- ros2 run camera driver""",
-)
+@verb("import")
 @click.argument("answer", type=PATH)
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
 @click.option("--force", is_flag=True, help="Accept an older answer, or one from other CAs.")
@@ -580,6 +562,15 @@ def import_verb(
     signatures, the validity, and that the archive has no other files.  The first answer sets the
     CAs that the robot trusts: give --ca, or an attacker could replace this answer on its way.
     Later answers must come from the same CAs.
+
+    Example:
+      $ sros import request.answer.tar.gz robot
+      imported enclave /arm/camera, which can run until 2027-05-20T07:45:12Z
+        it trusts CN=sros identity CA 4f122aed, SHA-256 5fe417aa...
+        and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af...
+        compare both with the output of sign_request, or use --ca: ...
+      $ sros import request.answer.tar.gz robot --ca e15ab4af9ee8c94bd8a5e4c6c1...
+      $ sros run robot /arm/camera -- ros2 run camera driver
     """
     from sros_tool.keystore.delivery.robot import import_answer, read_pin, shown_import
 

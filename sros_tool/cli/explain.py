@@ -27,6 +27,7 @@ from sros_tool.cli.common import (
     progress,
     read_log,
     ros_domain,
+    verb,
 )
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, SrosError, UsageError
@@ -137,24 +138,7 @@ def _refuse_ignored(mode: str) -> None:
             raise UsageError(text, "", "Leave it out.")
 
 
-@click.command(
-    "explain",
-    epilog="""\b
-Example:
-  $ sros explain keystore /talker publish /chatter --policy robot.xml
-  yes: /talker may publish topic /chatter, on Fast DDS 2.14 (...)
-    why       rule 1 allows publish rt/chatter by rt/chatter
-    rule      allow rule 1 of grant /talker: rt/chatter
-    from      robot.xml:12: ALLOW publish chatter
-    protected payload ENCRYPT, submessages ENCRYPT, RTPS messages SIGN
-    until     2036-11-18T09:00:00Z, when cert.pem expires
-  $ sros explain keystore /talker call /add_two_ints --all-vendors
-  $ sros explain keystore /talker publish /chatter --vendor zenoh
-  $ sros explain keystore --who publish /cmd_vel
-  $ sros explain keystore --reach /mobile_robot/teleop
-  $ ros2 run demo_nodes_cpp talker 2>&1 | \\
-        sros explain keystore /talker --log -""",
-)
+@verb("explain")
 @click.argument(
     "words",
     metavar="[ROOT] [ENCLAVE] [publish|subscribe|call|serve|execute|join [NAME]]",
@@ -235,7 +219,7 @@ def explain(
     logs: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    """Show whether DDS or Zenoh lets an enclave do something, by which rule, and how to change it.
+    r"""Show whether DDS or Zenoh lets an enclave do something, by which rule, and how to change it.
 
     call and serve apply to services, execute to actions; call and serve apply to an action if the
     rights have an action NAME and no service NAME; --type decides it. ROOT is a keystore, here or
@@ -244,6 +228,21 @@ def explain(
 
     The exit status is 0 if it is allowed (with --who: to any enclave), and 1 if it is denied; with
     --log, 1 if the log reports a fault.
+
+    Example:
+      $ sros explain keystore /talker publish /chatter --policy robot.xml
+      yes: /talker may publish topic /chatter, on Fast DDS 2.14 (...)
+        why       rule 1 allows publish rt/chatter by rt/chatter
+        rule      allow rule 1 of grant /talker: rt/chatter
+        from      robot.xml:12: ALLOW publish chatter
+        protected payload ENCRYPT, submessages ENCRYPT, RTPS messages SIGN
+        until     2036-11-18T09:00:00Z, when cert.pem expires
+      $ sros explain keystore /talker call /add_two_ints --all-vendors
+      $ sros explain keystore /talker publish /chatter --vendor zenoh
+      $ sros explain keystore --who publish /cmd_vel
+      $ sros explain keystore --reach /mobile_robot/teleop
+      $ ros2 run demo_nodes_cpp talker 2>&1 | \
+            sros explain keystore /talker --log -
     """
     if sum((who, bool(reach), bool(logs))) > 1:
         raise UsageError("--who, --reach and --log exclude each other")

@@ -11,6 +11,7 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
+    Verb,
     check_metrics_file,
     check_output,
     complete_file,
@@ -40,27 +41,26 @@ if TYPE_CHECKING:
     from sros_tool.keystore.fleet_status import FleetStatus, RobotStatus
 
 
-@click.group(
-    "fleet",
-    epilog="""\b
-Example:
-  $ sros fleet status keystore
-  50 robots: 48 current, 1 earlier, 1 never confirmed""",
-)
+class _Fleet(Verb, click.Group):
+    """A group of verbs."""
+
+    command_class = Verb
+
+
+@click.group("fleet", cls=_Fleet)
 def fleet() -> None:
-    """Show the robots of a fleet, and what they have."""
+    """Show the robots of a fleet, and what they have.
+
+    Example:
+      $ sros fleet status keystore
+      50 robots: 48 current, 1 earlier, 1 never confirmed
+    """
 
 
 # ── the robots ─────────────────────────────────────────────────────────────────────────────
 
 
-@fleet.command(
-    "inventory",
-    epilog="""\b
-Example:
-  $ sros fleet inventory keystore > hosts.json
-  $ ansible-playbook -i hosts.json sros.fleet.deliver""",
-)
+@fleet.command("inventory")
 @click.argument("root", type=PATH, required=False)
 @click.option("--yaml", "as_yaml", is_flag=True, help="Print YAML in place of JSON.")
 @click.option(
@@ -74,6 +74,10 @@ def _inventory(root: Path | None, as_yaml: bool, as_list: bool) -> None:
 
     Robots are hosts and groups are groups. Variables of a host are ansible_host, ansible_user,
     sros_robot, sros_namespace and sros_domain.
+
+    Example:
+      $ sros fleet inventory keystore > hosts.json
+      $ ansible-playbook -i hosts.json sros.fleet.deliver
     """
     from sros_tool.fleet.fleet_file import inventory, script_inventory
     from sros_tool.keystore.fleet import recorded_fleet
@@ -90,13 +94,7 @@ def _inventory(root: Path | None, as_yaml: bool, as_list: bool) -> None:
 # ── on the robot ───────────────────────────────────────────────────────────────────────────
 
 
-@fleet.command(
-    "report",
-    epilog="""\b
-Example:
-  $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
-        sros fleet confirm keystore --robot r7 -""",
-)
+@fleet.command("report")
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
 @click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
 def _report(folder: Path | None, robot: str) -> None:
@@ -104,6 +102,10 @@ def _report(folder: Path | None, robot: str) -> None:
 
     It is JSON with the SHA-256 of each file of the enclaves in DIR but their keys, and the time.
     docs/json.md describes it under confirmation.
+
+    Example:
+      $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
+            sros fleet confirm keystore --robot r7 -
     """
     from sros_tool.keystore.confirmation import make_confirmation, render_confirmation
 
@@ -116,14 +118,7 @@ def _report(folder: Path | None, robot: str) -> None:
 # ── at home ────────────────────────────────────────────────────────────────────────────────
 
 
-@fleet.command(
-    "confirm",
-    epilog="""\b
-Example:
-  $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
-        sros fleet confirm keystore --robot r7 -
-  kept what r7 has: 18 files of 2 enclaves""",
-)
+@fleet.command("confirm")
 @click.argument(
     "words",
     metavar="[ROOT] FILE",
@@ -146,6 +141,11 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     FILE is what `sros fleet report` or the Ansible collection made on the robot; - is standard
     input. It replaces the last one of the robot, and proves nothing about it: `sros fleet status`
     compares it with what the robot should have.
+
+    Example:
+      $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
+            sros fleet confirm keystore --robot r7 -
+      kept what r7 has: 18 files of 2 enclaves
     """
     from sros_tool.keystore.confirmation import MAX_BYTES, KeptConfirmation, keep, receive
     from sros_tool.keystore.fleet import recorded_fleet
@@ -190,22 +190,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     print_notes(notes)
 
 
-@fleet.command(
-    "status",
-    epilog="""\b
-Example:
-  $ sros fleet status keystore
-  50 robots: 47 current, 1 earlier, 1 another's files, 1 never confirmed
-  robot  state            confirmed   what
-  r7     earlier          3 d 4 h ago earlier permissions of 2027-05-01T06:...
-  r8     another's files  2 min ago   10 files of r9
-  r31    never confirmed  -           2 enclaves
-  $ sros fleet status keystore --max-age 7d
-  $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
-
-The exit status is 0 if every robot confirmed that it has what an export would
-give it now, and 1 if not.""",
-)
+@fleet.command("status")
 @click.argument("root", metavar="[ROOT]", type=PATH, required=False)
 @robot_option("Only this robot of the fleet, with all that it has.")
 @click.option(
@@ -234,6 +219,19 @@ def _status(
     earlier, which the keystore issued for the enclave before; another's; revoked; missing; or
     unknown, which the keystore never issued. Files on a robot take effect when its processes are
     restarted, which a confirmation does not tell.
+
+    Example:
+      $ sros fleet status keystore
+      50 robots: 47 current, 1 earlier, 1 another's files, 1 never confirmed
+      robot  state            confirmed   what
+      r7     earlier          3 d 4 h ago earlier permissions of 2027-05-01T06:...
+      r8     another's files  2 min ago   10 files of r9
+      r31    never confirmed  -           2 enclaves
+      $ sros fleet status keystore --max-age 7d
+      $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
+
+    The exit status is 0 if every robot confirmed that it has what an export would
+    give it now, and 1 if not.
     """
     from sros_tool.keystore.fleet_status import ComparedFleet, fleet_status
     from sros_tool.keystore.reader import Keystore

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sros_tool.cli.common import PATH, json_option, now, print_json
+from sros_tool.cli.common import PATH, json_option, now, print_json, verb
 from sros_tool.terminal import echo
 from sros_tool.validity import iso
 from sros_tool.wording import counted
@@ -39,22 +39,7 @@ if TYPE_CHECKING:
 _INDENT = "  "
 
 
-@click.command(
-    "inspect",
-    epilog="""\b
-Example:
-  $ sros inspect keystore/enclaves/talker/permissions.p7s
-  permissions keystore/enclaves/talker/permissions.p7s
-    signed by CN=sros permissions CA 5f0c3a1e (SHA-256 8e1d22c4), ...
-    grant /talker for CN=/talker
-      valid from 2026-11-20T05:59:44Z to 2027-05-20T05:59:44Z
-      ALLOW in domain 0
-        publish topics: /chatter, /parameter_events, /rosout
-        ...
-  $ sros inspect keystore --history
-  2026-11-20T05:59:44Z  certificate  current     /talker  until 2027-11-20...
-  ...""",
-)
+@verb("inspect")
 @click.argument("path", type=PATH)
 @click.option(
     "--ca",
@@ -76,6 +61,19 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
     cannot run, a signature does not verify or is missing (in a .p7s file, or with --ca), a Zenoh
     configuration does not fit its signature or its enclave, a certificate or signed document is
     missing from the keystore's ledger, or lines of the ledger are missing or were changed.
+
+    Example:
+      $ sros inspect keystore/enclaves/talker/permissions.p7s
+      permissions keystore/enclaves/talker/permissions.p7s
+        signed by CN=sros permissions CA 5f0c3a1e (SHA-256 8e1d22c4), ...
+        grant /talker for CN=/talker
+          valid from 2026-11-20T05:59:44Z to 2027-05-20T05:59:44Z
+          ALLOW in domain 0
+            publish topics: /chatter, /parameter_events, /rosout
+            ...
+      $ sros inspect keystore --history
+      2026-11-20T05:59:44Z  certificate  current     /talker  until 2027-11-20...
+      ...
     """
     from sros_tool.errors import DocumentError, UsageError
     from sros_tool.keystore.describe import describe, problems_of

@@ -34,6 +34,7 @@ from sros_tool.cli.common import (
     ros_domain,
     several_enclaves,
     split_root,
+    verb,
 )
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo
@@ -46,16 +47,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.update import KeystoreUpdate
 
 
-@click.command(
-    "create_enclave",
-    epilog="""\b
-Example:
-  $ sros create_enclave keystore /talker /listener
-  created enclave /talker
-  created enclave /listener
-  $ sros create_enclave keystore /arm --key 'pkcs11:token=robot;object=arm'
-  created enclave /arm""",
-)
+@verb("create_enclave")
 @click.argument(
     "words",
     metavar="[ROOT] NAME...",
@@ -71,6 +63,13 @@ def create_enclave(words: tuple[str, ...], key: str, dry_run: bool, as_json: boo
 
     An existing enclave keeps its key and its permissions; missing files are added. With --key, the
     key is on a PKCS#11 token and cannot be copied; without object= in URI, its label is NAME.
+
+    Example:
+      $ sros create_enclave keystore /talker /listener
+      created enclave /talker
+      created enclave /listener
+      $ sros create_enclave keystore /arm --key 'pkcs11:token=robot;object=arm'
+      created enclave /arm
     """
     from sros_tool.keystore.lifecycle.create import create_enclaves
 
@@ -98,15 +97,7 @@ _revoke_old_option = click.option(
 )
 
 
-@click.command(
-    "create_permission",
-    epilog="""\b
-Example:
-  $ sros create_permission keystore /talker_listener/talker policy.xml
-  replaced the permissions of enclave /talker_listener/talker
-  $ sros create_permission keystore --match '/arm/*' policy.xml
-  $ sros create_permission keystore --robot r7 robot.xml --fleet fleet.toml""",
-)
+@verb("create_permission")
 @click.argument(
     "words",
     metavar="[ROOT] [NAME...] POLICY_FILE",
@@ -135,6 +126,12 @@ def create_permission(
 
     Anyone who has a copy of the replaced permissions, with the certificate of that time, can use
     them until they expire. With --revoke-old, processes that load the new crl.pem refuse them.
+
+    Example:
+      $ sros create_permission keystore /talker_listener/talker policy.xml
+      replaced the permissions of enclave /talker_listener/talker
+      $ sros create_permission keystore --match '/arm/*' policy.xml
+      $ sros create_permission keystore --robot r7 robot.xml --fleet fleet.toml
     """
     from sros_tool.keystore.lifecycle.create import create_permission as create
 
@@ -185,18 +182,7 @@ class _SeveralEnclavesAndPolicies(SeveralValues):
     several = ("-e", "--enclaves", "-p", "--policy-files")
 
 
-@click.command(
-    "generate_artifacts",
-    cls=_SeveralEnclavesAndPolicies,
-    epilog="""\b
-Example:
-  $ sros generate_artifacts -k keystore -e /spare \\
-        -p talker_listener.xml mobile_robot.xml
-  created enclave /spare
-  created enclave /talker_listener/talker
-  ...
-  $ sros generate_artifacts -k keystore -p robot.xml --fleet fleet.toml""",
-)
+@verb("generate_artifacts", cls=_SeveralEnclavesAndPolicies)
 @click.option("-k", "--keystore-root-path", type=PATH, help="The keystore; created if missing.")
 @click.option("-e", "--enclaves", multiple=True, metavar="NAME...", help="Enclaves to create.")
 @click.option(
@@ -234,13 +220,21 @@ def generate_artifacts(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Create enclaves, with the permissions that policies state for them: all or nothing.
+    r"""Create enclaves, with the permissions that policies state for them: all or nothing.
 
     The permissions in a policy replace the current permissions of an enclave, unless these state
     the same and more than a third of their validity is left. To sign them again in any case, use
     `sros create_permission` or `sros renew`. What --revoke-old does is described at `sros
     create_permission --help`. Where a policy demands more protection of a name than the keystore
     gives, the governance of all enclaves is signed again.
+
+    Example:
+      $ sros generate_artifacts -k keystore -e /spare \
+            -p talker_listener.xml mobile_robot.xml
+      created enclave /spare
+      created enclave /talker_listener/talker
+      ...
+      $ sros generate_artifacts -k keystore -p robot.xml --fleet fleet.toml
     """
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.layout import is_keystore
@@ -349,21 +343,20 @@ def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
         yield f"unchanged: {counted(len(result.kept), 'enclave')}: {shown_names(result.kept)}"
 
 
-@click.command(
-    "list_enclaves",
-    epilog="""\b
-Example:
-  $ sros list_enclaves keystore
-  /listener
-  /talker""",
-)
+@verb("list_enclaves")
 @click.argument("root", type=PATH, required=False)
 @only_enclaves()
 @json_option
 def list_enclaves(
     root: Path | None, patterns: tuple[str, ...], robots: tuple[str, ...], as_json: bool
 ) -> None:
-    """List the enclaves of the keystore ROOT, sorted."""
+    """List the enclaves of the keystore ROOT, sorted.
+
+    Example:
+      $ sros list_enclaves keystore
+      /listener
+      /talker
+    """
     from sros_tool.errors import KeystoreError
     from sros_tool.keystore.layout import (
         enclave_names,
@@ -408,18 +401,7 @@ if TYPE_CHECKING:
     from sros_tool.policy.model import Policy
 
 
-@click.command(
-    "create_keystore",
-    epilog="""\b
-Example:
-  $ sros create_keystore keystore
-  created keystore 'keystore' for domain 0
-    template development: encrypted and authenticated; every enclave may ...
-    identity CA and permissions CA: separate, valid for 3650d; ...
-    identity CA SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e1003ee5b8c...
-    permissions CA SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91...
-  $ sros create_keystore fleet --template production --domain 10-19""",
-)
+@verb("create_keystore")
 @click.argument("root", type=PATH)
 @click.option(
     "--template",
@@ -485,6 +467,15 @@ def create_keystore(
     Passphrases of CA keys come from a prompt, from $SROS_CA_PASSPHRASE or from the file
     $SROS_CA_PASSPHRASE_FILE; the PIN of a token from a prompt or $SROS_PKCS11_PIN. A new
     passphrase has at least 12 characters, unless you set SROS_SHORT_PASSPHRASE=1.
+
+    Example:
+      $ sros create_keystore keystore
+      created keystore 'keystore' for domain 0
+        template development: encrypted and authenticated; every enclave may ...
+        identity CA and permissions CA: separate, valid for 3650d; ...
+        identity CA SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e1003ee5b8c...
+        permissions CA SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91...
+      $ sros create_keystore fleet --template production --domain 10-19
     """
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.lifecycle.create import create_keystore as create
@@ -614,20 +605,7 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
     return found
 
 
-@click.command(
-    "update_keystore",
-    epilog="""\b
-Example:
-  $ sros update_keystore keystore --template production --dry-run
-  would update keystore 'keystore': template development -> production
-    tighter  protection.rtps SIGN -> ENCRYPT: whole messages: encrypted
-    ...
-  $ sros update_keystore keystore --template production --next
-  $ sros update_keystore keystore --template production --next
-  $ sros update_keystore keystore --domain 0,7 --allow-looser
-  $ sros update_keystore keystore --set permissions.validity=90d \\
-        --rule 'topic /camera/* data=NONE metadata=SIGN' --allow-looser""",
-)
+@verb("update_keystore")
 @click.argument("root", type=PATH, required=False)
 @click.option(
     "--template",
@@ -694,7 +672,7 @@ def update_keystore(
     as_json: bool,
     dry_run: bool,
 ) -> int:
-    """Change the settings of the keystore ROOT, and sign again what follows from them.
+    r"""Change the settings of the keystore ROOT, and sign again what follows from them.
 
     The keys are those of sros.toml. What becomes looser and what tighter is shown, and a looser
     keystore has to be allowed. Keys of enclaves stay, and so do the rights of policies.
@@ -705,6 +683,17 @@ def update_keystore(
     the new one do not communicate (Cyclone DDS 0.10.2, Fast DDS 2.14.5): restart them together.
 
     The exit status of a dry run is 1 if --allow-looser is needed and missing.
+
+    Example:
+      $ sros update_keystore keystore --template production --dry-run
+      would update keystore 'keystore': template development -> production
+        tighter  protection.rtps SIGN -> ENCRYPT: whole messages: encrypted
+        ...
+      $ sros update_keystore keystore --template production --next
+      $ sros update_keystore keystore --template production --next
+      $ sros update_keystore keystore --domain 0,7 --allow-looser
+      $ sros update_keystore keystore --set permissions.validity=90d \
+            --rule 'topic /camera/* data=NONE metadata=SIGN' --allow-looser
     """
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.lifecycle.update import edited_settings

@@ -27,6 +27,7 @@ from sros_tool.cli.common import (
     progress,
     several_enclaves,
     split_root,
+    verb,
 )
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo
@@ -38,15 +39,7 @@ if TYPE_CHECKING:
     from sros_tool.pki.crl import RevocationList
 
 
-@click.command(
-    "renew",
-    epilog="""\b
-Example:
-  $ sros renew keystore /talker
-  renewed enclave /talker
-  the replaced certificate works until 2027-11-21T09:00:00Z, unless ...
-  $ sros renew keystore --all-expiring 30d --revoke-old""",
-)
+@verb("renew")
 @click.argument(
     "words",
     metavar="[ROOT] [NAME...]",
@@ -93,6 +86,12 @@ def renew(
     renewed processes first, then all others.
 
     With --key, the enclaves NAME... get other keys, on a token; a key.pem that one had is removed.
+
+    Example:
+      $ sros renew keystore /talker
+      renewed enclave /talker
+      the replaced certificate works until 2027-11-21T09:00:00Z, unless ...
+      $ sros renew keystore --all-expiring 30d --revoke-old
     """
     from sros_tool.keystore.expiry import parse_threshold
     from sros_tool.keystore.lifecycle.renew import renew as work
@@ -153,14 +152,7 @@ def _complete_reason(
     return [each for each in REASONS if each.startswith(incomplete)]
 
 
-@click.command(
-    "revoke",
-    epilog="""\b
-Example:
-  $ sros revoke keystore /talker --reason key_compromise
-  revoked enclave /talker
-  restart the processes of 2 enclaves for it to take effect: /listener, ...""",
-)
+@verb("revoke")
 @click.argument(
     "words",
     metavar="[ROOT] [NAME...]",
@@ -202,6 +194,11 @@ def revoke(
     During a rotation both CAs revoke, because Fast DDS trusts both. If the key of the old CA is
     gone, its certificates are refused only after `sros rotate_ca --to retire`; --until-retired
     accepts this delay.
+
+    Example:
+      $ sros revoke keystore /talker --reason key_compromise
+      revoked enclave /talker
+      restart the processes of 2 enclaves for it to take effect: /listener, ...
     """
     from sros_tool.keystore.lifecycle.revoke import revoke as work
     from sros_tool.keystore.reader import Keystore
@@ -233,15 +230,7 @@ def revoke(
     print_changed(result, shown, (f"revoked enclave {name}" for name in result.outcomes))
 
 
-@click.command(
-    "crl",
-    epilog="""\b
-Example:
-  $ sros crl keystore
-  revocation list 3, until 2036-11-18T06:05:29Z
-    69aa94992b4cf7d761cf3c3e06f16849896e24a3  2026-11-21T07:00:00Z  ...
-  $ sros crl keystore --refresh""",
-)
+@verb("crl")
 @click.argument("root", type=PATH, required=False)
 @click.option("--refresh", is_flag=True, help="Sign the list again to extend its validity.")
 @allow_refusal_option
@@ -258,6 +247,12 @@ def crl(
 
     DDS refuses every participant once the list has expired, so the exit status is 1 if it expires
     within 30 days.
+
+    Example:
+      $ sros crl keystore
+      revocation list 3, until 2036-11-18T06:05:29Z
+        69aa94992b4cf7d761cf3c3e06f16849896e24a3  2026-11-21T07:00:00Z  ...
+      $ sros crl keystore --refresh
     """
     from datetime import timedelta
 
@@ -335,22 +330,7 @@ _DONE = {
 }
 
 
-@click.command(
-    "rotate_ca",
-    epilog="""\b
-Example:
-  $ sros rotate_ca keystore --next
-  distributed the new CA next to the old one: identity_ca, permissions_ca
-  $ sros rotate_ca keystore --status
-  stage: distribute, next: reissue
-    identity CA    issuing 2 of 2 enclaves  until 2036-11-18T07:37:42Z  ...
-    identity CA    next    0 of 2 enclaves  until 2036-11-18T07:37:45Z  ...
-  $ sros rotate_ca keystore --next     # once all processes were restarted
-  issued and signed everything with the new CA: identity_ca, permissions_ca
-  $ sros rotate_ca keystore --next     # once they were restarted again
-  retired the old CA: identity_ca, permissions_ca
-  $ sros rotate_ca keystore --finish   # or all at once; then restart all""",
-)
+@verb("rotate_ca")
 @click.argument("root", type=PATH, required=False)
 @click.option("--identity", is_flag=True, help="Replace only the identity CA.")
 @click.option("--permissions", is_flag=True, help="Replace only the permissions CA.")
@@ -417,6 +397,19 @@ def rotate_ca(
 
     In a keystore with a fleet, a stage is refused while robots have not confirmed the one before
     (`sros fleet confirm`).
+
+    Example:
+      $ sros rotate_ca keystore --next
+      distributed the new CA next to the old one: identity_ca, permissions_ca
+      $ sros rotate_ca keystore --status
+      stage: distribute, next: reissue
+        identity CA    issuing 2 of 2 enclaves  until 2036-11-18T07:37:42Z  ...
+        identity CA    next    0 of 2 enclaves  until 2036-11-18T07:37:45Z  ...
+      $ sros rotate_ca keystore --next     # once all processes were restarted
+      issued and signed everything with the new CA: identity_ca, permissions_ca
+      $ sros rotate_ca keystore --next     # once they were restarted again
+      retired the old CA: identity_ca, permissions_ca
+      $ sros rotate_ca keystore --finish   # or all at once; then restart all
     """
     from sros_tool.keystore.lifecycle.rotate import renew_identity_ca
     from sros_tool.keystore.lifecycle.rotate import rotate_ca as work

@@ -17,6 +17,7 @@ import click
 from sros_tool.cli.common import (
     PATH,
     Decorated,
+    Verb,
     dry_run_option,
     enclave_environment,
     json_option,
@@ -24,6 +25,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     read_log,
+    verb,
 )
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.terminal import echo, echo_document
@@ -44,7 +46,7 @@ _FOREVER = "until Ctrl-C"
 _DURATION = re.compile(r"\d+[smhdwy]\Z", re.ASCII)
 
 
-class Watching(click.Command):
+class Watching(Verb):
     """A command whose ``--watch`` needs no value."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -297,32 +299,7 @@ class _Words(Watching):
         return super().parse_args(ctx, words)
 
 
-@click.command(
-    "generate_policy",
-    cls=_Words,
-    epilog="""\b
-Example:
-  $ sros generate_policy robot.xml
-  wrote 'robot.xml': 2 enclaves, 2 nodes, 20 rights
-  copied common/node/logging.xml, common/node/types.xml, ... next to it
-  $ sros generate_policy robot.xml --watch 10m
-  watching for 600 s, or until Ctrl-C; then the policy is written
-  new: /talker (/talker_listener/talker)
-  new: /talker (/talker_listener/talker) publish /chatter
-  ...
-  $ sros generate_policy unsecured.xml --enclave-per-node
-  wrote 'unsecured.xml': 2 enclaves, 2 nodes, 20 rights
-  $ sros generate_policy robot.xml --enclave /talker_listener/talker \\
-        --from-log talker.log --accept
-  added 1 right to 'robot.xml'
-    /talker_listener/talker ALLOW publish topic /nope
-  these lines of logs ask for it; a process can print any line:
-    talker.log:7: talker-1: publish rt/nope in /talker_listener/talker
-
-On a secured robot, observe in a separate enclave. Create it with `sros generate_artifacts -k ROOT
--p observer.xml`: policies/observer.xml (see `sros policies`) has the few rights it needs. Observe
-with --keystore ROOT --enclave /sros_observer.""",
-)
+@verb("generate_policy", cls=_Words)
 @click.argument("file", type=PATH, required=False)
 @observing_options("Observe in this enclave; with --from-log, the enclave of the node.")
 @click.option(
@@ -371,7 +348,7 @@ def generate_policy(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Write to FILE the smallest policy that allows everything the robot is observed to do.
+    r"""Write to FILE the smallest policy that allows everything the robot is observed to do.
 
     Observes the running nodes until the ROS graph stops changing, about four seconds. An existing
     FILE keeps its content; new rights are added to it. Read the result before you enforce it: on a
@@ -380,6 +357,28 @@ def generate_policy(
     A log proves less: a process can print any line, and so ask for rights. Rights from a log are
     shown with the lines that ask for them, and are written only with --accept; the exit status is 2
     if that is missing. Without FILE, the rights are printed as a policy, for merge_policy.
+
+    Example:
+      $ sros generate_policy robot.xml
+      wrote 'robot.xml': 2 enclaves, 2 nodes, 20 rights
+      copied common/node/logging.xml, common/node/types.xml, ... next to it
+      $ sros generate_policy robot.xml --watch 10m
+      watching for 600 s, or until Ctrl-C; then the policy is written
+      new: /talker (/talker_listener/talker)
+      new: /talker (/talker_listener/talker) publish /chatter
+      ...
+      $ sros generate_policy unsecured.xml --enclave-per-node
+      wrote 'unsecured.xml': 2 enclaves, 2 nodes, 20 rights
+      $ sros generate_policy robot.xml --enclave /talker_listener/talker \
+            --from-log talker.log --accept
+      added 1 right to 'robot.xml'
+        /talker_listener/talker ALLOW publish topic /nope
+      these lines of logs ask for it; a process can print any line:
+        talker.log:7: talker-1: publish rt/nope in /talker_listener/talker
+
+    On a secured robot, observe in a separate enclave. Create it with `sros generate_artifacts -k
+    ROOT -p observer.xml`: policies/observer.xml (see `sros policies`) has the few rights it needs.
+    Observe with --keystore ROOT --enclave /sros_observer.
     """
     present = _present_policy(file)
     if logs:

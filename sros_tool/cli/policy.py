@@ -25,6 +25,7 @@ from sros_tool.cli.common import (
     print_notes,
     progress,
     save,
+    verb,
 )
 from sros_tool.errors import PolicyError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines
@@ -45,17 +46,7 @@ if TYPE_CHECKING:
 # ── merge_policy ────────────────────────────────────────────────────────────────────────
 
 
-@click.command(
-    "merge_policy",
-    epilog="""\b
-Example:
-  $ sros merge_policy robot.xml learned.xml --in-place
-  added 2 rights
-    /talker ALLOW publish topic /diagnostics
-    /talker ALLOW subscribe topic /tf
-  note [merge.still-denied]: /talker DENY publish topic /cmd_vel stays ...
-  replaced 'robot.xml'""",
-)
+@verb("merge_policy")
 @click.argument("policy", metavar="POLICY", type=PATH)
 @click.argument("others", metavar="OTHER...", type=PATH, nargs=-1, required=True)
 @output_option("Write the result to FILE.")
@@ -78,6 +69,14 @@ def merge_policy(
     enclave does not have it yet; rights from includes and wildcards count. Publish and subscribe
     are separate rights. A DENY always stays and always wins over an ALLOW; contradictions between
     the policies are reported.
+
+    Example:
+      $ sros merge_policy robot.xml learned.xml --in-place
+      added 2 rights
+        /talker ALLOW publish topic /diagnostics
+        /talker ALLOW subscribe topic /tf
+      note [merge.still-denied]: /talker DENY publish topic /cmd_vel stays ...
+      replaced 'robot.xml'
     """
     from sros_tool.policy.document import read_policy
     from sros_tool.policy.merge import EditedText, MergedPolicy, merge_all, merge_notes
@@ -154,22 +153,7 @@ def _check_includes(policy: Path, output: Path, document: bytes) -> None:
 # ── diff_policy ─────────────────────────────────────────────────────────────────────────
 
 
-@click.command(
-    "diff_policy",
-    epilog="""\b
-Example:
-  $ sros diff_policy robot.xml keystore
-  - /talker ALLOW publish topic /status
-  - /talker ALLOW request service /*
-  + /talker ALLOW request service /add_two_ints  (A has it by request ...
-  3 rights differ
-  $ sros diff_policy robot.xml keystore/enclaves/talker/permissions.p7s
-  $ sros diff_policy keystore keystore/enclaves/router/router.json5
-  $ sros diff_policy robot.xml robot.xml --fleet old.toml --fleet new.toml
-  $ sros diff_policy --no-new-access git:main:robot.xml robot.xml
-  + /talker publish topic /arm_*  (robot.xml:7): such as /arm_c
-  1 right is new""",
-)
+@verb("diff_policy")
 @click.argument("a", metavar="A", type=PATH)
 @click.argument("b", metavar="B", type=PATH)
 @fleets_option
@@ -211,6 +195,19 @@ def diff_policy(
     2 if that cannot be decided. A policy counts as signed with access control of everything: as
     A, a keystore that protects less gives more; as B, it lowers no protection. The last line says
     what is assumed and what is left out, such as dates.
+
+    Example:
+      $ sros diff_policy robot.xml keystore
+      - /talker ALLOW publish topic /status
+      - /talker ALLOW request service /*
+      + /talker ALLOW request service /add_two_ints  (A has it by request ...
+      3 rights differ
+      $ sros diff_policy robot.xml keystore/enclaves/talker/permissions.p7s
+      $ sros diff_policy keystore keystore/enclaves/router/router.json5
+      $ sros diff_policy robot.xml robot.xml --fleet old.toml --fleet new.toml
+      $ sros diff_policy --no-new-access git:main:robot.xml robot.xml
+      + /talker publish topic /arm_*  (robot.xml:7): such as /arm_c
+      1 right is new
     """
     from sros_tool.keystore.rights import compare_sources, load_rights, policy_difference
 
@@ -319,24 +316,7 @@ class _SeveralObserved(SeveralValues):
     several = ("--observed",)
 
 
-@click.command(
-    "minimize_policy",
-    cls=_SeveralObserved,
-    epilog="""\b
-Example:
-  $ sros minimize_policy robot.xml --observed learned.xml -o narrow.xml
-  /talker: allowed 23, observed 4: 5.8x
-    never observed, and removed
-      publish topic /status
-    wider than used
-      request service /*  becomes  request service /add_two_ints
-    never observed, but kept because every node needs it: 11
-    observed, and not allowed
-      publish topic /cmd_vel
-    permissions.p7s: 4044 bytes, then 4028, of at most 61439
-  wrote 'narrow.xml'
-  $ sros minimize_policy robot.xml --observed learned.xml --fleet fleet.toml""",
-)
+@verb("minimize_policy", cls=_SeveralObserved)
 @click.argument("policy", type=PATH)
 @click.option(
     "--observed",
@@ -375,6 +355,20 @@ def minimize_policy(
 
     With --fleet, what was observed of some robots stays for all robots of the same enclave, and
     sizes are those of the robot with the longest name.
+
+    Example:
+      $ sros minimize_policy robot.xml --observed learned.xml -o narrow.xml
+      /talker: allowed 23, observed 4: 5.8x
+        never observed, and removed
+          publish topic /status
+        wider than used
+          request service /*  becomes  request service /add_two_ints
+        never observed, but kept because every node needs it: 11
+        observed, and not allowed
+          publish topic /cmd_vel
+        permissions.p7s: 4044 bytes, then 4028, of at most 61439
+      wrote 'narrow.xml'
+      $ sros minimize_policy robot.xml --observed learned.xml --fleet fleet.toml
     """
     from sros_tool.fleet.expansion import as_written
     from sros_tool.fleet.fleet_file import read_fleet
@@ -457,21 +451,7 @@ def _as_written(value: Any) -> Any:
 # ── policies ────────────────────────────────────────────────────────────────────────────
 
 
-@click.command(
-    "policies",
-    epilog="""\b
-Example:
-  $ sros policies
-  add_two_ints.xml     /add_two_ints/client, /add_two_ints/server
-  ...
-  $ sros policies --copy my_policies
-  copied the policies to 'my_policies'
-  $ sros policies --copy common
-  copied the common parts of policies to 'common'
-  $ sros policies --convert eloquent.xml -o robot.policy.xml
-  converted 2 nodes of 'eloquent.xml' to enclaves: /listener, /talker
-  wrote 'robot.policy.xml'""",
-)
+@verb("policies")
 @click.option(
     "--copy",
     "target",
@@ -517,6 +497,18 @@ def policies(
     the same rights: each node becomes an enclave with the node's name. Nodes of a later ROS 2 need
     more, which --with-node-rights adds. The result is one file: includes are resolved, and comments
     are lost. The exit status is 1 if a part was left out.
+
+    Example:
+      $ sros policies
+      add_two_ints.xml     /add_two_ints/client, /add_two_ints/server
+      ...
+      $ sros policies --copy my_policies
+      copied the policies to 'my_policies'
+      $ sros policies --copy common
+      copied the common parts of policies to 'common'
+      $ sros policies --convert eloquent.xml -o robot.policy.xml
+      converted 2 nodes of 'eloquent.xml' to enclaves: /listener, /talker
+      wrote 'robot.policy.xml'
     """
     from sros_tool.files import policies_dir
     from sros_tool.policy.document import PolicyFile, ShippedPolicies, read_policy

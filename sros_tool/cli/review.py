@@ -21,6 +21,7 @@ from sros_tool.cli.common import (
     now,
     print_json,
     progress,
+    verb,
 )
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo
@@ -76,21 +77,7 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     )
 
 
-@click.command(
-    "review",
-    epilog="""\b
-Example:
-  $ sros review --base refs/remotes/origin/main --policy robot/robot.xml
-  policy robot/robot.xml: nothing found
-  new-access robot/robot.xml: 1 right is new
-  ...
-  $ sros review --base 5d1c0a41c3ec2f2a9d2d1b3c63ff7b6e0aa1d9f4 \\
-        --policy robot/robot.xml --requirements robot/requirements.toml \\
-        --keystore keystore --summary /tmp/review.md --sarif /tmp/review.sarif
-
-Exit status: 0 if nothing was found, 1 if something was, 2 if something could not be
-decided.""",
-)
+@verb("review")
 @click.option(
     "--base",
     required=True,
@@ -173,7 +160,7 @@ def review(
     sarif: Path | None,
     as_json: bool,
 ) -> int:
-    """Review a change of policies, requirements and keystores, as in a pull request.
+    r"""Review a change of policies, requirements and keystores, as in a pull request.
 
     Checks what the commit HEAD has, decides its requirements and those that it drops, and compares
     all access with that of the commit BASE. PATHs are from the top of the repository.
@@ -181,6 +168,18 @@ def review(
     Both commits are read from git itself: nothing is checked out, no file of the work tree is read
     but to say that it differs, no link of a commit is followed, and nothing that the repository has
     or configures is run. What was not looked at is in the result.
+
+    Example:
+      $ sros review --base refs/remotes/origin/main --policy robot/robot.xml
+      policy robot/robot.xml: nothing found
+      new-access robot/robot.xml: 1 right is new
+      ...
+      $ sros review --base 5d1c0a41c3ec2f2a9d2d1b3c63ff7b6e0aa1d9f4 \
+            --policy robot/robot.xml --requirements robot/requirements.toml \
+            --keystore keystore --summary /tmp/review.md --sarif /tmp/review.sarif
+
+    Exit status: 0 if nothing was found, 1 if something was, 2 if something could not be
+    decided.
     """
     from sros_tool.keystore.expiry import parse_threshold
     from sros_tool.proof.commit_files import checked_path

@@ -19,6 +19,7 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
+    Verb,
     check_one_format,
     chosen_enclaves,
     complete_keystore_and_enclave,
@@ -32,6 +33,7 @@ from sros_tool.cli.common import (
     progress,
     several_enclaves,
     split_root,
+    verb,
 )
 from sros_tool.enclave_environment import INSTALLED, RMWS, container_text, target_path
 from sros_tool.errors import Note, UnavailableError, UsageError
@@ -82,7 +84,7 @@ _ACCEPT_KEY = click.option(
 )
 
 
-class _FailingClosed(click.Command):
+class _FailingClosed(Verb):
     """A verb whose output is evaluated: if it fails in any way, no node starts with its output.
 
     That includes wrong options: a shell evaluates whatever is printed, and ignores the exit status.
@@ -137,24 +139,7 @@ def _form_of(arguments: Sequence[str]) -> str:
     return next((form for form in named if form in _FORMS), _FORMS[0])
 
 
-@click.command(
-    "env",
-    cls=_FailingClosed,
-    epilog="""\b
-Example:
-  $ eval "$(sros env keystore /talker)"
-  $ sros env keystore /talker
-  export ROS_SECURITY_KEYSTORE=/home/robot/keystore
-  export ROS_SECURITY_ENABLE=true
-  export ROS_SECURITY_STRATEGY=Enforce
-  export ROS_SECURITY_ENCLAVE_OVERRIDE=/talker
-  export ROS_DOMAIN_ID=0
-  $ sros env keystore /talker --format compose > secured.yaml
-  $ sros env keystore /talker --format kubernetes-secret | \\
-        kubectl apply --server-side -f -
-  $ sros env keystore /talker --format kubernetes --image talker:1 | \\
-        kubectl apply -f -""",
-)
+@verb("env", cls=_FailingClosed)
 @_WORDS
 @click.option(
     "--format",
@@ -195,7 +180,7 @@ def env(
     accept_readable_key: bool,
     as_json: bool,
 ) -> None:
-    """Print the environment variables that make a process run in the enclave NAME.
+    r"""Print the environment variables that make a process run in the enclave NAME.
 
     The strategy is Enforce: a process that cannot run in the enclave does not start. If the
     variables cannot be given, those that are printed let no node start. With rmw_zenoh_cpp, which
@@ -204,6 +189,20 @@ def env(
 
     A container gets the files of the enclave from an export in DIR (Compose), or from a Secret
     (Kubernetes). Without --image, what is printed is to be merged with a definition that has one.
+
+    Example:
+      $ eval "$(sros env keystore /talker)"
+      $ sros env keystore /talker
+      export ROS_SECURITY_KEYSTORE=/home/robot/keystore
+      export ROS_SECURITY_ENABLE=true
+      export ROS_SECURITY_STRATEGY=Enforce
+      export ROS_SECURITY_ENCLAVE_OVERRIDE=/talker
+      export ROS_DOMAIN_ID=0
+      $ sros env keystore /talker --format compose > secured.yaml
+      $ sros env keystore /talker --format kubernetes-secret | \
+            kubectl apply --server-side -f -
+      $ sros env keystore /talker --format kubernetes --image talker:1 | \
+            kubectl apply -f -
     """
     from sros_tool.runtime.environment import PrintedEnvironment, render_environment
 
@@ -264,7 +263,7 @@ def _refuse_open_output() -> None:
             )
 
 
-class _WithCommand(click.Command):
+class _WithCommand(Verb):
     """A verb with a command as argument, whose options it does not parse.
 
     The command is all words after ``--``; without it, if ``needs_no_dashes``, parsing of options
@@ -284,17 +283,7 @@ class _WithCommand(click.Command):
         return super().parse_args(ctx, own)
 
 
-@click.command(
-    "run",
-    cls=_WithCommand,
-    epilog="""\b
-Example:
-  $ sros run keystore /talker_listener/talker -- \\
-        python3 -m sros_tool.demo.ros_node talker
-  [INFO] [talker]: Publishing: 'Hello World: 1'
-  $ ros2 launch --launch-prefix 'sros run keystore --policy policy.xml --' \\
-        demo_nodes_cpp talker_listener_launch.py""",
-)
+@verb("run", cls=_WithCommand)
 @click.argument(
     "words",
     metavar="[ROOT] NAME -- COMMAND...",
@@ -322,7 +311,7 @@ def run(
     accept_readable_key: bool,
     no_ros_args: bool,
 ) -> None:
-    """Run COMMAND in the enclave NAME of the keystore ROOT, or not at all (strategy Enforce).
+    r"""Run COMMAND in the enclave NAME of the keystore ROOT, or not at all (strategy Enforce).
 
     The enclave is checked first, so that problems are reported here and not by an obscure message
     of the middleware. A COMMAND that is known to start a ROS node (`ros2 run`, or an executable of
@@ -331,6 +320,13 @@ def run(
 
     With --policy, COMMAND gives its node a name: `--ros-args -r __node:=NAME -r __ns:=NAMESPACE`,
     as launch files do.
+
+    Example:
+      $ sros run keystore /talker_listener/talker -- \
+            python3 -m sros_tool.demo.ros_node talker
+      [INFO] [talker]: Publishing: 'Hello World: 1'
+      $ ros2 launch --launch-prefix 'sros run keystore --policy policy.xml --' \
+            demo_nodes_cpp talker_listener_launch.py
     """
     from sros_tool.runtime.environment import enclave_argument, named_enclave, with_enclave
 
@@ -422,15 +418,14 @@ def _enclave_of_node(file: Path, command: Sequence[str]) -> str:
     return enclaves[0].path
 
 
-@click.command(
-    "completion",
-    epilog="""\b
-Example:
-  $ sros completion bash > ~/.local/share/bash-completion/completions/sros""",
-)
+@verb("completion")
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion(shell: str) -> None:
-    """Print the script that makes SHELL complete verbs, options, enclaves and templates."""
+    """Print the script that makes SHELL complete verbs, options, enclaves and templates.
+
+    Example:
+      $ sros completion bash > ~/.local/share/bash-completion/completions/sros
+    """
     from click.shell_completion import get_completion_class
 
     from sros_tool.cli.program import program
@@ -453,19 +448,7 @@ class _WithCommandAfterDashes(_WithCommand):
     needs_no_dashes = False
 
 
-@click.command(
-    "units",
-    cls=_WithCommandAfterDashes,
-    epilog="""\b
-Examples:
-  $ sros units keystore /talker units -- /opt/robot/talker.sh
-  wrote units/sros@.service
-  wrote units/sros@talker.service.d/enclave.conf
-  $ sudo cp -r units/* /etc/systemd/system/
-  $ sudo systemctl enable --now sros@talker
-  $ sros units keystore --match '/arm/*' units  # /etc/sros/nodes/arm/...
-  $ sros units keystore --job renew --job check --job metrics units""",
-)
+@verb("units", cls=_WithCommandAfterDashes)
 @click.argument(
     "words",
     metavar="[ROOT] [NAME...] FOLDER [-- COMMAND...]",
@@ -538,6 +521,15 @@ def units(
     A node runs in its enclave or not at all, sees the keys of no other enclave, and gets no right
     that a ROS node does not need. COMMAND is its program; without it, that is a file with the path
     of the enclave in /etc/sros/nodes.
+
+    Examples:
+      $ sros units keystore /talker units -- /opt/robot/talker.sh
+      wrote units/sros@.service
+      wrote units/sros@talker.service.d/enclave.conf
+      $ sudo cp -r units/* /etc/systemd/system/
+      $ sudo systemctl enable --now sros@talker
+      $ sros units keystore --match '/arm/*' units  # /etc/sros/nodes/arm/...
+      $ sros units keystore --job renew --job check --job metrics units
     """
     from sros_tool.keystore.layout import enclaves_below
     from sros_tool.runtime.units import (

@@ -27,6 +27,7 @@ from sros_tool.cli.common import (
     print_json,
     progress,
     save,
+    verb,
 )
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo, echo_document
@@ -63,22 +64,7 @@ def _complete_focus(
     return [name for name in sorted(names) if name.startswith(incomplete)]
 
 
-@click.command(
-    "view",
-    cls=_SeveralObserved,
-    epilog="""\b
-Examples:
-  $ sros view keystore -o robot.html --open
-  wrote 'robot.html'
-  $ sros view policies/mobile_robot.xml --format svg -o mobile_robot.svg
-  $ sros view robot.xml --focus /cmd_vel -o drive.html
-  $ sros view robot.xml --requirements robot.requirements.toml -o broken.svg
-  $ sros view robot.xml --observed learned.xml -o use.html
-  $ sros view old.xml new.xml -o change.html
-  $ sros view robot.xml keystore -o drift.html
-  $ sros view robot.xml --fleet fleet.toml -o fleet.html
-  $ sros view keystore keystore/enclaves/router/router.json5 -o zenoh.html""",
-)
+@verb("view", cls=_SeveralObserved)
 @click.argument("sources", metavar="SOURCE...", type=PATH, nargs=-1, required=True)
 @click.option(
     "--format",
@@ -162,6 +148,18 @@ def view(
     with those that are used. --focus answers who may use a name, and who influences these.
 
     The page is one file that needs no network. No format contains keys or paths of this machine.
+
+    Examples:
+      $ sros view keystore -o robot.html --open
+      wrote 'robot.html'
+      $ sros view policies/mobile_robot.xml --format svg -o mobile_robot.svg
+      $ sros view robot.xml --focus /cmd_vel -o drive.html
+      $ sros view robot.xml --requirements robot.requirements.toml -o broken.svg
+      $ sros view robot.xml --observed learned.xml -o use.html
+      $ sros view old.xml new.xml -o change.html
+      $ sros view robot.xml keystore -o drift.html
+      $ sros view robot.xml --fleet fleet.toml -o fleet.html
+      $ sros view keystore keystore/enclaves/router/router.json5 -o zenoh.html
     """
     from sros_tool.report.formats import render
     from sros_tool.report.sources import Drawing, draw

@@ -25,6 +25,7 @@ from sros_tool.cli.common import (
     print_notes,
     progress,
     save,
+    verb,
 )
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.terminal import echo
@@ -41,22 +42,7 @@ _DONE = {"create": "wrote", "replace": "replaced", "remove": "removed"}
 _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer needed"}
 
 
-@click.command(
-    "zenoh",
-    epilog="""\b
-Example:
-  $ sros zenoh keystore
-  created enclave /router
-  wrote keystore/enclaves/router/router.json5
-  wrote keystore/enclaves/talker/session.json5
-  $ sros zenoh keystore --mode peer --endpoint robot:7447 --listen [::]:7447
-  $ sros zenoh keystore --check
-  $ sros zenoh --from session.json5 -o policy.xml
-
-Exit status: 0 written, or up to date; with --check 1 if a file is missing or
-out of date; with --from 1 if the file is open or does not work; 2 if it could
-not be done, such as for rights that Zenoh cannot enforce.""",
-)
+@verb("zenoh")
 @click.argument("root", type=PATH, required=False)
 @click.option("--router", metavar="NAME", help="Enclave of the router; usually /router.")
 @click.option(
@@ -114,6 +100,19 @@ def zenoh(
     document signed next to it.  They state the rights of the signed permissions.  The choices are
     kept in the keystore's settings, and from then on every verb that changes the keystore keeps
     the files in step.
+
+    Example:
+      $ sros zenoh keystore
+      created enclave /router
+      wrote keystore/enclaves/router/router.json5
+      wrote keystore/enclaves/talker/session.json5
+      $ sros zenoh keystore --mode peer --endpoint robot:7447 --listen [::]:7447
+      $ sros zenoh keystore --check
+      $ sros zenoh --from session.json5 -o policy.xml
+
+    Exit status: 0 written, or up to date; with --check 1 if a file is missing or
+    out of date; with --from 1 if the file is open or does not work; 2 if it could
+    not be done, such as for rights that Zenoh cannot enforce.
     """
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
     from sros_tool.keystore.lifecycle.update import set_zenoh
@@ -294,10 +293,10 @@ def _lines(document: ConfigurationDocument, subjects: Sequence[RightsBehindRules
 def _keys(what: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
     from sros_tool.checks.zenoh import VERBS
 
-    for right, verb in VERBS.items():
+    for right, word in VERBS.items():
         keys = [key for of, key in pairs if of == right]
         if keys:
-            yield f"  {what} {verb} the keys {first_few(keys, _MOST_KEYS)}"
+            yield f"  {what} {word} the keys {first_few(keys, _MOST_KEYS)}"
 
 
 def _kind(document: ConfigurationDocument) -> str:
