@@ -50,7 +50,7 @@ class Letters:
     @classmethod
     def _joined(cls, ranges: Iterable[tuple[int, int]]) -> Letters:
         found: list[tuple[int, int]] = []
-        for low, high in sorted(each for each in ranges if each[0] <= each[1]):
+        for low, high in sorted(part for part in ranges if part[0] <= part[1]):
             if found and low <= found[-1][1] + 1:
                 found[-1] = found[-1][0], max(high, found[-1][1])
             else:
@@ -60,7 +60,7 @@ class Letters:
     @classmethod
     def union(cls, sets: Iterable[Letters]) -> Letters:
         """Return the characters of any of some sets."""
-        return cls._joined(each for some in sets for each in some.ranges)
+        return cls._joined(part for some in sets for part in some.ranges)
 
     def __or__(self, other: Letters) -> Letters:
         return self.union((self, other))
@@ -70,7 +70,7 @@ class Letters:
 
     def __invert__(self) -> Letters:
         """Return all other characters."""
-        ends = [-1, *(end for each in self.ranges for end in each), _LAST + 1]
+        ends = [-1, *(end for part in self.ranges for end in part), _LAST + 1]
         between = zip(ends[::2], ends[1::2], strict=True)
         return Letters(tuple((a + 1, b - 1) for a, b in between if a + 1 < b))
 
@@ -199,7 +199,7 @@ class Automaton:
     @cached_property
     def end_bits(self) -> int:
         """The positions where it accepts, as bits."""
-        return sum(1 << each for each in self.ends)
+        return sum(1 << end for end in self.ends)
 
     @cached_property
     def endless_bits(self) -> int:
@@ -305,7 +305,7 @@ class _Some:
     @cached_property
     def everything(self) -> frozenset[Automaton]:
         """Those of the automata that accept every name."""
-        return frozenset(each for each in self.automata if each.endless_bits & 1)
+        return frozenset(automaton for automaton in self.automata if automaton.endless_bits & 1)
 
     def has(self, name: str) -> bool:
         """Return whether a name is in the set."""
@@ -334,8 +334,8 @@ class _Some:
     @cached_property
     def _by_prefix(self) -> dict[str, list[Automaton]]:
         found: dict[str, list[Automaton]] = {}
-        for each in self.automata:
-            found.setdefault(each.prefix, []).append(each)
+        for automaton in self.automata:
+            found.setdefault(automaton.prefix, []).append(automaton)
         return found
 
     @cached_property
@@ -494,12 +494,12 @@ class NameSet:
         others: list[_Node] = []
         exact: set[str] = set()
         automata: set[Automaton] = set()
-        for each in sets:
-            if isinstance(each._node, _Some):
-                exact |= each._node.exact
-                automata |= each._node.automata
+        for names in sets:
+            if isinstance(names._node, _Some):
+                exact |= names._node.exact
+                automata |= names._node.automata
             else:
-                others.append(each._node)
+                others.append(names._node)
         plain = _Some(frozenset(exact), frozenset(automata))
         if not others:
             return cls._of(plain)
@@ -508,7 +508,7 @@ class NameSet:
     @classmethod
     def at_least(cls, count: int, sets: Iterable[NameSet]) -> NameSet:
         """Return the names that are in at least ``count`` of several sets."""
-        return cls._of(_AtLeast(tuple(each._node for each in sets), count))
+        return cls._of(_AtLeast(tuple(names._node for names in sets), count))
 
     def between(self, begin: str, end: str) -> NameSet:
         """Return the texts that this set has with ``begin`` before and ``end`` behind them."""
@@ -592,7 +592,9 @@ def _between(node: _Node, begin: str, end: str) -> _Node:
                 for each in node.exact
                 if len(each) >= size and each.startswith(begin) and each.endswith(end)
             )
-            return _Some(exact, frozenset(each.between(begin, end) for each in node.automata))
+            return _Some(
+                exact, frozenset(automaton.between(begin, end) for automaton in node.automata)
+            )
         case _Not():
             return _Not(_between(node.of, begin, end))
         case _Every():
@@ -651,8 +653,8 @@ def _length(name: str) -> tuple[int, str]:
 def _leaves(node: _Node) -> Iterator[_Some]:
     if isinstance(node, _Some):
         yield node
-    for each in node.parts():
-        yield from _leaves(each)
+    for part in node.parts():
+        yield from _leaves(part)
 
 
 # ── searching ──────────────────────────────────────────────────────────────────────────────
@@ -757,7 +759,7 @@ def _needed(node: _Node) -> frozenset[Automaton]:
         case _Every():
             return frozenset[Automaton]().union(*map(_needed, node.of))
         case _AtLeast():
-            counts = Counter(each for one in node.of for each in _needed(one))
+            counts = Counter(need for one in node.of for need in _needed(one))
             spare = len(node.of) - node.count
             return frozenset(each for each, number in counts.items() if number > spare)
         case _First(last=False):
@@ -800,7 +802,7 @@ class _Search:
 
     def __init__(self, node: _Node, taken: frozenset[str]) -> None:
         self._node = node
-        found = {each for leaf in _leaves(node) for each in leaf.automata}
+        found = {automaton for leaf in _leaves(node) for automaton in leaf.automata}
         self._machine = _machine(tuple(sorted(found, key=_order)))
         self._needed = _needed(node)
         self._taken = _Taken(name for name in taken if node.truth(_asked_of(name)))
@@ -840,8 +842,8 @@ class _Search:
     def _left(self, reached: int) -> int | None:
         """Return the letters to go at least, or None if no name can begin so."""
         left = 0
-        for each in self._needed:
-            some = self._machine.left(each, reached)
+        for need in self._needed:
+            some = self._machine.left(need, reached)
             if some is None:
                 return None
             left = max(left, some)
@@ -879,7 +881,7 @@ class _Machine:
     """Several automata with their positions one after the other, as the bits of one integer."""
 
     def __init__(self, automata: tuple[Automaton, ...]) -> None:
-        sizes = [each.size for each in automata]
+        sizes = [automaton.size for automaton in automata]
         begins = dict(zip(automata, accumulate((0, *sizes)), strict=False))
         self.size = sum(sizes)
         self._span = {a: ((1 << a.size) - 1) << begin for a, begin in begins.items()}
@@ -899,15 +901,19 @@ class _Machine:
 
     def ended(self, reached: int) -> _Ask:
         """Return what to ask about a name that ends at positions."""
-        return lambda some: any(reached & self._ends[each] for each in some.automata)
+        return lambda some: any(reached & self._ends[automaton] for automaton in some.automata)
 
     def going_on(self, reached: int) -> _Ask:
         """Return what to ask about a name that goes on from positions."""
 
         def ask(some: _Some) -> _Truth:
-            if any(reached & self._endless[each] for each in some.automata):
+            if any(reached & self._endless[automaton] for automaton in some.automata):
                 return True
-            return None if any(reached & self._span[each] for each in some.automata) else False
+            return (
+                None
+                if any(reached & self._span[automaton] for automaton in some.automata)
+                else False
+            )
 
         return ask
 

@@ -106,9 +106,9 @@ def needed_expressions(topics: Set[str]) -> set[str]:
     wildcards = set(filter(is_expression, topics))
     matched = [ExpressionIndex(style, wildcards) for style in Style]
     return {
-        each
-        for each in topics
-        if each in wildcards or any(index.first(each) is None for index in matched)
+        topic
+        for topic in topics
+        if topic in wildcards or any(index.first(topic) is None for index in matched)
     }
 
 
@@ -173,7 +173,7 @@ def _values(
     protection: DomainProtection | TopicProtection, rule: type[DomainRule | TopicRule]
 ) -> dict[str, Any]:
     """Map each attribute of a rule to the value of the ``protection`` field named by ``term``."""
-    chosen = {each: getattr(protection, each.term) for each in attributes(rule)}
+    chosen = {attribute: getattr(protection, attribute.term) for attribute in attributes(rule)}
     return {
         each.name: value if each.is_flag else ProtectionKind(value)
         for each, value in chosen.items()
@@ -242,7 +242,7 @@ def _terms(rule: DomainRule | TopicRule) -> dict[str, Any]:
     """Map the fields of a protection to the values of a rule, as `_values` does backwards."""
     from sros_tool.policy.model import Level
 
-    chosen = {each: getattr(rule, each.name) for each in attributes(type(rule))}
+    chosen = {attribute: getattr(rule, attribute.name) for attribute in attributes(type(rule))}
     return {
         each.term: value if each.is_flag else Level(str(value)) for each, value in chosen.items()
     }
@@ -333,7 +333,7 @@ def grant_rights(enclave: str, grant: Grant) -> frozenset[Right]:
 
 def _all_topics(criteria: Iterable[Criteria]) -> dict[str, bool]:
     """Map each topic to False; `ros_rights` sets True for the topics of a service or action."""
-    return dict.fromkeys((topic for each in criteria for topic in each.topics), False)
+    return dict.fromkeys((topic for criterion in criteria for topic in criterion.topics), False)
 
 
 def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tuple[str, str, str]]:

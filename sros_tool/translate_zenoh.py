@@ -123,7 +123,7 @@ def remote_of(enclave: str, stated: Mapping[int, Iterable[StatedRight]]) -> Remo
     for domain, rights in stated.items():
         rules += _graph_rules(enclave, domain)
         for right, keys in _allowed_keys(domain, rights):
-            below = tuple([f"{each}/{_ADVANCED}" for each in keys])
+            below = tuple([f"{key}/{_ADVANCED}" for key in keys])
             rules += [
                 AccessRule(flow, messages, below if history else keys)
                 for flow, messages, history in (_MESSAGES[right] if keys else ())
@@ -187,7 +187,7 @@ def as_router(router: str, own: RemoteRights) -> RemoteRights:
 
     It may send and get what the process itself may get and send: it passes on what others said.
     """
-    return RemoteRights(router, in_order(each.mirrored() for each in own.rules))
+    return RemoteRights(router, in_order(rule.mirrored() for rule in own.rules))
 
 
 # ── names and denials ──────────────────────────────────────────────────────────────────────
@@ -442,15 +442,17 @@ def ros_names(key: str) -> tuple[str, ...]:
     The first chunk is the ROS domain, and the last two are the type and its hash.
     """
     chunks = _without_type(key.split("/")[1:])
-    if chunks.count(ANY_CHUNKS) > _MOST_ANY_CHUNKS or any(each.startswith("@") for each in chunks):
+    if chunks.count(ANY_CHUNKS) > _MOST_ANY_CHUNKS or any(
+        chunk.startswith("@") for chunk in chunks
+    ):
         return ()
     names = [""]
-    for each in chunks:
-        if each == ANY_CHUNKS:
+    for chunk in chunks:
+        if chunk == ANY_CHUNKS:
             # It may stand for no chunk; a star of ROS before it includes what it stands for.
             names += [f"{name}/*" for name in names if not name.endswith("*")]
         else:
-            names = [f"{name}/{each.replace(ANY_PART, '*')}" for name in names]
+            names = [f"{name}/{chunk.replace(ANY_PART, '*')}" for name in names]
     found = sorted({each for each in names if each and not expression_problem(each)})
     return tuple(
         each for each in found if not any(one != each and covers(one, each) for one in found)
@@ -554,16 +556,16 @@ def rights_behind(document: ConfigurationDocument) -> tuple[RightsBehindRules, .
         return (_rights("", None, False, rules, limit),)
     own = is_self_limiting(document)
     return tuple(
-        _rights(each.id, each.cert_common_names, own, _rules(access, each), limit)
-        for each in access.subjects
-        if access.rules_of(each.id) or access.allows_by_default
+        _rights(subject.id, subject.cert_common_names, own, _rules(access, subject), limit)
+        for subject in access.subjects
+        if access.rules_of(subject.id) or access.allows_by_default
     )
 
 
 def is_self_limiting(document: ConfigurationDocument) -> bool:
     """Return whether a session's rules name no other process, so that they bind only itself."""
     access = document.access
-    used = [each for each in access.subjects if access.rules_of(each.id)]
+    used = [subject for subject in access.subjects if access.rules_of(subject.id)]
     return (
         document.mode is not Mode.ROUTER
         and bool(used)
@@ -634,9 +636,9 @@ class _ByPrefix:
     def __init__(self, expressions: Iterable[str], limit: ComparisonLimit) -> None:
         self._limit = limit
         self._found: dict[str, list[str]] = {}
-        for each in expressions:
+        for expression in expressions:
             # "/**" and "/*" may stand for nothing, or for a part without the slash.
-            self._found.setdefault(each.partition("*")[0].rstrip("$/"), []).append(each)
+            self._found.setdefault(expression.partition("*")[0].rstrip("$/"), []).append(expression)
 
     def any(self, text: str, holds: Callable[[str, str], bool]) -> bool:
         """Return whether ``holds`` of an expression and ``text``, for one that may match it."""

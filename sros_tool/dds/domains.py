@@ -116,11 +116,11 @@ class DomainSet:
         """
         sets = dict.fromkeys((*listed, *others))
         borders = {0}
-        for part in (part for each in sets for part in each.ranges):
+        for part in (part for names in sets for part in names.ranges):
             borders |= {
                 end + more for end in (part.first, part.last) if end is not None for more in (0, 1)
             }
-        if any(part.first is None or part.last is None for each in sets for part in each.ranges):
+        if any(part.first is None or part.last is None for names in sets for part in names.ranges):
             return tuple(sorted(borders))
         known = [each for each in sorted(borders) if any(each in one for one in listed)]
         kinds = {tuple(each in one for one in sets): each for each in reversed(known)}

@@ -150,7 +150,10 @@ def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
 
 def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
     """Map the names of a rule's attributes to protecting values, or else to open ones."""
-    return {each.name: each.portable if protect else each.open for each in attributes(rule)}
+    return {
+        attribute.name: attribute.portable if protect else attribute.open
+        for attribute in attributes(rule)
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,12 +194,12 @@ def render_governance(governance: Governance) -> bytes:
 
 
 def _attribute_lines(rule: DomainRule | TopicRule) -> Iterator[str]:
-    for each in attributes(type(rule)):
-        value = getattr(rule, each.name)
+    for attribute in attributes(type(rule)):
+        value = getattr(rule, attribute.name)
         # Vendors refuse elements that they do not know, so an optional default is left out.
-        if each.default is None or value != each.default:
-            text = json.dumps(value) if each.is_flag else str(value)
-            yield f"<{each.name}>{text}</{each.name}>"
+        if attribute.default is None or value != attribute.default:
+            text = json.dumps(value) if attribute.is_flag else str(value)
+            yield f"<{attribute.name}>{text}</{attribute.name}>"
 
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────
@@ -236,21 +239,23 @@ def _read_domain_rule(element: etree._Element) -> DomainRule:
 
 def _read(element: etree._Element, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    for each in attributes(rule):
-        if each.default is not None and element.find(each.name) is None:
-            values[each.name] = each.default
+    for attribute in attributes(rule):
+        if attribute.default is not None and element.find(attribute.name) is None:
+            values[attribute.name] = attribute.default
             continue
-        text = _text(element, each.name)
-        if each.is_flag:
+        text = _text(element, attribute.name)
+        if attribute.is_flag:
             if text.lower() not in ("true", "false", "1", "0"):
                 raise DocumentError(
-                    f"<{each.name}> holds {text!r}, which is neither true nor false"
+                    f"<{attribute.name}> holds {text!r}, which is neither true nor false"
                 )
-            values[each.name] = text.lower() in ("true", "1")
+            values[attribute.name] = text.lower() in ("true", "1")
         elif text.upper() in ProtectionKind.__members__:
-            values[each.name] = ProtectionKind(text.upper())
+            values[attribute.name] = ProtectionKind(text.upper())
         else:
-            raise DocumentError(f"<{each.name}> holds {text!r}, which is not a protection kind")
+            raise DocumentError(
+                f"<{attribute.name}> holds {text!r}, which is not a protection kind"
+            )
     return values
 
 

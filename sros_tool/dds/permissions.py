@@ -87,7 +87,7 @@ class Grant:
 
     def domains(self) -> DomainSet:
         """Return the domains in which some rule allows something."""
-        allowed = (each.domains.closed() for each in self.rules if each.allow)
+        allowed = (rule.domains.closed() for rule in self.rules if rule.allow)
         return DomainSet.of(
             *((part.first or 0, part.last or 0) for each in allowed for part in each.ranges)
         )
@@ -399,7 +399,7 @@ def outside(
 
 
 def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
-    return tuple(topic for each in criteria for topic in each.topics)
+    return tuple(topic for criterion in criteria for topic in criterion.topics)
 
 
 def _blocked(denied: list[str], denied_too: set[str], is_allowed: Meets) -> list[str]:

@@ -341,8 +341,8 @@ class Answer:
     @property
     def topic_rule(self) -> TopicRule | None:
         """The rule of the governance for the topic, None if it is not known."""
-        decisions = (self.decision, *(each.decision for each in self.parts))
-        return next((each.topic_rule for each in decisions if each.topic_rule), None)
+        decisions = (self.decision, *(part.decision for part in self.parts))
+        return next((decision.topic_rule for decision in decisions if decision.topic_rule), None)
 
     @property
     def protection(self) -> AppliedProtection | None:

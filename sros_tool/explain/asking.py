@@ -154,7 +154,7 @@ def open_to_ask(
 def _not_in_policy(policy: Policy, name: str, file: Path) -> PolicyError:
     from sros_tool.keystore.selection import likely_names
 
-    there = [each.path for each in policy.enclaves]
+    there = [enclave.path for enclave in policy.enclaves]
     meant = likely_names(name, there)
     return PolicyError(
         f"unable to find enclave {name} in the policy '{file}'",

@@ -397,8 +397,8 @@ def _unjudged(observation: Observation) -> list[tuple[Note, str]]:
 
     The words are "" for tools that do nothing but observe.
     """
-    tools = {each.fqn for each in observation.nodes if is_tool(each)}
-    active = {each.fqn for each in observation.nodes if is_tool(each) and not _only_observes(each)}
+    tools = {node.fqn for node in observation.nodes if is_tool(node)}
+    active = {node.fqn for node in observation.nodes if is_tool(node) and not _only_observes(node)}
     silent = {(expand("~", ns, name), is_tool_name(name)) for _, ns, name in observation.silent}
     tools |= {name for name, tool in silent if tool}
     mute = {name for name, tool in silent if not tool}
@@ -428,7 +428,7 @@ def _only_observes(node: ObservedNode) -> bool:
     own = expand("~/", node.ns, node.name)
     folded = fold(node.endpoints)
     return not (folded.halves or folded.foreign) and all(
-        each.name in _OF_EVERY_NODE or each.name.startswith(own) for each in folded.rights
+        right.name in _OF_EVERY_NODE or right.name.startswith(own) for right in folded.rights
     )
 
 
@@ -490,8 +490,8 @@ def _denied_to(node: ObservedNode, enclave: str, evaluator: Evaluator) -> Iterat
 def _rights_of(node: ObservedNode, enclave: str) -> Iterator[tuple[Right, tuple[Endpoint, ...]]]:
     """Yield the rights that a node uses, each with the endpoints that it needs."""
     folded = fold(node.endpoints)
-    for each in folded.rights:
-        yield Right(enclave, ALLOW, each.right, each.name), _endpoints(each.right, each.name)
+    for right in folded.rights:
+        yield Right(enclave, ALLOW, right.right, right.name), _endpoints(right.right, right.name)
     for endpoint in folded.halves | folded.foreign:
         yield Right(enclave, ALLOW, endpoint.direction, endpoint.topic), (endpoint,)
 

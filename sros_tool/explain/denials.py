@@ -104,7 +104,7 @@ def read_denials(text: str) -> tuple[Denial, ...]:
     for number, line in enumerate(log_lines(text), 1):
         process, rest = labelled_line(line)
         processes.setdefault(process, []).append((number, rest))
-    found = {each: None for item in processes.items() for each in _denials_of(*item)}
+    found = {denial: None for item in processes.items() for denial in _denials_of(*item)}
     known = {replace(each, direction="") for each in found if each.direction}
     return tuple(each for each in found if each.direction or each not in known)
 
@@ -151,18 +151,18 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
     """
     rights: dict[str, set[NodeRight]] = {}
     rest: dict[str, list[Denial]] = {"unclear": [], "by_rule": [], "remote": [], "foreign": []}
-    for each in denials:
+    for denial in denials:
         kind = (
-            "remote" if each.remote
-            else "by_rule" if each.by_rule
-            else "foreign" if not _is_ros(each.topic)
-            else "unclear" if not each.direction
+            "remote" if denial.remote
+            else "by_rule" if denial.by_rule
+            else "foreign" if not _is_ros(denial.topic)
+            else "unclear" if not denial.direction
             else ""
         )  # fmt: skip
         if kind:
-            rest[kind].append(each)
+            rest[kind].append(denial)
         else:
-            rights.setdefault(each.enclave, set()).add(_right(each))
+            rights.setdefault(denial.enclave, set()).add(_right(denial))
     return MissingRights(
         {enclave: _without_parts(found) for enclave, found in rights.items()},
         **{kind: tuple(found) for kind, found in rest.items()},
@@ -198,9 +198,9 @@ def _right(denial: Denial) -> NodeRight:
 def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
     """Return the rights without the topics that belong to an action among them."""
     parts = {
-        NodeRight(way, f"{each.name}{ACTION_SEPARATOR}{topic}")
-        for each in rights
-        for way in ({"call": SUBSCRIBE, "execute": PUBLISH}.get(each.right),)
+        NodeRight(way, f"{right.name}{ACTION_SEPARATOR}{topic}")
+        for right in rights
+        for way in ({"call": SUBSCRIBE, "execute": PUBLISH}.get(right.right),)
         if way
         for topic in ACTION_TOPICS
     }
@@ -345,14 +345,14 @@ def _by_place(
     """Return the rights by namespace and name of their profile."""
     if node is not None:
         return {node: rights}
-    own = nodes_served((each.right, each.name) for each in rights)
+    own = nodes_served((right.right, right.name) for right in rights)
     found: dict[tuple[str, str], set[NodeRight]] = {}
     (only,) = present if len(present) == 1 else (None,)
     (one,) = own if len(own) == 1 else (None,)
     rest = only or (_place(one, present) if one and not present else _ANY_NODE)
-    for each in rights:
-        served = nodes_served([(each.right, each.name)])
-        found.setdefault(_place(served[0], present) if served else rest, set()).add(each)
+    for right in rights:
+        served = nodes_served([(right.right, right.name)])
+        found.setdefault(_place(served[0], present) if served else rest, set()).add(right)
     return {place: frozenset(some) for place, some in found.items()}
 
 

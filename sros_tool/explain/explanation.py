@@ -79,7 +79,7 @@ def explain(evaluator: Evaluator, question: Question) -> Answer:
         return answer
     if not answer.problems and (changed := _changed(evaluator, answer)):
         return changed
-    faulty = (each.file for each in answer.problems if each.fault.id == answer.reason)
+    faulty = (problem.file for problem in answer.problems if problem.fault.id == answer.reason)
     found = remedy(answer.reason, str(enclave.root or ""), enclave.name, next(faulty, ""))
     return replace(answer, remedy=found)
 
@@ -236,7 +236,7 @@ def _is_latest(keystore: Path, enclave: str) -> bool:
         entries = reversed(Keystore(keystore).ledger_with("enclave", enclave).entries)
     except (SrosError, OSError):
         return True
-    last = (each for each in entries if (each.what, each.enclave) == ("permissions", enclave))
+    last = (entry for entry in entries if (entry.what, entry.enclave) == ("permissions", enclave))
     digest = next((each.sha256 for each in last), "")
     return not digest or digest == hashlib.sha256(signed).hexdigest()
 
@@ -304,7 +304,7 @@ def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Ri
     """Return the present rights of an enclave, except those that no policy can state."""
     found: Iterable[Right] = ()
     if policy:
-        found = (r for each in policy.all_profiles() for r in profile_rights(name, each))
+        found = (r for profile in policy.all_profiles() for r in profile_rights(name, profile))
     elif answer.grant:
         found = _granted(name, answer)
     return {right for right in found if right.kind != "dds"}
@@ -356,7 +356,7 @@ def _places(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, str]]
     Without its policy, these are the nodes whose standard services its permissions allow.
     """
     if policy:
-        yield from ((each.ns, each.node) for each in policy.all_profiles())
+        yield from ((profile.ns, profile.node) for profile in policy.all_profiles())
         return
     for node in nodes_served((each.right, each.name) for each in _granted("", answer)):
         ns, _, name = node.rpartition("/")
@@ -384,12 +384,13 @@ def likely_names(answer: Answer) -> tuple[str, ...]:
     """
     question, enclave = answer.question, answer.enclave
     names = {
-        each.name
-        for each in _present_rights(enclave.policy, enclave.name, answer)
-        if (each.right, each.qualifier) == (question.right, ALLOW) and not is_expression(each.name)
+        right.name
+        for right in _present_rights(enclave.policy, enclave.name, answer)
+        if (right.right, right.qualifier) == (question.right, ALLOW)
+        and not is_expression(right.name)
     } - {question.name}
     last = question.name.rpartition("/")[2]
-    same = sorted(each for each in names if each.rpartition("/")[2] == last)
+    same = sorted(name for name in names if name.rpartition("/")[2] == last)
     if (question.type == "service" and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
         return tuple(same) if len(same) <= _SHOWN else ()
     if not names:
@@ -417,7 +418,7 @@ def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
             rights = tuple(each for each in group.rights if (name, each[0]) not in lifted[source])
             if rights:
                 kept.setdefault(rights, []).append(name)
-        yield GroupEdit(source, "\n".join(_xml(group.kind, *each) for each in kept.items()))
+        yield GroupEdit(source, "\n".join(_xml(group.kind, *item) for item in kept.items()))
 
 
 def _xml(kind: str, rights: tuple[tuple[str, str], ...], names: list[str]) -> str:

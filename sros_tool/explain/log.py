@@ -407,12 +407,12 @@ def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
     """Yield what access control of Zenoh dropped: one finding for each right that is missing."""
     numbered = ((n, *labelled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, str], list[DroppedMessage]] = {}
-    for each in dropped_messages(numbered):
-        _, name = name_of_key(each.key)
-        right = _DROPPED.get((each.message, each.ingress), "") if name else ""
-        what = f"{right} {name}" if right else _GRAPH.get((each.message, each.ingress), "")
-        what = what or f"pass {each.message} of {each.key}"
-        groups.setdefault((each.process, each.name or each.zid, what), []).append(each)
+    for message in dropped_messages(numbered):
+        _, name = name_of_key(message.key)
+        right = _DROPPED.get((message.message, message.ingress), "") if name else ""
+        what = f"{right} {name}" if right else _GRAPH.get((message.message, message.ingress), "")
+        what = what or f"pass {message.message} of {message.key}"
+        groups.setdefault((message.process, message.name or message.zid, what), []).append(message)
     for (process, who, what), found in groups.items():
         first = found[0]
         yield LogFinding(
@@ -660,7 +660,7 @@ class _Examiner:
         self, enclave: LoadedEnclave, answer: Answer, faults: tuple[Fault, ...]
     ) -> Iterator[tuple[str, str]]:
         """Yield the faults of an enclave with remedies; only those in ``faults``, if it has any."""
-        fitting = [each for each in answer.problems if each.fault in faults]
+        fitting = [problem for problem in answer.problems if problem.fault in faults]
         for each in fitting or answer.problems:
             yield str(each), remedy(each.fault, self._root, enclave.name, each.file)
         if not answer.problems and not answer.allowed:
@@ -720,7 +720,7 @@ def _nodes(answer: Answer) -> tuple[str, ...]:
 
 def _served(answer: Answer) -> tuple[str, ...]:
     rights = grant_rights("", answer.grant) if answer.grant else ()
-    return nodes_served((each.right, each.name) for each in rights)
+    return nodes_served((right.right, right.name) for right in rights)
 
 
 def _renamed(right: str, wrong: str) -> str:

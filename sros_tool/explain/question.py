@@ -145,7 +145,7 @@ def about_action(question: Question, rights: Iterable[Right]) -> Question | None
     """
     if question.type != "service" or question.word not in _OF_ACTIONS:
         return None
-    kinds = {each.kind for each in rights if each.name == question.name}
+    kinds = {right.kind for right in rights if right.name == question.name}
     if "actions" not in kinds or "services" in kinds:
         return None
     return ask(_OF_ACTIONS[question.word], question.name, "action")

@@ -71,7 +71,7 @@ class VendorComparison(NamedTuple):
     @property
     def differ(self) -> bool:
         """Whether they differ."""
-        return len({each.outcome for each in self.vendors}) > 1
+        return len({vendor.outcome for vendor in self.vendors}) > 1
 
 
 def explain_on_dds(
@@ -117,7 +117,7 @@ def explain_on_dds(
 def differences(answers: Sequence[Answer]) -> str:
     """Return a sentence that names the vendors whose outcome differs from the first one's."""
     first = answers[0]
-    others = [each for each in answers if each.outcome is not first.outcome]
+    others = [answer for answer in answers if answer.outcome is not first.outcome]
     if not others:
         return "all vendors decide alike"
     listed = ", ".join(f"{each.vendor.title} ({each.outcome})" for each in others)

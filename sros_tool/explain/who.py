@@ -84,7 +84,7 @@ def ask_everybody(decider: Decider, question: Question, kind: str | None) -> Eve
     outcomes = decider.outcomes(question)
     taken: tuple[Note, ...] = ()
     # A name that an enclave has as a service is one; a wildcard shows nothing about it.
-    unclear = all(each.wildcard for each in outcomes if each.allowed)
+    unclear = all(outcome.wildcard for outcome in outcomes if outcome.allowed)
     if not kind and unclear and question.type == "service":
         rights = rights_naming(decider.keystore, question.name)
         if action := about_action(question, rights):
@@ -97,7 +97,7 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
     """Return a note if enclaves may call an action that has the name of a service."""
     if (question.word, question.type) == ("call", "service"):
         action = ask("call", question.name, "action")
-        if any(each.allowed for each in decider.outcomes(action)):
+        if any(outcome.allowed for outcome in decider.outcomes(action)):
             text = f"enclaves may {action}: add --type action if it is an action."
             return Note("explain.an-action", text)
     return None

@@ -190,7 +190,7 @@ class ZenohAnswer:
     @property
     def dropped(self) -> Check | None:
         """The check that drops a message, or None; that of data if there are several."""
-        return _first((each for each in self.checks if not each.allowed), self.enclave)
+        return _first((check for check in self.checks if not check.allowed), self.enclave)
 
     @property
     def deciding(self) -> Check | None:
@@ -353,14 +353,14 @@ class ZenohEvaluator:
         except SrosError:
             return None
         ours = {answer.enclave, self.router.enclave}
-        deciding = ours | {each.enforcer for each in answer.checks}
+        deciding = ours | {check.enforcer for check in answer.checks}
         return tuple(
             sorted(
-                signed_path(each.path) if each.kind is Drift.UNSIGNED else each.path
-                for each in drifts
+                signed_path(drift.path) if drift.kind is Drift.UNSIGNED else drift.path
+                for drift in drifts
                 # Whether the files of the first two are signed is told apart.
-                if each.enclave in deciding
-                and not (each.kind is Drift.UNSIGNED and each.enclave in ours)
+                if drift.enclave in deciding
+                and not (drift.kind is Drift.UNSIGNED and drift.enclave in ours)
             )
         )
 
@@ -425,8 +425,8 @@ class ZenohEvaluator:
             for name in self.names
             if name not in (own.name, self.router.enclave)
         )
-        peers = (each.process for each in files if each.process)
-        return tuple(each for each in peers if each.mode is Mode.PEER) or (router,)
+        peers = (file.process for file in files if file.process)
+        return tuple(peer for peer in peers if peer.mode is Mode.PEER) or (router,)
 
     def _rights(self, enclave: str, question: Question) -> tuple[Right, ...]:
         """Return the rights to topics and services that the question asks for; none for joining."""
@@ -514,8 +514,8 @@ class ZenohEvaluator:
             return ""
         file = self._file(check.enforcer, self._file_of(check.enforcer))
         rules = file.process.access.rules if file.process else ()
-        keys = next(each.key_expressions for each in rules if each.id in check.decision.rules)
-        wide = next((each for each in keys if includes(each, check.key)), "")
+        keys = next(rule.key_expressions for rule in rules if rule.id in check.decision.rules)
+        wide = next((key for key in keys if includes(key, check.key)), "")
         return wide if "*" in wide.removesuffix("/*/*") else ""
 
 
@@ -536,12 +536,14 @@ def _first(checks: Iterable[Check], enclave: str) -> Check | None:
 
 def _meet(connect: Sequence[ZenohEndpoint], listen: Sequence[ZenohEndpoint]) -> bool:
     """Return whether a process may connect to where another listens: hosts have several names."""
-    ports = {(each.protocol, each.address.rpartition(":")[2]) for each in listen}
-    return any((each.protocol, each.address.rpartition(":")[2]) in ports for each in connect)
+    ports = {(endpoint.protocol, endpoint.address.rpartition(":")[2]) for endpoint in listen}
+    return any(
+        (endpoint.protocol, endpoint.address.rpartition(":")[2]) in ports for endpoint in connect
+    )
 
 
 def _listed(endpoints: Sequence[ZenohEndpoint]) -> str:
-    return ", ".join(each.text for each in endpoints[:3]) or "nothing"
+    return ", ".join(endpoint.text for endpoint in endpoints[:3]) or "nothing"
 
 
 def _closed(enclave: str, file: str, problem: str) -> ZenohFile:
@@ -585,14 +587,16 @@ class ZenohOfKeystore:
     def printed(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> WhoOnZenoh:
         """Return what ``--json`` prints of its outcomes."""
         shown = [
-            ZenohEnclaveOutcome(each.enclave, each.in_brief, each.outcome, each.wildcard)
-            for each in outcomes
+            ZenohEnclaveOutcome(
+                outcome.enclave, outcome.in_brief, outcome.outcome, outcome.wildcard
+            )
+            for outcome in outcomes
         ]
         return WhoOnZenoh(str(question), "zenoh", self._why, self._evaluator.domain, shown)
 
     def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
         """Yield a note if peers were asked by the file of the router."""
-        if any(each.mode is Mode.PEER for each in outcomes):
+        if any(outcome.mode is Mode.PEER for outcome in outcomes):
             text = (
                 "peers decide by their own files, and this is by that of the router, which has the "
                 "same rights if `sros zenoh --check` says so; a question about one enclave reads "

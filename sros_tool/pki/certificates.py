@@ -716,9 +716,9 @@ def _form_of_extensions(part: der.Value) -> tuple[object, ...]:
         return (part.whole,)
     (extensions,) = der.children(part.content)
     return tuple(
-        each.whole if kind.content in _JUDGED else (kind.content, len(rest) > 1)
-        for each in der.children(extensions.content)
-        for kind, *rest in (der.children(each.content),)
+        child.whole if kind.content in _JUDGED else (kind.content, len(rest) > 1)
+        for child in der.children(extensions.content)
+        for kind, *rest in (der.children(child.content),)
     )
 
 

@@ -433,10 +433,10 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     for unused in (value for bag in lists for value in der.split_all(bag.content)):
         tolerant.check_list(unused)  # OpenSSL reads it, and does not use it
     embedded = [value for bag in bags for value in der.split_all(bag.content)]
-    listed = [_digest_of(each) for each in der.children(digests.content)]
+    listed = [_digest_of(child) for child in der.children(digests.content)]
     if None in listed:
         raise ValueError("unknown digest")
-    signatures = tuple(_signature(each) for each in der.children(signers.content))
+    signatures = tuple(_signature(child) for child in der.children(signers.content))
     if not signatures or any(each.digest not in listed for each in signatures):
         raise ValueError("no signature, or another digest than announced")
     return SignedDocument(

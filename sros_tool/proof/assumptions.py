@@ -35,7 +35,7 @@ def completed(side: AccessSource, other: AccessSource) -> AccessSource:
         }
     if side.governance:
         return replace(side, permissions=permissions)
-    own = DomainSet.of(*((each, each) for each in domains.values()))
+    own = DomainSet.of(*((domain, domain) for domain in domains.values()))
     if side.kind != "policy":
         own = _granted(side)
     governance = _controlling(other.governance, own)
@@ -112,10 +112,10 @@ def _controlling(governance: Governance | None, more: DomainSet) -> Governance |
 
     def controlling(rule: DomainRule) -> DomainRule:
         topics = tuple(
-            replace(each, enable_read_access_control=True, enable_write_access_control=True)
-            for each in rule.topic_access_rules
+            replace(topic_rule, enable_read_access_control=True, enable_write_access_control=True)
+            for topic_rule in rule.topic_access_rules
         )
-        if not any(each.topic_expression == "*" for each in topics):
+        if not any(topic.topic_expression == "*" for topic in topics):
             topics += strict.topic_access_rules
         return replace(
             rule,
@@ -179,7 +179,7 @@ def _left_out(base: AccessSource, head: AccessSource) -> Iterator[str]:
     if {base.kind, head.kind} & {"keystore", "enclave"}:
         yield "who holds which key"
     if any(
-        each.document.mode is Mode.CLIENT for _, side in sides for each in side.zenoh_files.values()
+        file.document.mode is Mode.CLIENT for _, side in sides for file in side.zenoh_files.values()
     ):
         yield "what clients of Zenoh let their router do"
     for name, side in sides:

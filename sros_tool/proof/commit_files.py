@@ -99,7 +99,7 @@ class CommitFiles:
             raise self._no_file(path, entry)
         folder = Revision(self.repository, self.name, self.commit, path)
         try:
-            return [self._policy(each.path, placeholders) for each in folder.policies()]
+            return [self._policy(policy.path, placeholders) for policy in folder.policies()]
         except SrosError as error:
             texts = (folder.shown(each) for each in (error.what, error.why, error.remedy))
             raise DocumentError(*texts) from error
@@ -136,7 +136,7 @@ class CommitFiles:
             for digits, content in part.items():
                 for where in places[digits]:
                     self._write(where, plain[where], content)
-        contents = self.repository.contents(each.id for each in links.values())
+        contents = self.repository.contents(link.id for link in links.values())
         for where, each in links.items():
             if b"\0" in contents[each.id]:
                 raise DocumentError(f"'{where}' is a link that no file system can have")

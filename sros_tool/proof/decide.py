@@ -66,12 +66,12 @@ class Witness:
     @property
     def enclaves(self) -> tuple[str, ...]:
         """The enclaves of the uses, in their order, each once."""
-        return tuple(dict.fromkeys(each.enclave for each in self.uses))
+        return tuple(dict.fromkeys(use.enclave for use in self.uses))
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the uses, in their order, each once."""
-        return tuple(dict.fromkeys(each.name for each in self.uses))
+        return tuple(dict.fromkeys(use.name for use in self.uses))
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,9 +212,9 @@ def _each(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
 
 def _match(patterns: Sequence[str], enclave: str) -> bool:
     """Return whether a list of enclaves has an enclave: by a pattern, and excepted by none."""
-    return any(fnmatchcase(enclave, each) for each in patterns if each[0] != EXCEPT) and not any(
-        fnmatchcase(enclave, each[1:]) for each in patterns if each[0] == EXCEPT
-    )
+    return any(
+        fnmatchcase(enclave, pattern) for pattern in patterns if pattern[0] != EXCEPT
+    ) and not any(fnmatchcase(enclave, pattern[1:]) for pattern in patterns if pattern[0] == EXCEPT)
 
 
 def _use(enclave: str, right: str, part: _Part, topics: Topics, topic: str) -> Use:
@@ -253,7 +253,7 @@ def _first_of(uses: Collection[Use]) -> Witness | None:
     if not uses:
         return None
     best = min(uses, key=_better)
-    return Witness((best,), tuple(sorted({each.enclave for each in uses} - {best.enclave})))
+    return Witness((best,), tuple(sorted({use.enclave for use in uses} - {best.enclave})))
 
 
 def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
@@ -354,11 +354,11 @@ def _shared_by(
 
     def is_shared(name: str) -> bool:
         least = count - exactly[name]
-        return least <= len(wild) and sum(name in each for each in wild) >= least
+        return least <= len(wild) and sum(name in wildcard for wildcard in wild) >= least
 
     if not is_expression(expression):
         return expression if is_shared(expression) else None
-    known = [each for each in stated if is_shared(each)]
+    known = [right for right in stated if is_shared(right)]
     valid = shortest(each for each in known if each in valid_topics("", ""))
     if valid or len(wild) < count:  # nobody but holders with wildcards has a name not stated
         return valid or shortest(known)
@@ -468,8 +468,8 @@ def _of_kinds(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
 
 def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness | None:
     """Return a chain with the fewest hops from a source to a target, past ``through``."""
-    through = {each for each in world.enclaves if _match(requirement.through, each)}
-    inside = [each for each in world.enclaves if each not in through]
+    through = {enclave for enclave in world.enclaves if _match(requirement.through, enclave)}
+    inside = [enclave for enclave in world.enclaves if enclave not in through]
     sources = [each for each in inside if _match(requirement.sources, each)]
     targets = {each for each in inside if _match(requirement.targets, each)}
     chain = _shortest_chain(world, sources, targets, through, limit)
@@ -553,18 +553,20 @@ def _always(requirement: Requirement, world: World) -> str:
     count = len(world.enclaves)
     match requirement:
         case Only(enclaves=enclaves) if any(map(is_expression, enclaves)):
-            if all(_match(enclaves, each) for each in world.enclaves):
+            if all(_match(enclaves, enclave) for enclave in world.enclaves):
                 return f"all {count} enclaves are among them"
         case AtMost(most=most) if most >= count:
             return f"there are only {count} enclaves"
         case Widest(rights=rights):
-            if all(any(covers(each, "/*") for each in names) for _, names in rights):
+            if all(any(covers(name, "/*") for name in names) for _, names in rights):
                 return "wildcards may match every name"
         case Apart():
-            left = [each for each in world.enclaves if not _match(requirement.through, each)]
+            left = [
+                enclave for enclave in world.enclaves if not _match(requirement.through, enclave)
+            ]
             sources = {each for each in left if _match(requirement.sources, each)}
             targets = {each for each in left if _match(requirement.targets, each)}
-            if not any(sources - {each} for each in targets):
+            if not any(sources - {target} for target in targets):
                 return "no two enclaves are left that it keeps apart"
     return ""
 
@@ -622,10 +624,10 @@ def _shortest_chain(
     """
     starts = list(sources)
     # A target can be a source, too, and must be reached from another one: so two are kept.
-    most = 2 if any(each in targets for each in starts) else 1
-    origins: dict[str, set[str]] = {each: {each} for each in starts}
+    most = 2 if any(start in targets for start in starts) else 1
+    origins: dict[str, set[str]] = {start: {start} for start in starts}
     used: dict[str, set[str]] = {}
-    queue: deque[tuple[str, str, _Chain]] = deque((each, each, ()) for each in starts)
+    queue: deque[tuple[str, str, _Chain]] = deque((start, start, ()) for start in starts)
     flow = _Flow(world, limit)
     while queue:
         here, origin, chain = queue.popleft()

@@ -111,12 +111,12 @@ def dropped_findings(
     """Return a finding for each requirement that ``after``, of ``file``, does not demand."""
     return [
         DROPPED.found(
-            ": ".join(filter(None, (each.name, each.demand))),
-            each.text(),
+            ": ".join(filter(None, (requirement.name, requirement.demand))),
+            requirement.text(),
             file,
-            related=(RelatedPlace("required before", each.file, each.line or None),),
+            related=(RelatedPlace("required before", requirement.file, requirement.line or None),),
         )
-        for each in dropped_requirements(before, after)
+        for requirement in dropped_requirements(before, after)
     ]
 
 
@@ -159,8 +159,8 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
 
 def _one_by_one(enclaves: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Yield lists of one enclave or pattern each, with what the whole list excepts."""
-    excepted = tuple(each for each in enclaves if each.startswith(EXCEPT))
-    yield from ((each, *excepted) for each in enclaves if not each.startswith(EXCEPT))
+    excepted = tuple(enclave for enclave in enclaves if enclave.startswith(EXCEPT))
+    yield from ((enclave, *excepted) for enclave in enclaves if not enclave.startswith(EXCEPT))
 
 
 def _single_rights(rights: RightNames) -> Iterator[tuple[str, tuple[str, ...]]]:

@@ -134,8 +134,10 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             steps = tuple(_step(use, world, system) for use in witness.uses)
             titles = tuple(world.title for world, _ in broken)
             titles = () if len(broken) == len(system.worlds) else titles
-            known = {each for world in system.worlds for each in world.enclaves}
-            missing = next((each for each in witness.enclaves if each and each not in known), "")
+            known = {enclave for world in system.worlds for enclave in world.enclaves}
+            missing = next(
+                (enclave for enclave in witness.enclaves if enclave and enclave not in known), ""
+            )
             idle = isinstance(requirement, Must) and requirement.enclave in world.idle
             violations.append(Violation(requirement, witness, steps, titles, missing, idle))
         if reasons := tuple(_never_fails([each for _, each in verdicts])):
@@ -158,7 +160,7 @@ def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
     empty = [each for each in first.empty if all(each in other.empty for other in others)]
     if empty:
         yield f"nothing has {_listed(empty)}"
-    if all(each.always for each in verdicts):
+    if all(verdict.always for verdict in verdicts):
         yield first.always
 
 
@@ -178,7 +180,7 @@ def requirement_findings(requirements: Sequence[Requirement], system: System) ->
 
 def decided_findings(decided: Decided, system: System) -> list[Finding]:
     """Return the findings of decisions, those of what does not hold first and in their order."""
-    found = [_violated(each) for each in decided.violations]
+    found = [_violated(violation) for violation in decided.violations]
     found += [_vacuous(requirement, why) for requirement, why in decided.vacuous]
     found += [_assumed(*each) for each in decided.assumed]
     if system.left_out:
@@ -206,11 +208,11 @@ def _subject(violation: Violation) -> str:
 
 def _violated(violation: Violation) -> Finding:
     requirement, steps = violation.requirement, violation.steps
-    first = next((each.source for each in steps if each.source), None) or requirement.source
+    first = next((step.source for step in steps if step.source), None) or requirement.source
     related = [
-        RelatedPlace(each.text(), each.source.file, each.source.line or None)
-        for each in steps
-        if each.source and len(steps) > 1
+        RelatedPlace(step.text(), step.source.file, step.source.line or None)
+        for step in steps
+        if step.source and len(steps) > 1
     ]
     own = requirement.source
     related.append(RelatedPlace(f"required: {_titled(requirement)}", own.file, own.line or None))
@@ -260,9 +262,9 @@ def _chain(steps: Sequence[Step]) -> str:
 
 def _together(steps: Sequence[Step]) -> str:
     """Return text such as ``/a and /b may publish /x``, or for each what it may do."""
-    if len({each.does() for each in steps}) > 1:
-        return _listed([each.text() for each in steps])
-    return f"{_listed([each.use.enclave for each in steps])} may {steps[0].does()}"
+    if len({step.does() for step in steps}) > 1:
+        return _listed([step.text() for step in steps])
+    return f"{_listed([step.use.enclave for step in steps])} may {steps[0].does()}"
 
 
 def _others(violation: Violation) -> str:
@@ -343,13 +345,13 @@ class _Stated:
     def __init__(self, rights: Iterable[Right]) -> None:
         self.users: dict[tuple[str, str], set[str]] = defaultdict(set)
         self.wild: dict[str, set[str]] = defaultdict(set)
-        for each in rights:
-            if each.kind == "dds" or expression_problem(each.name):
+        for right in rights:
+            if right.kind == "dds" or expression_problem(right.name):
                 continue  # permissions of others may have any text
-            if is_expression(each.name):
-                self.wild[each.right].add(each.name)
+            if is_expression(right.name):
+                self.wild[right.right].add(right.name)
             else:
-                self.users[each.right, each.name].add(each.enclave)
+                self.users[right.right, right.name].add(right.enclave)
 
     def names(self, right: str) -> list[str]:
         """Return the names without wildcards that a right is stated for, sorted."""
@@ -421,9 +423,9 @@ def render_requirements(requirements: Iterable[Requirement], of: str) -> str:
     `sros_tool.proof.requirements.parse_requirements` returns equal ones but for their places.
     """
     lines = [_HEAD.format(of=json.dumps(of))]
-    for each in requirements:
-        lines += [f"# {demand(each)}", f"[[{each.KIND}]]"]
-        lines += [f"{key} = {_toml(value)}" for key, value in _values(each)]
+    for requirement in requirements:
+        lines += [f"# {demand(requirement)}", f"[[{requirement.KIND}]]"]
+        lines += [f"{key} = {_toml(value)}" for key, value in _values(requirement)]
         lines.append("")
     return "\n".join(lines)
 
@@ -462,4 +464,4 @@ def _toml(value: object) -> str:
     line = f"[{', '.join(texts)}]"
     if len(line) <= _WIDTH:
         return line
-    return "\n".join(("[", *(f"  {each}," for each in texts), "]"))
+    return "\n".join(("[", *(f"  {text}," for text in texts), "]"))

@@ -259,8 +259,8 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         unknown,
         lost,
         tuple(replace(each, effect=Effect.TIGHTER) for each in more),
-        tuple(each.title for each in worlds),
-        tuple(sorted({domain for each in worlds for domain in each.domains})),
+        tuple(world.title for world in worlds),
+        tuple(sorted({domain for world in worlds for domain in world.domains})),
         assumptions(base, head),
         left_out(base, head),
         unclear,
@@ -288,8 +288,8 @@ def _fits(vendor: Vendor, side: AccessSource, name: str, subject: str) -> bool:
     text = certified_text(vendor.traits, subject)
     with suppress(ComparisonCrash):
         return any(
-            same_subject(vendor.traits.subjects, each.subject.strip(), text)
-            for each in side.permissions[name].grants
+            same_subject(vendor.traits.subjects, grant.subject.strip(), text)
+            for grant in side.permissions[name].grants
         )
     return False
 
@@ -360,7 +360,7 @@ def _zenoh_domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
 def _domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
     """Return one domain of each kind: between two of them, all have the same rules as the first."""
     governances = (each.governance for each in (base, head) if each.governance)
-    listed = {rule.domains for each in governances for rule in each.domain_access_rules}
+    listed = {rule.domains for governance in governances for rule in governance.domain_access_rules}
     return DomainSet.one_of_each_kind(listed, _granted(base) | _granted(head))
 
 
@@ -395,7 +395,7 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
 
         Those that do not fit it count as if they did: `_not_compared` says so.
         """
-        granted = (each.subject for each in side.permissions[name].grants[:1])
+        granted = (grant.subject for grant in side.permissions[name].grants[:1])
         subject = subject if _fits(vendor, side, name, subject) else next(granted, "")
         governed = GovernedDomain(vendor, governance, at)
         found = Access(governed, side.permissions[name], subject, at=AT)
@@ -417,9 +417,9 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
             for name in (enclave, *lenders(side, enclave))
         ]
         return _Access(
-            {verb: NameSet.union([each.topics(verb) for each in usable]) for verb in _VERBS},
-            lambda verb, topic: any(each.decide(verb, topic).outcome.ok for each in usable),
-            any(each.join().outcome.ok for each in usable),
+            {verb: NameSet.union([access.topics(verb) for access in usable]) for verb in _VERBS},
+            lambda verb, topic: any(access.decide(verb, topic).outcome.ok for access in usable),
+            any(access.join().outcome.ok for access in usable),
         )
 
     return access
@@ -446,7 +446,7 @@ def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
 
         writes, reads = (each & ROS_TOPICS for each in (found.writes, found.reads))
         topics = {AccessVerb.PUBLISH: writes, AccessVerb.SUBSCRIBE: reads}
-        joins = any(enclave in each.names() for each in side.enforcers)
+        joins = any(enclave in enforcer.names() for enforcer in side.enforcers)
         return _Access(topics, decide, joins=joins)
 
     return access
@@ -465,7 +465,7 @@ def _of_rights(side: AccessSource, robots: Mapping[str, int]) -> Callable[[str, 
             return () if elsewhere else by_enclave.get(enclave, ())
         grants = side.permissions[enclave].grants if enclave in side.permissions else ()
         return [
-            right for each in grants for right in grant_rights(enclave, _in_domain(each, domain))
+            right for grant in grants for right in grant_rights(enclave, _in_domain(grant, domain))
         ]
 
     def access(enclave: str, domain: int) -> _Access:
@@ -499,14 +499,14 @@ def _of_rights(side: AccessSource, robots: Mapping[str, int]) -> Callable[[str, 
 
 
 def _in_domain(grant: Grant, domain: int) -> Grant:
-    rules = (each for each in grant.rules if domain in each.domains.closed())
+    rules = (rule for rule in grant.rules if domain in rule.domains.closed())
     return replace(grant, rules=tuple(rules))
 
 
 def _by_enclave(rights: Iterable[Right]) -> dict[str, list[Right]]:
     found: dict[str, list[Right]] = defaultdict(list)
-    for each in sorted(rights):
-        found[each.enclave].append(each)
+    for right in sorted(rights):
+        found[right.enclave].append(right)
     return found
 
 
@@ -527,7 +527,7 @@ def _gains(
         _, seen, domains = found.setdefault(key, (gain, set(), set()))
         seen.update(gain.worlds)
         domains.update(gain.domains)
-    order = [each.title for each in worlds]
+    order = [world.title for world in worlds]
     together: dict[Gain, list[str]] = {}
     for gain, seen, domains in found.values():
         one = replace(
@@ -550,8 +550,8 @@ def _each_gain(
     limit: SearchLimit,
 ) -> Iterator[Gain]:
     stated = _Stated(old, new)
-    names = set(new.permissions) | {each.enclave for each in new.rights}
-    names.update(*(each.names() for each in new.enforcers))
+    names = set(new.permissions) | {right.enclave for right in new.rights}
+    names.update(*(enforcer.names() for enforcer in new.enforcers))
     for enclave in sorted(names if scope is None else names.intersection(scope)):
         for world in worlds:
             if _same(old, new, enclave, world):
@@ -585,7 +585,7 @@ def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> 
         names == (enclave, *world.lenders(new, enclave))
         and old.subject_of(enclave) == new.subject_of(enclave)
         and all(
-            _same_grants(old.permissions.get(each), new.permissions.get(each)) for each in names
+            _same_grants(old.permissions.get(name), new.permissions.get(name)) for name in names
         )
     )
 
@@ -593,8 +593,8 @@ def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> 
 def _same_grants(one: Permissions | None, other: Permissions | None) -> bool:
     if one is None or other is None:
         return one is other
-    return [_without_name(each) for each in one.grants] == [
-        _without_name(each) for each in other.grants
+    return [_without_name(grant) for grant in one.grants] == [
+        _without_name(grant) for grant in other.grants
     ]
 
 
@@ -629,7 +629,7 @@ class _Stated:
         self._denials_of: dict[tuple[str, AccessVerb, Style], _Denials] = {}
         rights = new.rights if new.zenoh is None else new.rights | new.zenoh
         earlier = old.rights if old.zenoh is None else old.rights | old.zenoh
-        self._allowed = _by_enclave(each for each in rights if each.qualifier is ALLOW)
+        self._allowed = _by_enclave(right for right in rights if right.qualifier is ALLOW)
         self._denied = _by_enclave(each for each in earlier if each.qualifier is not ALLOW)
 
     def gains(
@@ -792,7 +792,7 @@ def _borrowed(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[st
     """Yield the enclaves that can use the permissions of another one in a world, with that one."""
     worlds = tuple(worlds)
     for enclave in side.permissions:
-        lenders = (each for world in worlds for each in world.lenders(side, enclave))
+        lenders = (lender for world in worlds for lender in world.lenders(side, enclave))
         yield from ((enclave, each) for each in dict.fromkeys(lenders))
 
 

@@ -52,16 +52,16 @@ def _demanded_governance(stated: Sequence[StatedProtection], domains: DomainSet)
     (every,) = rule.topic_access_rules
     kinds = {Level.SIGN: ProtectionKind.NONE, Level.ENCRYPT: ProtectionKind.ENCRYPT}
     topics = {
-        (each.level, topic): replace(
+        (right.level, topic): replace(
             every,
             topic_expression=topic,
             metadata_protection_kind=ProtectionKind.NONE,
-            data_protection_kind=kinds[each.level],
+            data_protection_kind=kinds[right.level],
         )
         for level in (Level.ENCRYPT, Level.SIGN)
-        for each in stated
-        if each.level is level
-        for topic in protected_topics(each.kind, each.name)
+        for right in stated
+        if right.level is level
+        for topic in protected_topics(right.kind, right.name)
     }
     return Governance((replace(rule, topic_access_rules=(*topics.values(), every)),))
 
@@ -75,7 +75,7 @@ def _of_payloads(governance: Governance) -> Governance:
             topic.metadata_protection_kind,
             domain.rtps_protection_kind,
         )
-        names = [each.value.partition("_")[0] for each in kinds]
+        names = [kind.value.partition("_")[0] for kind in kinds]
         found = max(names, key=("NONE", "SIGN", "ENCRYPT").index)
         return replace(topic, data_protection_kind=ProtectionKind(found))
 
@@ -83,7 +83,9 @@ def _of_payloads(governance: Governance) -> Governance:
         tuple(
             replace(
                 rule,
-                topic_access_rules=tuple(strongest(rule, each) for each in rule.topic_access_rules),
+                topic_access_rules=tuple(
+                    strongest(rule, topic_rule) for topic_rule in rule.topic_access_rules
+                ),
             )
             for rule in governance.domain_access_rules
         )
@@ -150,9 +152,9 @@ def _looser_later(
         *compare_settings(old.later, new.later, AT),
         *_looser_governance(before, after, limit),
     ]
-    for each in changes:
-        if each.effect is Effect.LOOSER and not each.key.endswith("validity"):
-            yield replace(each, key=f"later enclaves: {each.key}")
+    for change in changes:
+        if change.effect is Effect.LOOSER and not change.key.endswith("validity"):
+            yield replace(change, key=f"later enclaves: {change.key}")
     if old.fleet and new.fleet:
         for name, robot in new.fleet.robots.items():
             known = old.fleet.robots.get(name)
@@ -185,7 +187,7 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
     """Yield the certificates that enclaves refuse in ``old``, and not in ``new``."""
     if old.trusts is None or new.trusts is None:
         return
-    all_revoked = frozenset(each for trust in old.trusts.values() for each in trust.revoked)
+    all_revoked = frozenset(entry for trust in old.trusts.values() for entry in trust.revoked)
     again: dict[int, list[str]] = defaultdict(list)
 
     @lru_cache(maxsize=8)  # most enclaves have the same lists
@@ -221,9 +223,9 @@ def _looser_governance(
         if any(each in other.domains.closed() for each in one.domains.closed())
     )
     for one, other in pairs:
-        for each in attribute_changes(one, other, "protection", ""):
-            if each.effect is Effect.LOOSER:
-                yield each
+        for change in attribute_changes(one, other, "protection", ""):
+            if change.effect is Effect.LOOSER:
+                yield change
         for style in Style:
             yield from _looser_topics(one, other, style, limit)
 
@@ -234,9 +236,9 @@ def _looser_topics(
     for before, had in _by_protection(old, style):
         for after, has in _by_protection(new, style):
             changes = [
-                each
-                for each in attribute_changes(before, after, "protection", "{}")
-                if each.effect is Effect.LOOSER
+                change
+                for change in attribute_changes(before, after, "protection", "{}")
+                if change.effect is Effect.LOOSER
             ]
             both = had & has
             if not changes:
@@ -246,15 +248,15 @@ def _looser_topics(
                 continue
             if topic not in ROS_TOPICS:
                 topic = (both & ROS_TOPICS).example(limit) or topic
-            for each in changes:
-                yield replace(each, meaning=each.meaning.replace("{}", f"DDS topic {topic}"))
+            for change in changes:
+                yield replace(change, meaning=change.meaning.replace("{}", f"DDS topic {topic}"))
 
 
 def _by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, NameSet]]:
     """Return each protection of topics, as a rule without its expression, and all its topics."""
     rules = [
-        (names_of(style, (each.topic_expression,)), replace(each, topic_expression="*"))
-        for each in rule.topic_access_rules
+        (names_of(style, (topic_rule.topic_expression,)), replace(topic_rule, topic_expression="*"))
+        for topic_rule in rule.topic_access_rules
     ]
     return [
         (kind, NameSet.first((names, each == kind) for names, each in rules))
@@ -289,7 +291,7 @@ def _no_longer_stated(
 
 
 def _signed(stated: Iterable[StatedProtection], kind: str) -> list[str]:
-    return [each.name for each in stated if each.kind == kind]
+    return [right.name for right in stated if right.kind == kind]
 
 
 def _named(names: Iterable[str]) -> NameSet:

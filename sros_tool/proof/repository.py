@@ -187,7 +187,7 @@ class Repository:
 
     def _targets(self, references: Sequence[str]) -> dict[str, str]:
         """Return the ids of exactly these references; those that do not exist are left out."""
-        wanted = [each for each in references if not _NO_REFERENCE.search(each)]
+        wanted = [reference for reference in references if not _NO_REFERENCE.search(reference)]
         if not wanted:
             return {}
         lines = self._ask("for-each-ref", "--format=%(objectname) %(refname)", "--", *wanted)
@@ -221,7 +221,7 @@ class Repository:
         """Return the ids of the commits that a commit follows; a merge has several."""
         head = self._objects([commit])[commit][1].partition(b"\n\n")[0]
         lines = head.decode(errors="replace").split("\n")
-        return tuple(each.removeprefix("parent ") for each in lines if each.startswith("parent "))
+        return tuple(line.removeprefix("parent ") for line in lines if line.startswith("parent "))
 
     def base_commit(self, name: str, remote: str | None) -> str:
         """Return the full id of the commit to compare with, or "" for the name ``none``.
@@ -551,7 +551,7 @@ def _unknown(name: str) -> DocumentError:
 
 
 def _either(candidates: Iterable[str]) -> str:
-    return " and ".join(f"'{each}'" for each in candidates)
+    return " and ".join(f"'{candidate}'" for candidate in candidates)
 
 
 def _parted(line: str) -> tuple[str, str, str]:

@@ -212,7 +212,7 @@ def read_requirements(path: Path) -> tuple[Requirement, ...]:
 
 def read_all_requirements(paths: Iterable[Path]) -> tuple[Requirement, ...]:
     """Return the requirements in several files; raises what `read_requirements` raises."""
-    return tuple(each for path in paths for each in read_requirements(path))
+    return tuple(requirement for path in paths for requirement in read_requirements(path))
 
 
 def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:

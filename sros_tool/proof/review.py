@@ -179,7 +179,7 @@ class Review:
     @property
     def status(self) -> int:
         """The worst status of all steps."""
-        return max((each.status for each in self.steps), default=_OK)
+        return max((step.status for step in self.steps), default=_OK)
 
     @property
     def findings(self) -> list[Finding]:
@@ -381,7 +381,7 @@ class _Review:
                 files = side.policies(path, placeholders=fleet is not None)
                 if not files:
                     raise self._missing(path)
-                found += [each for each in files if each not in found]
+                found += [file for file in files if file not in found]
             except (SrosError, OSError) as error:
                 known = error if isinstance(error, SrosError) else DocumentError(str(error))
                 yield ReviewStep("policy", path, _UNDECIDED, known)
@@ -502,7 +502,9 @@ class _Review:
         )
         if not policies:
             return
-        rights = {each for file in reviewed for each in policy_rights(read_policy_for(file, fleet))}
+        rights = {
+            right for file in reviewed for right in policy_rights(read_policy_for(file, fleet))
+        }
         for path in policies:
             with suppress(SrosError):
                 (file,) = self.head.policies(path, placeholders=fleet is not None)
@@ -542,7 +544,7 @@ class _Review:
             if path in files and may_be_policy(repository.content(entry.id))
         ]
         ids: dict[str, str] = {}
-        for folder in sorted({parent for each in parts for parent in Path(each).parents}):
+        for folder in sorted({parent for part in parts for parent in Path(part).parents}):
             entry = self.head.entry("" if folder == Path() else str(folder))
             assert entry
             for name, each in repository.folders([entry.id])[entry.id].items():
@@ -717,7 +719,7 @@ class _Review:
     def _dropped(
         self, earlier: Sequence[Requirement], wanted: Sequence[Requirement], system: System
     ) -> tuple[int, Content]:
-        dropped = [each.requirement for each in dropped_requirements(earlier, wanted)]
+        dropped = [requirement.requirement for requirement in dropped_requirements(earlier, wanted)]
         found = dropped_findings(earlier, wanted, " ".join(self.request.requirements))
         broken = requirement_findings(dropped, system)
         chosen = FindingFilter(exclude=(VACUOUS.id,)).choose([*found, *broken])
@@ -778,13 +780,13 @@ def _place(robot: Robot) -> str:
 def _holders(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | None]:
     """Map the enclaves of policies to the robot that gets their keys; None for those of none."""
     if fleet is None:
-        return {each.path: None for file in files for each in read_policy(file).enclaves}
+        return {enclave.path: None for file in files for enclave in read_policy(file).enclaves}
     policies = (FleetPolicy(read_policy(each, placeholders=True), fleet) for each in files)
     return {path: policy.stated(path)[1] for policy in policies for path in policy}
 
 
 def _is_below(path: str, folders: Iterable[str]) -> bool:
-    return any(f"{path}/".startswith(f"{each}/") for each in folders)
+    return any(f"{path}/".startswith(f"{folder}/") for folder in folders)
 
 
 def _same(base: CommitFiles | None, head: CommitFiles, path: str) -> bool:
@@ -808,7 +810,7 @@ def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
     """
     if not files:
         raise PolicyError("requirements are decided of policies, and there is none to read")
-    policies = [read_policy_for(each, fleet) for each in files]
+    policies = [read_policy_for(file, fleet) for file in files]
     first, *others = policies
     enclaves = {each.path: each for each in first.enclaves}
     for each in (enclave for policy in others for enclave in policy.enclaves):

@@ -170,7 +170,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
     if path.is_dir() and not is_keystore(path) and not (path / PERMISSIONS_FILE).exists():
         files = list(policy_files(path))
         if files:
-            return _of_policies(str(path), [_read(each, fleet) for each in files])
+            return _of_policies(str(path), [_read(file, fleet) for file in files])
     source = load_rights(path, fleet, hidden=True)
     for note in source.notes:
         if not source.sound or note.id in UNCERTAIN:
@@ -289,8 +289,8 @@ def _of_all(root: Path, folders: Iterable[Path]) -> Governance:
     """
     wanted = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document")).document
     same: set[bytes] = set()
-    for each in folders:
-        file = each / GOVERNANCE_FILE
+    for folder in folders:
+        file = folder / GOVERNANCE_FILE
         data = read_bytes(file, "governance document") if file.exists() else b""
         if not data or data in same:
             continue
@@ -323,10 +323,10 @@ def _expiries(root: Path) -> dict[int, str]:
     if not (root / CRL).exists():
         return {}
     found: dict[int, str] = {}
-    for each in Keystore(root).ledger_with("what", "certificate").entries:
+    for entry in Keystore(root).ledger_with("what", "certificate").entries:
         with suppress(ValueError):
-            serial = int(each.serial, 16)
-            found[serial] = max(found.get(serial, ""), each.not_after or _NEVER)
+            serial = int(entry.serial, 16)
+            found[serial] = max(found.get(serial, ""), entry.not_after or _NEVER)
     return found
 
 
@@ -346,7 +346,7 @@ def _trusts(
     @lru_cache(maxsize=8)  # most enclaves have the same files
     def trust(pem: bytes, own: bytes | None) -> Trust:
         authorities = load_certificates(pem, IDENTITY_CA_FILE)
-        keys = [(each, key_digest(each.public_key())) for each in authorities]  # type: ignore[arg-type]
+        keys = [(authority, key_digest(authority.public_key())) for authority in authorities]  # type: ignore[arg-type]
         revoked = set()
         lists: dict[str, bytes] = {}
         for data in dict.fromkeys(([] if own is None else [own]) + embedded_lists(pem)):
@@ -360,9 +360,9 @@ def _trusts(
                 raise DocumentError("it has several revocation lists of one CA, and one counts")
             signed = iso(found.this_update)
             revoked |= {
-                (key, each.serial)
-                for each in found.revoked
-                if expiries.get(each.serial, signed) >= signed
+                (key, entry.serial)
+                for entry in found.revoked
+                if expiries.get(entry.serial, signed) >= signed
             }
         return Trust(frozenset(key for _, key in keys), frozenset(revoked))
 
@@ -398,13 +398,13 @@ def _without_dates(permissions: Permissions) -> Permissions:
     """Return permissions that are valid at `AT`: what they give is compared, not until when."""
     begin, end = iso(_VALID.not_before), iso(_VALID.not_after)
     return Permissions(
-        tuple(replace(each, not_before=begin, not_after=end) for each in permissions.grants)
+        tuple(replace(grant, not_before=begin, not_after=end) for grant in permissions.grants)
     )
 
 
 def _of_revision(revision: Revision, fleet: Fleet | None) -> AccessSource:
     try:
-        policies = [_read(each.place, fleet, each.read) for each in revision.policies()]
+        policies = [_read(policy.place, fleet, policy.read) for policy in revision.policies()]
         side = _of_policies(str(revision), policies)
     except SrosError as error:
         texts = (revision.shown(each) for each in (error.what, error.why, error.remedy))
@@ -443,7 +443,7 @@ def _of_policies(shown: str, policies: list[_Read]) -> AccessSource:
         )
         for path, each in enclaves.items()
     }
-    rights = frozenset(each for policy, _ in policies for each in policy_rights(policy))
+    rights = frozenset(right for policy, _ in policies for right in policy_rights(policy))
     stated = stated_protections(enclaves.values())
     fleets = [fleet for _, fleet in policies if fleet]
     patterns = dict.fromkeys(each for fleet in fleets for each in fleet.enclaves)
@@ -459,4 +459,4 @@ def load_policies(files: Iterable[Path], shown: str, fleet: Fleet | None = None)
     Raises:
         SrosError: one cannot be read, or two have the same enclave.
     """
-    return _of_policies(shown, [_read(each, fleet) for each in files])
+    return _of_policies(shown, [_read(file, fleet) for file in files])

@@ -154,22 +154,22 @@ def policy_system(
     """
     refuse_fallbacks(policy)
     domains = DomainSet.of((domain, domain))
-    rights = frozenset(each for each in policy_rights(policy) if each.qualifier is ALLOW)
-    stated = _stated([each.path for each in policy.enclaves], rights)
+    rights = frozenset(right for right in policy_rights(policy) if right.qualifier is ALLOW)
+    stated = _stated([enclave.path for enclave in policy.enclaves], rights)
     protections = stated_protections(policy.enclaves)
     protection = (template or load_template(DEFAULT_TEMPLATE)).protection
     governance = governance_for(with_stated(protection, protections), domains)
     demanded = None if template else _demanded(protections)
-    subjects = {each.path: f"CN={each.path}" for each in policy.enclaves}
+    subjects = {enclave.path: f"CN={enclave.path}" for enclave in policy.enclaves}
     unique = template is not None and template.unique_subject
     signed = {
-        each.path: permissions_for(
-            each,
-            subject=subjects[each.path],
+        enclave.path: permissions_for(
+            enclave,
+            subject=subjects[enclave.path],
             validity=window(at, _PLANNED),
             domains=domains,
         )
-        for each in policy.enclaves
+        for enclave in policy.enclaves
     }
     worlds = []
     for vendor in MEASURED:
@@ -185,7 +185,7 @@ def policy_system(
     left_out = None
     if world in ("", _ZENOH):
         try:
-            remotes = tuple(remote_rights(each, domain) for each in policy.enclaves)
+            remotes = tuple(remote_rights(enclave, domain) for enclave in policy.enclaves)
             worlds.append(_planned_zenoh(policy, AccessControl(remotes), domain, stated))
         except SrosError as error:
             if world:
@@ -201,7 +201,7 @@ def _planned_zenoh(
 
     The names are those of ROS: only for them are the rules those of the policy.
     """
-    rules = {each.common_name: AccessControl((each,)) for each in control.remotes}
+    rules = {remote.common_name: AccessControl((remote,)) for remote in control.remotes}
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
         messages = zenoh_message(topic, domain, writes=writes)
@@ -273,8 +273,8 @@ def _weak(access: Iterable[Access]) -> dict[Level, NameSet]:
 def _demanded(protections: Iterable[StatedProtection]) -> dict[Level, NameSet]:
     """Map levels to the topics for which a policy says them."""
     topics: dict[Level, list[str]] = {level: [] for level in PROTECT.values()}
-    for each in protections:
-        topics[each.level] += protected_topics(each.kind, each.name)
+    for protection in protections:
+        topics[protection.level] += protected_topics(protection.kind, protection.name)
     return {level: NameSet.union(map(named, some)) for level, some in topics.items()}
 
 
@@ -285,12 +285,12 @@ def _rank(domain: DomainRule, rule: TopicRule) -> int:
         rule.metadata_protection_kind,
         rule.data_protection_kind,
     )
-    return max(_RANK[Level(each.value.partition("_")[0])] for each in kinds)
+    return max(_RANK[Level(kind.value.partition("_")[0])] for kind in kinds)
 
 
 def _stated(enclaves: Iterable[str], rights: Iterable[Right]) -> dict[str, TopicAccess]:
     """Map enclaves to the topics that their rights name without wildcards."""
-    found: dict[str, tuple[set[str], set[str]]] = {each: (set(), set()) for each in enclaves}
+    found: dict[str, tuple[set[str], set[str]]] = {enclave: (set(), set()) for enclave in enclaves}
     for right in rights:
         if right.enclave in found and not is_expression(right.name):
             for writes, topic in topics_of(right):
@@ -321,7 +321,7 @@ def _keystore_system(
     root = keystore.root
     names = enclave_names(root, hidden=True)
     source = load_rights(keystore, hidden=True)
-    rights = frozenset(each for each in source.rights if each.qualifier is ALLOW)
+    rights = frozenset(right for right in source.rights if right.qualifier is ALLOW)
     stated = _stated(names, rights)
     folders = {name: enclave_path(root, name) for name in names}
     # Without any key this is the public part of a keystore, and the keys are where it came from.
@@ -352,7 +352,9 @@ def _keystore_system(
             f"`sros check {quote(str(root))}` shows them; a keystore has one.",
         )
     listed = {
-        rule.domains for each in documents for rule in parse_governance(each).domain_access_rules
+        rule.domains
+        for document in documents
+        for rule in parse_governance(document).domain_access_rules
     }
     grants = {name: each.grants for name, each in source.documents.items()}
     granted = {rule.domains for some in grants.values() for each in some for rule in each.rules}
@@ -382,7 +384,9 @@ def _keystore_system(
             if now is None:
                 idle.append(name)
             # Those who read and write enforce rights by their governance, too.
-            possible = (_possible(enclave, grants.get(name, ()), each) for each in documents)
+            possible = (
+                _possible(enclave, grants.get(name, ()), document) for document in documents
+            )
             found = (
                 Evaluator(vendor, each, JoinContext(number, moment, zone)).access
                 for each, moment in product(possible, moments[name])
@@ -394,7 +398,7 @@ def _keystore_system(
         worlds += _zenoh_worlds(keystore, domain, stated)
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}
     places = {
-        name: [Place(each, Source(files[name], 0)) for each in rights if each.enclave == name]
+        name: [Place(right, Source(files[name], 0)) for right in rights if right.enclave == name]
         for name in names
     }
     return System(str(root), tuple(worlds), Places(places), rights)
@@ -402,7 +406,7 @@ def _keystore_system(
 
 def _possible(enclave: LoadedEnclave, grants: Sequence[Grant], governance: bytes) -> LoadedEnclave:
     """Return an enclave with its permissions, and with nothing that keeps it from starting."""
-    subject = enclave.subject or next((each.subject for each in grants), "")
+    subject = enclave.subject or next((grant.subject for grant in grants), "")
     return replace(enclave, subject=subject, governance=governance, state=None)
 
 
@@ -416,10 +420,10 @@ def _later(name: str, grants: Iterable[Grant], at: datetime) -> tuple[datetime, 
         KeystoreError: there are too many moments to decide for all.
     """
     validities = []
-    for each in grants:
+    for grant in grants:
         with suppress(UsageError):  # it ends before it begins
-            validities.append(each.validity)
-    later = (each for each in validities if at < each.not_before)
+            validities.append(grant.validity)
+    later = (validity for validity in validities if at < validity.not_before)
     found = {each.not_before + (each.not_after - each.not_before) / 2 for each in later}
     if len(found) > _MOST_MOMENTS:
         raise KeystoreError(
@@ -462,7 +466,7 @@ def _enforced(
     stated: Mapping[str, TopicAccess],
 ) -> World:
     """Return the world of a domain on Zenoh, of enclaves and of all other names in the rules."""
-    names = {*enclaves, *(name for each in enforcers for name in each.names())}
+    names = {*enclaves, *(name for enforcer in enforcers for name in enforcer.names())}
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
         return is_enforced(enforcers, enclave, domain, topic, writes=writes)
@@ -498,7 +502,7 @@ class Places:
     @classmethod
     def of_policy(cls, policy: Policy) -> Places:
         """Return the places in a policy, with their lines."""
-        return cls({each.path: _Lazy(each) for each in policy.enclaves})
+        return cls({enclave.path: _Lazy(enclave) for enclave in policy.enclaves})
 
     def find(self, use: Use) -> Place | None:
         """Return the right that states a use: one without wildcards if there is one."""

@@ -136,8 +136,8 @@ class Side:
                 continue
             for name in around.exact:
                 self.exact[name].append(enclave)
-            for each in around.automata:
-                self._wild[each].append(enclave)
+            for automaton in around.automata:
+                self._wild[automaton].append(enclave)
         self._topics = sorted(self.exact)
         self._backwards = sorted(each[::-1] for each in self.exact)
 
@@ -307,11 +307,11 @@ class World:
 
     @cached_property
     def _writers(self) -> Side:
-        return Side({each: self._access[each].writes for each in self.enclaves})
+        return Side({enclave: self._access[enclave].writes for enclave in self.enclaves})
 
     @cached_property
     def _readers(self) -> Side:
-        return Side({each: self._access[each].reads for each in self.enclaves})
+        return Side({enclave: self._access[enclave].reads for enclave in self.enclaves})
 
     def side(self, writes: bool) -> Side:
         """Return what enclaves may write, or what they may read."""
@@ -354,7 +354,7 @@ class World:
         if met.wild:
             return self.example(met.names, topics, limit)
         valid = valid_topics(topics.begin, topics.end)
-        return shortest(each for each in met.stated if each in valid) or shortest(met.stated)
+        return shortest(right for right in met.stated if right in valid) or shortest(met.stated)
 
     def readers_of(self, topic: str) -> list[str]:
         """Return the enclaves that may read a topic."""
@@ -369,7 +369,7 @@ class World:
         """
         if (writer, reader) not in self._shared:
             both = written & self._readers.of[reader]
-            valid = (both & each for each in _VALID)
+            valid = (both & names for names in _VALID)
             found = next(
                 filter(None, (each.example(limit, longest=self.longest) for each in valid)), None
             )
@@ -443,7 +443,7 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
 
     def topics(enforcer: Enforcement, writes: bool, begin: str) -> NameSet:
         def of(keys: Iterable[str]) -> NameSet:
-            return NameSet.union(_topics(each, domain, begin) for each in keys)
+            return NameSet.union(_topics(key, domain, begin) for key in keys)
 
         first, *others = (enforcer.passing(remote, *each, of) for each in _USES[writes, begin])
         for other in others:
@@ -466,7 +466,8 @@ def is_enforced(
     messages = zenoh_message(topic, domain, writes=writes)
     remote = Remote(enclave)
     return bool(messages) and any(
-        all(enforcer.decide(remote, *each).allowed for each in messages) for enforcer in enforcers
+        all(enforcer.decide(remote, *message).allowed for message in messages)
+        for enforcer in enforcers
     )
 
 
@@ -514,7 +515,7 @@ def _topics(key: str, domain: int, begin: str) -> NameSet:
         return NameSet((f"{begin}{name}{end}",)) if name.startswith("/") else NameSet()
     around = names_of_keys((key,)).around()
     assert around
-    inner = (each.between(space, "".join(_TYPE)) for each in around.automata)
+    inner = (automaton.between(space, "".join(_TYPE)) for automaton in around.automata)
     exact = (
         f"{begin}{each[len(space) : -len(''.join(_TYPE))]}{end}"
         for each in around.exact

@@ -205,13 +205,15 @@ class _GrantRules:
             for index, rule in self._rules
             for verb in self._verbs
         ):
-            for each in criteria:
+            for criterion in criteria:
                 count += 1
                 # Fast DDS joins the partitions of all criteria of a verb in a rule.
-                weighed = _partitions(traits, rule, criteria if traits.topic_decides else (each,))
+                weighed = _partitions(
+                    traits, rule, criteria if traits.topic_decides else (criterion,)
+                )
                 entries += [
                     _Entry(count, index, rule.allow, _trimmed(traits, expression), weighed)
-                    for expression in each.topics
+                    for expression in criterion.topics
                     if _trimmed(traits, expression) or traits.crashes_on_empty_texts
                 ]
         return entries
@@ -276,7 +278,7 @@ class _GrantRules:
             yield self._names_of(some), allowed
 
     def _names_of(self, entries: Iterable[_Entry]) -> NameSet:
-        texts = tuple([_usable_expression(self._traits, each.expression) for each in entries])
+        texts = tuple([_usable_expression(self._traits, entry.expression) for entry in entries])
         return _of_texts(self._traits.style, texts)
 
     def _fits(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
@@ -318,9 +320,9 @@ def _partitions(
     """Return the partitions that ``criteria`` name, or the ones that the vendor implies."""
     everywhere = not rule.allow and traits.deny_partitions is DenyPartitions.ANY_OR_ALL
     implied = ("*",) if everywhere else _DEFAULT_PARTITION
-    if implied is _DEFAULT_PARTITION and not any(each.partitions for each in criteria):
+    if implied is _DEFAULT_PARTITION and not any(criterion.partitions for criterion in criteria):
         return _DEFAULT_PARTITION
-    found = [text for each in criteria for text in each.partitions or implied]
+    found = [text for criterion in criteria for text in criterion.partitions or implied]
     return tuple(dict.fromkeys(_trimmed(traits, text) for text in found))
 
 

@@ -202,7 +202,7 @@ _INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]*|0[0-7]*|[1-9]\d*)\Z", re.ASCII
 
 
 def _names(rule: type[DomainRule | TopicRule]) -> tuple[str, ...]:
-    return tuple(each.name for each in attributes(rule))
+    return tuple(attribute.name for attribute in attributes(rule))
 
 
 # The allowed children of each element; an element without an entry holds only text.
@@ -236,7 +236,7 @@ def read_governance(xml: bytes) -> Governance:
     rules = parent.all("domain_rule") if parent else []
     if not rules:
         raise UnreadableError("it has no <domain_rule>")
-    return Governance(tuple(_domain_rule(each) for each in rules))
+    return Governance(tuple(_domain_rule(rule) for rule in rules))
 
 
 def read_permissions(xml: bytes) -> Permissions:
@@ -250,7 +250,7 @@ def read_permissions(xml: bytes) -> Permissions:
     grants = parent.all("grant") if parent else []
     if not grants:
         raise UnreadableError("it has no <grant>")
-    return Permissions(tuple(_grant(each) for each in grants))
+    return Permissions(tuple(_grant(grant) for grant in grants))
 
 
 class _Node:
@@ -385,7 +385,7 @@ def _domain_rule(node: _Node) -> DomainRule:
         raise UnreadableError("a <domain_rule> has no topic rules")
     return DomainRule(
         domains=read,
-        topic_access_rules=tuple(_topic_rule(each) for each in rules),
+        topic_access_rules=tuple(_topic_rule(rule) for rule in rules),
         **_values(node, DomainRule),
     )
 
@@ -399,11 +399,11 @@ def _topic_rule(node: _Node) -> TopicRule:
 
 def _values(node: _Node, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    for each in attributes(rule):
-        child = node.last(each.name)
-        if child is None and each.default is None:
-            raise UnreadableError(f"a <{node.tag}> lacks its <{each.name}>")
-        values[each.name] = each.default if child is None else _value(child, each)
+    for attribute in attributes(rule):
+        child = node.last(attribute.name)
+        if child is None and attribute.default is None:
+            raise UnreadableError(f"a <{node.tag}> lacks its <{attribute.name}>")
+        values[attribute.name] = attribute.default if child is None else _value(child, attribute)
     return values
 
 

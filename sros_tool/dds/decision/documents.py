@@ -102,7 +102,9 @@ def is_plain_governance(governance: Governance) -> bool:
 
 
 def _has_valid_values(rule: DomainRule | TopicRule) -> bool:
-    return all(getattr(rule, each.name) in each.values for each in attributes(type(rule)))
+    return all(
+        getattr(rule, attribute.name) in attribute.values for attribute in attributes(type(rule))
+    )
 
 
 def is_plain_permissions(permissions: Permissions) -> bool:

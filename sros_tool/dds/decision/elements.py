@@ -67,7 +67,8 @@ class XmlElement:
 
 def _attributes(rule: type[DomainRule | TopicRule]) -> str:
     return "".join(
-        f"{each.name}," if each.default is None else f"({each.name},)?" for each in attributes(rule)
+        f"{attribute.name}," if attribute.default is None else f"({attribute.name},)?"
+        for attribute in attributes(rule)
     )
 
 
@@ -113,9 +114,9 @@ _TEXTS = {
     "not_after": _DATE,
     "default": "ALLOW|DENY",
 } | {
-    each.name: _FLAG if each.is_flag else "|".join(map(str, each.values))
+    attribute.name: _FLAG if attribute.is_flag else "|".join(map(str, attribute.values))
     for rule in (DomainRule, TopicRule)
-    for each in attributes(rule)
+    for attribute in attributes(rule)
 }
 _EVERYWHERE = "{http://www.w3.org/2001/XMLSchema-instance}"
 

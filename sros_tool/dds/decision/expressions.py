@@ -64,7 +64,7 @@ def _automaton(style: Style, expression: str) -> Automaton | None:
 
 def names_of(style: Style, expressions: Iterable[str]) -> NameSet:
     """Return the names that any of the expressions matches."""
-    made = {each: _automaton(style, each) for each in expressions}
+    made = {expression: _automaton(style, expression) for expression in expressions}
     return NameSet(
         (each for each, wild in made.items() if wild is None), filter(None, made.values())
     )

@@ -118,7 +118,7 @@ class _Reader:
             raise self._error(f"{begin} is not closed")
         self._index = stop + len(end)
         if begin == "<?":
-            if len(stack) > 1 or any(each is not NodeMark.DECLARATION for each in children):
+            if len(stack) > 1 or any(child is not NodeMark.DECLARATION for child in children):
                 raise self._error("a processing instruction follows the prolog")
             children.append(NodeMark.DECLARATION)
         elif begin == "<![CDATA[":
@@ -384,9 +384,11 @@ def _topic_rule(element: XmlElement) -> TopicRule:
 
 def _values(take: _Sequence, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    for each in attributes(rule):
-        left_out = each.default is not None and not take.is_next(each.name)
-        values[each.name] = each.default if left_out else _value(take.next(each.name), each)
+    for attribute in attributes(rule):
+        left_out = attribute.default is not None and not take.is_next(attribute.name)
+        values[attribute.name] = (
+            attribute.default if left_out else _value(take.next(attribute.name), attribute)
+        )
     return values
 
 

@@ -249,7 +249,7 @@ def _local(text: str, zone: tzinfo) -> float | None:
     found = _LOCAL.match(text)
     if not found or (found[6] is None and found.end() < len(text)):
         return None
-    year, month, day, hour, minute, second = (int(each or -1) for each in found.groups())
+    year, month, day, hour, minute, second = (int(group or -1) for group in found.groups())
     if 0 in (month, day) or month > 12 or day > 31 or hour > 23 or minute > 59 or second > 60:
         return None
     # A missing month or day stays zero: January, or the last day of the month before.

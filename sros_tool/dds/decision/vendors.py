@@ -290,11 +290,11 @@ class Vendor(StrEnum):
         return not self.traits.measured and self is not Vendor.STANDARD
 
 
-MEASURED = tuple(each for each in Vendor if each.traits.measured)
+MEASURED = tuple(vendor for vendor in Vendor if vendor.traits.measured)
 """The vendors whose decisions were compared with the real library."""
 
-NEWEST = tuple({each.traits.product: each for each in reversed(MEASURED)}.values())[::-1]
+NEWEST = tuple({vendor.traits.product: vendor for vendor in reversed(MEASURED)}.values())[::-1]
 """The newest measured release of each implementation."""
 
-FAST_DDS = tuple(each for each in Vendor if each.traits.product == Vendor.FAST.traits.product)
+FAST_DDS = tuple(vendor for vendor in Vendor if vendor.traits.product == Vendor.FAST.traits.product)
 """All releases of Fast DDS."""
