@@ -32,6 +32,7 @@ from sros_tool.cli.common import (
     force_option,
     json_option,
     json_text,
+    keystore_argument,
     keystore_from_environment,
     local_zone,
     moment_of,
@@ -800,7 +801,7 @@ def _watch_processes(
 
 
 @verb("metrics")
-@click.argument("root", metavar="[ROOT]", type=PATH, required=False)
+@keystore_argument()
 @output_option("Replace FILE at once, which ends in .prom, instead of printing.")
 @click.option(
     "--earliest", is_flag=True, help="Leave out the files of single enclaves, for large keystores."
@@ -820,7 +821,7 @@ def _watch_processes(
 @dry_run_option
 @json_option
 def metrics(
-    root: Path | None,
+    root: Path,
     output: Path | None,
     earliest: bool,
     policies: tuple[Path, ...],
@@ -847,7 +848,7 @@ def metrics(
     from sros_tool.keystore.reader import Keystore
     from sros_tool.prometheus import KeystoreMetrics, render_metrics
 
-    root, moment = root or keystore_from_environment(), now()
+    moment = now()
     if output:
         check_metrics_file(output)
         check_output(output, force=True)

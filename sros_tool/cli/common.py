@@ -320,6 +320,17 @@ def split_root(words: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
     return Path(first), tuple(words[1:])
 
 
+def root_and_file(words: Sequence[str], usage: str) -> tuple[Path, Path]:
+    """Return the keystore (from the first of two words or the environment) and the file.
+
+    Raises `UsageError` with ``usage`` if there are other words.
+    """
+    root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
+    if len(rest) != 1:
+        raise UsageError(usage)
+    return root, PATH.convert(rest[0], None, None)
+
+
 def keystore_from_environment() -> Path:
     """Return the keystore that $ROS_SECURITY_KEYSTORE names.  Raises `UsageError`."""
     root = os.environ.get(KEYSTORE_VARIABLE)
@@ -330,6 +341,17 @@ def keystore_from_environment() -> Path:
             f"Name the keystore's folder, or set {KEYSTORE_VARIABLE}.",
         )
     return Path(root)
+
+
+def keystore_argument(
+    name: str = "root", metavar: str = "[ROOT]"
+) -> Callable[[Decorated], Decorated]:
+    """Add a keystore, by default that of the environment, as argument to a verb."""
+
+    def given(context: click.Context, _argument: click.Parameter, path: Path | None) -> Path | None:
+        return path if path or context.resilient_parsing else keystore_from_environment()
+
+    return click.argument(name, metavar=metavar, type=PATH, required=False, callback=given)
 
 
 def complete_keystore_and_enclave(
@@ -346,6 +368,16 @@ def complete_keystore_and_enclave(
         names = search_enclaves(root)[0] if is_keystore(root) else ()
         return [*_completions(names, incomplete)]
     return [CompletionItem(incomplete, type="dir")]
+
+
+def words_argument(metavar: str, **more: Any) -> Callable[[Decorated], Decorated]:
+    """Add the words of a keystore and of enclaves, for `split_root`, as argument to a verb."""
+    return click.argument(
+        "words",
+        metavar=metavar,
+        nargs=-1,
+        **{"required": True, "shell_complete": complete_keystore_and_enclave, **more},
+    )
 
 
 def _completions(names: Iterable[str], incomplete: str) -> list[str]:
@@ -366,7 +398,9 @@ def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: 
     return _completions(fleet.robots if fleet else (), incomplete)
 
 
-def complete_file(incomplete: str) -> list[CompletionItem | str]:
+def complete_file(
+    _ctx: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem | str]:
     """Complete files and folders, as the shell does."""
     from click.shell_completion import CompletionItem
 

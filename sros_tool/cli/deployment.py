@@ -15,14 +15,13 @@ from sros_tool.cli.common import (
     PATH,
     allow_refusal_option,
     complete_file,
-    complete_keystore_and_enclave,
     domain_of,
     dry_run_option,
     fleet_option,
     json_option,
     key_option,
     keyring,
-    keystore_from_environment,
+    keystore_argument,
     moment_of,
     now,
     only_enclaves,
@@ -30,10 +29,12 @@ from sros_tool.cli.common import (
     print_notes,
     progress,
     read_named,
+    root_and_file,
     secrets,
     several_enclaves,
     split_root,
     verb,
+    words_argument,
 )
 from sros_tool.errors import UsageError
 from sros_tool.terminal import Coloured, echo, echo_bytes
@@ -54,13 +55,7 @@ _STREAM = Path("-")
 
 
 @verb("distribute_key")
-@click.argument(
-    "words",
-    metavar="[ROOT] [NAME...] TARGET",
-    nargs=-1,
-    required=True,
-    shell_complete=complete_keystore_and_enclave,
-)
+@words_argument("[ROOT] [NAME...] TARGET")
 @several_enclaves
 @click.option("--force", is_flag=True, help="Replace files in TARGET that differ.")
 @click.option(
@@ -198,7 +193,7 @@ def _refuse_terminal() -> None:
 
 
 @verb("verify")
-@click.argument("folder", metavar="[DIR]", type=PATH, required=False)
+@keystore_argument("folder", "[DIR]")
 @click.option("--domain", metavar="ID", help="Also check whether enclaves may join this domain.")
 @click.option(
     "--at", metavar="MOMENT", help="Check as of a date (2027-06-01) or time from now (90d)."
@@ -209,7 +204,7 @@ def _refuse_terminal() -> None:
 )
 @json_option
 def verify(
-    folder: Path | None,
+    folder: Path,
     domain: str | None,
     at: str | None,
     patterns: tuple[str, ...],
@@ -240,7 +235,6 @@ def verify(
     from sros_tool.keystore.selection import select_enclaves
     from sros_tool.validity import iso
 
-    folder = folder or keystore_from_environment()
     wanted, moment = domain_of(domain), moment_of(at)
     chosen = patterns or robots
     only = select_enclaves(Keystore(folder), (), patterns, robots=robots) if chosen else None
@@ -275,13 +269,13 @@ def verify(
 
 @verb("create_request")
 @click.argument("name")
-@click.argument("folder", metavar="[DIR]", type=PATH, required=False)
+@keystore_argument("folder", "[DIR]")
 @click.option("--again", is_flag=True, help="Make the request again, for the existing key.")
 @key_option
 @dry_run_option
 @json_option
 def create_request(
-    name: str, folder: Path | None, again: bool, key: str, dry_run: bool, as_json: bool
+    name: str, folder: Path, again: bool, key: str, dry_run: bool, as_json: bool
 ) -> None:
     """On a robot: create the key of the enclave NAME in the folder DIR, and a signing request.
 
@@ -302,7 +296,6 @@ def create_request(
     from sros_tool.keystore.delivery.robot import create_request as create
     from sros_tool.keystore.delivery.robot import shown_request
 
-    folder = folder or keystore_from_environment()
     made = create(folder, name, again=again, key=key, secrets=secrets(), dry_run=dry_run)
     if as_json:
         print_json(shown_request(folder, made, again=again, dry_run=dry_run))
@@ -325,13 +318,7 @@ def create_request(
 
 
 @verb("sign_request")
-@click.argument(
-    "words",
-    metavar="[ROOT] REQUEST",
-    nargs=-1,
-    required=True,
-    shell_complete=lambda _ctx, _parameter, incomplete: complete_file(incomplete),
-)
+@words_argument("[ROOT] REQUEST", shell_complete=complete_file)
 @click.option(
     "-p",
     "--policy-file",
@@ -403,10 +390,7 @@ def sign_request(
     from sros_tool.keystore.delivery.signing import sign_request as sign
     from sros_tool.runtime.variables import domain_from
 
-    root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
-    if len(rest) != 1:
-        raise UsageError("sign_request takes a keystore and one request")
-    request = PATH.convert(rest[0], None, None)
+    root, request = root_and_file(words, "sign_request takes a keystore and one request")
     if no_answer:
         if output is not None or force:
             raise UsageError("--no-answer makes no file: leave out -o and --force")
@@ -535,7 +519,7 @@ def _certify(
 
 @verb("import")
 @click.argument("answer", type=PATH)
-@click.argument("folder", metavar="[DIR]", type=PATH, required=False)
+@keystore_argument("folder", "[DIR]")
 @click.option("--force", is_flag=True, help="Accept an older answer, or one from other CAs.")
 @click.option(
     "--ca",
@@ -549,7 +533,7 @@ def _certify(
 @json_option
 def import_verb(
     answer: Path,
-    folder: Path | None,
+    folder: Path,
     force: bool,
     pin: str | None,
     allow_refusal: tuple[Vendor, ...],
@@ -574,7 +558,6 @@ def import_verb(
     """
     from sros_tool.keystore.delivery.robot import import_answer, read_pin, shown_import
 
-    folder = folder or keystore_from_environment()
     pinned = read_pin(pin) if pin is not None else frozenset[str]()
     data = read_named(answer, "answer")
     done = import_answer(

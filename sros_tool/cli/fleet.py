@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import click
 
 from sros_tool.cli.common import (
-    PATH,
     Verb,
     check_metrics_file,
     check_output,
@@ -19,7 +18,7 @@ from sros_tool.cli.common import (
     dry_run_option,
     json_option,
     json_text,
-    keystore_from_environment,
+    keystore_argument,
     now,
     output_option,
     print_json,
@@ -27,8 +26,9 @@ from sros_tool.cli.common import (
     progress,
     read_named,
     robot_option,
+    root_and_file,
     save,
-    split_root,
+    words_argument,
 )
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
@@ -61,7 +61,7 @@ def fleet() -> None:
 
 
 @fleet.command("inventory")
-@click.argument("root", type=PATH, required=False)
+@keystore_argument()
 @click.option("--yaml", "as_yaml", is_flag=True, help="Print YAML in place of JSON.")
 @click.option(
     "--list",
@@ -69,7 +69,7 @@ def fleet() -> None:
     is_flag=True,
     help="Print what Ansible takes from a program that it runs as an inventory.",
 )
-def _inventory(root: Path | None, as_yaml: bool, as_list: bool) -> None:
+def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
     """Print the robots of the keystore ROOT as an inventory of Ansible.
 
     Robots are hosts and groups are groups. Variables of a host are ansible_host, ansible_user,
@@ -86,7 +86,7 @@ def _inventory(root: Path | None, as_yaml: bool, as_list: bool) -> None:
 
     if as_yaml and as_list:
         raise UsageError("--yaml and --list exclude each other", "", "Choose one.")
-    recorded = recorded_fleet(Keystore(root or keystore_from_environment()))
+    recorded = recorded_fleet(Keystore(root))
     value = script_inventory(recorded) if as_list else inventory(recorded)
     echo_document(yaml_text(value) if as_yaml else f"{json_text(value)}\n")
 
@@ -95,9 +95,9 @@ def _inventory(root: Path | None, as_yaml: bool, as_list: bool) -> None:
 
 
 @fleet.command("report")
-@click.argument("folder", metavar="[DIR]", type=PATH, required=False)
+@keystore_argument("folder", "[DIR]")
 @click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
-def _report(folder: Path | None, robot: str) -> None:
+def _report(folder: Path, robot: str) -> None:
     """On a robot: print what it has, for `sros fleet confirm` at the keystore.
 
     It is JSON with the SHA-256 of each file of the enclaves in DIR but their keys, and the time.
@@ -109,7 +109,6 @@ def _report(folder: Path | None, robot: str) -> None:
     """
     from sros_tool.keystore.confirmation import make_confirmation, render_confirmation
 
-    folder = folder or keystore_from_environment()
     with progress("reading"):
         made = make_confirmation(folder, robot, now=now())
     echo_document(render_confirmation(made))
@@ -119,13 +118,7 @@ def _report(folder: Path | None, robot: str) -> None:
 
 
 @fleet.command("confirm")
-@click.argument(
-    "words",
-    metavar="[ROOT] FILE",
-    nargs=-1,
-    required=True,
-    shell_complete=lambda _ctx, _parameter, incomplete: complete_file(incomplete),
-)
+@words_argument("[ROOT] FILE", shell_complete=complete_file)
 @click.option(
     "--robot",
     metavar="NAME",
@@ -152,12 +145,9 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     from sros_tool.keystore.layout import confirmation_file
     from sros_tool.keystore.reader import Keystore
 
-    root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
-    if len(rest) != 1:
-        raise UsageError("fleet confirm takes a keystore and one file")
+    root, file = root_and_file(words, "fleet confirm takes a keystore and one file")
     recorded_fleet(Keystore(root)).robot(robot)
-    file = PATH.convert(rest[0], None, None)
-    what = "standard input" if rest[0] == "-" else f"'{file}'"
+    what = "standard input" if str(file) == "-" else f"'{file}'"
     data = read_named(file, "confirmation", most=MAX_BYTES)
     received = receive(data, robot, what, now=now())
     path = confirmation_file(robot)
@@ -191,7 +181,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
 
 
 @fleet.command("status")
-@click.argument("root", metavar="[ROOT]", type=PATH, required=False)
+@keystore_argument()
 @robot_option("Only this robot of the fleet, with all that it has.")
 @click.option(
     "--max-age",
@@ -204,7 +194,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
 @dry_run_option
 @json_option
 def _status(
-    root: Path | None,
+    root: Path,
     robots: tuple[str, ...],
     max_age: str | None,
     prometheus: bool,
@@ -241,7 +231,7 @@ def _status(
         raise UsageError("--json, --prometheus and --html exclude each other", "", "Choose one.")
     if as_json and output:
         raise UsageError("--json takes no --output", "", "Leave one of them out.")
-    root, moment = root or keystore_from_environment(), now()
+    moment = now()
     oldest = parse_duration(max_age) if max_age is not None else None
     if output:
         if prometheus:

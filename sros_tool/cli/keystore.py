@@ -16,7 +16,6 @@ from sros_tool.cli.common import (
     SeveralValues,
     allow_refusal_option,
     chosen_enclaves,
-    complete_keystore_and_enclave,
     complete_template,
     dry_run_option,
     fleet_option,
@@ -24,6 +23,7 @@ from sros_tool.cli.common import (
     json_option,
     key_option,
     keyring,
+    keystore_argument,
     keystore_from_environment,
     now,
     only_enclaves,
@@ -35,6 +35,7 @@ from sros_tool.cli.common import (
     several_enclaves,
     split_root,
     verb,
+    words_argument,
 )
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo
@@ -48,13 +49,7 @@ if TYPE_CHECKING:
 
 
 @verb("create_enclave")
-@click.argument(
-    "words",
-    metavar="[ROOT] NAME...",
-    nargs=-1,
-    required=True,
-    shell_complete=complete_keystore_and_enclave,
-)
+@words_argument("[ROOT] NAME...")
 @key_option
 @dry_run_option
 @json_option
@@ -98,13 +93,7 @@ _revoke_old_option = click.option(
 
 
 @verb("create_permission")
-@click.argument(
-    "words",
-    metavar="[ROOT] [NAME...] POLICY_FILE",
-    nargs=-1,
-    required=True,
-    shell_complete=complete_keystore_and_enclave,
-)
+@words_argument("[ROOT] [NAME...] POLICY_FILE")
 @several_enclaves
 @fleet_option("The robots that the placeholders of the policy stand for.")
 @_revoke_old_option
@@ -344,11 +333,11 @@ def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
 
 
 @verb("list_enclaves")
-@click.argument("root", type=PATH, required=False)
+@keystore_argument()
 @only_enclaves()
 @json_option
 def list_enclaves(
-    root: Path | None, patterns: tuple[str, ...], robots: tuple[str, ...], as_json: bool
+    root: Path, patterns: tuple[str, ...], robots: tuple[str, ...], as_json: bool
 ) -> None:
     """List the enclaves of the keystore ROOT, sorted.
 
@@ -365,7 +354,6 @@ def list_enclaves(
         refuse_earlier,
     )
 
-    root = root or keystore_from_environment()
     if not is_keystore(root):
         refuse_earlier(root)
         raise KeystoreError(f"'{root}' is not a valid keystore")
@@ -447,7 +435,7 @@ if TYPE_CHECKING:
 @dry_run_option
 @json_option
 def create_keystore(
-    root: Path | None,
+    root: Path,
     template_name: str,
     domain: str | None,
     ca_layout: str | None,
@@ -480,7 +468,6 @@ def create_keystore(
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.lifecycle.create import create_keystore as create
 
-    root = root or keystore_from_environment()
     own = ros_domain() if domain is None else None
     domains = DomainSet.parse(domain, "--domain") if domain is not None else None
     if own is not None:
@@ -606,7 +593,7 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
 
 
 @verb("update_keystore")
-@click.argument("root", type=PATH, required=False)
+@keystore_argument()
 @click.option(
     "--template",
     "template_name",
@@ -656,7 +643,7 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
 @json_option
 @dry_run_option
 def update_keystore(
-    root: Path | None,
+    root: Path,
     template_name: str | None,
     values: tuple[str, ...],
     rules: tuple[str, ...],
@@ -702,7 +689,6 @@ def update_keystore(
     from sros_tool.keystore.settings import present_settings
     from sros_tool.keystore.template import load_template, with_values
 
-    root = root or keystore_from_environment()
     if sum((template_name is not None, take_edits, discard_edits)) > 1 and not (
         template_name and discard_edits
     ):

@@ -12,22 +12,21 @@ import click
 
 from sros_tool.cli.changed import json_form, print_changed, print_follow_up, print_plan
 from sros_tool.cli.common import (
-    PATH,
     allow_refusal_option,
     check_chosen,
     chosen_enclaves,
-    complete_keystore_and_enclave,
     dry_run_option,
     json_option,
     key_option,
     keyring,
-    keystore_from_environment,
+    keystore_argument,
     now,
     print_json,
     progress,
     several_enclaves,
     split_root,
     verb,
+    words_argument,
 )
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo
@@ -40,12 +39,7 @@ if TYPE_CHECKING:
 
 
 @verb("renew")
-@click.argument(
-    "words",
-    metavar="[ROOT] [NAME...]",
-    nargs=-1,
-    shell_complete=complete_keystore_and_enclave,
-)
+@words_argument("[ROOT] [NAME...]", required=False)
 @several_enclaves
 @click.option(
     "--all-expiring",
@@ -153,12 +147,7 @@ def _complete_reason(
 
 
 @verb("revoke")
-@click.argument(
-    "words",
-    metavar="[ROOT] [NAME...]",
-    nargs=-1,
-    shell_complete=complete_keystore_and_enclave,
-)
+@words_argument("[ROOT] [NAME...]", required=False)
 @several_enclaves
 @click.option(
     "--reason",
@@ -231,13 +220,13 @@ def revoke(
 
 
 @verb("crl")
-@click.argument("root", type=PATH, required=False)
+@keystore_argument()
 @click.option("--refresh", is_flag=True, help="Sign the list again to extend its validity.")
 @allow_refusal_option
 @json_option
 @dry_run_option
 def crl(
-    root: Path | None,
+    root: Path,
     refresh: bool,
     allow_refusal: tuple[Vendor, ...],
     as_json: bool,
@@ -260,7 +249,6 @@ def crl(
     from sros_tool.keystore.lifecycle.revoke import refresh_crl
     from sros_tool.keystore.reader import Keystore
 
-    root = root or keystore_from_environment()
     list_enclaves(root)
     result = None
     if refresh:
@@ -331,7 +319,7 @@ _DONE = {
 
 
 @verb("rotate_ca")
-@click.argument("root", type=PATH, required=False)
+@keystore_argument()
 @click.option("--identity", is_flag=True, help="Replace only the identity CA.")
 @click.option("--permissions", is_flag=True, help="Replace only the permissions CA.")
 @click.option("--status", is_flag=True, help="Show the stage of the keystore (the default).")
@@ -365,7 +353,7 @@ _DONE = {
 @json_option
 @dry_run_option
 def rotate_ca(
-    root: Path | None,
+    root: Path,
     identity: bool,
     permissions: bool,
     status: bool,
@@ -418,7 +406,6 @@ def rotate_ca(
 
     if sum((status, go_on, to is not None, finish, same_key)) > 1:
         raise UsageError("give only one of --status, --next, --to, --finish and --same-key")
-    root = root or keystore_from_environment()
     if not (go_on or to or finish or same_key):
         _show_status(rotation_status(root, now=now()), _unconfirmed(root), as_json)
         return

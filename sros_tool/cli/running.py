@@ -22,7 +22,6 @@ from sros_tool.cli.common import (
     Verb,
     check_one_format,
     chosen_enclaves,
-    complete_keystore_and_enclave,
     domain_of,
     dry_run_option,
     enclave_environment,
@@ -34,6 +33,7 @@ from sros_tool.cli.common import (
     several_enclaves,
     split_root,
     verb,
+    words_argument,
 )
 from sros_tool.enclave_environment import INSTALLED, RMWS, container_text, target_path
 from sros_tool.errors import Note, UnavailableError, UsageError
@@ -53,13 +53,7 @@ _NO_PIN = (
     f"no file has the PIN of the token (pin-source), so Fast DDS takes it from ${_FAST_DDS_PIN}, "
     "which root and this user can read in /proc."
 )
-_WORDS = click.argument(
-    "words",
-    metavar="[ROOT] NAME",
-    nargs=-1,
-    required=True,
-    shell_complete=complete_keystore_and_enclave,
-)
+_WORDS = words_argument("[ROOT] NAME")
 _DOMAIN = click.option(
     "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"
 )
@@ -284,13 +278,7 @@ class _WithCommand(Verb):
 
 
 @verb("run", cls=_WithCommand)
-@click.argument(
-    "words",
-    metavar="[ROOT] NAME -- COMMAND...",
-    nargs=-1,
-    type=click.UNPROCESSED,
-    shell_complete=complete_keystore_and_enclave,
-)
+@words_argument("[ROOT] NAME -- COMMAND...", required=False, type=click.UNPROCESSED)
 @click.option(
     "--policy",
     metavar="FILE",
@@ -449,13 +437,7 @@ class _WithCommandAfterDashes(_WithCommand):
 
 
 @verb("units", cls=_WithCommandAfterDashes)
-@click.argument(
-    "words",
-    metavar="[ROOT] [NAME...] FOLDER [-- COMMAND...]",
-    nargs=-1,
-    required=True,
-    shell_complete=complete_keystore_and_enclave,
-)
+@words_argument("[ROOT] [NAME...] FOLDER [-- COMMAND...]")
 @several_enclaves
 @click.option(
     "--job",
