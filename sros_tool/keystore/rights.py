@@ -10,16 +10,16 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import field
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from cryptography import x509
 
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
-from sros_tool.errors import DocumentError, KeystoreError, Note, PolicyError, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import load_fleet
@@ -41,21 +41,18 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import (
-    ALLOW,
-    RIGHTS,
     Policy,
-    Source,
     StatedProtection,
     stated_protections,
 )
-from sros_tool.policy.rights import Right, RightsDifference, compare, parts, policy_rights
+from sros_tool.policy.rights import Right, RightsDifference, compare, policy_rights
 from sros_tool.translate import grant_rights
-from sros_tool.translate_zenoh import StatedRight, rights_in_rules
 from sros_tool.values import Words, shows
 from sros_tool.xml import parse, read_bytes
-from sros_tool.zenoh.access import Enforcement
-from sros_tool.zenoh.configuration import Mode
-from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
+
+if TYPE_CHECKING:
+    from sros_tool.zenoh.access import Enforcement
+    from sros_tool.zenoh.document import ConfigurationDocument
 
 _COMMON_NAME = re.compile(r"(?:^|[,/])\s*CN\s*=\s*(/[^,]*?)\s*(?:,|$)")
 
@@ -129,6 +126,8 @@ def load_rights(
         )
     data = read_bytes(path, "file")
     if is_zenoh(data):
+        from sros_tool.zenoh.document import parse_configuration
+
         return _zenoh_rights(path, parse_configuration(data, str(path), lines=False))
     signed = b"multipart/signed" in data[:1000].lower()
     # read_policy says how a policy of an earlier format, with <profiles> at the top, is converted.
@@ -153,6 +152,9 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
         KeystoreError: there is no configuration of a router, or there are several.
         DocumentError: Zenoh would not accept a configuration.
     """
+    from sros_tool.zenoh.configuration import Mode
+    from sros_tool.zenoh.document import parse_configuration
+
     root = keystore.root
     files = {name: keystore.folder(name) for name in enclave_names(root, hidden=hidden)}
     routers = [name for name, folder in files.items() if (folder / ROUTER_FILE).is_file()]
@@ -202,6 +204,8 @@ def is_zenoh(data: bytes) -> bool:
 
 
 def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
+    from sros_tool.translate_zenoh import rights_in_rules
+
     access = document.access
     found = rights_in_rules(access)
     notes = []
@@ -371,39 +375,6 @@ def _left_out(grants: Iterable[Grant]) -> Iterator[Note]:
         if False in kinds[kinds.index(True) if True in kinds else len(kinds) :]:
             text = "a deny_rule after an allow_rule may have no effect: the first match decides."
             yield Note("rights.rule-order", text)
-
-
-def joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
-    """Return those of the ROS domains that signed permissions let an enclave join."""
-    allowed = grant.domains()
-    return tuple(domain for domain in domains if domain in allowed)
-
-
-def recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRight, ...]:
-    """Return the ROS rights that signed permissions give an enclave in a ROS domain.
-
-    A topic ``*`` without a ROS name, as ros2/sros2 grants it, stands for all topics and services if
-    it may be published and subscribed; other topics without a ROS name are not on Zenoh.
-
-    Raises:
-        PolicyError: it is uncertain which ROS names a denial is about.
-    """
-    source = Source(f"the permissions of {enclave}", 0)
-    rules = tuple(each for each in grant.rules if domain in each.domains.closed())
-    rights = grant_rights(enclave, replace(grant, rules=rules))
-    raw = {each for each in rights if not each.name.startswith("/")}
-    if unclear := sorted(each.describe() for each in raw if each.qualifier is not ALLOW):
-        raise PolicyError(
-            f"{source}: DENY {unclear[0]} cannot be said to Zenoh",
-            "It is a name of DDS, and not certainly one of ROS.",
-            "State the rights of the enclave in a policy, with `sros create_permission`.",
-        )
-    if {each.right for each in raw if each.name == "*"} == {"publish", "subscribe"}:
-        rights |= {
-            Right(enclave, ALLOW, right, "/*") for right in (*RIGHTS["topics"], *RIGHTS["services"])
-        }
-    parted = (part for each in rights - raw for part in parts(each))
-    return tuple([StatedRight(each, source) for each in sorted(set(parted))])
 
 
 # ── what is printed of a comparison ─────────────────────────────────────────────────────────

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from datetime import datetime
 from enum import Enum, StrEnum
 from pathlib import Path
@@ -33,13 +33,14 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave
-from sros_tool.keystore.rights import RecordedRights, joined_domains, recorded_rights
+from sros_tool.keystore.rights import RecordedRights
 from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
-from sros_tool.policy.model import ALLOW, RIGHTS, Enclave
-from sros_tool.policy.rights import Rules
+from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Source
+from sros_tool.policy.rights import Right, Rules, parts
+from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh import StatedRight, as_router, domains_of, remote_of, remote_rights
 from sros_tool.zenoh.access import AccessControl, Flow, Message, RemoteRights, joined
 from sros_tool.zenoh.configuration import (
@@ -184,8 +185,8 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
     if not is_session or state.grant is None:
         return ""
     control = configuration.access_control
-    domains = joined_domains(state.grant, domains_of(control))
-    stated = {each: recorded_rights(name, state.grant, each) for each in domains}
+    domains = _joined_domains(state.grant, domains_of(control))
+    stated = {each: _recorded_rights(name, state.grant, each) for each in domains}
     try:
         own = remote_of(name, stated)
     except SrosError as error:
@@ -468,7 +469,7 @@ class _RightsReader:
         grants |= issued
         joined = for_each(grants, lambda name: self._joined(grants[name]))
         stated = {
-            name: {domain: recorded_rights(name, grants[name], domain) for domain in domains}
+            name: {domain: _recorded_rights(name, grants[name], domain) for domain in domains}
             for name, domains in joined.items()
         }
         remotes = {name: self._remote(name, each) for name, each in stated.items()}
@@ -521,7 +522,7 @@ class _RightsReader:
         return grant
 
     def _joined(self, grant: Grant) -> tuple[int, ...]:
-        domains = joined_domains(grant, self._domains)
+        domains = _joined_domains(grant, self._domains)
         if not domains:
             raise KeystoreError("its permissions are for no domain of the network")
         return domains
@@ -627,3 +628,36 @@ def signed_path(path: str) -> str:
     """Return the path of the signed document next to a configuration."""
     folder, _, file = path.rpartition("/")
     return f"{folder}/{ZENOH_SIGNED[file]}"
+
+
+def _joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
+    """Return those of the ROS domains that signed permissions let an enclave join."""
+    allowed = grant.domains()
+    return tuple(domain for domain in domains if domain in allowed)
+
+
+def _recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRight, ...]:
+    """Return the ROS rights that signed permissions give an enclave in a ROS domain.
+
+    A topic ``*`` without a ROS name, as ros2/sros2 grants it, stands for all topics and services if
+    it may be published and subscribed; other topics without a ROS name are not on Zenoh.
+
+    Raises:
+        PolicyError: it is uncertain which ROS names a denial is about.
+    """
+    source = Source(f"the permissions of {enclave}", 0)
+    rules = tuple(each for each in grant.rules if domain in each.domains.closed())
+    rights = grant_rights(enclave, replace(grant, rules=rules))
+    raw = {each for each in rights if not each.name.startswith("/")}
+    if unclear := sorted(each.describe() for each in raw if each.qualifier is not ALLOW):
+        raise PolicyError(
+            f"{source}: DENY {unclear[0]} cannot be said to Zenoh",
+            "It is a name of DDS, and not certainly one of ROS.",
+            "State the rights of the enclave in a policy, with `sros create_permission`.",
+        )
+    if {each.right for each in raw if each.name == "*"} == {"publish", "subscribe"}:
+        rights |= {
+            Right(enclave, ALLOW, right, "/*") for right in (*RIGHTS["topics"], *RIGHTS["services"])
+        }
+    parted = (part for each in rights - raw for part in parts(each))
+    return tuple([StatedRight(each, source) for each in sorted(set(parted))])

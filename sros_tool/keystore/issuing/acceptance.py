@@ -11,7 +11,6 @@ evaluated for all.
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -176,6 +175,8 @@ def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
 
     The key is taken to be that of the certificate.
     """
+    import tempfile
+
     with tempfile.TemporaryDirectory(prefix="sros-") as folder:
         for file, data in files.items():
             write_new_file(Path(folder, file), data)
