@@ -9,7 +9,7 @@ Sources: ROS 2 design "Topic and Service Names" and "Actions"; rcl's ``validate_
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from sros_tool.errors import InvalidNameError
@@ -212,6 +212,23 @@ def expand(name: str, ns: str, node: str) -> str:
     return prefix + name
 
 
+def has_parts(text: str, parts: Sequence[str]) -> bool:
+    """Return whether a text begins with the first part, ends with the last, and has all in order.
+
+    Those are at least two, and do not overlap: what is between the ``*`` of an expression.
+    """
+    first, *middle, last = parts
+    at, end = len(first), len(text) - len(last)
+    if end < at or not text.startswith(first) or not text.endswith(last):
+        return False
+    for part in middle:
+        at = text.find(part, at, end)
+        if at < 0:
+            return False
+        at += len(part)
+    return True
+
+
 def action_part(name: str) -> tuple[str, str]:
     """Return the action that a service or topic belongs to, and its part, such as ``send_goal``.
 
@@ -294,3 +311,20 @@ def service_of(topic: str) -> tuple[str, str]:
     ):
         return "", ""
     return name.removesuffix(end), begin
+
+
+_RIGHTS_TO_USE = {
+    "rt": ("publish", "subscribe"),
+    "rq": ("request", "reply"),
+    "rr": ("reply", "request"),
+}
+"""By the prefix of a DDS topic: the right to write it, and the right to read it."""
+
+
+def right_to_use(topic: str, *, writes: bool) -> tuple[str, str]:
+    """Return the right to write or to read a DDS topic, and its ROS name; or "" and the topic."""
+    service, begin = service_of(topic)
+    name = service or (topic[2:] if topic.startswith("rt/") else "")
+    if not name:
+        return "", topic
+    return _RIGHTS_TO_USE[begin or "rt"][not writes], name

@@ -45,7 +45,7 @@ class Provenance(StrEnum):
     """The answer is about the policy; nothing is signed yet."""
 
 
-@shows("file", "line", "qualifier", "right", "name", "protection")
+@shows("source", "qualifier", "right", "name", "protection", spread=("source",))
 class PolicyLine(NamedTuple):
     """A line.
 
@@ -63,16 +63,6 @@ class PolicyLine(NamedTuple):
     profile: Profile
 
     @property
-    def file(self) -> str:
-        """The file."""
-        return self.source.file
-
-    @property
-    def line(self) -> int:
-        """The line, from 1."""
-        return self.source.line
-
-    @property
     def protection(self) -> Annotated[str, Words(("sign", "encrypt"))] | None:
         """The protection that it demands at least, or null."""
         return self.group.protect.lower() if self.group.protect else None
@@ -87,23 +77,13 @@ class PolicyLine(NamedTuple):
         return f"{self.qualifier.value} {self.right} {self.name}"
 
 
-@shows("file", "line", "xml")
+@shows("source", "xml", spread=("source",))
 class GroupEdit(NamedTuple):
     """A group."""
 
     source: Source
     xml: str
     """Its new text; empty to remove it."""
-
-    @property
-    def file(self) -> str:
-        """The file."""
-        return self.source.file
-
-    @property
-    def line(self) -> int:
-        """The line, from 1."""
-        return self.source.line
 
 
 @shows(null_if_empty=("document",))

@@ -40,6 +40,7 @@ from sros_tool.names import (
     is_expression,
     node_of_service,
     nodes_served,
+    right_to_use,
     service_of,
 )
 from sros_tool.policy.model import Policy
@@ -185,14 +186,11 @@ def _is_ros(topic: str) -> bool:
 
 
 def _right(denial: Denial) -> NodeRight:
-    service, begin = service_of(denial.topic)
-    if not service:
-        return NodeRight(denial.direction, denial.topic[2:])
-    client = (begin == "rq") == (denial.direction == PUBLISH)
-    action, part = action_part(service)
-    if action and part in ACTION_SERVICES:
-        return NodeRight("call" if client else "execute", action)
-    return NodeRight("request" if client else "reply", service)
+    right, name = right_to_use(denial.topic, writes=denial.direction == PUBLISH)
+    action, part = action_part(name)
+    if right in ("request", "reply") and action and part in ACTION_SERVICES:
+        return NodeRight("call" if right == "request" else "execute", action)
+    return NodeRight(right, name)
 
 
 def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:

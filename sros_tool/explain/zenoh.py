@@ -60,12 +60,6 @@ _OF_TLS = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)
 """The files of an enclave that a process on Zenoh needs; those of DDS do not count."""
 _ANY_TYPE = "type/hash"
 """Type and hash at the end of a key: rules that sros writes hold for all of them."""
-_OTHER_SIDE = {
-    "publish": "subscribe",
-    "subscribe": "publish",
-    "request": "reply",
-    "reply": "request",
-}
 
 
 class _Outcome(StrEnum):

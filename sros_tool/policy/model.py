@@ -23,6 +23,8 @@ RIGHTS: dict[str, tuple[str, str]] = {
     "actions": ("call", "execute"),
 }
 """The kinds of groups, and the two rights that a group of each kind allows or denies."""
+OTHER_SIDE = {one: other for pair in RIGHTS.values() for one, other in (pair, pair[::-1])}
+"""For each right, the right at the other end."""
 
 
 class Qualifier(StrEnum):

@@ -20,7 +20,7 @@ from operator import and_
 from typing import TYPE_CHECKING
 
 from sros_tool.errors import DocumentError
-from sros_tool.names import is_expression
+from sros_tool.names import has_parts, is_expression
 
 if TYPE_CHECKING:
     from sros_tool.automata import Letters, NameSet
@@ -45,19 +45,8 @@ def matches(expression: str, name: str) -> bool:
     if "?" in expression or "[" in expression:
         return compiled(expression).match(name) is not None
     # To compile an expression takes much longer than to look for its parts once.
-    first, *others = expression.split("*")
-    if not others:
-        return expression == name
-    *middle, last = others
-    at, end = len(first), len(name) - len(last)
-    if end < at or not name.startswith(first) or not name.endswith(last):
-        return False
-    for part in middle:
-        at = name.find(part, at, end)
-        if at < 0:
-            return False
-        at += len(part)
-    return True
+    parts = expression.split("*")
+    return expression == name if len(parts) == 1 else has_parts(name, parts)
 
 
 def literal_prefix(expression: str) -> str:

@@ -16,8 +16,14 @@ from functools import lru_cache
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.dataclass import dataclass
-from sros_tool.names import ROS_DISCOVERY_TOPIC, SERVICE_ENDS, dds_names, is_expression, service_of
-from sros_tool.policy.model import RIGHTS
+from sros_tool.names import (
+    ROS_DISCOVERY_TOPIC,
+    SERVICE_ENDS,
+    dds_names,
+    is_expression,
+    right_to_use,
+)
+from sros_tool.policy.model import OTHER_SIDE, RIGHTS
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.requirements import (
@@ -410,7 +416,7 @@ def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Wit
         for enclave in enclaves:
             more = world.side(writes).of[enclave] - allowed - ordinary
             if topic := world.any_example(more, limit):
-                right, name = _in_ros_terms(topic, writes=writes)
+                right, name = right_to_use(topic, writes=writes)
                 use = Use(enclave, right, name, topic, writes)
                 found[enclave] = min(use, found.get(enclave, use), key=_better)
     return _first_of(found.values())
@@ -481,31 +487,11 @@ def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness 
 def _uses(hop: TopicHop) -> Iterator[Use]:
     """Yield the use that writes and the use that reads."""
     for enclave, writes in ((hop.source, True), (hop.target, False)):
-        right, name = _in_ros_terms(hop.topic, writes=writes)
+        right, name = right_to_use(hop.topic, writes=writes)
         yield Use(enclave, right, name, hop.topic, writes)
 
 
-_OF_PREFIX = {
-    "rt": ("publish", "subscribe"),
-    "rq": ("request", "reply"),
-    "rr": ("reply", "request"),
-}
-"""By the prefix of a DDS topic: the right to write it, and the right to read it."""
-
-
-def _in_ros_terms(topic: str, *, writes: bool) -> tuple[str, str]:
-    """Return the right to write or to read a DDS topic, and its ROS name; or "" and the topic."""
-    service, begin = service_of(topic)
-    name = service or (topic[2:] if topic.startswith("rt/") else "")
-    if not name:
-        return "", topic
-    return _OF_PREFIX[begin or "rt"][not writes], name
-
-
 # ── requirements that cannot fail ──────────────────────────────────────────────────────────
-
-OTHER_SIDE = {one: other for pair in RIGHTS.values() for one, other in (pair, pair[::-1])}
-"""For each right, the right at the other end."""
 
 
 def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterator[str]:

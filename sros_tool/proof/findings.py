@@ -20,9 +20,9 @@ from sros_tool.names import (
     is_expression,
     service_of,
 )
-from sros_tool.policy.model import RIGHTS, Level, Source
+from sros_tool.policy.model import OTHER_SIDE, RIGHTS, Level, Source
 from sros_tool.policy.rights import KIND_OF, Right
-from sros_tool.proof.decide import OTHER_SIDE, Use, Verdict, Witness, Worlds, influencers
+from sros_tool.proof.decide import Use, Verdict, Witness, Worlds, influencers
 from sros_tool.proof.requirements import (
     Apart,
     AtMost,

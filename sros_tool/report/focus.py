@@ -22,7 +22,7 @@ from sros_tool.dds.governance import Governance
 from sros_tool.errors import UsageError
 from sros_tool.keystore.selection import likely_names
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
-from sros_tool.policy.model import ALLOW, DENY, Qualifier
+from sros_tool.policy.model import ALLOW, DENY, OTHER_SIDE, Qualifier
 from sros_tool.policy.patterns import matches, overlap
 from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_text, unguarded
@@ -69,13 +69,6 @@ _VERBS = {
     "dds": ("write DDS topic", "writer", "read"),
 }
 """By kind of name: what senders do, what they are, and what receivers do."""
-_OTHER_SIDE = {
-    "publish": "subscribe",
-    "request": "reply",
-    "reply": "request",
-    "call": "execute",
-    "execute": "call",
-}
 _ONE_WAY = ("publish", "subscribe")
 _COMMANDS = ("send_goal", "cancel_goal")
 _NAMED = 3  # enclaves that a sentence names; of more it says the number
@@ -311,7 +304,7 @@ class _System:
         for hop in {hop for path in self._paths for hop in path}:
             for enclave, right, stated, fits in (
                 (hop.source, hop.right, hop.said, _may_write),
-                (hop.target, _OTHER_SIDE[hop.right], hop.heard, _may_read),
+                (hop.target, OTHER_SIDE[hop.right], hop.heard, _may_read),
             ):
                 if (enclave, hop.kind, hop.name, fits) not in drawn:
                     by = () if stated == hop.name else (stated,)

@@ -13,6 +13,7 @@ from functools import cached_property, lru_cache
 from itertools import count
 
 from sros_tool.automata import Automaton, Letters, NameSet
+from sros_tool.names import has_parts
 
 ANY_PART, ANY_CHUNKS = "$*", "**"
 _ANY_CHUNK = "*"
@@ -178,19 +179,8 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
         return True
     if narrow == _ANY_CHUNK:
         return False
-    first, *others = wide.split(ANY_PART)
     # "\0" is no character of a key: what only a wildcard includes.
-    text = narrow.replace(ANY_PART, "\0")
-    *middle, last = others
-    at, end = len(first), len(text) - len(last)
-    if end < at or not text.startswith(first) or not text.endswith(last):
-        return False
-    for part in middle:
-        at = text.find(part, at, end)
-        if at < 0:
-            return False
-        at += len(part)
-    return True
+    return has_parts(narrow.replace(ANY_PART, "\0"), wide.split(ANY_PART))
 
 
 def widest(expression: str) -> str:
