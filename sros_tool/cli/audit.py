@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 @observing_options("Observe a robot that is secured already, in this enclave.")
 @click.option(
     "--vendor",
-    type=click.Choice([each.value for each in Vendor]),
+    type=click.Choice([vendor.value for vendor in Vendor]),
     help="The vendor whose decision counts. [default: the vendor of this machine's RMW]",
 )
 @click.option(

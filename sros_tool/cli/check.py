@@ -69,7 +69,7 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     """Complete the ids of findings."""
     from sros_tool.checks.registry import all_kinds
 
-    return [each for each in all_kinds() if each.startswith(incomplete)]
+    return [kind_id for kind_id in all_kinds() if kind_id.startswith(incomplete)]
 
 
 @verb("check")
@@ -143,7 +143,7 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
 )
 @click.option(
     "--vendor",
-    type=click.Choice([*(each.value for each in MEASURED), "zenoh"]),
+    type=click.Choice([*(vendor.value for vendor in MEASURED), "zenoh"]),
     help="Leave out findings that concern only other DDS vendors, or only DDS.",
 )
 @click.option(
@@ -287,8 +287,8 @@ def check(
         every = _findings(family, paths, at)
         if decide:
             every += decide(lambda path: _system(path, at, vendor, template))
-        found = [_shown(each) for each in every]
-    chosen = selection.choose(found)
+        findings = [_shown(finding) for finding in every]
+    chosen = selection.choose(findings)
     if form == "text" and at.fleet:
         _print_text(chosen, _with_enclaves(at.fleet, paths))
     else:
@@ -330,8 +330,8 @@ def _status(chosen: ChosenFindings, fail_on: str) -> int:
 
     if fail_on == "never":
         return 0
-    failing = [each for each in chosen.shown if each.severity >= Severity[fail_on.upper()]]
-    if failing and all(each.id == "runtime.process-not-seen" for each in failing):
+    failing = [finding for finding in chosen.shown if finding.severity >= Severity[fail_on.upper()]]
+    if failing and all(finding.id == "runtime.process-not-seen" for finding in failing):
         return NOT_DONE
     return 1 if failing else 0
 
@@ -464,14 +464,14 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
     if paths:
         every = (finding for path in paths for finding in path_findings(path, at))
         return list(dict.fromkeys(every))
-    found = _runtime(at)
+    findings = _runtime(at)
     root = os.environ.get("ROS_SECURITY_KEYSTORE")
     if root and is_keystore(Path(root)):
-        found += path_findings(Path(root), at)
+        findings += path_findings(Path(root), at)
     elif not root:
         looked = "checked the runtime only: no path is given and ROS_SECURITY_KEYSTORE is not set"
         echo(looked, err=True)
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(findings))
 
 
 def _runtime(at: Circumstances) -> list[Finding]:
@@ -504,7 +504,7 @@ def _findings_here(
 
 def _shown(finding: Finding) -> Finding:
     """Return the finding; files below the working directory get relative paths."""
-    related = tuple(replace(each, file=_relative(each.file)) for each in finding.related)
+    related = tuple(replace(place, file=_relative(place.file)) for place in finding.related)
     return replace(finding, file=_relative(finding.file), related=related)
 
 
@@ -529,7 +529,7 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     if form == "json":
         print_json(expiring_enclaves(due, unreadable))
     else:
-        lines = [describe_lifetime(each, moment) for each in due]
+        lines = [describe_lifetime(enclave, moment) for enclave in due]
         lines += [f"{other.name}  unknown: {other.error}" for other in unreadable]
         none = "the 1 enclave does not need" if count == 1 else ""
         none = f"{none or f'none of {count} enclaves needs'} to be renewed ({text})"
@@ -579,14 +579,16 @@ def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Findi
     """
     from sros_tool.fleet.enclaves import path_of_robots
 
-    found: dict[object, list[tuple[Finding, str]]] = {}
+    groups: dict[object, list[tuple[Finding, str]]] = {}
     number: Counter[object] = Counter()
-    for each in findings:
-        path, robot = path_of_robots(fleet, each.subject)
-        place = (each.id, each.file, each.line, each.accepted, each.remedy)
-        number[each.subject, place] += 1  # of several that an enclave has there
-        found.setdefault((place, path, number[each.subject, place]), []).append((each, robot))
-    for (first, _), *others in found.values():
+    for finding in findings:
+        path, robot = path_of_robots(fleet, finding.subject)
+        place = (finding.id, finding.file, finding.line, finding.accepted, finding.remedy)
+        number[finding.subject, place] += 1  # of several that an enclave has there
+        groups.setdefault((place, path, number[finding.subject, place]), []).append(
+            (finding, robot)
+        )
+    for (first, _), *others in groups.values():
         robots = [robot for _, robot in others]
         more = ", ..." if len(robots) > _MOST_ROBOTS else ""
         count = counted(len(robots), "more robot")
@@ -609,11 +611,13 @@ def _print_text(chosen: ChosenFindings, fleet: Fleet | None = None) -> None:
         if len(group) > 1:
             echo_findings(group)
     single = [group[0] for group in groups if len(group) == 1]
-    for each, others in _by_robot(single, fleet) if fleet else ((each, "") for each in single):
-        echo_findings([each])
+    for finding, others in (
+        _by_robot(single, fleet) if fleet else ((finding, "") for finding in single)
+    ):
+        echo_findings([finding])
         if others:
             echo(f"    {others}")
-    for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
+    for choice in dict.fromkeys(finding.accepted for finding in chosen.accepted):
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
         echo(f"accepted by the {choice}: {kinds_text}")
@@ -642,9 +646,9 @@ def _print_kinds(selection: FindingFilter, form: str) -> None:
     if form != "text":
         print_json(AllKinds(kinds))
         return
-    width = max((len(each.id) for each in kinds), default=0)
-    for each in kinds:
-        echo(f"{each.id:{width}}  {each.severity.word:7}  {each.title}")
+    width = max((len(kind.id) for kind in kinds), default=0)
+    for kind in kinds:
+        echo(f"{kind.id:{width}}  {kind.severity.word:7}  {kind.title}")
 
 
 @shows(spread=("diagnosis",))
@@ -722,16 +726,16 @@ def doctor(report: Path | None, force: bool, as_json: bool) -> None:
         echo_lines(diagnosis_text(diagnosis))
         if provider:
             echo(str(provider))
-        for each in findings:
-            if each.severity >= WARNING:
+        for finding in findings:
+            if finding.severity >= WARNING:
                 echo("")
-                echo_findings([each])
+                echo_findings([finding])
     if report:
         lines = _report_sections(diagnosis, provider, findings)
         text = support_report(os.environ, lines, secrets=taken_secrets())
         document = visible(text).encode("utf-8", "backslashreplace")
         echo(f"{save(report, document)}; read it before you attach it", err=True)
-    if not diagnosis.sound or any(each.severity >= ERROR for each in findings):
+    if not diagnosis.sound or any(finding.severity >= ERROR for finding in findings):
         sys.exit(1)
 
 
@@ -741,11 +745,13 @@ def _report_sections(
     """Return the lines of a support report; of findings only what is the same for all users."""
     words = {True: "enforces security", False: "does not enforce", None: "could not be tried"}
     stacks = [
-        f"{each.name}: {words[each.enforces]}. {each.dds} {each.version}. {each.evidence}"
-        for each in diagnosis.stacks
-        if each.present
+        f"{stack.name}: {words[stack.enforces]}. {stack.dds} {stack.version}. {stack.evidence}"
+        for stack in diagnosis.stacks
+        if stack.present
     ]
-    counted = Counter((each.severity.word, each.id, each.kind.title) for each in findings)
+    counted = Counter(
+        (finding.severity.word, finding.id, finding.kind.title) for finding in findings
+    )
     return {
         "DDS": [*stacks, diagnosis.conclusion],
         "ros2 security": [str(provider)] if provider else [],
@@ -785,10 +791,10 @@ def _watch_processes(
             running = table.look(moment)
             if judged is None or judged[0] != running or moment - judged[1] >= _AGAIN:
                 judged = running, moment
-                found = process_findings(
+                findings = process_findings(
                     environment, running, now=moment, zone=zone, one_by_one=True
                 )
-                for change in news.changes(selection.choose(found).shown, moment):
+                for change in news.changes(selection.choose(findings).shown, moment):
                     if as_json:
                         line = json.dumps(versioned(change), ensure_ascii=False)
                         echo_lines(visible_json(line))

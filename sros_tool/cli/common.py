@@ -554,8 +554,8 @@ def local_zone(environment: Mapping[str, str]) -> tzinfo:
 
     name = environment.get("TZ", "").removeprefix(":")
     if not name and _LOCALTIME.exists():
-        _, found, name = str(_LOCALTIME.resolve()).partition("zoneinfo/")
-        name = name if found else ""
+        _, marker, name = str(_LOCALTIME.resolve()).partition("zoneinfo/")
+        name = name if marker else ""
     if name:
         from zoneinfo import ZoneInfo
 

@@ -251,17 +251,17 @@ def verify(
     if as_json:
         print_json(arrival.verified(moment, wanted))
         return 1 if arrival.findings else 0
-    for each in arrival.enclaves:
-        until = f" until {iso(each.valid_until)}" if each.valid_until else ""
+    for enclave in arrival.enclaves:
+        until = f" until {iso(enclave.valid_until)}" if enclave.valid_until else ""
         state = (
-            f"loadable in domain {each.domains}{until}"
-            if each.loadable
+            f"loadable in domain {enclave.domains}{until}"
+            if enclave.loadable
             else "its key is on its robot: verify it there"
-            if each.key_on_robot
+            if enclave.key_on_robot
             else Coloured("NOT LOADABLE")
         )
-        place = f", key on the token {each.token}" if each.token else ""
-        echo(f"{each.name}  ", state, place)
+        place = f", key on the token {enclave.token}" if enclave.token else ""
+        echo(f"{enclave.name}  ", state, place)
     for finding in arrival.findings:
         echo_findings([finding])
     return 1 if arrival.findings else 0

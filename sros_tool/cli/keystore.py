@@ -155,9 +155,9 @@ def _check_order(root: Path, names: Sequence[str], file: Path) -> None:
     from sros_tool.keystore.layout import is_keystore
 
     paths = [
-        each
-        for each in names
-        if is_keystore(Path(each)) or (not each.startswith("/") and os.path.lexists(each))
+        word
+        for word in names
+        if is_keystore(Path(word)) or (not word.startswith("/") and os.path.lexists(word))
     ]
     if not (paths or is_keystore(file) or root.is_file()):
         return
@@ -247,7 +247,7 @@ def generate_artifacts(
     if template_name is not None and is_keystore(root):
         refuse_other_template(root, template)
     total = len(enclaves) + sum(
-        len(each if isinstance(each, FleetPolicy) else each.enclaves) for each in policies
+        len(policy if isinstance(policy, FleetPolicy) else policy.enclaves) for policy in policies
     )
     with progress("signing", total) as step:
         result = generate(
@@ -366,7 +366,7 @@ def list_enclaves(
     else:
         every = enclave_names(root, hidden=True)
         hidden = hidden_enclaves(root, every)
-        names = tuple(each for each in every if "/." not in each)
+        names = tuple(name for name in every if "/." not in name)
     if as_json:
         from sros_tool.keystore.reader import Keystore
         from sros_tool.keystore.selection import EnclaveList, robots_of
@@ -574,22 +574,22 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
     from sros_tool.keystore.template import EVERYTHING
 
     change = f"`sros update_keystore {quote(str(root))} --template production`"
-    found = []
+    notes = []
     if template.default_permissions == EVERYTHING:
         text = (
             f"by the template {template.name}, an enclave without a policy may publish, subscribe "
             "and call everything; restrict it with `sros create_permission` and a policy, or the "
             f"whole keystore with {change}."
         )
-        found.append(Note("keystore.open-permissions", text))
+        notes.append(Note("keystore.open-permissions", text))
     if not template.separate_authorities:
         text = (
             "with one CA for both, an enclave can sign its own permissions, and Cyclone DDS 0.10.2 "
             "and Fast DDS 2.9.1 accept them; create the keystore with `--ca-layout separate`, or "
             f"change it with {change}."
         )
-        found.append(Note("keystore.single-ca", text))
-    return found
+        notes.append(Note("keystore.single-ca", text))
+    return notes
 
 
 @verb("update_keystore")
@@ -697,12 +697,12 @@ def update_keystore(
     if trust_records:
         from sros_tool.keystore.lifecycle.update import trust_records as trust
 
-        if next_stage or any(each not in (None, (), False) for each in chosen):
+        if next_stage or any(value not in (None, (), False) for value in chosen):
             raise UsageError("--trust-records changes nothing else", "", "Give it alone.")
         update = trust(root, now=now(), keyring=keyring(), dry_run=dry_run)
         _show_update(update, (), "", as_json)
         return 0
-    if not any(each not in (None, (), False) for each in chosen):
+    if not any(value not in (None, (), False) for value in chosen):
         again = f"sros update_keystore {quote(str(root))} --template production --next"
         raise UsageError(
             "no change is named",
@@ -730,9 +730,9 @@ def update_keystore(
         target = present.undone() if discard_edits else present.base()
     target = with_values(
         target,
-        [_key_and_value(each) for each in values],
-        [_named_rule(each) for each in rules],
-        [_kind_and_name(each.split()) for each in dropped],
+        [_key_and_value(value) for value in values],
+        [_named_rule(rule) for rule in rules],
+        [_kind_and_name(words.split()) for words in dropped],
     )
     if domain is not None:
         domains = DomainSet.parse(domain, "--domain")
@@ -802,7 +802,7 @@ def _named_rule(text: str) -> NamedValues:
             f"{text!r} is not a rule", "", "Write 'topic /camera/* data=NONE metadata=SIGN'."
         )
     kind, name = _kind_and_name(words[:2])
-    return NamedValues(kind, name, tuple(_key_and_value(each) for each in words[2:]))
+    return NamedValues(kind, name, tuple(_key_and_value(word) for word in words[2:]))
 
 
 def _show_update(update: KeystoreUpdate, undone: Sequence[str], again: str, as_json: bool) -> None:

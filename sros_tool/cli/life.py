@@ -143,7 +143,7 @@ def _complete_reason(
     """Complete the revocation reasons of RFC 5280."""
     from sros_tool.pki.crl import REASONS
 
-    return [each for each in REASONS if each.startswith(incomplete)]
+    return [reason for reason in REASONS if reason.startswith(incomplete)]
 
 
 @verb("revoke")
@@ -261,7 +261,9 @@ def crl(
         print_follow_up(result, restart=not dry_run)
     keystore = Keystore(root)
     lists = keystore.revocation_lists
-    soon = bool(lists) and min(each.next_update for each in lists) - now() < timedelta(days=30)
+    soon = bool(lists) and min(revoked.next_update for revoked in lists) - now() < timedelta(
+        days=30
+    )
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_lists
 
@@ -292,11 +294,11 @@ def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> It
     from sros_tool.pki.certificates import subject_text
     from sros_tool.validity import iso
 
-    found, *others = lists
-    yield f"revocation list {found.number}, until {iso(found.next_update)}"
-    for each in found.revoked:
-        serial = f"{each.serial:x}"
-        yield f"  {serial}  {iso(each.date)}  {each.reason}  {names.get(serial, '')}".rstrip()
+    newest, *others = lists
+    yield f"revocation list {newest.number}, until {iso(newest.next_update)}"
+    for entry in newest.revoked:
+        serial = f"{entry.serial:x}"
+        yield f"  {serial}  {iso(entry.date)}  {entry.reason}  {names.get(serial, '')}".rstrip()
     for other in others:  # of the other CA during a rotation
         yield (
             f"next to it, list {other.number} of the other CA, "
@@ -484,7 +486,7 @@ def _print_step(
             err=True,
         )
         return
-    reissued = any(each.path.endswith("/cert.pem") for each in step.changes)
+    reissued = any(change.path.endswith("/cert.pem") for change in step.changes)
     done = f"{_DONE['reissue']}, and " if together and reissued else ""
     echo(f"{done}{_DONE[step.stage]}: {', '.join(step.files)}")
     for place in step.kept_elsewhere:
@@ -529,14 +531,14 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
         print_json(shown_status(status, None if isinstance(unconfirmed, str) else unconfirmed))
         return
     echo(f"stage: {rotation.stage}, next: {rotation.next_stage()}")
-    for each in status.authorities:
-        name = f"{each.roles[0]} CA" if len(each.roles) == 1 else "CA"
-        end = f"until {iso(each.validity.not_after)}"
-        if each.validity.not_after < now():
-            end = f"EXPIRED {iso(each.validity.not_after)}"
+    for authority in status.authorities:
+        name = f"{authority.roles[0]} CA" if len(authority.roles) == 1 else "CA"
+        end = f"until {iso(authority.validity.not_after)}"
+        if authority.validity.not_after < now():
+            end = f"EXPIRED {iso(authority.validity.not_after)}"
         echo(
-            f"  {name:14} {each.state:7} {each.enclaves} of {status.enclaves} enclaves  {end}"
-            f"  {each.subject} (SHA-256 {each.sha256[:8]})"
+            f"  {name:14} {authority.state:7} {authority.enclaves} of {status.enclaves} enclaves"
+            f"  {end}  {authority.subject} (SHA-256 {authority.sha256[:8]})"
         )
     if isinstance(unconfirmed, str):
         echo(f"which robots confirmed this stage is unknown: {unconfirmed}")
@@ -554,7 +556,7 @@ def _new_keys(identity: str | None, permissions: str | None, encrypt: bool) -> K
     from dataclasses import replace
 
     named = {"identity": identity, "permissions": permissions}
-    found = keyring(identity, permissions, encrypt=encrypt)
+    given = keyring(identity, permissions, encrypt=encrypt)
     return replace(
-        found, places={role: place for role, place in found.places.items() if named[role]}
+        given, places={role: place for role, place in given.places.items() if named[role]}
     )

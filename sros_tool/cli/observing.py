@@ -204,7 +204,7 @@ def _until_signalled() -> Iterator[Callable[[], bool]]:
     def note(number: int, _frame: object) -> None:
         came.append(number)
 
-    before = {each: signal.signal(each, note) for each in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(came)
     finally:
@@ -440,11 +440,11 @@ def generate_policy(
         secured=enclave is not None,
         then="the policy is written",
     )
-    found = named(snapshot.observation)
-    learned = learn(found.observation, None if flat else common).noting(found.notes)
+    seen = named(snapshot.observation)
+    learned = learn(seen.observation, None if flat else common).noting(seen.notes)
     if not learned.profiles:
         if as_json:
-            print_json(_printed(None, file, learned, found.observation, dry_run))
+            print_json(_printed(None, file, learned, seen.observation, dry_run))
         echo(_NO_NODES, err=True)
         print_notes(learned.notes)
         echo(why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
@@ -453,10 +453,10 @@ def generate_policy(
     if not dry_run:
         write(plan)
     if as_json:
-        print_json(_printed(plan, file, learned, found.observation, dry_run))
+        print_json(_printed(plan, file, learned, seen.observation, dry_run))
     else:
         _show(plan, learned, written=not dry_run)
-    if gone := sorted(each for each in snapshot.gone if not is_tool_name(each.rpartition("/")[2])):
+    if gone := sorted(node for node in snapshot.gone if not is_tool_name(node.rpartition("/")[2])):
         text = f"left out, because these nodes went while the graph was observed: {listed(gone)}"
         echo(f"{text}; --watch keeps them.", err=True)
     if not snapshot.settled:

@@ -293,7 +293,7 @@ def _difference_lines(
 
     lines: list[tuple[str, str, str]] = []
     for sign, right in difference.lines():
-        by = ", ".join(each.describe() for each in difference.covered.get(right, ()))
+        by = ", ".join(cover.describe() for cover in difference.covered.get(right, ()))
         remark = f"  ({'B' if sign == '-' else 'A'} has it by {by})" if by else ""
         lines.append((sign, right.enclave, f"{sign} {right}{remark}"))
     if first is None and second is None:
@@ -442,7 +442,7 @@ def _as_written(value: Any) -> Any:
     from sros_tool.fleet.expansion import as_written
 
     if isinstance(value, dict):
-        return {key: _as_written(each) for key, each in value.items()}
+        return {key: _as_written(part) for key, part in value.items()}
     if isinstance(value, list):
         return list(map(_as_written, value))
     return as_written(value) if isinstance(value, str) else value
@@ -535,7 +535,7 @@ def policies(
         return 0
     width = max(len(path.name) for path in shipped)
     for path, policy in shipped.items():
-        echo(f"{path.name:{width}}  {', '.join(each.path for each in policy.enclaves)}")
+        echo(f"{path.name:{width}}  {', '.join(enclave.path for enclave in policy.enclaves)}")
     echo(f"they are in '{source}'", err=True)
     return 0
 
@@ -582,7 +582,7 @@ def _convert(
     if complete:
         policy = with_node_rights(policy, policies_dir())
     document = checked_text(policy, output or earlier, "converted")
-    names = ", ".join(each.path for each in policy.enclaves)
+    names = ", ".join(enclave.path for enclave in policy.enclaves)
     changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, document) if output and not dry_run else ""
     if as_json:

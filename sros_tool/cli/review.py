@@ -231,9 +231,9 @@ def review(
 
         steps = [
             StepResult(
-                each.kind, result.shown(each.subject) or None, each.status, _sentence(result, each)
+                step.kind, result.shown(step.subject) or None, step.status, _sentence(result, step)
             )
-            for each in result.steps
+            for step in result.steps
         ]
         print_json(
             ReviewResult(
@@ -241,7 +241,7 @@ def review(
                 result.head,
                 result.status,
                 steps,
-                findings=[result.shown_finding(each) for each in result.findings],
+                findings=[result.shown_finding(finding) for finding in result.findings],
                 left_out=result.left_out,
             )
         )
@@ -261,10 +261,10 @@ class _Outputs:
         """Check the files.  Raises `UsageError`."""
         self._summary, self._sarif = summary, sarif
         self._top = repository.top() or repository.folder
-        named = [each for each in (summary, sarif) if each]
+        named = [file for file in (summary, sarif) if file]
         for file in named:
             _check_outside(file, self._top)
-        if len({each.absolute() for each in named}) < len(named):
+        if len({file.absolute() for file in named}) < len(named):
             raise UsageError("--summary and --sarif name the same file")
 
     def write(self, result: Review, request: ReviewRequest) -> None:
@@ -358,7 +358,7 @@ def _text(result: Review) -> list[str]:
 
 def _verdict(result: Review) -> str:
     """Return the result in one sentence, with what it leaves out."""
-    counts = [sum(each.status == status for each in result.steps) for status in (1, 2)]
+    counts = [sum(step.status == status for step in result.steps) for status in (1, 2)]
     words = [
         f"{counted(count, 'step')} {word}"
         for count, word in zip(counts, ("failed", "could not be decided"), strict=True)
@@ -375,10 +375,10 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
 
     verdict = _WORDS[result.status] if result.status != 1 else "something found"
     lines = (
-        f"{_SIGNS[each.status]} {_TITLES[each.kind]}"
-        f"{' ' + code(result.shown(each.subject)) if each.subject else ''}: "
-        f"{code(_sentence(result, each))}"
-        for each in _by_weight(result)
+        f"{_SIGNS[step.status]} {_TITLES[step.kind]}"
+        f"{' ' + code(result.shown(step.subject)) if step.subject else ''}: "
+        f"{code(_sentence(result, step))}"
+        for step in _by_weight(result)
     )
     count = len(result.left_out)
     out = f", but {count} thing{'s were' if count > 1 else ' was'} left out:" if count else ""
@@ -396,13 +396,13 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
         if detail:
             parts.append(detail)
             room -= len(detail) + 2
-    return "\n\n".join(each.rstrip("\n") for each in parts) + "\n"
+    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
 def _by_weight(result: Review) -> list[ReviewStep]:
     """Return the steps, those that fail first, and of them what matters most."""
     kinds = list(_TITLES)
-    return sorted(result.steps, key=lambda each: (not each.status, kinds.index(each.kind)))
+    return sorted(result.steps, key=lambda step: (not step.status, kinds.index(step.kind)))
 
 
 def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
@@ -438,8 +438,8 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             title = "### The requirements change: these are decided as they were before"
             return f"{title}\n\n{findings(chosen)}"
         case ExpiryCheck(due=due, unreadable=unreadable):
-            lines = [describe_lifetime(each, request.at) for each in due]
-            lines += [f"{each.name}  unknown: {each.error}" for each in unreadable]
+            lines = [describe_lifetime(lifetime, request.at) for lifetime in due]
+            lines += [f"{enclave.name}  unknown: {enclave.error}" for enclave in unreadable]
             return renewal_markdown(lines, "", "as asked") if lines else ""
         case Facts(lines=facts):
             said = (f"{code(name)} {code(text)}" for text, name in facts)

@@ -126,9 +126,9 @@ _FORMS = ("sh", "fish", "json", "systemd", "docker", *CONTAINER_FORMS)
 def _form_of(arguments: Sequence[str]) -> str:
     """Return the form that arguments ask for which could not be parsed."""
     named = (
-        each.removeprefix("--format=")
-        for each, before in zip(arguments, ["", *arguments], strict=False)
-        if each.startswith("--format=") or before == "--format"
+        word.removeprefix("--format=")
+        for word, before in zip(arguments, ["", *arguments], strict=False)
+        if word.startswith("--format=") or before == "--format"
     )
     return next((form for form in named if form in _FORMS), _FORMS[0])
 
@@ -443,7 +443,7 @@ class _WithCommandAfterDashes(_WithCommand):
     "--job",
     "jobs",
     multiple=True,
-    type=click.Choice([each.value for each in Job]),
+    type=click.Choice([job.value for job in Job]),
     help="A timer that renews what expires within 30 days, checks the keystore each day, or "
     "writes metrics every 15 minutes: of the keystore, or of `sros fleet status` (fleet); guard is "
     "no timer, and watches all ROS processes of the machine, as root.  Can be repeated.",

@@ -261,8 +261,8 @@ def _show_from(
     else:
         for line in _lines(document, rights):
             echo(line)
-        for each in shown:
-            echo_findings([each])
+        for finding in shown:
+            echo_findings([finding])
         if output and dry_run:
             echo(f"would {changes[0].action} {output}")
     print_notes(notes)
