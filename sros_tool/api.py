@@ -236,16 +236,16 @@ def _fleet_policies(policies: Iterable[AnyPath | Policy], fleet: AnyPath) -> lis
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.policy.document import read_policy
 
-    robots, found = read_fleet(Path(fleet)), []
-    for each in policies:
-        if not isinstance(each, str | PathLike):
+    robots, read = read_fleet(Path(fleet)), []
+    for policy in policies:
+        if not isinstance(policy, str | PathLike):
             raise UsageError(
                 "a policy that was read already has no placeholders for a fleet",
                 "",
                 "Pass the path of its file.",
             )
-        found.append(FleetPolicy(read_policy(Path(each), placeholders=True), robots))
-    return found
+        read.append(FleetPolicy(read_policy(Path(policy), placeholders=True), robots))
+    return read
 
 
 def fleet_status(
@@ -274,14 +274,14 @@ def fleet_status(
 
     Example:
         >>> status = sros_tool.fleet_status(keystore, max_age=timedelta(days=7))
-        >>> [each.robot for each in status.robots if each.state != "current"]
+        >>> [robot.robot for robot in status.robots if robot.state != "current"]
         ['r8']
     """
     from sros_tool.keystore import fleet_status as status
     from sros_tool.keystore.reader import Keystore as OpenedKeystore
 
-    found = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(_several("robots", robots)))
-    return found.with_overdue(max_age, _moment(now)) if max_age else found
+    fleet = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(_several("robots", robots)))
+    return fleet.with_overdue(max_age, _moment(now)) if max_age else fleet
 
 
 def export_enclaves(
@@ -364,7 +364,7 @@ def explain_access(
 
     question = ask(action, name, kind)
     domain = _domain(domain)
-    vendors = [each.value for each in Vendor]
+    vendors = [known.value for known in Vendor]
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
     opened = OpenedOnce(Path(keystore))
@@ -386,7 +386,7 @@ def explain_access(
         (reason if colon else answer.text).removesuffix("."),
         vendor,
         answer.decision.expression or "",
-        tuple(str(each.source) for each in answer.lines),
+        tuple(str(line.source) for line in answer.lines),
         answer.until,
         answer.remedy,
     )
@@ -428,15 +428,15 @@ def check(
     from sros_tool.checks.registry import FindingFilter
     from sros_tool.checks.targets import Circumstances, path_findings
 
-    levels = {each.word: each for each in Severity}
+    levels = {level.word: level for level in Severity}
     if not paths:
         raise UsageError("no path is given to check", "", "Pass at least one path.")
     if severity not in levels:
         raise UsageError(f"unknown severity {severity!r}", "", f"Choose {', '.join(levels)}.")
-    read = tuple(_policy(each) for each in _several("policies", policies))
+    read = tuple(_policy(policy) for policy in _several("policies", policies))
     at = Circumstances(_moment(now), zone, _domain(domain), read)
-    found = dict.fromkeys(each for path in paths for each in path_findings(Path(path), at))
-    return FindingFilter(severity=levels[severity], strict=strict).choose(found).shown
+    findings = dict.fromkeys(finding for path in paths for finding in path_findings(Path(path), at))
+    return FindingFilter(severity=levels[severity], strict=strict).choose(findings).shown
 
 
 def check_requirements(
@@ -500,8 +500,10 @@ def check_requirements(
         world=vendor,
         template=load_template(template) if template else None,
     )
-    found = requirement_findings(read, system)
-    return tuple(each for each in found if each.severity > NOTE or each.kind.prominent)
+    findings = requirement_findings(read, system)
+    return tuple(
+        finding for finding in findings if finding.severity > NOTE or finding.kind.prominent
+    )
 
 
 def new_access(

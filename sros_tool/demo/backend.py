@@ -62,8 +62,8 @@ _ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 @cache
 def _modules() -> Mapping[str, str]:
     """Return the variable with which `_LEAN_PYTHON` finds what nodes import."""
-    found = map(importlib.util.find_spec, ("sros_tool", "lxml", "zenoh"))
-    folders = (Path(each.origin).parents[1] for each in found if each and each.origin)
+    modules = map(importlib.util.find_spec, ("sros_tool", "lxml", "zenoh"))
+    folders = (Path(module.origin).parents[1] for module in modules if module and module.origin)
     return {"PYTHONPATH": os.pathsep.join(dict.fromkeys(map(str, folders)))}
 
 
@@ -190,8 +190,8 @@ def zenoh_backend() -> Backend:
             "It is not installed in this Python.",
             "Install it with `pip install 'sros_tool[zenoh]'`.",
         )
-    found = tuple(int(part) for part in version.split(".")[:2] if part.isdigit())
-    if found < _OLDEST_ZENOH:
+    numbers = tuple(int(part) for part in version.split(".")[:2] if part.isdigit())
+    if numbers < _OLDEST_ZENOH:
         raise UnavailableError(
             f"the demo on Zenoh needs eclipse-zenoh {'.'.join(map(str, _OLDEST_ZENOH))} or newer",
             f"Version {version} is installed in this Python.",
@@ -243,7 +243,7 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
     if backend.on_zenoh:
         return frozenset()
     (domain,) = governance_for(template.protection, DomainSet.of((0, 0))).domain_access_rules
-    rule = next(each for each in domain.topic_access_rules if matches(each.topic_expression, topic))
+    rule = next(rule for rule in domain.topic_access_rules if matches(rule.topic_expression, topic))
     kinds = (
         domain.rtps_protection_kind,
         rule.metadata_protection_kind,
@@ -252,7 +252,7 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
     unauthenticated = domain.allow_unauthenticated_participants
     bare = all(kind is ProtectionKind.NONE for kind in kinds)
     uncontrolled = not (rule.enable_read_access_control or rule.enable_write_access_control)
-    found = {
+    holding = {
         Condition.ONE_CA: not template.separate_authorities,
         Condition.SHARED_SUBJECTS: not template.unique_subject,
         Condition.OPEN_DEFAULT: template.default_permissions == EVERYTHING,
@@ -265,7 +265,7 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
         Condition.EXACT_SIGNER: backend.vendor is Condition.FAST and _checks_signers(backend.dds),
     }
     vendor = {backend.vendor} if backend.vendor else set()
-    return frozenset(name for name, holds in found.items() if holds) | vendor
+    return frozenset(name for name, holds in holding.items() if holds) | vendor
 
 
 def _checks_signers(dds: str) -> bool:

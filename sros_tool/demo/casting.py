@@ -116,7 +116,7 @@ class UserKeystore(NamedTuple):
     def copy(self, target: Path) -> None:
         """Copy the keystore with modes and links, but only the enclaves of rows and no CA keys."""
         of_rows = {party.identity.enclave for row in self.rows for party in row.parties}
-        names = {*self.cast.values(), *(each for each in of_rows if each.startswith("/"))}
+        names = {*self.cast.values(), *(part for part in of_rows if part.startswith("/"))}
         folders = {f"{ENCLAVES}{name}" for name in names}
         shutil.copytree(self.root, target, symlinks=True, ignore=_all_but(self.root, folders))
 
@@ -295,8 +295,10 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
             rights[name] = replace(grant, rules=rules)
             governances[name] = state.governance
             if newest or serials:
-                found = _content(enclave_path(keystore.root, name) / CRL_FILE)
-                without_list += [name] if not found or found != (newest or found) else []
+                revocations = _content(enclave_path(keystore.root, name) / CRL_FILE)
+                without_list += (
+                    [name] if not revocations or revocations != (newest or revocations) else []
+                )
     usual = Counter(governances.values()).most_common(1)
     return _Enclaves(
         rights=rights,
@@ -329,7 +331,7 @@ def _content(path: Path) -> bytes:
 def _strange_authority(keystore: Keystore, state: OpenedEnclave) -> str:
     """Return which CA file of an enclave has no CA of the keystore, or ""."""
     for file, role in ((IDENTITY_CA_FILE, IDENTITY), (PERMISSIONS_CA_FILE, PERMISSIONS)):
-        known = {digest(each) for each in keystore.authority(role)}
+        known = {digest(certificate) for certificate in keystore.authority(role)}
         if fingerprints(state.files[file]).isdisjoint(known):
             return f"{file}: it has no certificate of the keystore's {role} CA"
     return ""
@@ -345,7 +347,7 @@ def _best_cast(
     """
     best: tuple[int, dict[str, str], str] = (-1, {}, "")
     serving = _serving(rights)
-    named = sorted(each for each in _topics(rights) if "rt/" in each)
+    named = sorted(topic for topic in _topics(rights) if "rt/" in topic)
     for topic in [wanted] if wanted else [*named, f"rt{DEFAULT_TOPIC}"]:
         talkers = {name for name in rights if allows(rights[name], "publish", topic)}
         listeners = {name for name in rights if allows(rights[name], "subscribe", topic)}
@@ -405,7 +407,7 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
 
     A client that may not serve is preferred, and one that names the service.
     """
-    found: dict[str, str] = {}
+    cast: dict[str, str] = {}
     best = -1
     for server, client in permutations(rights, 2):
         for topic in _application_topics(rights[server], "publish"):
@@ -417,10 +419,10 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
             score = 2 * (not allows(rights[client], "publish", topic))
             score += _may(rights[client], "request", service, named=True)
             if score > best:
-                best, found = score, {"server": server, "client": client}
+                best, cast = score, {"server": server, "client": client}
             if best == 3:
-                return found
-    return found
+                return cast
+    return cast
 
 
 def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
@@ -454,17 +456,17 @@ def _widest(
             for enclave, grant in rights.items()
             if not _may(grant, right, name, named=True) or _may(grant, right, DENIED_TOPIC)
         ]
-        tried = {cast[each] for each in others if each in cast}
-        width = {each: _width(rights[each], right, name) for each in unnamed}
-        free = [each for each in unnamed if each not in tried]
+        tried = {cast[other] for other in others if other in cast}
+        width = {enclave: _width(rights[enclave], right, name) for enclave in unnamed}
+        free = [enclave for enclave in unnamed if enclave not in tried]
         if not free:
             continue
-        found = max(free, key=width.__getitem__)
-        if any(width[found][:2]):
-            why = f"may {right} {name if width[found][0] else 'what nobody named'} by a wildcard"
+        widest = max(free, key=width.__getitem__)
+        if any(width[widest][:2]):
+            why = f"may {right} {name if width[widest][0] else 'what nobody named'} by a wildcard"
         else:
             why = f"has the most rights of those that may not {right} {name}"
-        yield part, (found, why)
+        yield part, (widest, why)
 
 
 def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
@@ -473,7 +475,9 @@ def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
     Tuples compare as the grants do: the greatest is the widest.
     """
     size = sum(
-        len(each.topics) for rule in grant.rules for each in (*rule.publish, *rule.subscribe)
+        len(criteria.topics)
+        for rule in grant.rules
+        for criteria in (*rule.publish, *rule.subscribe)
     )
     return _may(grant, right, name), _may(grant, right, DENIED_TOPIC), size
 
@@ -664,7 +668,7 @@ def _names(
             yield name
             continue
         # With more nodes than names, two nodes share a name: DDS allows that in a process.
-        alike = [each for each in free if name[1:] in each.lower()]
+        alike = [enclave for enclave in free if name[1:] in enclave.lower()]
         chosen = (alike or free or named)[0]
         if chosen in free:
             free.remove(chosen)

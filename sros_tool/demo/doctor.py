@@ -135,10 +135,10 @@ _OURS = ("sros_tool", "sros_ros2_security")
 _SECONDS = 60.0
 _ASK = """
 import sys
-sys.path[:] = [each for each in sys.path if each]  # not the working folder: anybody may own it
+sys.path[:] = [path for path in sys.path if path]  # not the working folder: anybody may own it
 import json, importlib.metadata as metadata
-found = metadata.entry_points(group="ros2cli.command", name="security")
-print(json.dumps([each.dist.name for each in found if each.dist]))
+entries = metadata.entry_points(group="ros2cli.command", name="security")
+print(json.dumps([entry.dist.name for entry in entries if entry.dist]))
 """
 
 
@@ -181,7 +181,7 @@ def security_provider(environment: Mapping[str, str]) -> SecurityProvider | None
             timeout=_SECONDS,
             check=True,
         )
-        names = [str(each) for each in json.loads(ended.stdout)]
+        names = [str(package) for package in json.loads(ended.stdout)]
         if names:
             hidden = {name for name in names if name != names[-1] and name not in _OURS}
             return SecurityProvider(names[-1], tuple(sorted(hidden)))
@@ -207,8 +207,8 @@ _KNOWN_VALUES: Mapping[str, frozenset[str] | re.Pattern[str]] = {
     "ROS_LOCALHOST_ONLY": _NUMBER,
     "ROS_AUTOMATIC_DISCOVERY_RANGE": frozenset(("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")),
     "RMW_IMPLEMENTATION": frozenset(
-        f"rmw_{each}"
-        for each in (
+        f"rmw_{middleware}"
+        for middleware in (
             "connextdds",
             "cyclonedds_cpp",
             "fastrtps_cpp",
@@ -269,12 +269,14 @@ def support_report(
 
 
 def _versions() -> list[str]:
-    found = []
+    versions = []
     for name in _PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):
             version = importlib.metadata.version(name)
-            found.append(f"{name} {version if _VERSION.match(version) else 'of a local version'}")
-    return [f"sros {__version__}", f"Python {platform.python_version()}", *found]
+            versions.append(
+                f"{name} {version if _VERSION.match(version) else 'of a local version'}"
+            )
+    return [f"sros {__version__}", f"Python {platform.python_version()}", *versions]
 
 
 def _system() -> list[str]:
@@ -309,7 +311,7 @@ class _Neutral:
         words = dict.fromkeys((*values, *secrets), "SECRET")
         homes = (environment.get("HOME", ""), user.pw_dir if user else "", str(Path.home()))
         words |= dict.fromkeys((home.rstrip("/") for home in homes), "~")
-        names = (environment.get(each, "") for each in ("USER", "LOGNAME", "SUDO_USER"))
+        names = (environment.get(name, "") for name in ("USER", "LOGNAME", "SUDO_USER"))
         words |= dict.fromkeys((*names, user.pw_name if user else ""), "USER")
         hosts = (socket.gethostname(), environment.get("HOSTNAME", ""))
         words |= dict.fromkeys((*hosts, *(host.split(".")[0] for host in hosts)), "HOST")

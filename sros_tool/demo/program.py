@@ -154,8 +154,8 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 KeystoreSummary(user.enclaves, user.elsewhere, user.not_tried) if user else None
             )
             results.append(_result_of(scenario, row_results, cast, summary))
-        left_out = sum(len(each.rows) for each in options.scenarios)
-        left_out -= sum(len(each.rows) for each in results)
+        left_out = sum(len(scenario.rows) for scenario in options.scenarios)
+        left_out -= sum(len(scenario.rows) for scenario in results)
         result = DemoResult(
             backend=backend.name,
             dds=backend.dds,
@@ -274,7 +274,7 @@ def _with_chosen_rows(options: DemoOptions) -> tuple[Scenario, ...]:
     if not chosen:
         raise UsageError(
             f"no row has {' or '.join(map(repr, options.only))} in its name",
-            f"The scenarios are {', '.join(each.name for each in options.scenarios)}.",
+            f"The scenarios are {', '.join(scenario.name for scenario in options.scenarios)}.",
             "Run without --only to see the names of the rows.",
         )
     return chosen

@@ -326,10 +326,10 @@ def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Findi
         return finding
     outputs = [(party.name, record.parties[party.name].output) for party in record.row.parties]
     lines = ((name, line) for name, output in outputs for line in output.splitlines())
-    found = next(((name, line) for name, line in lines if claim.evidence in line), None)
-    if found is None:
+    logged = next(((name, line) for name, line in lines if claim.evidence in line), None)
+    if logged is None:
         return _undecided(f"{finding.detail}, but nobody logged {claim.evidence!r}")
-    name, line = found
+    name, line = logged
     return _Finding(finding.status, f"{finding.detail}; {name}: {_message_of(line)}")
 
 
@@ -793,7 +793,7 @@ def _attacks(attacks: Sequence[RowResult], removed: Sequence[RowResult]) -> list
         "| --- | --- | --- | --- | --- |",
     ]
     for row in closed:
-        twins = "; ".join(_unique(_twin(each) for each in removed if each.attack == row.attack))
+        twins = "; ".join(_unique(_twin(twin) for twin in removed if twin.attack == row.attack))
         lines.append(f"| {_cells(row)} | {row.mechanism} | {twins} |")
     if open_:
         lines += ["", "## Attacks known to succeed, and remedies", ""]

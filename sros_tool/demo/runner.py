@@ -155,8 +155,8 @@ class _Runner:
         for number in ENDING_SIGNALS:
             loop.add_signal_handler(number, task.cancel)
         results: dict[int, RowResult] = {}
-        for found in await asyncio.gather(*map(self._run, groups)):
-            results |= found
+        for played in await asyncio.gather(*map(self._run, groups)):
+            results |= played
         return [results[index] for index in range(len(plan.rows))]
 
     def _text(self, index: int, party: Party) -> str:
@@ -174,8 +174,8 @@ class _Runner:
             async with self._slots:
                 for patience in _PATIENCE if self._plan.backend.on_zenoh else _PATIENCE[:1]:
                     played = await self._play(group[0], together(tried), patience)
-                    found = (judge_row(replace(played, row=row)).observed for row in tried)
-                    if RowStatus.UNDECIDED not in found:
+                    observed = (judge_row(replace(played, row=row)).observed for row in tried)
+                    if RowStatus.UNDECIDED not in observed:
                         break
         results = {}
         for index, row in zip(group, rows, strict=True):
@@ -231,9 +231,11 @@ class _Runner:
             window = await self._watch(row, processes, expiry)
             if _in_memory(row):
                 texts = {name: process.text for name, process in processes.items()}
-                segments = frozenset().union(*(each.segments() for each in processes.values()))
+                segments = frozenset().union(
+                    *(process.segments() for process in processes.values())
+                )
                 memory = shared_memory(texts, segments)
-            ports = frozenset[int]().union(*(each.ports() for each in processes.values()))
+            ports = frozenset[int]().union(*(process.ports() for process in processes.values()))
             wire = tap.count(ports) if tap and row.wire else {}
             injected = None
             if tap and row.replay and window:
@@ -282,7 +284,7 @@ class _Runner:
         if party.role in SPEAKING or (plan.backend.on_zenoh and party.role in CALLING):
             options += ["--text", text]
         if party.role is Role.ACTION_CLIENT:
-            servers = [each for each in row.parties if each.role is Role.ACTION_SERVER]
+            servers = [party for party in row.parties if party.role is Role.ACTION_SERVER]
             options += ["--server", self._text(index, servers[0])] if len(servers) == 1 else []
         if party.role is Role.OBSERVER:
             for other in row.parties:
@@ -446,9 +448,9 @@ async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
     started = time.monotonic()
     # Twice, since the listener may use the first round only to discover the talker.
     for _ in range(_REPLAY_ROUNDS):
-        for before, each in zip([*packets[:1], *packets], packets, strict=False):
-            await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
-            tap.send(each.packet)
+        for before, packet in zip([*packets[:1], *packets], packets, strict=False):
+            await asyncio.sleep(min(packet.time - before.time, _LONGEST_PAUSE))
+            tap.send(packet.packet)
     await asyncio.sleep(_AFTER_REPLAY)
     return Injection(len(packets), started)
 
@@ -461,7 +463,9 @@ async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
     """
     talker.hold()
     await asyncio.sleep(_GRACE)
-    last = {len(each.packet): each.packet for each in tap.packets(talker.ports())[-_LAST_PACKETS:]}
+    last = {
+        len(packet.packet): packet.packet for packet in tap.packets(talker.ports())[-_LAST_PACKETS:]
+    }
     places = range(_CHANGED_PLACES)
     changed = [
         with_changed_bit(packet, 1 + later, (later + turn) % len(places), len(places))

@@ -59,12 +59,12 @@ def path_for(parts: Parts, robot: Robot) -> str:
 
 def enclaves_of(fleet: Fleet, robot: Robot) -> tuple[str, ...]:
     """Return the paths of the enclaves that a robot has by the patterns of the fleet, sorted."""
-    found = set()
+    paths = set()
     for pattern in fleet.enclaves:
         parts = parts_of(pattern)
         if group_of(parts) in ("", *robot.groups):
-            found.add(path_for(parts, robot))
-    return tuple(sorted(found))
+            paths.add(path_for(parts, robot))
+    return tuple(sorted(paths))
 
 
 def size_problem(fleet: Fleet) -> str:
@@ -149,12 +149,12 @@ def _folders(fleet: Fleet) -> Mapping[str, frozenset[str]]:
 
     They are the paths of the fleet down to the part with the first placeholder.
     """
-    found: dict[str, set[str]] = {}
+    folders: dict[str, set[str]] = {}
     for begin in dict.fromkeys(_begin(parts_of(path)) for path in fleet.enclaves):
         for robot in fleet.robots.values():
             if len(folder := path_for(begin, robot)) > 1:
-                found.setdefault(folder, set()).add(robot.name)
-    return {folder: frozenset(robots) for folder, robots in found.items()}
+                folders.setdefault(folder, set()).add(robot.name)
+    return {folder: frozenset(robots) for folder, robots in folders.items()}
 
 
 def _begin(path: Parts) -> Parts:
@@ -189,13 +189,13 @@ class _Pattern(NamedTuple):
 @lru_cache(maxsize=8)
 def _patterns(paths: tuple[str, ...]) -> Mapping[str, list[_Pattern]]:
     """Return the patterns by the whole parts of a name behind their last placeholder."""
-    found: dict[str, list[_Pattern]] = {}
+    patterns: dict[str, list[_Pattern]] = {}
     for path in paths:
         parts = parts_of(path)
         last = parts[-1] if isinstance(parts[-1], str) else ""
         key = last[last.find("/") :] if "/" in last else ""
-        found.setdefault(key, []).append(_Pattern(parts, _expression(parts)))
-    return found
+        patterns.setdefault(key, []).append(_Pattern(parts, _expression(parts)))
+    return patterns
 
 
 def _expression(parts: Parts) -> re.Pattern[str]:
@@ -239,13 +239,13 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
         fleet: the robots; without them every line stays as it is.
         lines: pairs of an enclave and a text about it.
     """
-    found: dict[str, list[tuple[str, str]]] = {}
+    kinds: dict[str, list[tuple[str, str]]] = {}
     for enclave, text in lines:
         robot = robot_of(fleet, enclave) if fleet else None
         # Another text that has such words of its own is not mixed up with a folded one.
         kind = _with_placeholders(text, enclave, robot) if robot else f"\0{text}"
-        found.setdefault(kind, []).append((robot.name if robot else "", text))
-    for kind, same in found.items():
+        kinds.setdefault(kind, []).append((robot.name if robot else "", text))
+    for kind, same in kinds.items():
         names = list(dict.fromkeys(name for name, _ in same))
         if fleet is None or len(names) == 1:
             yield from (text for _, text in same)

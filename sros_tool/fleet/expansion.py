@@ -47,11 +47,13 @@ class FleetPolicy(Mapping[str, Enclave]):
         self.fleet = fleet
         self._of: dict[str, tuple[Enclave, Robot | None]] = {}
         self._names: dict[tuple[str, Source], tuple[str, ...]] = {}
-        self.patterns = tuple(each.path for each in policy.enclaves if has_placeholder(each.path))
+        self.patterns = tuple(
+            enclave.path for enclave in policy.enclaves if has_placeholder(enclave.path)
+        )
         self.protects = any(
             group.protect
-            for each in policy.enclaves
-            for profile in each.all_profiles()
+            for enclave in policy.enclaves
+            for profile in enclave.all_profiles()
             for group in profile.groups
         )
         for enclave in policy.enclaves:
@@ -174,13 +176,13 @@ class FleetPolicy(Mapping[str, Enclave]):
                 raise _not_valid(name, problem, source)
             return (name,)
         key = name, source
-        found = self._names.get(key)
-        if found is None:
+        names = self._names.get(key)
+        if names is None:
             parts = parts_of(name)
-            found = tuple(dict.fromkeys(self._for_each(parts, source)))
+            names = tuple(dict.fromkeys(self._for_each(parts, source)))
             if name == written:  # the same for all enclaves that say it
-                self._names[key] = found
-        return found
+                self._names[key] = names
+        return names
 
     def _for_each(self, parts: Parts, source: Source) -> Iterator[str]:
         for robot in self._members(placeholders_of(parts)[0].group, source):
@@ -255,13 +257,13 @@ def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozens
     A right that the policy does not state keeps its name; one of no enclave of the policy also its
     enclave.
     """
-    found: set[Right] = set()
+    expanded: set[Right] = set()
     for path, rights in _by_enclave(observed).items():
         if path in policy:
-            found.update(_stated(policy, path, unfolded(rights)))
+            expanded.update(_stated(policy, path, unfolded(rights)))
         else:
-            found.update(rights)
-    return frozenset(found)
+            expanded.update(rights)
+    return frozenset(expanded)
 
 
 def unobserved_robots(policy: FleetPolicy, observed: Iterable[Right]) -> dict[str, list[str]]:
@@ -302,11 +304,11 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
 
 
 def _by_enclave(observed: Iterable[Right]) -> dict[str, list[Right]]:
-    found: dict[str, list[Right]] = defaultdict(list)
+    by_enclave: dict[str, list[Right]] = defaultdict(list)
     for right in observed:
         if right.qualifier is ALLOW:
-            found[right.enclave].append(right)
-    return found
+            by_enclave[right.enclave].append(right)
+    return by_enclave
 
 
 def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterator[Right]:
@@ -315,9 +317,9 @@ def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterat
     policy[path]  # which has a bounded number of names
     stated = [e for e in policy_rights(absolute(Policy((enclave,)))) if e.qualifier is ALLOW]
     exact: dict[tuple[str, str], list[Right]] = defaultdict(list)
-    for each in stated:
-        for name in _names(policy, each.name, robot):
-            for part, own in zip(parts(each), parts(each._replace(name=name)), strict=True):
+    for right in stated:
+        for name in _names(policy, right.name, robot):
+            for part, own in zip(parts(right), parts(right._replace(name=name)), strict=True):
                 exact[own.right, own.name].append(part)
     rules = Rules(stated)
     wide = [(used, name, some) for (used, name), some in exact.items() if is_expression(name)]
@@ -345,14 +347,14 @@ def _names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]
     """Return the names of a robot that a name of `absolute` stands for."""
     if not has_placeholder(name):
         return (name,)
-    found = parts_of(as_written(name))
+    parts = parts_of(as_written(name))
     if robot:
-        found = fill(found, robot.name, robot.namespace)
-    several = placeholders_of(found)
+        parts = fill(parts, robot.name, robot.namespace)
+    several = placeholders_of(parts)
     if not several:
-        return ("".join(map(str, found)),)
+        return ("".join(map(str, parts)),)
     return [
-        "".join(map(str, fill(found, member.name, member.namespace, plural=True)))
+        "".join(map(str, fill(parts, member.name, member.namespace, plural=True)))
         for member in policy.fleet.members(several[0].group)
     ]
 

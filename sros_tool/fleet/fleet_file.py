@@ -185,15 +185,15 @@ class _Reader:
 
     def _tables(self, table: Mapping[str, Any], key: str) -> Mapping[str, Mapping[str, Any]]:
         """Return the tables below ``key``, each by a name that is valid."""
-        found = table.get(key, {})
-        if not isinstance(found, dict):
+        tables = table.get(key, {})
+        if not isinstance(tables, dict):
             raise self._error(f"{key} is not a table", "", f"Write [{key}.NAME].")
-        for name, values in found.items():
+        for name, values in tables.items():
             if problem := name_problem(name):
                 raise self._refused(key, name, problem)
             if not isinstance(values, dict):
                 raise self._error(f"{key}.{name} is not a table", "", f"Write [{key}.{name}].")
-        return found
+        return tables
 
     def _texts(self, table: Mapping[str, Any], key: str, at: str, most: int) -> tuple[str, ...]:
         values = table.get(key, [])
@@ -305,16 +305,16 @@ def _connections(data: bytes, what: str, *, is_json: bool) -> dict[str, str]:
     """
     values = dict(_values_below(_loaded(data, what, is_json=is_json)))
     known = {*_VARIABLES.values(), _ROBOT}
-    found = {
+    kept = {
         path: text
         for path, text in values.items()
         if any(part.startswith(("ansible_", "sros_")) and part not in known for part in path)
     }
-    if any("{" in text for text in found.values()):
-        found = values
-    elif any("vars" in path for path in found):
-        found |= {path: text for path, text in values.items() if {"hosts", "children"} & {*path}}
-    return {".".join(path): text for path, text in found.items()}
+    if any("{" in text for text in kept.values()):
+        kept = values
+    elif any("vars" in path for path in kept):
+        kept |= {path: text for path, text in values.items() if {"hosts", "children"} & {*path}}
+    return {".".join(path): text for path, text in kept.items()}
 
 
 def _values_below(top: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
@@ -323,7 +323,7 @@ def _values_below(top: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str
     while left:
         path, value = left.pop()
         if isinstance(value, dict) and value:
-            left += [((*path, str(key)), each) for key, each in value.items()]
+            left += [((*path, str(key)), inner) for key, inner in value.items()]
         else:
             yield path, str(value)
 
@@ -422,7 +422,7 @@ class _Inventory:
             group = {"hosts": group} if isinstance(group, list) else self._mapping(group, name)
         inside = (*above, name)
         set_here = self._known(group.get("vars"), f"{name}.vars")
-        variables = {**variables, **{key: (len(above), each) for key, each in set_here.items()}}
+        variables = {**variables, **{key: (len(above), value) for key, value in set_here.items()}}
         if name not in _OF_ALL:
             self._groups.setdefault(name, set())
         hosts = group.get("hosts") or {}
@@ -432,7 +432,7 @@ class _Inventory:
             self._host(host, own, inside, variables)
         children = group.get("children") or {}
         if isinstance(children, list):  # of `ansible-inventory --list`: groups at the top
-            children = {each: self._top.get(each) for each in map(str, children)}
+            children = {group: self._top.get(group) for group in map(str, children)}
         for child, value in self._mapping(children, f"{name}.children").items():
             self._read(child, value, inside, variables)
 

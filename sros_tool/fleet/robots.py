@@ -68,7 +68,7 @@ class Fleet:
         cls, robots: Iterable[Robot], groups: Iterable[str] = (), enclaves: Sequence[str] = ()
     ) -> Fleet:
         """Return the fleet of these robots; ``groups`` may be without robots."""
-        named = {each.name: each for each in sorted(robots, key=lambda robot: robot.name)}
+        named = {robot.name: robot for robot in sorted(robots, key=lambda robot: robot.name)}
         members: dict[str, list[str]] = {name: [] for name in groups}
         spaces: dict[str, list[str]] = {}
         for robot in named.values():
@@ -110,9 +110,11 @@ class Fleet:
 def _near(name: str, known: Iterable[str]) -> str:
     """Return the remedy for an unknown name: those that are most alike, or the first ones."""
     names = list(known)
-    found = get_close_matches(name[:_MAX_NAME], names, n=3, cutoff=0.5) or names[:3]
+    similar = get_close_matches(name[:_MAX_NAME], names, n=3, cutoff=0.5) or names[:3]
     return (
-        f"It has {', '.join(found)}{', ...' if len(names) > len(found) else ''}." if found else ""
+        f"It has {', '.join(similar)}{', ...' if len(names) > len(similar) else ''}."
+        if similar
+        else ""
     )
 
 

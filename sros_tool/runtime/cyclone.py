@@ -328,8 +328,8 @@ def _string_of(address: int) -> str:
 
 
 def _publication_of(address: int) -> Publication:
-    found = ctypes.cast(address, ctypes.POINTER(_EndpointSample)).contents
-    return Publication(_text(found.topic_name), _text(found.type_name))
+    sample = ctypes.cast(address, ctypes.POINTER(_EndpointSample)).contents
+    return Publication(_text(sample.topic_name), _text(sample.type_name))
 
 
 def _text(raw: bytes | None) -> str:
@@ -479,8 +479,8 @@ def version_of(path: Path) -> str:
     """
     copies = [copy for copy in path.parent.glob(f"{path.name}.*") if _same_size(copy, path)]
     name = max([path.name, *(copy.name for copy in copies)], key=len)
-    found = re.search(r"\.so\.(\d+(?:\.\d+)+)$", name)
-    return found.group(1) if found else "of unknown version"
+    version = re.search(r"\.so\.(\d+(?:\.\d+)+)$", name)
+    return version.group(1) if version else "of unknown version"
 
 
 def _same_size(one: Path, other: Path) -> bool:

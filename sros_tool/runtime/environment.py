@@ -48,7 +48,7 @@ NO_CONFIGURATION = "/dev/null/refused-by-sros.json5"
 """A path that can never exist: a process that has to read it as its configuration ends."""
 
 _TLS = "transport/link/tls"
-_LINE_ENDS = {each: f"\\u{each:04x}" for each in (0x2028, 0x2029)}
+_LINE_ENDS = {point: f"\\u{point:04x}" for point in (0x2028, 0x2029)}
 """Characters that JSON allows in a string, and JSON5 does not."""
 _MOST_KEYS = 5
 _MOST_CHARACTERS = 60
@@ -172,7 +172,7 @@ _LINES = {"sh": _sh, "fish": _fish, "systemd": _systemd, "docker": _docker}
 
 
 def _is_not_unicode(value: str) -> bool:
-    return any("\ud800" <= each <= "\udfff" for each in value)
+    return any("\ud800" <= letter <= "\udfff" for letter in value)
 
 
 def _is_not_printable(value: str) -> bool:
@@ -232,15 +232,15 @@ def named_enclave(command: Sequence[str]) -> str:
     The last one counts.  ``--`` ends the arguments for ROS until the next ``--ros-args``
     (rcl/src/rcl/arguments.c).
     """
-    found, of_ros = "", False
+    enclave, of_ros = "", False
     for before, word in pairwise(("", *command)):
         if of_ros and _ENCLAVE_OPTION.match(before):
-            found = word
+            enclave = word
         elif word == ROS_ARGS:
             of_ros = True
         elif word == "--":
             of_ros = False
-    return found
+    return enclave
 
 
 _REMAP_OPTIONS = ("-r", "--remap")
@@ -254,7 +254,7 @@ def node_argument(command: Sequence[str]) -> tuple[str, str] | None:
     as rcl takes them (``remap.c``); without a namespace it is "/".  Rules for one of several nodes
     (``-r talker:__node:=NAME``) are passed over: they name no enclave of the process.
     """
-    found: dict[str, str] = {}
+    rules: dict[str, str] = {}
     of_ros = False
     for before, word in pairwise(("", *command)):
         if word == ROS_ARGS:
@@ -264,9 +264,9 @@ def node_argument(command: Sequence[str]) -> tuple[str, str] | None:
         elif of_ros and before in _REMAP_OPTIONS:
             rule, mark, value = word.partition(":=")
             if mark:
-                found.setdefault("__node" if rule in _NODE_RULES else rule, value)
-    name = found.get("__node")
-    return (found.get(_NAMESPACE_RULE) or "/", name) if name else None
+                rules.setdefault("__node" if rule in _NODE_RULES else rule, value)
+    name = rules.get("__node")
+    return (rules.get(_NAMESPACE_RULE) or "/", name) if name else None
 
 
 def _is_ros2_run(command: Sequence[str]) -> bool:
@@ -323,7 +323,7 @@ def _text(path: Path) -> str:
     meaning (measured with 1.10.2).
     """
     text = str(path)
-    if set(text) & set(";?") or any("\ud800" <= each <= "\udfff" for each in text):
+    if set(text) & set(";?") or any("\ud800" <= letter <= "\udfff" for letter in text):
         raise KeystoreError(
             f"the path {text!r} cannot be given to Zenoh",
             "Zenoh reads paths as UTF-8 text, in which neither ';' nor '?' can be.",

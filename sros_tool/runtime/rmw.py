@@ -57,13 +57,13 @@ _NOT_AN_RMW = "rmw_implementation"
 
 def middleware_of(rmw: str) -> Middleware | None:
     """Return the middleware of an RMW, or None if sros does not know the RMW."""
-    return next((each for each in MIDDLEWARE if each.rmw in rmw), None)
+    return next((middleware for middleware in MIDDLEWARE if middleware.rmw in rmw), None)
 
 
 def vendor_of(rmw: str) -> Vendor | None:
     """Return the DDS vendor of an RMW, or None if it is unknown or does not use DDS."""
-    found = middleware_of(rmw)
-    return found.vendor if found else None
+    middleware = middleware_of(rmw)
+    return middleware.vendor if middleware else None
 
 
 def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
@@ -71,19 +71,19 @@ def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
 
     Searches the prefixes in AMENT_PREFIX_PATH, and the prefix of this Python, which wheels use.
     """
-    found = {
+    names = {
         file.name
         for prefix in _prefixes(environment)
         for file in Path(prefix, _RMW_INDEX).glob("*")
         if file.name != _NOT_AN_RMW
     }
     preferred = environment.get(RMW) or DEFAULT_RMW
-    return tuple(sorted(found, key=lambda name: (name != preferred, name)))
+    return tuple(sorted(names, key=lambda name: (name != preferred, name)))
 
 
 def _prefixes(environment: Mapping[str, str]) -> list[str]:
     paths = environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    return [each for each in (*paths, sys.prefix) if each]
+    return [prefix for prefix in (*paths, sys.prefix) if prefix]
 
 
 def chosen_rmw(named: str | None, environment: Mapping[str, str]) -> str:

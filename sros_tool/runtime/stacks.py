@@ -462,10 +462,10 @@ def _report_failure(events: EventWriter, error: Exception, stage: ProcessStage, 
 
 def _dds_in_memory() -> str:
     """Return name, version and file of the DDS in this process, one per line; "" if none."""
-    for each in MIDDLEWARE:
-        for prefix in each.libraries:
+    for middleware in MIDDLEWARE:
+        for prefix in middleware.libraries:
             for file in loaded_libraries(prefix):
-                return f"{each.name}\n{version_of(file)}\n{file}"
+                return f"{middleware.name}\n{version_of(file)}\n{file}"
     return ""
 
 

@@ -192,8 +192,8 @@ def node_settings(
             f"BindReadOnlyPaths={place}",
         ]
     lines += [
-        f"InaccessiblePaths=-{_check_path(folder + each, 'the folder of an enclave')}"
-        for each in below
+        f"InaccessiblePaths=-{_check_path(folder + folder_below, 'the folder of an enclave')}"
+        for folder_below in below
     ]
     if sros:
         verify = (_check_path(sros, "the program"), "verify", keystore, "--match", enclave)
@@ -347,20 +347,20 @@ def unit_changes(folder: Path, files: Mapping[str, str], *, force: bool) -> dict
         UsageError: a file differs, and not ``force``.
     """
     _refuse_folders_of_others(folder, files)
-    found = {}
+    changes: dict[str, str] = {}
     for path, text in files.items():
         if not os.path.lexists(folder / path):
-            found[path] = "create"
+            changes[path] = "create"
         elif read_bytes(folder / path, "unit") != text.encode():
-            found[path] = "replace"
-    different = [path for path, action in found.items() if action == "replace"]
+            changes[path] = "replace"
+    different = [path for path, action in changes.items() if action == "replace"]
     if different and not force:
         raise UsageError(
             f"'{folder}' already holds other versions of {', '.join(different[:3])}",
             "Nothing was changed.",
             "Add --force to replace these files, or choose another folder.",
         )
-    return found
+    return changes
 
 
 def _refuse_folders_of_others(folder: Path, files: Iterable[str]) -> None:
@@ -370,10 +370,10 @@ def _refuse_folders_of_others(folder: Path, files: Iterable[str]) -> None:
         others = [*replaceable_on_the_way(place, trusted)]
         if os.path.lexists(place):
             others.append((place, other_writers(place.lstat(), trusted)))
-        for each, why in others:
+        for place, why in others:
             if why:
                 raise UsageError(
-                    f"the units would be in '{each}', which others can change: {why}",
+                    f"the units would be in '{place}', which others can change: {why}",
                     "systemd would run what they write there.",
                     "Choose a folder that only you can change, such as /etc/systemd/system.",
                 )
