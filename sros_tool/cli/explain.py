@@ -443,7 +443,7 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     yield from (_row("and", str(each)) for each in answer.problems[1:])
     if len(answer.parts) > 1 and not answer.allowed:
         for part in answer.parts:
-            sign = "ok" if part.outcome.ok else str(part.outcome)
+            sign = "ok" if part.decision.outcome.ok else str(part.decision.outcome)
             yield _row("part", f"{part.part}: {sign}")
     if decision.rule is not None and grant:
         what = f"{'allow' if grant.rules[decision.rule].allow else 'deny'} rule {decision.rule + 1}"

@@ -13,7 +13,13 @@ from typing import Annotated, NamedTuple
 
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome
+from sros_tool.dds.decision.answers import (
+    AccessVerb,
+    Decision,
+    Outcome,
+    OutcomeWord,
+    ReasonWord,
+)
 from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import DomainRule, ProtectionKind, TopicRule
@@ -155,51 +161,12 @@ class AppliedProtection(NamedTuple):
     """Whether permissions decide who may write."""
 
 
-OutcomeWord = Annotated[
-    Outcome,
-    "What happens: creating it fails (`denied`), peers do not match it (`peer denies`), the "
-    "process does not start (`refused`), or it or its peers crash (`crashes`).",
-]
-ReasonWord = Annotated[str, "Why, as a stable word such as `no-rule`."]
-DecidingExpression = Annotated[str | None, "The expression that decided, or null."]
-
-
-@shows("verb", "topic", "role", "outcome", "reason", "expression", null_if_empty=("role",))
+@shows("part", "decision", spread=("part", "decision"))
 class DecidedPart(NamedTuple):
     """An endpoint."""
 
     part: Part
     decision: Decision
-
-    @property
-    def verb(self) -> AccessVerb:
-        """What it does."""
-        return self.part.verb
-
-    @property
-    def topic(self) -> str:
-        """Its DDS topic."""
-        return self.part.topic
-
-    @property
-    def role(self) -> str:
-        """What it is for, or null."""
-        return self.part.role
-
-    @property
-    def outcome(self) -> OutcomeWord:
-        """What happens."""
-        return self.decision.outcome
-
-    @property
-    def reason(self) -> ReasonWord:
-        """Why."""
-        return self.decision.reason
-
-    @property
-    def expression(self) -> DecidingExpression:
-        """The expression that decided, or null."""
-        return self.decision.expression
 
 
 @shows(

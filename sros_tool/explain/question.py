@@ -40,12 +40,16 @@ WORDS = (*dict.fromkeys(word for word, _ in _RIGHTS), _JOIN)
 _ROLES = {"rq": "requests", "rr": "replies"}
 
 
+@shows("verb", "topic", "role", null_if_empty=("role",))
 class Part(NamedTuple):
     """One DDS endpoint that a right needs; ``role`` names it in ROS terms, "" for a topic."""
 
     verb: AccessVerb
+    """What it does."""
     topic: str
+    """Its DDS topic."""
     role: str = ""
+    """What it is for, or null."""
 
     def __str__(self) -> str:
         """Return text like ``publish its requests (rq/addRequest)``."""

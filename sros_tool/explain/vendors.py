@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.answers import Outcome, OutcomeWord, ReasonWord
 from sros_tool.dds.decision.vendors import NEWEST, Vendor
 from sros_tool.errors import Note, SrosError
-from sros_tool.explain.answer import Answer, Evaluator, OutcomeWord, Provenance, ReasonWord
+from sros_tool.explain.answer import Answer, Evaluator, Provenance
 from sros_tool.explain.asking import Asked, AskedEnclave, AskingContext, ZenohInBrief, meant
 from sros_tool.explain.explanation import explain, likely_names
 from sros_tool.explain.question import Question, ask

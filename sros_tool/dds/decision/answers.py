@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Annotated
 
 from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import TopicRule
+from sros_tool.values import shows
 
 
 class AccessVerb(StrEnum):
@@ -35,6 +37,15 @@ class Outcome(StrEnum):
         return self is Outcome.ALLOWED
 
 
+OutcomeWord = Annotated[
+    Outcome,
+    "What happens: creating it fails (`denied`), peers do not match it (`peer denies`), the "
+    "process does not start (`refused`), or it or its peers crash (`crashes`).",
+]
+ReasonWord = Annotated[str, "Why, as a stable word such as `no-rule`."]
+
+
+@shows("outcome", "reason", "expression")
 @dataclass(frozen=True, slots=True)
 class Decision:
     """An outcome and what decided it.
@@ -45,12 +56,12 @@ class Decision:
     ``hits_peers`` says that the processes of peers crash, and its own does not.
     """
 
-    outcome: Outcome
-    reason: str
+    outcome: OutcomeWord
+    reason: ReasonWord
     text: str
     grant: int | None = None
     rule: int | None = None
-    expression: str | None = None
+    expression: Annotated[str | None, "The expression that decided, or null."] = None
     topic_rule: TopicRule | None = None
     hits_peers: bool = False
 
