@@ -99,7 +99,7 @@ class Learned:
     @property
     def includes(self) -> tuple[str, ...]:
         """The common parts that the profiles include, sorted."""
-        return tuple(sorted({each for profile in self.profiles for each in profile.includes}))
+        return tuple(sorted({part for profile in self.profiles for part in profile.includes}))
 
     def flat(self) -> Learned:
         """Return the same rights without includes."""
@@ -120,7 +120,9 @@ class Learned:
                 Profile(profile.ns, profile.node, groups)
             )
         return Policy(
-            tuple(Enclave(path, (Profiles(tuple(found)),)) for path, found in enclaves.items())
+            tuple(
+                Enclave(path, (Profiles(tuple(profiles)),)) for path, profiles in enclaves.items()
+            )
         )
 
 
@@ -151,11 +153,11 @@ def learn(observation: Observation, common: CommonParts | None = None) -> Learne
     if unshown and len(seen) > 1:
         notes.add("root-enclave", f"{'all' if unshown == len(seen) else unshown} of {len(seen)}")
     profiles = []
-    for place, found in sorted(seen.items()):
-        if not found:
+    for place, used in sorted(seen.items()):
+        if not used:
             continue
         _, ns, name = place
-        rights = frozenset(found)
+        rights = frozenset(used)
         includes, rest = common.choose(rights, ns, name) if common else ((), rights)
         profiles.append(LearnedProfile(*place, rights, includes, groups_of(rest, ns, name)))
     return Learned(tuple(profiles), notes.notes())
@@ -167,7 +169,7 @@ def _rights_of(node: ObservedNode, notes: _Notes) -> list[tuple[_Place, frozense
         notes.add("unknown-enclave", node.fqn)
         return []
     name = stable_name(node.name)
-    enclaves = [each for each in node.enclaves if _is_enclave(each)]
+    enclaves = [enclave for enclave in node.enclaves if _is_enclave(enclave)]
     if not _is_place(node.ns, node.name) or not enclaves:
         notes.add("odd-node", f"{node.fqn!r} in {' or '.join(map(repr, node.enclaves))}")
         return []
@@ -242,13 +244,13 @@ def fold(endpoints: Iterable[Endpoint]) -> Folded:
     endpoints = tuple(endpoints)
     rule = Rule(True, _ANY_DOMAIN, _criteria(endpoints, PUBLISH), _criteria(endpoints, SUBSCRIBE))
     rights, halves, foreign = set(), set(), set()
-    for each in ros_rights(rule):
-        if each.kind != "dds":
-            rights.add(NodeRight(each.right, each.name))
-        elif each.name.startswith(("rq/", "rr/")):
-            halves.add(Endpoint(each.name, each.right))
+    for right in ros_rights(rule):
+        if right.kind != "dds":
+            rights.add(NodeRight(right.right, right.name))
+        elif right.name.startswith(("rq/", "rr/")):
+            halves.add(Endpoint(right.name, right.right))
         else:
-            foreign.add(Endpoint(each.name, each.right))
+            foreign.add(Endpoint(right.name, right.right))
     return Folded(frozenset(rights), frozenset(halves), frozenset(foreign))
 
 
@@ -291,8 +293,8 @@ _ABSOLUTE = frozenset(
 
 def is_tool(node: ObservedNode) -> bool:
     """Return whether a node belongs to a tool that observes the robot."""
-    found = _TOOLS.match(node.name)
-    return found is not None and (not found["observer"] or node.endpoints <= _OF_OBSERVER)
+    tool = _TOOLS.match(node.name)
+    return tool is not None and (not tool["observer"] or node.endpoints <= _OF_OBSERVER)
 
 
 def is_tool_name(name: str) -> bool:
@@ -387,15 +389,15 @@ def common_parts(folder: Path, shipped: Path) -> CommonParts:
     for part in PARTS:
         needed = _needed_files(shipped, part)
         if (folder / part).exists():
-            found, copies = _part_rights(folder, part), dict[str, bytes]()
+            known, copies = _part_rights(folder, part), dict[str, bytes]()
         else:
             copies = {path: data for path, data in needed.items() if not (folder / path).exists()}
             other = [
                 path for path in needed if path not in copies and _differs(folder, path, needed)
             ]
-            found = None if other else _part_rights(shipped, part)
-        if found:
-            rights[part], missing[part] = found, copies
+            known = None if other else _part_rights(shipped, part)
+        if known:
+            rights[part], missing[part] = known, copies
     return CommonParts(rights, missing)
 
 
@@ -428,21 +430,21 @@ def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
 
 def _needed_files(root: Path, part: str) -> dict[str, bytes]:
     """Return the content of a part and of all its includes, by path relative to ``root``."""
-    found: dict[str, bytes] = {}
+    files: dict[str, bytes] = {}
     waiting = [(root / part).resolve()]
     includer = Includer(root.resolve())
     while waiting:
         file = waiting.pop()
         path = file.relative_to(root.resolve()).as_posix()
-        if path in found:
+        if path in files:
             continue
-        found[path] = read_bytes(file, "policy file")
+        files[path] = read_bytes(file, "policy file")
         waiting += [
-            includer.target(each, IncludedFile(file))
-            for each in includer.load(file)
-            if tag_of(each).endswith("}include")
+            includer.target(element, IncludedFile(file))
+            for element in includer.load(file)
+            if tag_of(element).endswith("}include")
         ]
-    return found
+    return files
 
 
 # ── notes and news ─────────────────────────────────────────────────────────────────────────
@@ -559,10 +561,10 @@ def enclave_per_node(observation: Observation) -> NamedEnclaves:
             processes.setdefault(node.participant, []).append(node)
     names = {participant: _enclave_name(nodes) for participant, nodes in processes.items()}
     nodes = [
-        replace(each, enclaves=(names[each.participant],))
-        if each in processes.get(each.participant, ())
-        else each
-        for each in observation.nodes
+        replace(node, enclaves=(names[node.participant],))
+        if node in processes.get(node.participant, ())
+        else node
+        for node in observation.nodes
     ]
     named = make_observation(nodes, observation.silent, observation.strays)
     return NamedEnclaves(named, tuple(_notes(processes, names, nodes)))
@@ -590,9 +592,9 @@ def _notes(
     nodes: Sequence[ObservedNode],
 ) -> Iterator[Note]:
     several = [
-        f"{names[participant]} has {', '.join(sorted(each.fqn for each in found))}"
-        for participant, found in processes.items()
-        if len(found) > 1
+        f"{names[participant]} has {', '.join(sorted(each.fqn for each in nodes))}"
+        for participant, nodes in processes.items()
+        if len(nodes) > 1
     ]
     if several:
         yield Note(
@@ -756,21 +758,23 @@ def _parted(
     for enclave in read_policy(path, before).enclaves:
         for profile in enclave.all_profiles():
             rights = says.setdefault((enclave.path, profile.ns, profile.node), set())
-            rights |= {(each.right, each.name) for each in profile_rights(enclave.path, profile)}
+            rights |= {
+                (stated.right, stated.name) for stated in profile_rights(enclave.path, profile)
+            }
     by_name, shown = [], []
-    for each in learned.profiles:
-        place = each.enclave, each.ns, each.node
-        given = common.given(each.includes, each.ns, each.node)
+    for own in learned.profiles:
+        place = own.enclave, own.ns, own.node
+        given = common.given(own.includes, own.ns, own.node)
         if place not in known:
-            shown.append(each)
+            shown.append(own)
         elif given and not any(
             (right.right, right.name) in says[place]
-            or not rules.allow(each.enclave, right.right, right.name)
+            or not rules.allow(own.enclave, right.right, right.name)
             for right in given
         ):
-            shown.append(each)
-            each = replace(each, rights=each.rights - given)
-        by_name.append(each)
+            shown.append(own)
+            own = replace(own, rights=own.rights - given)
+        by_name.append(own)
     return Learned(tuple(by_name)), shown
 
 
@@ -788,10 +792,10 @@ def write(plan: Draft) -> None:
 
 def _check(plan: Draft) -> None:
     try:
-        found = policy_rights(read_policy(plan.path, plan.document))
-        if plan.least <= found <= plan.most:
+        again = policy_rights(read_policy(plan.path, plan.document))
+        if plan.least <= again <= plan.most:
             return
-        why = f"The written policy would differ in {min(found ^ plan.least, key=order)}."
+        why = f"The written policy would differ in {min(again ^ plan.least, key=order)}."
     except DocumentError as error:
         why = f"{error}"
     raise PolicyError(
@@ -806,11 +810,11 @@ def render(learned: Learned) -> bytes:
     """Return a policy file with the learned profiles; the same profiles give the same bytes."""
     declared = f' xmlns:xi="{_XINCLUDE}"' if learned.includes else ""
     lines = [f'<policy version="{VERSION}"{declared}>', "  <enclaves>"]
-    for path, found in groupby(learned.profiles, key=lambda each: each.enclave):
+    for path, profiles in groupby(learned.profiles, key=lambda profile: profile.enclave):
         lines += [f'    <enclave path="{path}">', "      <profiles>"]
-        for each in found:
-            lines.append(f'        <profile ns="{each.ns}" node="{each.node}">')
-            lines += [f"          {line}" for line in _content(each, "xi:include", _UNIT)]
+        for profile in profiles:
+            lines.append(f'        <profile ns="{profile.ns}" node="{profile.node}">')
+            lines += [f"          {line}" for line in _content(profile, "xi:include", _UNIT)]
             lines.append("        </profile>")
         lines += ["      </profiles>", "    </enclave>"]
     lines += ["  </enclaves>", "</policy>", ""]
@@ -846,7 +850,11 @@ def _with_includes(
     known = _profiles(EditedText(before, name))
     text = EditedText(merged, name)
     rules = Rules(policy_rights(read_policy(path, merged)))
-    wanted = {(each.enclave, each.ns, each.node): each for each in profiles if each.includes}
+    wanted = {
+        (profile.enclave, profile.ns, profile.node): profile
+        for profile in profiles
+        if profile.includes
+    }
     included: set[str] = set()
     for place, element in _profiles(text).items():
         profile = wanted.get(place)

@@ -155,8 +155,8 @@ class RosGraph:
                     raise self._failed(None)
                 self._rest += data
         line, _, self._rest = self._rest.partition(b"\n")
-        found: dict[str, Any] = json.loads(line)
-        return found
+        message: dict[str, Any] = json.loads(line)
+        return message
 
     def _failed(self, answer: Mapping[str, Any] | None) -> ObserverError:
         self._output.seek(0)
@@ -323,18 +323,20 @@ class Sighting(NamedTuple):
 
 def resolve(sighting: Sighting) -> Observation:
     """Return the nodes of a sighting, each with its process and its possible enclaves."""
-    found: dict[str, dict[_Name, set[Endpoint]]] = {}
+    by_participant: dict[str, dict[_Name, set[Endpoint]]] = {}
     strays = set()
     for participant, ns, name, endpoint in sighting.endpoints:
         if name in ("", NOBODY):
             strays.add((participant, endpoint))
         else:
-            nodes = found.setdefault(participant, {})
+            nodes = by_participant.setdefault(participant, {})
             nodes.setdefault((ns, name), set()).add(endpoint)
-    candidates = _enclaves(sighting, {each: frozenset(nodes) for each, nodes in found.items()})
+    candidates = _enclaves(
+        sighting, {each: frozenset(nodes) for each, nodes in by_participant.items()}
+    )
     nodes_seen = []
     heard = set()
-    for participant, nodes in found.items():
+    for participant, nodes in by_participant.items():
         enclaves = tuple(sorted(candidates[participant]))
         if not enclaves:  # not announced yet, or no longer
             strays |= {(participant, each) for every in nodes.values() for each in every}
@@ -353,27 +355,31 @@ def _enclaves(
     for enclave, ns, name in sighting.listed:
         free.setdefault(enclave, Counter())[(ns, name)] += 1
     candidates = {
-        each: frozenset(e for e, names in free.items() if all(names[n] for n in nodes))
-        for each, nodes in processes.items()
+        process: frozenset(e for e, names in free.items() if all(names[n] for n in nodes))
+        for process, nodes in processes.items()
     }
     if sighting.ordered:
         candidates = _by_order(sighting.listed, processes, candidates)
     settled: set[str] = set()
     while True:
-        news = [each for each, left in candidates.items() if len(left) == 1 and each not in settled]
+        news = [
+            process
+            for process, left in candidates.items()
+            if len(left) == 1 and process not in settled
+        ]
         if not news:
             return candidates
         # A listed node that belongs to one process cannot belong to another: that may decide more.
-        for each in news:
-            settled.add(each)
-            (enclave,) = candidates[each]
-            free[enclave].subtract(processes[each])
-        for each, left in candidates.items():
-            if each not in settled:
+        for process in news:
+            settled.add(process)
+            (enclave,) = candidates[process]
+            free[enclave].subtract(processes[process])
+        for process, left in candidates.items():
+            if process not in settled:
                 possible = frozenset(
-                    e for e in left if all(free[e][name] > 0 for name in processes[each])
+                    e for e in left if all(free[e][name] > 0 for name in processes[process])
                 )
-                candidates[each] = possible or left
+                candidates[process] = possible or left
 
 
 def _by_order(
@@ -391,13 +397,16 @@ def _by_order(
         enclaves.setdefault((ns, name), []).append(enclave)
     by_owner: dict[str, set[str]] = {}
     for node, places in enclaves.items():
-        owners = sorted(each for each, names in processes.items() if node in names)
+        owners = sorted(process for process, names in processes.items() if node in names)
         if len(owners) == len(places):
             for owner, enclave in zip(owners, places, strict=True):
                 by_owner.setdefault(owner, set()).add(enclave)
-    if any(len(each) > 1 or not each <= candidates[owner] for owner, each in by_owner.items()):
+    if any(
+        len(enclaves) > 1 or not enclaves <= candidates[owner]
+        for owner, enclaves in by_owner.items()
+    ):
         return candidates  # the list is not in the documented order
-    return {each: frozenset(by_owner.get(each, left)) for each, left in candidates.items()}
+    return {process: frozenset(by_owner.get(process, left)) for process, left in candidates.items()}
 
 
 # ── enclaves by certificates ────────────────────────────────────────────────────────────

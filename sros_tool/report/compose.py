@@ -110,13 +110,13 @@ def overlay(
     """Return the overlay of two sources; ``kind`` is a key of `_OVERLAYS`."""
     scope = first.scope if second.scope is None else second.scope
     rights = [
-        frozenset(each for each in side.rights if scope is None or each.enclave in scope)
+        frozenset(right for right in side.rights if scope is None or right.enclave in scope)
         for side in (first, second)
     ]
     known = Known(rights[0] | rights[1])
-    sides = [_edges_of(each, known, context.common) for each in rights]
+    sides = [_edges_of(own, known, context.common) for own in rights]
     edges = _marked(*sides, allowed_by=kind == "use")
-    normal = [folded(each) for each in rights]
+    normal = [folded(own) for own in rights]
     stated = {
         right: OverlaySide.BOTH
         if right in normal[0] and right in normal[1]
@@ -125,8 +125,8 @@ def overlay(
     }
     unseen: frozenset[str] = frozenset()
     if kind == "use":
-        unseen = frozenset(each.enclave for each in rights[0] - rights[1])
-        unseen -= {each.enclave for each in rights[1]}
+        unseen = frozenset(right.enclave for right in rights[0] - rights[1])
+        unseen -= {right.enclave for right in rights[1]}
         edges = [_neutral(edge, unseen) for edge in edges]
     picture = _picture((first, second), edges, stated, known, context)
     return replace(
@@ -149,17 +149,17 @@ def with_requirements(
         for violation in requirements.violations
         for use in violation.uses
     }
-    edges, found = [], set()
+    edges, violated = [], set()
     for edge in picture.edges:
         key = (edge.enclave, edge.kind, edge.name, edge.right)
         violates = key in broken and edge.qualifier is ALLOW
         edges.append(replace(edge, violates=True, common=False) if violates else edge)
-        found |= {key} if violates else set()
+        violated |= {key} if violates else set()
     for key, use in broken.items():
-        if key not in found:
+        if key not in violated:
             by = (use.by,) if use.by else ()
             edges.append(Edge(use.enclave, use.kind, use.name, use.right, ALLOW, by, violates=True))
-    known = {(each.kind, each.name) for each in picture.names}
+    known = {(name.kind, name.name) for name in picture.names}
     new = {(edge.kind, edge.name) for edge in edges} - known
     names = [
         Name(kind, name, namespace_of(name), protection_of(governance, kind, name))
@@ -170,7 +170,7 @@ def with_requirements(
         picture,
         requirements=requirements,
         edges=tuple(sorted((e for e in edges if e.enclave in paths), key=edge_order)),
-        names=tuple(sorted((*picture.names, *names), key=lambda each: (each.kind, each.name))),
+        names=tuple(sorted((*picture.names, *names), key=lambda name: (name.kind, name.name))),
     )
 
 
@@ -178,13 +178,13 @@ def union(sources: Sequence[PictureSource]) -> PictureSource:
     """Return several observations as one source."""
     nodes: dict[str, set[str]] = defaultdict(set)
     for source in sources:
-        for path, found in source.nodes.items():
-            nodes[path].update(found)
+        for path, names in source.nodes.items():
+            nodes[path].update(names)
     title = " and ".join(source.origin.title for source in sources)
     return PictureSource(
         SourceTitle(title, "observation"),
         frozenset(right for source in sources for right in source.rights),
-        {path: tuple(sorted(found)) for path, found in nodes.items()},
+        {path: tuple(sorted(names)) for path, names in nodes.items()},
         findings=tuple(finding for source in sources for finding in source.findings),
     )
 
@@ -197,14 +197,16 @@ def _picture(
     context: Context,
 ) -> Picture:
     edges = tuple(sorted(edges, key=edge_order))
-    governance = next((each.governance for each in reversed(sources) if each.governance), None)
+    governance = next(
+        (source.governance for source in reversed(sources) if source.governance), None
+    )
     sides = _sides(edges)
-    said = next((each.protections for each in reversed(sources) if each.protections), ())
+    said = next((source.protections for source in reversed(sources) if source.protections), ())
     demanded = _Demanded(() if governance else said)
     names = sorted({(edge.kind, edge.name) for edge in edges})
     return Picture(
-        title=" and ".join(each.origin.title for each in sources),
-        origins=tuple(each.origin for each in sources),
+        title=" and ".join(source.origin.title for source in sources),
+        origins=tuple(source.origin for source in sources),
         enclaves=_enclaves(sources, stated, known, context),
         names=tuple(
             Name(
@@ -228,13 +230,13 @@ def _picture(
 
 def _sides(edges: Iterable[Edge]) -> Mapping[tuple[str, str], list[bool]]:
     """Map names to whether an enclave may send to them, and whether one may receive from them."""
-    found: dict[tuple[str, str], list[bool]] = defaultdict(lambda: [False, False])
+    sides: dict[tuple[str, str], list[bool]] = defaultdict(lambda: [False, False])
     for edge in edges:
         if edge.qualifier is ALLOW:
             # Who publishes feedback serves an action, who subscribes to it is a client of it.
             sends = edge.sends != (edge.kind == "actions" and edge.right in _ONE_WAY)
-            found[edge.kind, edge.name][0 if sends else 1] = True
-    return found
+            sides[edge.kind, edge.name][0 if sends else 1] = True
+    return sides
 
 
 def _lack(protection: Protection, sends: bool, receives: bool) -> Lack:
@@ -267,8 +269,8 @@ def _enclaves(
         )
     nodes: dict[str, set[str]] = defaultdict(set)
     for source in sources:
-        for path, found in source.nodes.items():
-            nodes[path].update(found)
+        for path, names in source.nodes.items():
+            nodes[path].update(names)
     return tuple(
         replace(
             described.get(path, PicturedEnclave(path, "")),
@@ -305,17 +307,17 @@ def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) 
     ``allowed_by``, only the first side counts: an observed right always has an exact name.
     """
     sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
-    found = []
+    edges = []
     for key in {**sides[0], **sides[1]}:
         one, other = sides[0].get(key), sides[1].get(key)
         if one and other:
             both = tuple(sorted({*one.by, *other.by})) if one.by and other.by else ()
-            found.append(one if allowed_by else replace(one, by=both))
+            edges.append(one if allowed_by else replace(one, by=both))
         elif one:
-            found.append(replace(one, mark=OverlaySide.FIRST))
+            edges.append(replace(one, mark=OverlaySide.FIRST))
         elif other:
-            found.append(replace(other, mark=OverlaySide.SECOND))
-    return found
+            edges.append(replace(other, mark=OverlaySide.SECOND))
+    return edges
 
 
 def _neutral(edge: Edge, unseen: frozenset[str]) -> Edge:
@@ -335,8 +337,8 @@ def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[Overlay
             OverlaySide.FIRST if sign == "-" else OverlaySide.SECOND,
             str(right),
             tuple(
-                f"the other side has it by {each.describe()}"
-                for each in difference.covered.get(right, ())
+                f"the other side has it by {cover.describe()}"
+                for cover in difference.covered.get(right, ())
             ),
         )
         for sign, right in difference.lines()
@@ -349,7 +351,7 @@ def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
     Rights that every node needs are left out.  The names that a wildcard matches are only counted:
     there are too many for a recorder of all topics.
     """
-    found: dict[tuple[OverlaySide, Right], tuple[str, ...]] = {}
+    differences: dict[tuple[OverlaySide, Right], tuple[str, ...]] = {}
     reached: dict[Right, list[bool]] = defaultdict(list)
     for edge in sorted(edges, key=edge_order):
         for name in edge.by:
@@ -357,14 +359,14 @@ def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
             reached[right].append(edge.mark is OverlaySide.FIRST and not edge.common)
         if edge.mark is not OverlaySide.BOTH and not edge.common and not edge.by:
             right = Right(edge.enclave, edge.qualifier, edge.right, edge.name)
-            found[edge.mark, right] = ()
+            differences[edge.mark, right] = ()
     for right, unused in reached.items():
         if any(unused):
             note = f"{sum(unused)} of the {len(unused)} names that it matches were never observed"
-            found[OverlaySide.FIRST, right] = (note,)
+            differences[OverlaySide.FIRST, right] = (note,)
     return tuple(
         OverlayDifference(mark, str(right), notes)
-        for (mark, right), notes in sorted(found.items(), key=lambda each: order(each[0][1]))
+        for (mark, right), notes in sorted(differences.items(), key=lambda item: order(item[0][1]))
     )
 
 
@@ -376,16 +378,16 @@ class Known:
 
     def __init__(self, rights: Iterable[Right]) -> None:
         rights = frozenset(rights)
-        found: dict[str, set[str]] = defaultdict(set)
+        known: dict[str, set[str]] = defaultdict(set)
         for part in unfolded(rights):
             if not is_expression(part.name):
-                found[part.kind].add(part.name)
+                known[part.kind].add(part.name)
         self.actions = frozenset(
-            each.name
-            for each in folded(rights)
-            if each.kind == "actions" and not is_expression(each.name)
+            right.name
+            for right in folded(rights)
+            if right.kind == "actions" and not is_expression(right.name)
         )
-        self._names = {kind: sorted(names) for kind, names in found.items()}
+        self._names = {kind: sorted(names) for kind, names in known.items()}
         self._matched: dict[tuple[str, str], tuple[str, ...]] = {}
         wild: dict[str, list[str]] = defaultdict(list)
         for part in sorted(unfolded(rights)):
@@ -410,21 +412,21 @@ class Known:
         """
         if not is_expression(right.name):
             return (right.name,)
-        found = self._open.get(right.kind)
-        wild = found.drawn(right.qualifier, right.name) if found else ()
+        opened = self._open.get(right.kind)
+        wild = opened.drawn(right.qualifier, right.name) if opened else ()
         return (*self.reached(right.kind, right.name), *wild)
 
     def _matching(self, kind: str, expression: str) -> Iterable[str]:
         if kind == "actions":
             return sorted(action for action in self.actions if matches(expression, action))
         names, prefix = self._names.get(kind, ()), literal_prefix(expression)
-        found = []
+        fitting = []
         for name in names[bisect_left(names, prefix) :]:
             if not name.startswith(prefix):
                 break
             if matches(expression, name):
-                found.append(name)
-        return found
+                fitting.append(name)
+        return fitting
 
 
 class _Wild:
@@ -440,7 +442,7 @@ class _Wild:
         if key not in self._drawn:
             meeting = self._names.meeting(name)
             self._drawn[key] = tuple(
-                each for each in meeting if qualifier is not DENY or covers(name, each)
+                other for other in meeting if qualifier is not DENY or covers(name, other)
             )
         return self._drawn[key]
 
@@ -467,19 +469,19 @@ def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = (
         for right in RIGHT_ORDER
     }
     topics: dict[tuple[str, str, str, str], _Found] = defaultdict(lambda: defaultdict(set))
-    for each in unfolded(rights):
-        by = each.name if is_expression(each.name) else ""
-        for reached in known.drawn(each):
+    for stated in unfolded(rights):
+        by = stated.name if is_expression(stated.name) else ""
+        for reached in known.drawn(stated):
             # A wildcard drawn as a name is treated like an exact name.
             said = "" if reached == by else by
-            topics[each.enclave, each.kind, each.right, reached][each.qualifier].add(said)
+            topics[stated.enclave, stated.kind, stated.right, reached][stated.qualifier].add(said)
     whole: dict[tuple[str, str, Qualifier], dict[tuple[str, str], set[str]]] = defaultdict(dict)
     edges = []
-    for (enclave, kind, right, name), found in topics.items():
-        qualifier = DENY if DENY in found else ALLOW
+    for (enclave, kind, right, name), by_qualifier in topics.items():
+        qualifier = DENY if DENY in by_qualifier else ALLOW
         action, inside, part = name.rpartition(ACTION_SEPARATOR)
         if inside and (action in known.actions or is_expression(action)):
-            whole[enclave, action, qualifier][right, part] = found[qualifier]
+            whole[enclave, action, qualifier][right, part] = by_qualifier[qualifier]
             continue
         edges.append(
             Edge(
@@ -488,7 +490,7 @@ def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = (
                 name,
                 right,
                 qualifier,
-                _by(found[qualifier]),
+                _by(by_qualifier[qualifier]),
                 common=qualifier is ALLOW and _is_common(name, needed[right]),
             )
         )
@@ -514,9 +516,9 @@ def _action_edges(
     rest: dict[str, dict[str, set[str]]] = defaultdict(dict)
     for (right, inside), names in remaining.items():
         rest[right][inside] = names
-    for right, found in rest.items():
-        by = _by({each for said in found.values() for each in said})
-        yield Edge(enclave, "actions", action, right, qualifier, by, tuple(sorted(found)))
+    for right, halves in rest.items():
+        by = _by({text for said in halves.values() for text in said})
+        yield Edge(enclave, "actions", action, right, qualifier, by, tuple(sorted(halves)))
 
 
 def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
@@ -529,7 +531,7 @@ def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
 
 
 def _is_common(name: str, common: Sequence[str]) -> bool:
-    return any(matches(each, name) for each in common)
+    return any(matches(expression, name) for expression in common)
 
 
 # ── protection ──────────────────────────────────────────────────────────────────────────
@@ -546,15 +548,19 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
         return UNKNOWN
     domain = governance.domain_access_rules[0]
     topics = _topics(kind, name)
-    found = [_protection(domain, rule) for topic in topics for rule in _rules_of(domain, topic)]
+    protections = [
+        _protection(domain, rule) for topic in topics for rule in _rules_of(domain, topic)
+    ]
     anywhere = [
         rule
-        for each in governance.domain_access_rules
+        for access in governance.domain_access_rules
         for topic in topics
-        for rule in _rules_of(each, topic)
+        for rule in _rules_of(access, topic)
     ]
     weakest = min(
-        found, key=lambda each: _ORDER.index(each.level), default=Protection(WireLevel.NONE)
+        protections,
+        key=lambda protection: _ORDER.index(protection.level),
+        default=Protection(WireLevel.NONE),
     )
     return replace(
         weakest,
@@ -570,11 +576,11 @@ class _Demanded:
     """The protection that a policy demands, for pictures without a governance."""
 
     def __init__(self, stated: Iterable[StatedProtection]) -> None:
-        found: dict[WireLevel, list[str]] = defaultdict(list)
+        topics_of: dict[WireLevel, list[str]] = defaultdict(list)
         for protection in stated:
             topics = protected_topics(protection.kind, protection.name)
-            found[WireLevel(protection.word)] += topics
-        self._names = {level: Names(topics) for level, topics in found.items()}
+            topics_of[WireLevel(protection.word)] += topics
+        self._names = {level: Names(topics) for level, topics in topics_of.items()}
 
     def protection(self, kind: str, name: str) -> Protection | None:
         """Return the least that is demanded of all topics of a name, or None."""
@@ -590,8 +596,12 @@ class _Demanded:
 def _topics(kind: str, name: str) -> tuple[str, ...]:
     if kind == "dds":
         return (name,)
-    found = (dds_names(right, name) for right in RIGHTS[kind])
-    return tuple(dict.fromkeys(topic for each in found for topic in each.publish + each.subscribe))
+    topics = (dds_names(right, name) for right in RIGHTS[kind])
+    return tuple(
+        dict.fromkeys(
+            topic for endpoints in topics for topic in endpoints.publish + endpoints.subscribe
+        )
+    )
 
 
 def _rules_of(domain: DomainRule, topic: str) -> Iterator[TopicRule]:
@@ -607,7 +617,7 @@ def _protection(domain: DomainRule, rule: TopicRule) -> Protection:
     data, metadata = rule.data_protection_kind, rule.metadata_protection_kind
     rtps = domain.rtps_protection_kind
     return Protection(
-        max((_level(each) for each in (data, metadata, rtps)), key=_ORDER.index),
+        max((_level(kind) for kind in (data, metadata, rtps)), key=_ORDER.index),
         str(data),
         str(metadata),
         str(rtps),

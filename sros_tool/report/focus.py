@@ -85,9 +85,9 @@ def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[
         UsageError: nothing in the sources has such a name.
     """
     system = _System(picture, sources)
-    wanted = dict.fromkeys(each for word in words for each in system.meant(word))
-    found = tuple(system.focus(kind, name) for kind, name in wanted)
-    picture = system.with_shortest_paths(replace(picture, focus=found))
+    wanted = dict.fromkeys(meant for word in words for meant in system.meant(word))
+    focuses = tuple(system.focus(kind, name) for kind, name in wanted)
+    picture = system.with_shortest_paths(replace(picture, focus=focuses))
     flow = FocusFlow.of(picture)
     edges = tuple(edge for edge in picture.edges if flow.has(edge))
     enclaves = {edge.enclave for edge in edges} | flow.before.keys() | flow.after.keys()
@@ -95,7 +95,7 @@ def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[
     return replace(
         picture,
         enclaves=tuple(enclave for enclave in picture.enclaves if enclave.path in enclaves),
-        names=tuple(each for each in picture.names if (each.kind, each.name) in names),
+        names=tuple(name for name in picture.names if (name.kind, name.name) in names),
         edges=edges,
         findings=tuple(e for e in picture.findings if not e.enclave or e.enclave in enclaves),
         validities=tuple(e for e in picture.validities if not e.enclave or e.enclave in enclaves),
@@ -125,8 +125,8 @@ class FocusFlow:
     @classmethod
     def of(cls, picture: Picture) -> FocusFlow:
         """Return the flow of a picture, which has a focus."""
-        own = frozenset(each.name for each in picture.focus if each.kind == _ENCLAVE)
-        wanted = [(each.kind, each.name) for each in picture.focus if each.kind != _ENCLAVE]
+        own = frozenset(focus.name for focus in picture.focus if focus.kind == _ENCLAVE)
+        wanted = [(focus.kind, focus.name) for focus in picture.focus if focus.kind != _ENCLAVE]
         targets = frozenset(
             (name.kind, name.name)
             for name in picture.names
@@ -135,16 +135,16 @@ class FocusFlow:
         )
         before: dict[str, int] = {}
         after: dict[str, int] = {}
-        for each in picture.focus:
-            for found, near, far in (
-                (before, (each.name,) if each.name in own else each.senders, each.influencing),
-                (after, each.receivers, each.influenced),
+        for focus in picture.focus:
+            for hops_of, near, far in (
+                (before, (focus.name,) if focus.name in own else focus.senders, focus.influencing),
+                (after, focus.receivers, focus.influenced),
             ):
                 for enclave, hops in (
                     *((enclave, 1) for enclave in near),
                     *((one.enclave, one.hops) for one in far),
                 ):
-                    found[enclave] = min(hops, found.get(enclave, hops))
+                    hops_of[enclave] = min(hops, hops_of.get(enclave, hops))
         for edge in picture.edges:
             # Those that are denied a name, or that use a part of an action, belong to it.
             if (edge.kind, edge.name) in targets:
@@ -158,7 +158,7 @@ class FocusFlow:
             key: tuple(sorted((one & other) | ({0} if key in targets else set())))
             for key, (one, other) in ends.items()
         }
-        return replace(flow, stages={key: each for key, each in stages.items() if each})
+        return replace(flow, stages={key: stage for key, stage in stages.items() if stage})
 
     def ends(self, edge: Edge, stage: int) -> tuple[bool, bool]:
         """Return whether an edge leads to its name, and whether it leads from it, at a stage."""
@@ -219,7 +219,7 @@ class _System:
             right for source in sources for right in source.rights if right.enclave in enclaves
         ]
         self._governance: Governance | None = next(
-            (each.governance for each in reversed(sources) if each.governance), None
+            (source.governance for source in reversed(sources) if source.governance), None
         )
         everybody = sorted(enclaves)
         opened = tuple(unguarded(self._governance)) if self._governance else ()
@@ -241,13 +241,13 @@ class _System:
         An exact name that no right states can be meant if a wildcard matches it.
         """
         enclaves = [enclave.path for enclave in self._picture.enclaves]
-        found = [_ENCLAVE] * (word in enclaves)
-        found += [name.kind for name in self._picture.names if name.name == word]
-        if not found:
-            found = [
-                kind for kind in _VERBS if any(_meets(each, kind, word) for each in self._rights)
+        kinds = [_ENCLAVE] * (word in enclaves)
+        kinds += [name.kind for name in self._picture.names if name.name == word]
+        if not kinds:
+            kinds = [
+                kind for kind in _VERBS if any(_meets(right, kind, word) for right in self._rights)
             ]
-        if not found:
+        if not kinds:
             known = (*enclaves, *(name.name for name in self._picture.names))
             meant = likely_names(word, known)
             raise UsageError(
@@ -255,7 +255,7 @@ class _System:
                 "--focus takes a topic, service or action such as /cmd_vel, or an enclave.",
                 f"Perhaps you mean {' or '.join(meant)}." if meant else "",
             )
-        for kind in found:
+        for kind in kinds:
             yield kind, word
 
     def focus(self, kind: str, name: str) -> Focus:
@@ -286,10 +286,10 @@ class _System:
 
     def _influences(self, paths: Mapping[str, HopPath], near: int = 1) -> tuple[Influence, ...]:
         self._paths += paths.values()
-        found = (
+        influences = (
             Influence(enclave, near + len(path), path_text(path)) for enclave, path in paths.items()
         )
-        return tuple(sorted(found, key=lambda each: (each.hops, each.enclave)))
+        return tuple(sorted(influences, key=lambda influence: (influence.hops, influence.enclave)))
 
     def with_shortest_paths(self, picture: Picture) -> Picture:
         """Return a picture with all hops of shortest paths, also where no known name has it."""
@@ -309,28 +309,28 @@ class _System:
                 if (enclave, hop.kind, hop.name, fits) not in drawn:
                     by = () if stated == hop.name else (stated,)
                     added.add(Edge(enclave, hop.kind, hop.name, right, ALLOW, by))
-        for each in picture.focus:
-            if each.kind != _ENCLAVE and not is_expression(each.name):
-                added |= set(self._by_wildcards(each.kind, each.name))
+        for focus in picture.focus:
+            if focus.kind != _ENCLAVE and not is_expression(focus.name):
+                added |= set(self._by_wildcards(focus.kind, focus.name))
         new = {(edge.kind, edge.name) for edge in added} - self._known
         names = (*picture.names, *(self._name(*key) for key in new))
         return replace(
             picture,
             edges=tuple(sorted((*picture.edges, *added), key=edge_order)),
-            names=tuple(sorted(names, key=lambda each: (each.kind, each.name))),
+            names=tuple(sorted(names, key=lambda name: (name.kind, name.name))),
         )
 
     def _by_wildcards(self, kind: str, name: str) -> Iterator[Edge]:
         """Yield the edges of a name that no right states itself."""
         if (kind, name) in self._known:
             return
-        found: dict[tuple[str, str], list[Right]] = defaultdict(list)
+        by_right: dict[tuple[str, str], list[Right]] = defaultdict(list)
         for right in self._rights:
             if right.kind == kind and matches(right.name, name):
-                found[right.enclave, right.right].append(right)
-        for (enclave, what), rights in found.items():
-            qualifier = DENY if any(each.qualifier is DENY for each in rights) else ALLOW
-            by = sorted({each.name for each in rights if each.qualifier is qualifier})
+                by_right[right.enclave, right.right].append(right)
+        for (enclave, what), rights in by_right.items():
+            qualifier = DENY if any(right.qualifier is DENY for right in rights) else ALLOW
+            by = sorted({right.name for right in rights if right.qualifier is qualifier})
             yield Edge(enclave, kind, name, what, qualifier, tuple(by))
 
     def _name(self, kind: str, name: str) -> Name:
@@ -347,8 +347,8 @@ def _commands(kind: str, name: str) -> Iterator[str]:
     if kind == "dds":
         yield name
     elif kind == "actions":
-        for each in _COMMANDS:
-            yield from dds_names("request", f"{name}{ACTION_SEPARATOR}{each}").publish
+        for command in _COMMANDS:
+            yield from dds_names("request", f"{name}{ACTION_SEPARATOR}{command}").publish
     else:
         yield from dds_names("publish" if kind == "topics" else "request", name).publish
 
@@ -378,11 +378,11 @@ def _sentence(
     return f"{text}; {counted(near, 'other enclave')} influence{s} {them} directly{over}"
 
 
-def _several(found: Sequence[Influence], direct: int) -> str:
+def _several(influences: Sequence[Influence], direct: int) -> str:
     """Return a number of enclaves, and how many of them by one hop."""
-    near = sum(each.hops == direct for each in found)
-    text = counted(len(found), "enclave") if found else "no enclave"
-    return text if near == len(found) else f"{text} ({near} directly)"
+    near = sum(influence.hops == direct for influence in influences)
+    text = counted(len(influences), "enclave") if influences else "no enclave"
+    return text if near == len(influences) else f"{text} ({near} directly)"
 
 
 def _who(enclaves: Collection[str]) -> str:
@@ -417,7 +417,7 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, placed: bool = True) -> Sc
     names = {name for card in cards.values() if card.kind for name in card.members}
     scene = Scene(
         id="focus",
-        title=", ".join(dict.fromkeys(each.name for each in picture.focus)),
+        title=", ".join(dict.fromkeys(focus.name for focus in picture.focus)),
         width=max((card.x + card.width for card in cards.values()), default=200) + MARGIN,
         height=0,
         cards=tuple(cards.values()),
@@ -464,7 +464,7 @@ class _Draft:
         self.columns = self._column_of(True, 1) + 2 * self._right + 1
         self.columns += 2 if self._further[1] else 0
         self._nodes = self._folded()
-        self._stages = [self._stage(each) for each in range(1 - self._right, self._left)]
+        self._stages = [self._stage(stage) for stage in range(1 - self._right, self._left)]
 
     def _column_of(self, before: bool, hop: int) -> int:
         middle = self._first + 2 * self._left - 1
@@ -472,7 +472,7 @@ class _Draft:
 
     def _folded(self) -> Mapping[tuple[bool, str], str]:
         """Map each drawn enclave, before or after the focus, to the node that represents it."""
-        found = {}
+        nodes = {}
         for before, side in ((True, self._flow.before), (False, self._flow.after)):
             columns: dict[int, list[str]] = defaultdict(list)
             for path, hop in side.items():
@@ -485,8 +485,8 @@ class _Draft:
                     if len(paths) > _MOST_ENCLAVES:
                         whole = len(groups) > _MOST_ENCLAVES
                         node = f":{hop}" if whole else f":{hop} {self._groups[path]}"
-                    found[before, path] = node
-        return found
+                    nodes[before, path] = node
+        return nodes
 
     def _stage(self, stage: int) -> _Stage:
         edges: tuple[list[Edge], list[Edge]] = ([], [])
@@ -496,12 +496,12 @@ class _Draft:
                     edges[side].append(edge)
         # The mark of a side is in the name of the node, so that both fold together.
         sides = [
-            [replace(e, enclave=f"{'lr'[n]}{self._node(n, stage, e.enclave)}") for e in found]
-            for n, found in enumerate(edges)
+            [replace(e, enclave=f"{'lr'[n]}{self._node(n, stage, e.enclave)}") for e in drawn]
+            for n, drawn in enumerate(edges)
         ]
-        used = [{(each.kind, each.name) for each in side} for side in sides]
+        used = [{(edge.kind, edge.name) for edge in side} for side in sides]
         both = used[0] | used[1] if stage == 0 else used[0] & used[1]
-        kept = [each for side in sides for each in side if (each.kind, each.name) in both]
+        kept = [edge for side in sides for edge in side if (edge.kind, edge.name) in both]
         bundles: Iterable[Bundle] = fold(self._picture.names, kept)
         bundles = coarsened(bundles) if len(tuple(bundles)) > _MOST_BUNDLES else bundles
         middle = self._first + 2 * self._left - 1
@@ -526,14 +526,14 @@ class _Draft:
 
     def in_columns(self) -> dict[str, Card]:
         """Return all cards by id, with x and width."""
-        found = [*self._side_cards(), *self._further_cards(), *self._names_cards()]
+        cards = [*self._side_cards(), *self._further_cards(), *self._names_cards()]
         widths = [0] * self.columns
-        for card in found:
+        for card in cards:
             widths[card.column] = max(widths[card.column], _width(card))
         after = list(accumulate((w + _GUTTER if w else 0 for w in widths), initial=MARGIN))
         return {
             card.id: replace(card, x=after[card.column], width=widths[card.column])
-            for card in found
+            for card in cards
         }
 
     def _side_cards(self) -> Iterator[Card]:
@@ -597,7 +597,7 @@ class _Draft:
 
     def links(self, cards: Mapping[str, Card]) -> list[Link]:
         """Return all links, without the places of their ends."""
-        found: dict[tuple[str, str, str, bool, str, bool, bool], set[str]] = defaultdict(set)
+        groups: dict[tuple[str, str, str, bool, str, bool, bool], set[str]] = defaultdict(set)
         for stage in self._stages:
             for number, (_, left, right) in enumerate(stage.bundles):
                 names = f"n{stage.column} {number}"
@@ -612,7 +612,7 @@ class _Draft:
                             tie.violates,
                             tie.differs,
                         )
-                        found[key].add(tie.right)
+                        groups[key].add(tie.right)
         links = [
             Link(
                 source,
@@ -626,7 +626,7 @@ class _Draft:
                 OverlaySide(mark),
                 *more,
             )
-            for (source, target, qualifier, wildcard, mark, *more), rights in sorted(found.items())
+            for (source, target, qualifier, wildcard, mark, *more), rights in sorted(groups.items())
         ]
         return [*links, *self._further_links(cards)]
 
@@ -654,7 +654,7 @@ class _Draft:
 
     def heads(self, cards: Mapping[str, Card]) -> Iterator[Head]:
         """Yield what each column has."""
-        enclaves = any(each.kind == _ENCLAVE for each in self._picture.focus)
+        enclaves = any(focus.kind == _ENCLAVE for focus in self._picture.focus)
         texts = {
             self._column_of(before, hop): text
             for before, near, far, most in (
@@ -665,7 +665,7 @@ class _Draft:
             for text in (near if hop == 1 else f"{hop} {far}",)
         }
         for column, text in texts.items():
-            card = next((each for each in cards.values() if each.column == column), None)
+            card = next((other for other in cards.values() if other.column == column), None)
             if card:
                 yield Head(card.x + card.width // 2, "middle", text)
 

@@ -244,7 +244,7 @@ def _scene(
     draft = _Draft(picture, edges, owner, members, everybody)
     scene = draft.placed(name, title) if placed else draft.scene(name, title)
     shown = _real({(edge.kind, edge.name) for edge in edges}, drawn_as or {})
-    hidden = _real({(each.kind, each.name) for each in picture.names}, drawn_as or {}) - shown
+    hidden = _real({(name.kind, name.name) for name in picture.names}, drawn_as or {}) - shown
     return replace(scene, hidden=hidden, shown=shown)
 
 
@@ -307,7 +307,7 @@ class _Draft:
         drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
         if not all(map(is_plain, bundle.ties)):
             return ""
-        nodes = {each for name in bundle.names for each in self._everybody[bundle.kind, name]}
+        nodes = {node for name in bundle.names for node in self._everybody[bundle.kind, name]}
         nodes -= looking - drawn
         return nodes.pop() if len(nodes) == 1 else ""
 
@@ -446,9 +446,9 @@ def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
             wild[key] += bool(by)
     most = max(_ONLOOKER_LINES, _ONLOOKER_SHARE * len(bundles))
     looking = [
-        (key, sum(len(bundle.names) for bundle in found))
-        for key, found in sorted(reached.items())
-        if len(found) > most and 2 * wild[key] > len(found)
+        (key, sum(len(bundle.names) for bundle in bundles))
+        for key, bundles in sorted(reached.items())
+        if len(bundles) > most and 2 * wild[key] > len(bundles)
     ]
     return dict(looking[:_MOST_ONLOOKERS])
 
@@ -462,9 +462,9 @@ def _own_text(own: Iterable[Bundle]) -> list[str]:
     for bundle in own:
         kinds[bundle.kind] += len(bundle.names)
         lacks[bundle.lacks] += len(bundle.names)
-    found = [counted(number, KIND_NAMES[kind]) for kind, number in kinds.items()]
-    lines = [f"{OWN} {', '.join(found[:2])}"]
-    lines += [", ".join(found[2:])] if found[2:] else []
+    counts = [counted(number, KIND_NAMES[kind]) for kind, number in kinds.items()]
+    lines = [f"{OWN} {', '.join(counts[:2])}"]
+    lines += [", ".join(counts[2:])] if counts[2:] else []
     sides = (Lack.SENDER, Lack.RECEIVER)
     return [*lines, *(f"{lacks[side]} without a {side}" for side in sides if lacks[side])]
 
@@ -478,7 +478,7 @@ def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
         )
     if len(names) <= _MOST_NAMES:
         return names, ()
-    expressions = sorted({each for tie in bundle.ties for each in tie.by})
+    expressions = sorted({expression for tie in bundle.ties for expression in tie.by})
     if expressions and all(tie.by for tie in bundle.ties):
         return tuple(expressions[:_MOST_NAMES]), (f"reaches {counted(len(names), kind)}",)
     return names[:_SHOWN_NAMES], (f"and {len(names) - _SHOWN_NAMES} more {kind}s",)
@@ -557,14 +557,14 @@ def stacked(
 
     Cards of names are in odd columns; ``lines`` are pairs of ids in neighbouring columns.
     """
-    found = {card.id: card for card in cards}
+    by_id = {card.id: card for card in cards}
     items: list[list[ColumnItem]] = [[] for _ in range(columns)]
-    for card in found.values():
+    for card in by_id.values():
         items[card.column].append(ColumnItem(card.id, card.height, card.group))
     ordered = order_columns(items, lines)
     tops = _tops(ordered, lines)
     return {
-        item.id: replace(found[item.id], y=round(tops[item.id]))
+        item.id: replace(by_id[item.id], y=round(tops[item.id]))
         for column in ordered
         for item in column
     }
@@ -585,11 +585,11 @@ def linked(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]
         ):
             ports[here, out].append((cards[there].y + cards[there].height / 2, number))
     where: dict[tuple[int, bool], int] = {}
-    for (card, out), found in ports.items():
+    for (card, out), ends in ports.items():
         box = cards[card]
-        step = min(14.0, (box.height - 2 * PAD) / max(1, len(found) - 1))
-        first = box.y + box.height / 2 - step * (len(found) - 1) / 2
-        for place, (_, number) in enumerate(sorted(found)):
+        step = min(14.0, (box.height - 2 * PAD) / max(1, len(ends) - 1))
+        first = box.y + box.height / 2 - step * (len(ends) - 1) / 2
+        for place, (_, number) in enumerate(sorted(ends)):
             where[number, out] = round(first + place * step)
     return tuple(
         replace(link, y1=where[number, True], y2=where[number, False])
@@ -630,10 +630,10 @@ def frames_of(cards: Iterable[Card]) -> Iterable[Frame]:
     for card in cards:
         if card.role != "names":
             groups[card.column, card.group].append(card)
-    for (_, title), found in groups.items():
-        if not all(card.role == "group" for card in found):
-            top, bottom = found[0].y - 24, found[-1].y + found[-1].height + 6
-            yield Frame(title, found[0].x - 6, top, found[0].width + 12, bottom - top)
+    for (_, title), members in groups.items():
+        if not all(card.role == "group" for card in members):
+            top, bottom = members[0].y - 24, members[-1].y + members[-1].height + 6
+            yield Frame(title, members[0].x - 6, top, members[0].width + 12, bottom - top)
 
 
 class ColumnItem(NamedTuple):
@@ -682,7 +682,7 @@ def _by_barycentre(
 ) -> list[ColumnItem]:
     centre = {
         item.id: (
-            sum(places[each] for each in near[item.id]) / len(near[item.id])
+            sum(places[neighbour] for neighbour in near[item.id]) / len(near[item.id])
             if near[item.id]
             else places[item.id]
         )
@@ -716,18 +716,18 @@ def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[st
 def _inversions(ends: Sequence[int], size: int) -> int:
     """Return the number of pairs in the wrong order, with a Fenwick tree."""
     tree = [0] * (size + 1)
-    found = 0
+    crossings = 0
     for seen, end in enumerate(ends):
         at, before = end + 1, 0
         while at:
             before += tree[at]
             at -= at & -at
-        found += seen - before
+        crossings += seen - before
         at = end + 1
         while at <= size:
             tree[at] += 1
             at += at & -at
-    return found
+    return crossings
 
 
 def place_column(
