@@ -343,8 +343,8 @@ def recorded_policy(keystore: Keystore, signed: bytes) -> str:
     """
     digest = hashlib.sha256(signed).hexdigest()
     ledger = keystore.ledger_with("sha256", digest)
-    found = (e.policy for e in reversed(ledger.certain) if e.sha256 == digest)
-    return next(found, "")
+    policies = (e.policy for e in reversed(ledger.certain) if e.sha256 == digest)
+    return next(policies, "")
 
 
 def template_default(digest: str) -> str:

@@ -403,7 +403,7 @@ def _unjudged(observation: Observation) -> list[tuple[Note, str]]:
     tools |= {name for name, tool in silent if tool}
     mute = {name for name, tool in silent if not tool}
     strays = {endpoint.topic for _, endpoint in observation.strays}
-    found = [
+    notes = [
         (
             _note("tool", _TOOLS, tools),
             f"{counted(len(active), 'node')} with a tool's name",
@@ -412,12 +412,12 @@ def _unjudged(observation: Observation) -> list[tuple[Note, str]]:
         (_note("silent", _SILENT, mute), f"{counted(len(mute), 'node')} without endpoint", mute),
         (_note("stray", _STRAYS, strays), f"{counted(len(strays), 'topic')} of no node", strays),
     ]
-    return [(note, words if counts else "") for note, words, counts in found if note]
+    return [(note, words if counts else "") for note, words, counts in notes if note]
 
 
 def _note(kind: str, text: str, subjects: Iterable[str]) -> Note | None:
-    found = sorted(subjects)
-    return Note(f"audit.{kind}", f"{text}: {listed(found)}") if found else None
+    names = sorted(subjects)
+    return Note(f"audit.{kind}", f"{text}: {listed(names)}") if names else None
 
 
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
@@ -513,12 +513,12 @@ def _without_enclave(node: ObservedNode, what: str) -> Iterator[DeniedRight]:
 
 def _by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
     """Return each denied right once, sorted, with all nodes of the enclave that use it."""
-    found: dict[Right, DeniedRight] = {}
+    by_right: dict[Right, DeniedRight] = {}
     for each in denied:
-        other = found.get(each.right, each)
+        other = by_right.get(each.right, each)
         nodes = tuple(sorted({*other.nodes, *each.nodes}))
-        found[each.right] = replace(other, nodes=nodes)
-    return tuple(found[right] for right in sorted(found, key=order))
+        by_right[each.right] = replace(other, nodes=nodes)
+    return tuple(by_right[right] for right in sorted(by_right, key=order))
 
 
 def _used(denied: Iterable[DeniedRight], observation: Observation) -> Observation:

@@ -105,9 +105,9 @@ def read_denials(text: str) -> tuple[Denial, ...]:
     for number, line in enumerate(log_lines(text), 1):
         process, rest = labelled_line(line)
         processes.setdefault(process, []).append((number, rest))
-    found = {denial: None for item in processes.items() for denial in _denials_of(*item)}
-    known = {replace(each, direction="") for each in found if each.direction}
-    return tuple(each for each in found if each.direction or each not in known)
+    denials = {denial: None for item in processes.items() for denial in _denials_of(*item)}
+    known = {replace(each, direction="") for each in denials if each.direction}
+    return tuple(each for each in denials if each.direction or each not in known)
 
 
 def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denial]:

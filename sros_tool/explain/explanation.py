@@ -80,8 +80,8 @@ def explain(evaluator: Evaluator, question: Question) -> Answer:
     if not answer.problems and (changed := _changed(evaluator, answer)):
         return changed
     faulty = (problem.file for problem in answer.problems if problem.fault.id == answer.reason)
-    found = remedy(answer.reason, str(enclave.root or ""), enclave.name, next(faulty, ""))
-    return replace(answer, remedy=found)
+    text = remedy(answer.reason, str(enclave.root or ""), enclave.name, next(faulty, ""))
+    return replace(answer, remedy=text)
 
 
 def _provenance(enclave: LoadedEnclave, recorded: str) -> Provenance | None:
@@ -302,12 +302,12 @@ def policy_of(name: str, rights: Iterable[Right]) -> Enclave:
 
 def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Right]:
     """Return the present rights of an enclave, except those that no policy can state."""
-    found: Iterable[Right] = ()
+    rights: Iterable[Right] = ()
     if policy:
-        found = (r for profile in policy.all_profiles() for r in profile_rights(name, profile))
+        rights = (r for profile in policy.all_profiles() for r in profile_rights(name, profile))
     elif answer.grant:
-        found = _granted(name, answer)
-    return {right for right in found if right.kind != "dds"}
+        rights = _granted(name, answer)
+    return {right for right in rights if right.kind != "dds"}
 
 
 def _blocking(rights: Iterable[Right], answer: Answer) -> list[Right]:

@@ -244,10 +244,10 @@ def explain_log(
     denials = [(each, naming[each.process, each.topic]) for each in denied]
     reported = {each.process for each in denied}
     hits = _strongest(_hits(_joined(lines)), reported)
-    found = [examiner.message(group) for group in _grouped(hits) if examiner.matters(group[0])]
-    found += [examiner.denial(each, named) for each, named in denials]
-    found += _dropped(lines, root)
-    return tuple(sorted(found, key=lambda each: each.line))
+    findings = [examiner.message(group) for group in _grouped(hits) if examiner.matters(group[0])]
+    findings += [examiner.denial(each, named) for each, named in denials]
+    findings += _dropped(lines, root)
+    return tuple(sorted(findings, key=lambda each: each.line))
 
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────
@@ -350,12 +350,12 @@ def _strongest(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:
 
     ``reported`` are the processes whose denied topics are reported separately.
     """
-    found = list(hits)
+    all_hits = list(hits)
     least = dict.fromkeys(reported, 0)
-    for hit in found:
+    for hit in all_hits:
         if hit.meaning is not UNKNOWN:
             least[hit.process] = min(hit.meaning.weak, least.get(hit.process, hit.meaning.weak))
-    return (hit for hit in found if hit.meaning.weak <= least.get(hit.process, 0))
+    return (hit for hit in all_hits if hit.meaning.weak <= least.get(hit.process, 0))
 
 
 def _grouped(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
@@ -369,13 +369,13 @@ def _lines_naming(
     lines: list[str], topics: set[str]
 ) -> Mapping[tuple[str, str], list[tuple[int, str]]]:
     """Return, for each process and topic, the lines that name it: their numbers and texts."""
-    found = defaultdict[tuple[str, str], list[tuple[int, str]]](list)
+    lines_of = defaultdict[tuple[str, str], list[tuple[int, str]]](list)
     for number, line in enumerate(lines, 1):
         process, text = labelled_line(line)
         words = (word for pattern in _WORDS for word in pattern.findall(text))
         for topic in topics.intersection(words):
-            found[process, topic].append((number, text))
-    return found
+            lines_of[process, topic].append((number, text))
+    return lines_of
 
 
 # ── what Zenoh drops ───────────────────────────────────────────────────────────────────────
@@ -534,7 +534,7 @@ class _Examiner:
             else []
         )
         peers = {name: self._find(name) for name in names if name}
-        found: list[str] = []
+        known: list[str] = []
         remedies: list[str] = []
         rotating = self._keystore.rotates if self._keystore else False
         for name, peer in peers.items():
@@ -542,20 +542,20 @@ class _Examiner:
                 continue
             answer = self._answer(peer, finding.dds or Vendor.FAST, ask("join"))
             causes = list(self._causes(peer, answer, ()))
-            found += [f"the peer is enclave {name}: {cause}" for cause, _ in causes]
+            known += [f"the peer is enclave {name}: {cause}" for cause, _ in causes]
             remedies += [f"{each} Then restart its processes." for _, each in causes if each]
             if not causes:
-                found.append(f"the peer is enclave {name}, whose present files have no fault")
+                known.append(f"the peer is enclave {name}, whose present files have no fault")
                 if not (rotating and finding.id in _OF_ROTATION):
                     remedies.append(_OLDER_FILES.format(peer=name))
         if peers and rotating and finding.id in _OF_ROTATION:
             of = f" of enclave {finding.enclave}" if finding.enclave else ""
-            found.append("the CAs of this keystore are being replaced, and stage 2 is done")
+            known.append("the CAs of this keystore are being replaced, and stage 2 is done")
             remedies = [_NOT_RESTARTED[finding.dds or Vendor.FAST].format(of=of)]
         text = " ".join(dict.fromkeys(remedies)) or finding.remedy
         only = next(iter(peers)) if len(peers) == 1 else ""
         text = re.sub(r"\bPEER\b", lambda _: quote(only), text) if only else text
-        return replace(finding, found=tuple(found), checked=bool(found), remedy=text)
+        return replace(finding, found=tuple(known), checked=bool(known), remedy=text)
 
     def denial(self, denial: Denial, named: list[tuple[int, str]]) -> LogFinding:
         """Return the finding for a denied topic; ``named`` are the lines that name it."""
@@ -584,17 +584,17 @@ class _Examiner:
             return replace(finding, remedy=named_remedy)
         answer = self._answer(enclave, denial.vendor, _question(denial))
         if answer.allowed:
-            found = ["the present permissions allow it"]
+            facts = ["the present permissions allow it"]
             remedy = "Restart the process: it loaded earlier permissions."
         else:
             other, better = self._other_node(denial, answer)
             if not other:
                 other, better = self._other_name(denial, name, enclave, finding.remedy)
-            found = [answer.decision.text, *other]
+            facts = [answer.decision.text, *other]
             remedy = better or finding.remedy
         remedy = remedy.replace("ENCLAVE", enclave.name)
         return replace(
-            finding, enclave=enclave.name, found=tuple(found), checked=True, remedy=remedy
+            finding, enclave=enclave.name, found=tuple(facts), checked=True, remedy=remedy
         )
 
     def _other_node(self, denial: Denial, answer: Answer) -> tuple[list[str], str]:

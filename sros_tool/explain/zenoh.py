@@ -289,7 +289,7 @@ class ZenohEvaluator:
         if enclave not in self.names:
             raise no_such_enclave(self.keystore, enclave, self.names)
         own = self._file(enclave, self._file_of(enclave))
-        found = ZenohAnswer(
+        answer = ZenohAnswer(
             enclave,
             question,
             own.process.mode if own.process else None,
@@ -299,33 +299,33 @@ class ZenohEvaluator:
             unsigned=self._unsigned(own),
         )
         if own.process is None:
-            return found
+            return answer
         if own.process.mode is Mode.ROUTER:
             text = "it is the router's enclave, which passes on what others say and says nothing"
-            return replace(found, outcome=_Outcome.DROPPED, text=text)
+            return replace(answer, outcome=_Outcome.DROPPED, text=text)
         if self.router.process is None:
             text = f"no link to the router {self.router.enclave}: {self.router.problem}"
-            return replace(found, text=text)
+            return replace(answer, text=text)
         if not _meet(own.endpoints, self.router.endpoints):
             text = f"no link to the router: {own.file} connects to {_listed(own.endpoints)}, and "
             text += f"{ROUTER_FILE} listens at {_listed(self.router.endpoints)}"
-            return replace(found, text=text)
+            return replace(answer, text=text)
         wanted = self._rights(enclave, question)
         checks = tuple(
             check
             for other in self._enforcers(own.process, self.router.process, brief=brief)
             for check in self._decided(own.process, other, wanted)
         )
-        found = replace(found, checks=checks)
-        assert found.deciding
-        by = found.deciding.enforcer
-        why = found.deciding.decision.why
-        text = f"{found.deciding}: {why}, in {self._file_of(by)} of {by}"
-        if found.dropped:
-            return replace(found, outcome=_Outcome.DROPPED, text=text)
+        answer = replace(answer, checks=checks)
+        assert answer.deciding
+        by = answer.deciding.enforcer
+        why = answer.deciding.decision.why
+        text = f"{answer.deciding}: {why}, in {self._file_of(by)} of {by}"
+        if answer.dropped:
+            return replace(answer, outcome=_Outcome.DROPPED, text=text)
         reached = tuple(self._reached(own, wanted)) if reach else ()
         return replace(
-            found,
+            answer,
             outcome=_Outcome.ALLOWED,
             text=text,
             reached=reached,
@@ -465,14 +465,14 @@ class ZenohEvaluator:
                 continue
             assert own.process
             # What the others decide comes first: it needs no file of that enclave.
-            found = self._between(own.process, _unrestricted(name, own.process.mode), wanted)
-            if not all(each.arrives for each in found):
+            deliveries = self._between(own.process, _unrestricted(name, own.process.mode), wanted)
+            if not all(each.arrives for each in deliveries):
                 continue
             other = self._file(name, SESSION_FILE)
             if other.process:
-                found = self._between(own.process, other.process, wanted)
-            if all(each.arrives for each in found):
-                yield Reached(name, found, other.problem)
+                deliveries = self._between(own.process, other.process, wanted)
+            if all(each.arrives for each in deliveries):
+                yield Reached(name, deliveries, other.problem)
 
     def _between(
         self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right], key: str = ""
@@ -494,13 +494,13 @@ class ZenohEvaluator:
         """
         asked = [each for each in wanted if each.right in ("publish", "request")]
         for wide in dict.fromkeys(filter(None, map(self._wildcard, checks))):
-            found = [
+            enclaves = [
                 each.enclave
                 for each in reached
                 if (other := self._file(each.enclave, SESSION_FILE).process)
                 and any(one.arrives for one in self._between(own, other, asked, wide))
             ]
-            yield DecidingWildcard(wide, tuple(found))
+            yield DecidingWildcard(wide, tuple(enclaves))
 
     def _wildcard(self, check: Check) -> str:
         """Return the key expression that allows data, if its name has a wildcard, or ""."""

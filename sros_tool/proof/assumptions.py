@@ -71,10 +71,10 @@ def domains_of_robots(side: AccessSource, other: AccessSource) -> dict[str, int]
     robots = side.fleet or other.fleet
     if side.kind != "policy" or robots is None:
         return {}
-    found = ((name, robot_of(robots, name)) for name in side.permissions)
+    robots_of = ((name, robot_of(robots, name)) for name in side.permissions)
     return {
         name: robot.domain
-        for name, robot in found
+        for name, robot in robots_of
         if robot is not None and robot.domain is not None
     }
 

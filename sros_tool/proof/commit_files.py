@@ -159,15 +159,15 @@ class CommitFiles:
 
     def differing(self, work_tree: Path) -> list[str]:
         """Return the files of this snapshot that a work tree has otherwise, or not at all."""
-        found = []
+        paths = []
         with Folder(work_tree) as folder:
             for path in self.files:
                 there = None
                 with suppress(SrosError, OSError):
                     there = folder.read(path)
                 if there != (self.folder / path).read_bytes():
-                    found.append(path)
-        return found
+                    paths.append(path)
+        return paths
 
     def _policy(self, path: str, placeholders: bool) -> Path:
         revision = Revision(self.repository, self.name, self.commit, path)
@@ -303,16 +303,16 @@ def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) 
         policies: the paths of the policies.
         content: returns the content of the file at a path; None if there is none.
     """
-    found = dict.fromkeys(policies, True)
-    left = list(found)
+    used = dict.fromkeys(policies, True)
+    left = list(used)
     while left:
         path = left.pop()
         for target, pointer in _includes(path, content(path)):
             whole = _WHOLE.fullmatch(pointer)
-            if whole and (target not in found or (not found[target] and not whole["below"])):
-                found[target] = not whole["below"]
+            if whole and (target not in used or (not used[target] and not whole["below"])):
+                used[target] = not whole["below"]
                 left.append(target)
-    return found
+    return used
 
 
 def includes_files(content: bytes) -> bool:
@@ -326,10 +326,10 @@ def users_of(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str]:
     includes = {
         path: {target for target, _ in _includes(path, data)} for path, data in files.items()
     }
-    found = set(parts)
-    while more := {path for path, targets in includes.items() if targets & found} - found:
-        found |= more
-    return found.difference(parts)
+    users = set(parts)
+    while more := {path for path, targets in includes.items() if targets & users} - users:
+        users |= more
+    return users.difference(parts)
 
 
 def _includes(path: str, content: bytes | None) -> Iterator[tuple[str, str]]:

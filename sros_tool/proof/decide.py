@@ -244,15 +244,15 @@ def _first_uses(
     rights: RightNames, world: World, limit: SearchLimit, without: Sequence[str] = ()
 ) -> dict[str, Use]:
     """Map the enclaves that have one of some rights to the shortest use, except ``without``."""
-    found: dict[str, Use] = {}
+    uses: dict[str, Use] = {}
     for right, part, topics in _each(rights):
         for met in world.side(part.writes).meeting(topics, limit):
             if _match(without, met.enclave):
                 continue
             if topic := world.use(met, topics, limit):
                 use = _use(met.enclave, right, part, topics, topic)
-                found[met.enclave] = min(use, found.get(met.enclave, use), key=_better)
-    return found
+                uses[met.enclave] = min(use, uses.get(met.enclave, use), key=_better)
+    return uses
 
 
 def _first_of(uses: Collection[Use]) -> Witness | None:
@@ -379,7 +379,7 @@ def _shared_by(
 def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness | None:
     """Return the shortest name that a wildcard gives an enclave beyond the names it may."""
     enclaves = [each for each in world.enclaves if _match(requirement.enclaves, each)]
-    found: dict[str, Use] = {}
+    uses: dict[str, Use] = {}
     for right, names in requirement.rights:
         for part in _doing(right):
             side, every = world.side(part.writes), part.topics("*")
@@ -393,8 +393,8 @@ def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness 
                 exact = access.writes if part.writes else access.reads
                 if topic := world.example(own - exact - within, every, limit):
                     use = _use(enclave, right, part, every, topic)
-                    found[enclave] = min(use, found.get(enclave, use), key=_better)
-    return _first_of(found.values())
+                    uses[enclave] = min(use, uses.get(enclave, use), key=_better)
+    return _first_of(uses.values())
 
 
 _WRITTEN_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/rosout", "rt/parameter_events"))
@@ -404,7 +404,7 @@ _READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
 def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Witness | None:
     """Return the shortest name of which an enclave may do more than it should."""
     enclaves = [each for each in world.enclaves if _match(requirement.enclaves, each)]
-    found: dict[str, Use] = {}
+    uses: dict[str, Use] = {}
     for writes, ordinary in ((True, _WRITTEN_BY_EVERY_NODE), (False, _READ_BY_EVERY_NODE)):
         allowed = NameSet.union(
             part.topics(name).every()
@@ -418,8 +418,8 @@ def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Wit
             if topic := world.any_example(more, limit):
                 right, name = right_to_use(topic, writes=writes)
                 use = Use(enclave, right, name, topic, writes)
-                found[enclave] = min(use, found.get(enclave, use), key=_better)
-    return _first_of(found.values())
+                uses[enclave] = min(use, uses.get(enclave, use), key=_better)
+    return _first_of(uses.values())
 
 
 def _both(requirement: NotBoth, world: World, limit: SearchLimit) -> Witness | None:
@@ -439,22 +439,22 @@ def _unprotected(requirement: Protected, world: World, limit: SearchLimit) -> Wi
     weak = world.weaker(requirement.level)
     if weak is None:
         return None
-    found = []
+    uses = []
     for topics in _of_kinds(requirement.names):
         if topic := world.example(weak, topics, limit):
-            found.append(Use("", "", topics.ros_name(topic), topic, True))
-    return Witness((min(found, key=_better),)) if found else None
+            uses.append(Use("", "", topics.ros_name(topic), topic, True))
+    return Witness((min(uses, key=_better),)) if uses else None
 
 
 def _assumed(requirement: Requirement, world: World, limit: SearchLimit) -> str:
     """Return the shortest name whose protection is assumed in the world, or ""."""
     if not isinstance(requirement, Protected) or world.demanded is None:
         return ""
-    found = []
+    names = []
     for topics in _of_kinds(requirement.names):
         if topic := world.example(~world.demanded, topics, limit):
-            found.append(topics.ros_name(topic))
-    return shortest(found) or ""
+            names.append(topics.ros_name(topic))
+    return shortest(names) or ""
 
 
 def _of_kinds(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
@@ -639,16 +639,16 @@ def _shortest_chain(
 
 def influencers(world: World, limit: SearchLimit) -> dict[str, set[str]]:
     """Map each enclave that others influence directly to these."""
-    found: dict[str, set[str]] = {}
+    sources: dict[str, set[str]] = {}
     flow = _Flow(world, limit)
     for enclave in world.enclaves:
 
         def is_new(target: str, source: str = enclave) -> bool:
-            return source not in found.get(target, ())
+            return source not in sources.get(target, ())
 
         for _, target in flow.hops(enclave, lambda _: True, is_new):
-            found.setdefault(target, set()).add(enclave)
-    return found
+            sources.setdefault(target, set()).add(enclave)
+    return sources
 
 
 class _Flow:

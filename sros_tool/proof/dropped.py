@@ -95,14 +95,14 @@ def dropped_requirements(
     A requirement that is not returned holds wherever all of ``after`` hold.
     """
     now = [(part, whole) for whole in after for part in _parts(whole)]
-    found = []
+    dropped = []
     for requirement in before:
         parts = tuple(_parts(requirement))
         if all(any(_implies(each, part) for each, _ in now) for part in parts):
             continue
         kept = (whole for each, whole in now if any(_is_alike(each, part) for part in parts))
-        found.append(DroppedRequirement(requirement, tuple(dict.fromkeys(kept))))
-    return tuple(found)
+        dropped.append(DroppedRequirement(requirement, tuple(dict.fromkeys(kept))))
+    return tuple(dropped)
 
 
 def dropped_findings(

@@ -180,14 +180,14 @@ def requirement_findings(requirements: Sequence[Requirement], system: System) ->
 
 def decided_findings(decided: Decided, system: System) -> list[Finding]:
     """Return the findings of decisions, those of what does not hold first and in their order."""
-    found = [_violated(violation) for violation in decided.violations]
-    found += [_vacuous(requirement, why) for requirement, why in decided.vacuous]
-    found += [_assumed(*each) for each in decided.assumed]
+    findings = [_violated(violation) for violation in decided.violations]
+    findings += [_vacuous(requirement, why) for requirement, why in decided.vacuous]
+    findings += [_assumed(*each) for each in decided.assumed]
     if system.left_out:
         error = system.left_out
         text = f"{error.what}: {error.why}" if error.why else error.what
-        found.append(NOT_ON_ZENOH.found(system.file, text, system.file))
-    return found
+        findings.append(NOT_ON_ZENOH.found(system.file, text, system.file))
+    return findings
 
 
 def _text(violation: Violation) -> str:
@@ -315,15 +315,15 @@ def suggest(rights: Iterable[Right], worlds: Sequence[World]) -> tuple[Requireme
     Raises:
         DocumentError: one cannot be decided with so many wildcards.
     """
-    found: list[Requirement] = []
+    requirements: list[Requirement] = []
     limit = SearchLimit(_MOST_STEPS)
     all_worlds = Worlds(worlds)
     for each in islice(_candidates(_Stated(rights), worlds), _MOST):
         verdicts = all_worlds.decide(each, limit)
         if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
-            last = _joined(found[-1], each) if found else None
-            found[-1:] = [last] if last else [*found[-1:], each]
-    return tuple(found)
+            last = _joined(requirements[-1], each) if requirements else None
+            requirements[-1:] = [last] if last else [*requirements[-1:], each]
+    return tuple(requirements)
 
 
 def _joined(one: Requirement, other: Requirement) -> Requirement | None:

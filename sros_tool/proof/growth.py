@@ -328,33 +328,33 @@ class _World:
 
 
 def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
-    found = []
+    worlds = []
     if "zenoh" not in (base.kind, head.kind):
         domains = _domains(base, head)
         for vendor in MEASURED:
             lenders = _lenders(vendor, base, head)
             access = _of_vendor(vendor, lenders)
             traits = vendor.traits
-            found.append(
+            worlds.append(
                 _World(
                     vendor.title, traits.style, domains, access, lenders, traits.longest_topic_name
                 )
             )
     if base.zenoh is not None or head.zenoh is not None:
-        found.append(
+        worlds.append(
             _World(_ZENOH, Style.FNMATCH, _zenoh_domains(base, head), _on_zenoh(base, head))
         )
-    return found
+    return worlds
 
 
 def _zenoh_domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
     """Return one domain of each kind: by rules of Zenoh, and by the domains of what has none."""
-    found: set[DomainSet] = set()
+    domains: set[DomainSet] = set()
     for side, other in ((base, head), (head, base)):
-        found.update(DomainSet.of((e, e)) for e in domains_of_robots(side, other).values())
+        domains.update(DomainSet.of((e, e)) for e in domains_of_robots(side, other).values())
         if side.zenoh is None and side.kind != "policy":
-            found.update(each.closed() for each in _granted(side))
-    return domains_of((*base.enforcers, *head.enforcers), found) or (0,)
+            domains.update(each.closed() for each in _granted(side))
+    return domains_of((*base.enforcers, *head.enforcers), domains) or (0,)
 
 
 def _domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
@@ -398,14 +398,14 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
         granted = (grant.subject for grant in side.permissions[name].grants[:1])
         subject = subject if _fits(vendor, side, name, subject) else next(granted, "")
         governed = GovernedDomain(vendor, governance, at)
-        found = Access(governed, side.permissions[name], subject, at=AT)
-        if found.join().reason in ("no-grant", "malformed") or found.join().outcome == "crashes":
+        access = Access(governed, side.permissions[name], subject, at=AT)
+        if access.join().reason in ("no-grant", "malformed") or access.join().outcome == "crashes":
             raise DocumentError(
                 f"the permissions of {name} in '{side.shown}' cannot be compared",
-                found.join().text,
+                access.join().text,
                 "Sign them again.",
             )
-        return found
+        return access
 
     def access(side: AccessSource, enclave: str, domain: int) -> _Access:
         governance = side.governance
@@ -504,10 +504,10 @@ def _in_domain(grant: Grant, domain: int) -> Grant:
 
 
 def _by_enclave(rights: Iterable[Right]) -> dict[str, list[Right]]:
-    found: dict[str, list[Right]] = defaultdict(list)
+    by_enclave: dict[str, list[Right]] = defaultdict(list)
     for right in sorted(rights):
-        found[right.enclave].append(right)
-    return found
+        by_enclave[right.enclave].append(right)
+    return by_enclave
 
 
 # ── rights ─────────────────────────────────────────────────────────────────────────────────
@@ -521,15 +521,15 @@ def _gains(
     limit: SearchLimit,
 ) -> Iterator[Gain]:
     """Yield what ``new`` gives that ``old`` does not: the same in several worlds once."""
-    found: dict[tuple[object, ...], tuple[Gain, set[str], set[int]]] = {}
+    gains: dict[tuple[object, ...], tuple[Gain, set[str], set[int]]] = {}
     for gain in _each_gain(old, new, worlds, scope, limit):
         key = gain.enclaves[0], gain.action, gain.right, gain.name or gain.topic
-        _, seen, domains = found.setdefault(key, (gain, set(), set()))
+        _, seen, domains = gains.setdefault(key, (gain, set(), set()))
         seen.update(gain.worlds)
         domains.update(gain.domains)
     order = [world.title for world in worlds]
     together: dict[Gain, list[str]] = {}
-    for gain, seen, domains in found.values():
+    for gain, seen, domains in gains.values():
         one = replace(
             gain,
             worlds=tuple(each for each in order if each in seen),
@@ -558,7 +558,7 @@ def _each_gain(
                 continue
             for domain in world.domains:
                 before, after = (world.access(side, enclave, domain) for side in (old, new))
-                found = False
+                gained = False
                 for verb in _VERBS:
                     more = after.topics[verb] - before.topics[verb]
                     if not before.joins:
@@ -566,9 +566,9 @@ def _each_gain(
                     for gain in stated.gains(enclave, verb, more, world, domain, limit):
                         if not after.decide(verb, gain.topic) or before.decide(verb, gain.topic):
                             raise AssertionError(f"{gain} is not what {world.title} decides")
-                        found = True
+                        gained = True
                         yield gain
-                if not found and after.joins and not before.joins:
+                if not gained and after.joins and not before.joins:
                     yield Gain(
                         (enclave,), _JOIN, None, "", "", None, None, None, (world.title,), (domain,)
                     )
@@ -698,10 +698,10 @@ class _Stated:
         for topic in self._examples[key]:
             if topic in names and (world.longest is None or len(topic.encode()) <= world.longest):
                 return topic
-        found = _example(names, key[2], world, limit)
-        if found is not None:
-            self._examples[key].append(found)
-        return found
+        example = _example(names, key[2], world, limit)
+        if example is not None:
+            self._examples[key].append(example)
+        return example
 
     def _gain(
         self,
@@ -749,10 +749,10 @@ def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit)
     """Return a topic of a set that an expression covers: one of a ROS name if there is any."""
     if not is_expression(expression):
         return expression if expression in names else None
-    found = names.example(limit, longest=world.longest)
-    if found is None or found in ROS_TOPICS:
-        return found
-    return (names & ROS_TOPICS).example(limit, longest=world.longest) or found
+    example = names.example(limit, longest=world.longest)
+    if example is None or example in ROS_TOPICS:
+        return example
+    return (names & ROS_TOPICS).example(limit, longest=world.longest) or example
 
 
 # ── reach ──────────────────────────────────────────────────────────────────────────────────
@@ -778,13 +778,13 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
     sources = changed.union(*(_reached(backwards, each) for each in sorted(changed)))
     for source in sorted(sources):
         known = _reached(before, source).keys()
-        found = _reached(after, source)
-        for target in sorted(found.keys() - known - {source}):
+        reached = _reached(after, source)
+        for target in sorted(reached.keys() - known - {source}):
             path: list[Hop] = []
             at = target
             while at != source:
-                path.insert(0, found[at])
-                at = found[at].source
+                path.insert(0, reached[at])
+                at = reached[at].source
             yield NewReach(source, target, tuple(path))
 
 
@@ -819,27 +819,27 @@ def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | 
         unguarded=unguarded(side.governance) if side.governance else (),
         everybody=sorted(side.permissions),
     )
-    found: dict[str, dict[str, Hop]] = defaultdict(dict)
+    edges: dict[str, dict[str, Hop]] = defaultdict(dict)
     left = _MOST_HOPS
     for each in network.enclaves:
         source = real.get(each, each)
         for hop in network.hops(each):
             target = real.get(hop.target, hop.target)
-            if target != source and target not in found[source]:
-                found[source][target] = hop._replace(source=source, target=target)
+            if target != source and target not in edges[source]:
+                edges[source][target] = hop._replace(source=source, target=target)
                 left -= 1
         if left < 0:
             return None
-    return found
+    return edges
 
 
 def _reached(edges: _Edges, start: str) -> dict[str, Hop]:
     """Return the enclaves that hops lead to, each with the last hop of a shortest path."""
-    found: dict[str, Hop] = {}
+    reached: dict[str, Hop] = {}
     row = [start]
     for here in row:
         for there, hop in edges.get(here, {}).items():
-            if there not in found and there != start:
-                found[there] = hop
+            if there not in reached and there != start:
+                reached[there] = hop
                 row.append(there)
-    return found
+    return reached

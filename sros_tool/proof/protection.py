@@ -276,10 +276,10 @@ def _no_longer_stated(
             if other.kind == each.kind and (other.level, each.level) != (Level.SIGN, Level.ENCRYPT)
         ]
         names = _named((each.name,)) - _named(enough)
-        found = names.example(limit)
-        if found is not None:
+        example = names.example(limit)
+        if example is not None:
             valid = names & _ABSOLUTE
-            name = found if found in _ABSOLUTE else valid.example(limit) or found
+            name = example if example in _ABSOLUTE else valid.example(limit) or example
             less = "sign" if name in _named(_signed(later, each.kind)) else "nothing"
             yield SettingChange(
                 Effect.LOOSER,

@@ -103,14 +103,14 @@ class Repository:
                 f"A tag or branch of that name could stand for another commit.{there}",
                 "Write the 40 digits of the commit, or a name such as refs/remotes/origin/main.",
             )
-        found = name if _HASH.match(name) else self._target(name)
-        if not found:
+        digits = name if _HASH.match(name) else self._target(name)
+        if not digits:
             raise DocumentError(
                 f"git finds no reference '{name}'",
                 "",
                 "`git for-each-ref` shows what there is. Fetch it first.",
             )
-        return self._peeled(found, name)
+        return self._peeled(digits, name)
 
     def commit(self, name: str) -> str:
         """Return the full id of the commit that a name stands for, such as ``main`` or ``HEAD~2``.
@@ -175,11 +175,11 @@ class Repository:
         """Return the references that git looks up for a short name, and their ids."""
         places = ("refs/", "refs/tags/", "refs/heads/", "refs/remotes/")
         names = [f"{place}{name}" for place in places] + [f"refs/remotes/{name}/HEAD"]
-        found = self._targets(names)
+        commits = self._targets(names)
         if re.fullmatch(r"[A-Z_]+", name):  # such as FETCH_HEAD
             target = self._ask("rev-parse", "--verify", "--quiet", "--end-of-options", name)
-            found |= {name: target} if target and target not in found.values() else {}
-        return found
+            commits |= {name: target} if target and target not in commits.values() else {}
+        return commits
 
     def _target(self, reference: str) -> str:
         """Return the id that exactly this reference has, or ""."""
@@ -191,8 +191,8 @@ class Repository:
         if not wanted:
             return {}
         lines = self._ask("for-each-ref", "--format=%(objectname) %(refname)", "--", *wanted)
-        found = {name: digits for digits, _, name in map(_parted, lines.splitlines())}
-        return {each: found[each] for each in wanted if each in found}
+        targets = {name: digits for digits, _, name in map(_parted, lines.splitlines())}
+        return {each: targets[each] for each in wanted if each in targets}
 
     def _peeled(self, digits: str, name: str) -> str:
         """Return the commit that an id names, also by annotated tags."""
@@ -268,8 +268,8 @@ class Repository:
             DocumentError: one is missing or malformed, or has a name that no file system has.
         """
         wanted = list(dict.fromkeys(ids))
-        found = self._all("tree", wanted)
-        return {each: _entries(data, len(each) // 2) for each, data in found.items()}
+        trees = self._all("tree", wanted)
+        return {each: _entries(data, len(each) // 2) for each, data in trees.items()}
 
     def contents(self, ids: Iterable[str]) -> dict[str, bytes]:
         """Return the contents of files by id.
@@ -287,8 +287,8 @@ class Repository:
         """Return type and size of objects by id, as the repository says."""
         asked = "".join(f"{each}\n" for each in ids).encode()
         lines = self._git(["cat-file", "--batch-check"], stdin=asked).decode().splitlines()
-        found = (line.split() for line in lines)
-        return {words[0]: (words[1], int(words[2])) for words in found if len(words) == 3}
+        fields = (line.split() for line in lines)
+        return {words[0]: (words[1], int(words[2])) for words in fields if len(words) == 3}
 
     def find(self, commit: str, path: str) -> TreeEntry | None:
         """Return what is at a path of a commit, "" for its top; None if nothing is.
@@ -333,17 +333,17 @@ class Repository:
         return _content(self, digits)
 
     def _all(self, kind: str, ids: Sequence[str]) -> dict[str, bytes]:
-        found = self._objects(ids)
+        objects = self._objects(ids)
         for each in ids:
-            if each not in found:
+            if each not in objects:
                 raise DocumentError(
                     f"git cannot read it: the object {each} is not in the repository",
                     "",
                     "Fetch all of the commit: no partial clone (`git fetch --refetch`).",
                 )
-            if found[each][0] != kind:
-                raise DocumentError(f"the object {each} is no {kind}, but a {found[each][0]}")
-        return {each: found[each][1] for each in ids}
+            if objects[each][0] != kind:
+                raise DocumentError(f"the object {each} is no {kind}, but a {objects[each][0]}")
+        return {each: objects[each][1] for each in ids}
 
     def _objects(self, ids: Sequence[str]) -> dict[str, tuple[str, bytes]]:
         """Return type and content of objects, verified; what is missing is left out.
@@ -356,7 +356,7 @@ class Repository:
                 raise DocumentError(f"the object {each} is larger than {_MOST_BYTES} bytes")
         asked = "".join(f"{each}\n" for each in ids).encode()
         data = self._git(["cat-file", "--batch"], stdin=asked)
-        found: dict[str, tuple[str, bytes]] = {}
+        objects: dict[str, tuple[str, bytes]] = {}
         at = 0
         for each in ids:
             end = data.find(b"\n", at)
@@ -374,8 +374,8 @@ class Repository:
                     "Its content does not have this hash.",
                     "Clone the repository again.",
                 )
-            found[each] = words[1], content
-        return found
+            objects[each] = words[1], content
+        return objects
 
     # ── fetching ───────────────────────────────────────────────────────────────────────────
 
@@ -508,11 +508,11 @@ def walk(
         if depth > _MOST_DEPTH:
             raise DocumentError(f"the commit has more than {_MOST_DEPTH} folders in each other")
         ids = [each for _, *pair in level for each in pair if each]
-        found = repository.folders(ids)
+        folders = repository.folders(ids)
         below = []
         for path, here, there in level:
-            before = found[there] if there else {}
-            for name, entry in found[here].items():
+            before = folders[there] if there else {}
+            for name, entry in folders[here].items():
                 count += 1
                 if count > most:
                     raise DocumentError(f"there are more than {most} files in the commit")
@@ -535,10 +535,10 @@ def _program(path: str) -> str:
         UnavailableError: git is not installed.
     """
     folders = [each for each in path.split(os.pathsep) if each.startswith("/")]
-    found = shutil.which("git", path=os.pathsep.join(folders)) if folders else None
-    if not found:
+    program = shutil.which("git", path=os.pathsep.join(folders)) if folders else None
+    if not program:
         raise UnavailableError("git is not installed", "", "Install git.")
-    return found
+    return program
 
 
 def _unknown(name: str) -> DocumentError:
@@ -580,18 +580,18 @@ def _entries(data: bytes, length: int) -> dict[str, TreeEntry]:
     Raises:
         DocumentError: the object is malformed, or has a name twice, or one that leads elsewhere.
     """
-    found: dict[str, TreeEntry] = {}
+    entries: dict[str, TreeEntry] = {}
     while data:
         head, _, rest = data.partition(b"\0")
         mode, _, raw = head.partition(b" ")
         name, data = os.fsdecode(raw), rest[length:]
-        if name in found or name in ("", ".", "..") or "/" in name or name.lower() == ".git":
+        if name in entries or name in ("", ".", "..") or "/" in name or name.lower() == ".git":
             raise DocumentError(
                 f"a folder of the commit has '{name}' twice, or no file can have this name",
                 "Programs differ in what they take for it.",
             )
-        found[name] = TreeEntry(_checked_out(mode), rest[:length].hex())
-    return found
+        entries[name] = TreeEntry(_checked_out(mode), rest[:length].hex())
+    return entries
 
 
 _OCTAL = re.compile(rb"[0-7]{1,11}")

@@ -225,7 +225,7 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
     text = data.decode()
     places = _places(text)
     tables: list[tuple[int, _Table]] = []
-    for kind, found in document.items():
+    for kind, requirements in document.items():
         if kind not in _READERS:
             line = next((n for n, each in _headers(text) if each == kind), 0)
             raise DocumentError(
@@ -233,8 +233,10 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
                 f"There are {', '.join(_READERS)}.",
             )
         lines = places.get(kind, [])
-        plain = isinstance(found, list) and all(isinstance(each, dict) for each in found)
-        if not plain or len(found) != len(lines):
+        plain = isinstance(requirements, list) and all(
+            isinstance(each, dict) for each in requirements
+        )
+        if not plain or len(requirements) != len(lines):
             raise DocumentError(
                 f"{file}: {kind} is not written as tables",
                 "Each requirement begins with a line of its own, so that findings can name it.",
@@ -242,7 +244,7 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
             )
         tables += [
             (line, _Table(kind, table, Source(file, line), keys))
-            for (line, keys), table in zip(lines, found, strict=True)
+            for (line, keys), table in zip(lines, requirements, strict=True)
         ]
     if not tables:
         raise DocumentError(
@@ -252,9 +254,11 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
         )
     if len(tables) > _MOST_REQUIREMENTS:
         raise DocumentError(f"'{file}' has more than {_MOST_REQUIREMENTS} requirements")
-    found = tuple(_READERS[table.kind](table) for _, table in sorted(tables, key=lambda e: e[0]))
+    requirements = tuple(
+        _READERS[table.kind](table) for _, table in sorted(tables, key=lambda e: e[0])
+    )
     left = _MOST_PAIRS
-    for each in found:
+    for each in requirements:
         left -= _pairs(each)
         if left < 0:
             raise DocumentError(
@@ -262,7 +266,7 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
                 "Each name of one list counts with each one of the other.",
                 "Write patterns in place of names, or divide the file.",
             )
-    return found
+    return requirements
 
 
 def _pairs(requirement: Requirement) -> int:
@@ -290,15 +294,15 @@ def _headers(text: str) -> Iterator[tuple[int, str]]:
 
 def _places(text: str) -> dict[str, list[tuple[int, dict[str, int]]]]:
     """Map each kind to the lines of its tables, each with the lines of its keys."""
-    found: dict[str, list[tuple[int, dict[str, int]]]] = {}
+    places: dict[str, list[tuple[int, dict[str, int]]]] = {}
     keys: dict[str, int] = {}
     for number, line in enumerate(text.split("\n"), 1):
         if header := _HEADER.match(line):
             keys = {}
-            found.setdefault(header[1], []).append((number, keys))
+            places.setdefault(header[1], []).append((number, keys))
         elif key := _KEY.match(line):
             keys.setdefault(key[1], number)
-    return found
+    return places
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,8 +356,8 @@ class _Table:
 
     def names(self, key: str, *, least: int = 1) -> tuple[str, ...]:
         """Return absolute names, perhaps with wildcards."""
-        found = self.texts(key, least=least)
-        for each in found:
+        names = self.texts(key, least=least)
+        for each in names:
             problem = expression_problem(each)
             if not problem and each[0] not in "/*":
                 problem = "It is not absolute: it does not begin with '/' or '*'."
@@ -361,32 +365,32 @@ class _Table:
                 problem = "It is a namespace."
             if problem:
                 raise self.error(key, f"{_short(each)} is not valid in {key}", problem)
-        return found
+        return names
 
     def enclaves(self, key: str) -> tuple[str, ...]:
         """Return names and patterns of enclaves, those that are excepted with ``!`` before them."""
-        found = self.texts(key)
-        for each in found:
+        enclaves = self.texts(key)
+        for each in enclaves:
             name = each.removeprefix(EXCEPT)
             problem = "" if name == "/" else expression_problem(name)
             if not problem and name[0] not in "/*?[":
                 problem = "An enclave begins with '/'."
             if problem:
                 raise self.error(key, f"{_short(each)} is no enclave in {key}", problem)
-        if all(each.startswith(EXCEPT) for each in found):
+        if all(each.startswith(EXCEPT) for each in enclaves):
             raise self.error(key, f"{key} only excepts enclaves", 'Write "*" before them for all.')
-        return found
+        return enclaves
 
     def rights(self, *, least: int = 1) -> RightNames:
         """Return the rights that the table names, at least one, each with ``least`` names."""
-        found = tuple(
+        rights = tuple(
             (right, self.names(right, least=least)) for right in KIND_OF if right in self.values
         )
-        if not found:
+        if not rights:
             raise self.error(
                 "", f"[[{self.kind}]] names no right", f"The rights are {', '.join(KIND_OF)}."
             )
-        return found
+        return rights
 
     def error(self, key: str, what: str, why: str) -> DocumentError:
         place = Source(self.source.file, self.lines.get(key, self.source.line))

@@ -261,11 +261,11 @@ def review(request: ReviewRequest, folder: Path) -> Review:
         for name in (_HEAD, _BASE):
             private.mkdir(name, 0o700)
     steps = _Review(request, head, base)
-    found = tuple(steps.all())
+    steps_done = tuple(steps.all())
     return Review(
         request.base,
         request.head,
-        found,
+        steps_done,
         tuple(dict.fromkeys(steps.left_out())),
         folder / _HEAD,
         folder / _BASE,
@@ -375,21 +375,21 @@ class _Review:
         self, side: CommitFiles, fleet: Fleet | None
     ) -> Generator[ReviewStep, None, list[Path]]:
         """Return the files of the policies of a side."""
-        found: list[Path] = []
+        policies: list[Path] = []
         for path in self.request.policies:
             try:
                 files = side.policies(path, placeholders=fleet is not None)
                 if not files:
                     raise self._missing(path)
-                found += [file for file in files if file not in found]
+                policies += [file for file in files if file not in policies]
             except (SrosError, OSError) as error:
                 known = error if isinstance(error, SrosError) else DocumentError(str(error))
                 yield ReviewStep("policy", path, _UNDECIDED, known)
-        return found
+        return policies
 
     def _keystores(self, side: CommitFiles) -> Generator[ReviewStep, None, dict[str, Path]]:
         """Return the folders of the keystores of a side, by their paths."""
-        found: dict[str, Path] = {}
+        keystores: dict[str, Path] = {}
         for path in self.request.keystores:
             try:
                 folder = side.tree(path)
@@ -397,11 +397,11 @@ class _Review:
                     raise self._missing(path)
                 if not is_keystore(folder):
                     raise DocumentError(f"'{path}' is no keystore", "It has no enclaves in it.")
-                found[path] = folder
+                keystores[path] = folder
             except (SrosError, OSError) as error:
                 known = error if isinstance(error, SrosError) else DocumentError(str(error))
                 yield ReviewStep("keystore", path, _UNDECIDED, known)
-        return found
+        return keystores
 
     def _missing(self, path: str) -> DocumentError:
         """Return the error that HEAD does not have a file, and what became of it."""
@@ -676,17 +676,17 @@ class _Review:
         self, side: CommitFiles
     ) -> Generator[ReviewStep, None, list[Requirement]]:
         """Return the requirements of a side."""
-        found: list[Requirement] = []
+        requirements: list[Requirement] = []
         for path in self.request.requirements:
             try:
                 file = side.file(path)
                 if file:
-                    found += read_requirements(file)
+                    requirements += read_requirements(file)
                 elif side is self.head:
                     raise self._missing(path)
             except SrosError as error:
                 yield ReviewStep("requirements", path, _UNDECIDED, error)
-        return found
+        return requirements
 
     def _requirements(
         self, policies: Sequence[Path], fleet: Fleet | None, keystores: Mapping[str, Path]
@@ -720,9 +720,9 @@ class _Review:
         self, earlier: Sequence[Requirement], wanted: Sequence[Requirement], system: System
     ) -> tuple[int, Content]:
         dropped = [requirement.requirement for requirement in dropped_requirements(earlier, wanted)]
-        found = dropped_findings(earlier, wanted, " ".join(self.request.requirements))
+        findings = dropped_findings(earlier, wanted, " ".join(self.request.requirements))
         broken = requirement_findings(dropped, system)
-        chosen = FindingFilter(exclude=(VACUOUS.id,)).choose([*found, *broken])
+        chosen = FindingFilter(exclude=(VACUOUS.id,)).choose([*findings, *broken])
         return self._new_access, DroppedRequirements(len(dropped), chosen)
 
     # ── keystores ──────────────────────────────────────────────────────────────────────────
@@ -738,13 +738,13 @@ class _Review:
         same = before is not None and _same(self.base, self.head, settings)
 
         def findings() -> tuple[int, Content]:
-            found = (
+            findings = (
                 each
                 for each in path_findings(folder, self._circumstances())
                 if (each.id != _FILE_MISSING or Path(each.file).name != KEY_FILE)
                 and (not each.file or _is_below(os.path.normpath(each.file), (str(folder),)))
             )
-            chosen = FindingFilter(strict=bool(self.base) and not same).choose(found)
+            chosen = FindingFilter(strict=bool(self.base) and not same).choose(findings)
             return _status(chosen), chosen
 
         def access() -> tuple[int, Content]:

@@ -50,22 +50,22 @@ class Revision:
         if entry is None or entry.mode != FOLDER:
             return (self,)
         below = f"{self.path}/" if self.path else ""
-        found = [
+        files = [
             (Revision(self.repository, self.name, self.commit, below + name), each)
             for name, each in walk(self.repository, entry.id, most=_MOST_ENTRIES)
         ]
-        for file, each in found:
+        for file, each in files:
             if each.mode not in FILES:
                 raise DocumentError(f"'{file}' is {each.kind}", "", "Name a policy in the folder.")
-        ids = dict.fromkeys(each.id for _, each in found)
+        ids = dict.fromkeys(each.id for _, each in files)
         sizes = self.repository.sizes(ids)
-        if sum(sizes.get(each.id, 0) for _, each in found) > _MOST_BYTES:
+        if sum(sizes.get(each.id, 0) for _, each in files) > _MOST_BYTES:
             raise DocumentError(
                 f"'{self}' has more than {_MOST_BYTES} bytes", "", "Name a policy in it."
             )
         contents = self.repository.contents(ids)
         policies = [
-            file for file, each in found if is_policy(file.path, contents[each.id], f"'{file}'")
+            file for file, each in files if is_policy(file.path, contents[each.id], f"'{file}'")
         ]
         if len(policies) > _MOST_FILES:
             raise DocumentError(

@@ -258,14 +258,14 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
 
 def _certified(folders: Mapping[str, Path]) -> dict[str, CertifiedEnclave]:
     """Map the enclaves that have a certificate to what it says."""
-    found = {}
+    certified = {}
     for name, folder in folders.items():
         if (file := folder / CERTIFICATE_FILE).exists():
             certificate = load_certificate(read_bytes(file, "certificate"), f"'{file}'")
             key = key_digest(certificate.public_key())  # type: ignore[arg-type]
             subject = certificate.subject
-            found[name] = CertifiedEnclave(subject_text(subject), common_name_of(subject), key)
-    return found
+            certified[name] = CertifiedEnclave(subject_text(subject), common_name_of(subject), key)
+    return certified
 
 
 def _zenoh_file(path: Path, document: ConfigurationDocument) -> SignedConfiguration:
@@ -306,13 +306,13 @@ def _of_all(root: Path, folders: Iterable[Path]) -> Governance:
 
 def _authorities(folders: Iterable[Path]) -> frozenset[tuple[str, str]]:
     """Return role and fingerprint of the CAs that the enclaves in folders trust."""
-    found = {
+    authorities = {
         (role, read_bytes(folder / file, "certificate"))
         for folder in folders
         for role, file in (("identity", IDENTITY_CA_FILE), ("permissions", PERMISSIONS_CA_FILE))
         if (folder / file).exists()
     }
-    return frozenset((role, each) for role, pem in found for each in fingerprints(pem))
+    return frozenset((role, each) for role, pem in authorities for each in fingerprints(pem))
 
 
 _NEVER = "9999"
@@ -322,12 +322,12 @@ def _expiries(root: Path) -> dict[int, str]:
     """Return when certificates expire, by serial number, as the ledger of a keystore has it."""
     if not (root / CRL).exists():
         return {}
-    found: dict[int, str] = {}
+    expiries: dict[int, str] = {}
     for entry in Keystore(root).ledger_with("what", "certificate").entries:
         with suppress(ValueError):
             serial = int(entry.serial, 16)
-            found[serial] = max(found.get(serial, ""), entry.not_after or _NEVER)
-    return found
+            expiries[serial] = max(expiries.get(serial, ""), entry.not_after or _NEVER)
+    return expiries
 
 
 def _trusts(

@@ -208,8 +208,8 @@ def _planned_zenoh(
         own = rules.get(enclave)
         return own is not None and bool(messages) and all(own.allows(enclave, *e) for e in messages)
 
-    found = {each.path: ros_access(stated_rights(each)) for each in policy.enclaves}
-    return World("Zenoh", found, confirm=confirm, stated=stated)
+    access = {each.path: ros_access(stated_rights(each)) for each in policy.enclaves}
+    return World("Zenoh", access, confirm=confirm, stated=stated)
 
 
 def _dds_world(
@@ -290,15 +290,17 @@ def _rank(domain: DomainRule, rule: TopicRule) -> int:
 
 def _stated(enclaves: Iterable[str], rights: Iterable[Right]) -> dict[str, TopicAccess]:
     """Map enclaves to the topics that their rights name without wildcards."""
-    found: dict[str, tuple[set[str], set[str]]] = {enclave: (set(), set()) for enclave in enclaves}
+    topics_of_enclave: dict[str, tuple[set[str], set[str]]] = {
+        enclave: (set(), set()) for enclave in enclaves
+    }
     for right in rights:
-        if right.enclave in found and not is_expression(right.name):
+        if right.enclave in topics_of_enclave and not is_expression(right.name):
             for writes, topic in topics_of(right):
-                found[right.enclave][not writes].add(topic)
+                topics_of_enclave[right.enclave][not writes].add(topic)
     for writes, topic in _OF_EVERY_NODE:
-        for topics in found.values():
+        for topics in topics_of_enclave.values():
             topics[not writes].add(topic)
-    return {name: TopicAccess(*map(NameSet, topics)) for name, topics in found.items()}
+    return {name: TopicAccess(*map(NameSet, topics)) for name, topics in topics_of_enclave.items()}
 
 
 # ── a keystore ─────────────────────────────────────────────────────────────────────────────
@@ -387,11 +389,11 @@ def _keystore_system(
             possible = (
                 _possible(enclave, grants.get(name, ()), document) for document in documents
             )
-            found = (
+            accesses = (
                 Evaluator(vendor, each, JoinContext(number, moment, zone)).access
                 for each, moment in product(possible, moments[name])
             )
-            access[name] = tuple(each for each in found if each is not None)
+            access[name] = tuple(each for each in accesses if each is not None)
         lenders = also_fitting(vendor.traits, subjects, granting)
         worlds.append(_dds_world(vendor, access, stated, title=title, idle=idle, lenders=lenders))
     if world == _ZENOH or (not world and has_zenoh_files(root, hidden=True)):
@@ -424,15 +426,15 @@ def _later(name: str, grants: Iterable[Grant], at: datetime) -> tuple[datetime, 
         with suppress(UsageError):  # it ends before it begins
             validities.append(grant.validity)
     later = (validity for validity in validities if at < validity.not_before)
-    found = {each.not_before + (each.not_after - each.not_before) / 2 for each in later}
-    if len(found) > _MOST_MOMENTS:
+    moments = {each.not_before + (each.not_after - each.not_before) / 2 for each in later}
+    if len(moments) > _MOST_MOMENTS:
         raise KeystoreError(
             f"the permissions of enclave {name} become valid at more than {_MOST_MOMENTS}"
             " different times",
             "",
             "Sign them again with create_permission or generate_artifacts.",
         )
-    return tuple(sorted(found))
+    return tuple(sorted(moments))
 
 
 def _zenoh_worlds(
@@ -508,9 +510,9 @@ class Places:
         """Return the right that states a use: one without wildcards if there is one."""
         topics = self._by_enclave.get(use.enclave)
         if topics is None:
-            found = self._stated.get(use.enclave, ())
+            places = self._stated.get(use.enclave, ())
             topics = self._by_enclave[use.enclave] = [
-                (*topic, place) for place in found for topic in topics_of(place.right)
+                (*topic, place) for place in places for topic in topics_of(place.right)
             ]
         best = None
         for writes, topic, place in topics:

@@ -181,10 +181,10 @@ class Side:
         backwards = _starting(self._backwards, own.suffix[::-1])
         limit.spend(min(len(forwards), len(backwards)))
         if len(forwards) <= len(backwards):
-            found: Iterator[str] = (self._topics[i] for i in forwards)
+            topics: Iterator[str] = (self._topics[i] for i in forwards)
         else:
-            found = (self._backwards[i][::-1] for i in backwards)
-        return filter(own.matches, found)
+            topics = (self._backwards[i][::-1] for i in backwards)
+        return filter(own.matches, topics)
 
     def perhaps_meeting(
         self, automata: Collection[Automaton] | None, limit: SearchLimit
@@ -192,31 +192,31 @@ class Side:
         """Return the enclaves that may perhaps use a topic of the automata, or any (None)."""
         if automata is None:
             return sorted(self.of)
-        found = set(self._any)
+        enclaves = set(self._any)
         for own in automata:
             if own not in self._met:
                 self._met[own] = self._meeting(own, limit)
-            found.update(self._met[own])
-        return sorted(found)
+            enclaves.update(self._met[own])
+        return sorted(enclaves)
 
     def _meeting(self, own: Automaton, limit: SearchLimit) -> frozenset[str]:
         limit.spend(len(self._wild) // _OF_A_STEP)
-        found: set[str] = set()
+        met: set[str] = set()
         for topic in self._matching(own, limit):
-            found.update(self.exact[topic])
+            met.update(self.exact[topic])
         for each, enclaves in self._wild.items():
             if each.may_meet(own):
-                found.update(enclaves)
-        limit.spend(len(found))  # they are kept
-        return frozenset(found)
+                met.update(enclaves)
+        limit.spend(len(met))  # they are kept
+        return frozenset(met)
 
     def users_of(self, topic: str) -> list[str]:
         """Return the enclaves that may use one topic, sorted."""
-        found = set(self.exact.get(topic, ())).union(self._any)
+        users = set(self.exact.get(topic, ())).union(self._any)
         for each, enclaves in self._wild.items():
-            if not found.issuperset(enclaves) and each.matches(topic):
-                found.update(enclaves)
-        return sorted(each for each in found if topic in self.of[each])
+            if not users.issuperset(enclaves) and each.matches(topic):
+                users.update(enclaves)
+        return sorted(each for each in users if topic in self.of[each])
 
 
 def _starting(ordered: list[str], begin: str) -> range:
@@ -325,8 +325,8 @@ class World:
         """
         if not is_expression(topics.expression):
             return topics.expression if topics.expression in names else None
-        found = (names & topics.every()).example(limit, longest=self.longest)
-        if found is None:
+        example = (names & topics.every()).example(limit, longest=self.longest)
+        if example is None:
             return None
         known = {
             topic
@@ -339,15 +339,15 @@ class World:
             shortest(each for each in known if each in valid)
             or (names & topics.valid()).example(limit, longest=self.longest)
             or shortest(known)
-            or found
+            or example
         )
 
     def any_example(self, names: NameSet, limit: SearchLimit) -> str | None:
         """Return a topic of a set, if possible one that is stated, or that nodes can have."""
         sets = (names, *(names & each for each in _VALID))
         stated = (next(each.stated(), None) for each in sets)
-        found = (each.example(limit, longest=self.longest) for each in (*sets[1:], names))
-        return next(filter(None, (*stated, *found)), None)
+        examples = (each.example(limit, longest=self.longest) for each in (*sets[1:], names))
+        return next(filter(None, (*stated, *examples)), None)
 
     def use(self, met: Meeting, topics: Topics, limit: SearchLimit) -> str | None:
         """Return the best example of the topics that an enclave may use."""
@@ -370,10 +370,10 @@ class World:
         if (writer, reader) not in self._shared:
             both = written & self._readers.of[reader]
             valid = (both & names for names in _VALID)
-            found = next(
+            example = next(
                 filter(None, (each.example(limit, longest=self.longest) for each in valid)), None
             )
-            self._shared[writer, reader] = found or both.example(limit, longest=self.longest)
+            self._shared[writer, reader] = example or both.example(limit, longest=self.longest)
         return self._shared[writer, reader]
 
     def weaker(self, level: Level) -> NameSet | None:

@@ -158,15 +158,15 @@ def _rules_for(
     traits: VendorTraits, grant: Grant, domain: int
 ) -> tuple[list[NumberedRule], RuleVerdict]:
     """Return the rules of the grant for ``domain``, and the verdict if none of them matches."""
-    found: list[NumberedRule] = []
+    rules: list[NumberedRule] = []
     for index, rule in enumerate(grant.rules):
         holds = holds_for(traits.open_range, rule.domains, domain)
         if holds is None:
             # Cyclone DDS looks for the next rule before it uses one, so it never uses the last one.
-            return found[:-1], RuleVerdict(Outcome.CRASHES, "open-range", index)
+            return rules[:-1], RuleVerdict(Outcome.CRASHES, "open-range", index)
         if holds:
-            found.append((index, rule))
-    return found, _default_verdict(traits, grant)
+            rules.append((index, rule))
+    return rules, _default_verdict(traits, grant)
 
 
 def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
@@ -322,8 +322,8 @@ def _partitions(
     implied = ("*",) if everywhere else _DEFAULT_PARTITION
     if implied is _DEFAULT_PARTITION and not any(criterion.partitions for criterion in criteria):
         return _DEFAULT_PARTITION
-    found = [text for criterion in criteria for text in criterion.partitions or implied]
-    return tuple(dict.fromkeys(_trimmed(traits, text) for text in found))
+    names = [text for criterion in criteria for text in criterion.partitions or implied]
+    return tuple(dict.fromkeys(_trimmed(traits, text) for text in names))
 
 
 class GovernedDomain:
@@ -552,7 +552,7 @@ class Access:
             return NameSet()
         rules = list(self._governed.names_by_rule())
         kinds = [self._kind_of(verb, rule) for _, rule in rules]
-        found = (
+        topics = (
             NameSet.first(
                 (names, each is kind) for (names, _), each in zip(rules, kinds, strict=True)
             )
@@ -560,7 +560,7 @@ class Access:
             for kind in dict.fromkeys(kinds)
             if kind is not _Kind.NOTHING
         )
-        return NameSet.union(found) & _usable_topics(created=self._traits.creates_topics)
+        return NameSet.union(topics) & _usable_topics(created=self._traits.creates_topics)
 
     def protection(self) -> tuple[tuple[NameSet, DomainRule, TopicRule], ...]:
         """Return the topic rules of the domain, each with its topics: the first match counts."""

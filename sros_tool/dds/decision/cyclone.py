@@ -69,8 +69,8 @@ class _Reader:
         return UnreadableError(f"its XML is malformed: {why} (line {line})")
 
     def _skip(self) -> None:
-        found = _SKIPPED.match(self._text, self._index)
-        self._index = found.end() if found else self._index
+        match = _SKIPPED.match(self._text, self._index)
+        self._index = match.end() if match else self._index
         if self._text.startswith("<!--", self._index):
             raise self._error("a comment is not closed")
 
@@ -80,11 +80,11 @@ class _Reader:
         return there
 
     def _name(self) -> str:
-        found = _NAME.match(self._text, self._index)
-        if not found:
+        match = _NAME.match(self._text, self._index)
+        if not match:
             raise self._error("a name is malformed")
-        self._index = found.end()
-        return found[0]
+        self._index = match.end()
+        return match[0]
 
     def _string(self) -> str:
         for begin, end in _QUOTES.items():
@@ -293,8 +293,8 @@ class _Node:
         return [child for child in self._children if child.tag in tags]
 
     def last(self, tag: str) -> _Node | None:
-        found = self.all(tag)
-        return found[-1] if found else None
+        nodes = self.all(tag)
+        return nodes[-1] if nodes else None
 
 
 def _check_attributes(element: XmlElement, tag: str) -> None:

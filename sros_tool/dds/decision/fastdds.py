@@ -152,10 +152,10 @@ def _plain(text: str) -> str:
         if taken in "\r\n":
             taken, into = _LINE_END.match(text, index)[0], "\n"  # type: ignore[index]
         elif taken == "&":
-            found = _REFERENCE.match(text, index)
-            character = _referred(found) if found else None
-            if found and character is not None:
-                taken, into = found[0], character
+            match = _REFERENCE.match(text, index)
+            character = _referred(match) if match else None
+            if match and character is not None:
+                taken, into = match[0], character
             elif text[index + 1 :] == "#":
                 into = ""
             elif text[index + 1 : index + 2] != "#":
@@ -255,13 +255,13 @@ class _Sequence:
 
     def while_named(self, *names: str) -> list[XmlElement]:
         """Take the children up to the first one with another name."""
-        found = []
+        elements = []
         while self._index < len(self._children):
             if self._children[self._index].name not in names:
                 break
-            found.append(self._children[self._index])
+            elements.append(self._children[self._index])
             self._index += 1
-        return found
+        return elements
 
     def end(self) -> None:
         """Raise `UnreadableError` if another child follows."""
@@ -296,10 +296,10 @@ def _first_text(element: XmlElement) -> str:
 
 
 def _number(element: XmlElement) -> int:
-    found = _INTEGER.match(_first_text(element))
-    if not found:
+    match = _INTEGER.match(_first_text(element))
+    if not match:
         raise UnreadableError(f"<{element.name}> does not hold a number")
-    return _integer(found) % 2**32
+    return _integer(match) % 2**32
 
 
 def _integer(found: re.Match[str]) -> int:

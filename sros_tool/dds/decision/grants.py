@@ -46,7 +46,7 @@ def also_fitting(
     for name, subjects in granted.items():
         for part in {each for subject in subjects for each in _SEPARATORS.split(subject.strip())}:
             having.setdefault(part, set()).add(name)
-    found = {}
+    lenders = {}
     for name, subject in certified.items():
         own = certified_text(traits, subject)
         several = [having.get(part, set()) for part in _SEPARATORS.split(own) if part]
@@ -57,8 +57,8 @@ def also_fitting(
             if any(same_subject(traits.subjects, one.strip(), own) for one in granted[each])
         )
         if others:
-            found[name] = others
-    return found
+            lenders[name] = others
+    return lenders
 
 
 def certified_text(traits: VendorTraits, subject: str) -> str:
@@ -137,9 +137,9 @@ def _any_order(granted: str, certified: str) -> bool:
 
 def _types_and_values(name: str) -> list[tuple[str, str]]:
     """Return the attributes before a malformed one, as Fast DDS 2.14 (DistinguishedName.cpp)."""
-    found: list[tuple[str, str]] = []
+    pairs: list[tuple[str, str]] = []
     rest = name.lstrip(" ")
-    while rest and len(found) < _MOST_ATTRIBUTES:
+    while rest and len(pairs) < _MOST_ATTRIBUTES:
         equals = _outside_quotes(rest, "=")
         if equals < 0:
             break
@@ -147,9 +147,9 @@ def _types_and_values(name: str) -> list[tuple[str, str]]:
         kind, rest = rest[: equals or None], rest[equals + 1 :]
         comma = _outside_quotes(rest, ",")
         value = rest if comma < 0 else rest[: comma or None]
-        found.append((_plain(kind), _plain(value)))
+        pairs.append((_plain(kind), _plain(value)))
         rest = "" if comma < 0 else rest[comma + 1 :].lstrip(" ")
-    return found
+    return pairs
 
 
 def _outside_quotes(text: str, wanted: str) -> int:
@@ -165,7 +165,7 @@ _EQUALS = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
 
 def _attributes(name: str) -> list[tuple[str, str]]:
     """Return kinds and plain values (no quotes, escapes, outer spaces) before a malformed one."""
-    found = []
+    attributes = []
     index = 0
     while index < len(name):
         part = _PART.match(name, index)
@@ -173,9 +173,9 @@ def _attributes(name: str) -> list[tuple[str, str]]:
         kind = _EQUALS.match(text)
         if not text or not kind or kind.end() >= len(text):
             break
-        found.append((_plain(kind[0]), _plain(text[kind.end() + 1 :])))
+        attributes.append((_plain(kind[0]), _plain(text[kind.end() + 1 :])))
         index += len(part[0]) + 1 if part else 1
-    return found
+    return attributes
 
 
 def _plain(text: str) -> str:
@@ -246,10 +246,10 @@ def read_moment(rule: Moments, text: str, zone: tzinfo) -> float | None:
 
 
 def _local(text: str, zone: tzinfo) -> float | None:
-    found = _LOCAL.match(text)
-    if not found or (found[6] is None and found.end() < len(text)):
+    match = _LOCAL.match(text)
+    if not match or (match[6] is None and match.end() < len(text)):
         return None
-    year, month, day, hour, minute, second = (int(group or -1) for group in found.groups())
+    year, month, day, hour, minute, second = (int(group or -1) for group in match.groups())
     if 0 in (month, day) or month > 12 or day > 31 or hour > 23 or minute > 59 or second > 60:
         return None
     # A missing month or day stays zero: January, or the last day of the month before.
@@ -266,18 +266,18 @@ def _local(text: str, zone: tzinfo) -> float | None:
 
 
 def _cyclone(text: str) -> float:
-    found = _CYCLONE.match(text)
-    if not found:
+    match = _CYCLONE.match(text)
+    if not match:
         return -inf
-    year, month, day, hour, minute, second = (int(found[index]) for index in range(1, 7))
-    offset = timedelta(hours=int(found[9] or 0), minutes=int(found[10] or 0))
-    if not 1970 <= year <= _LAST_YEAR or offset > _FARTHEST or int(found[10] or 0) > 59:
+    year, month, day, hour, minute, second = (int(match[index]) for index in range(1, 7))
+    offset = timedelta(hours=int(match[9] or 0), minutes=int(match[10] or 0))
+    if not 1970 <= year <= _LAST_YEAR or offset > _FARTHEST or int(match[10] or 0) > 59:
         return -inf
     try:
         moment = timegm(datetime(year, month, day, hour, minute, second).timetuple())
     except ValueError:
         return -inf
-    seconds = moment + float(found[7] or 0)
-    if found[8]:
-        seconds -= offset.total_seconds() * (-1 if found[8] == "-" else 1)
+    seconds = moment + float(match[7] or 0)
+    if match[8]:
+        seconds -= offset.total_seconds() * (-1 if match[8] == "-" else 1)
     return seconds if 0 <= seconds < 2**63 / 1e9 else -inf

@@ -90,12 +90,12 @@ class ExpressionIndex:
         """Return the positions of the expressions that match ``name``, in order."""
         if self._both_ways and not _SPECIAL.isdisjoint(name):
             return self._either_way(name)
-        found = self._plain.get(name, [])
+        places = self._plain.get(name, [])
         for length, by_prefix in self._wild:
             candidates = by_prefix.get(name[:length])
             if candidates:
-                found = found + [place for place, match in candidates if match(name)]
-        return sorted(found)
+                places = places + [place for place, match in candidates if match(name)]
+        return sorted(places)
 
     def first(self, name: str) -> int | None:
         """Return the position of the first expression that matches ``name``."""
