@@ -540,13 +540,13 @@ def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
     )
 
 
-def read_certificate(path: Path, what: str = "certificate") -> x509.Certificate:
-    """Return the first certificate of a PEM file; ``what`` describes the file in errors.
+def read_certificate(path: Path) -> x509.Certificate:
+    """Return the first certificate of a PEM file.
 
     Raises:
         SrosError: the file is missing, or is not a readable certificate.
     """
-    return load_certificate(read_bytes(path, what), f"'{path}'")
+    return load_certificate(read_bytes(path, "certificate"), f"'{path}'")
 
 
 # ── signed permissions ─────────────────────────────────────────────────────────────────────

@@ -24,7 +24,7 @@ from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import Keystore
 from sros_tool.names import check_enclave_name
 from sros_tool.values import NamedKeystore, shows
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 
 
 @shows(optional=("robots",))
@@ -200,10 +200,9 @@ def no_such_enclave(
     what = f"enclave {name} does not exist in keystore '{root}'"
     names = sorted(there)
     if below := [each for each in names if name and each.startswith(f"{name}/")]:
-        number = "1 enclave" if len(below) == 1 else f"{len(below)} enclaves"
         return KeystoreError(
             what,
-            f"It is the namespace of {number}, such as {below[0]}.",
+            f"It is the namespace of {counted(len(below), 'enclave')}, such as {below[0]}.",
             f"Name one of them; a verb that takes several also has --match '{name}/*'.",
         )
     meant = likely_names(name, there)

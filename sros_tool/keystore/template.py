@@ -99,16 +99,13 @@ def load_template(choice: str) -> Template:
     return read_template(path)
 
 
-def read_template(path: Path, what: str = "template", remedy: str = "") -> Template:
-    """Return the template in a file; raise `DocumentError` with ``remedy`` if it is malformed.
-
-    ``what`` names the kind of file in the error.
-    """
-    return decode_template(read_bytes(path, what), path, what, remedy)
+def read_template(path: Path) -> Template:
+    """Return the template in a file; raise `DocumentError` if it is malformed."""
+    return decode_template(read_bytes(path, "template"), path, "template", "")
 
 
 def decode_template(data: bytes, path: Path, what: str, remedy: str) -> Template:
-    """Return the template in the content of a file, as `read_template` does."""
+    """Return the template in a file's content; ``what`` and ``remedy`` are for the error."""
     table = read_toml(data, f"the {what} '{path}'", remedy)
     try:
         return _template(table, path.stem)

@@ -372,12 +372,10 @@ class KeystoreChange:
             self.keystore.ledger_file,
         )
 
-    def finish(self, *, remedy: str = "", aim: str = "") -> None:
+    def finish(self, *, aim: str = "") -> None:
         """Put everything in place, unless vendors would refuse enclaves that they accept today.
 
-        Args:
-            remedy: what to do where they would, as sentences.
-            aim: what the user wants, if it needs a revocation list, such as ``revoke``.
+        ``aim`` is what the user wants, if it needs a revocation list, such as ``revoke``.
 
         Raises:
             KeystoreError: nodes of a vendor would stop.
@@ -387,7 +385,7 @@ class KeystoreChange:
             self.now,
             keystore=self.keystore,
             allowed=self._allowed,
-            remedy=lambda: self._another_ca(aim) if aim else remedy,
+            remedy=lambda: self._another_ca(aim) if aim else "",
         )
         self.transaction.commit()
 

@@ -96,6 +96,7 @@ from sros_tool.translate import (
     protection_for,
 )
 from sros_tool.validity import iso
+from sros_tool.wording import counted
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.configuration import ZenohNetwork
 
@@ -711,11 +712,10 @@ def trust_records(
         change.entries += entries
         change.record()
         change.transaction.commit()
-    number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
     text = (
-        f"taken on trust: the rights of {number}, as the ledger has them in lines "
-        "without a chain. If somebody removed one of these lines, older permissions may be in "
-        "force again: compare them with your policy (`sros diff_policy`)."
+        f"taken on trust: the rights of {counted(len(names), 'enclave')}, as the ledger has them "
+        "in lines without a chain. If somebody removed one of these lines, older permissions may "
+        "be in force again: compare them with your policy (`sros diff_policy`)."
     )
     change.remarks.append(Note("keystore.taken-on-trust", text))
     name = change.template.name
