@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from shlex import quote
@@ -527,3 +527,78 @@ def _check_mounted(root: Path, enclave: str, target: Path) -> None:
             "Files of an enclave are links to others of the keystore, which it would not have.",
             f"Export the enclave, {export}, and name the path of DIR with --target.",
         )
+
+
+def node_units(
+    root: Path,
+    names: Iterable[str],
+    secure: Callable[[str], EnclaveEnvironment],
+    *,
+    target: Path,
+    user: str,
+    command: Sequence[str] = (),
+    sros: str = "",
+) -> tuple[dict[str, str], list[Note]]:
+    """Return the units of systemd of nodes in enclaves, by their paths, and notes about them.
+
+    Args:
+        root: the keystore.
+        names: the enclaves.
+        secure: returns the environment of an enclave for a process that runs there.
+        target: the absolute path of the keystore where the units run.
+        user: who runs the nodes.
+        command: the program of the nodes; by default a file with the path of the enclave.
+        sros: the program sros there, which verifies an enclave before its node starts; "" for none.
+
+    Raises:
+        KeystoreError: a process cannot run in an enclave.
+    """
+    from sros_tool.keystore.layout import enclaves_below
+    from sros_tool.runtime.units import TEMPLATE, node_settings, node_template, unit_instance
+
+    files, notes = {TEMPLATE: node_template(user)}, list[Note]()
+    for name in names:
+        secured = secure(name)
+        notes += [*secured.notes, *secured.enclave_notes]
+        files[f"sros@{unit_instance(name)}.service.d/enclave.conf"] = node_settings(
+            name,
+            secured.variables,
+            str(target),
+            command=command,
+            below=enclaves_below(root, name),
+            sros=sros,
+        )
+    return files, notes
+
+
+def enclave_of_node(file: Path, command: Sequence[str]) -> str:
+    """Return the enclave in which a policy has the node that a command starts.
+
+    Raises:
+        UsageError: the command names no node, or the policy has it in none or several enclaves.
+        PolicyError: the policy cannot be read.
+    """
+    from sros_tool.policy.document import read_policy
+    from sros_tool.runtime.environment import node_argument
+
+    node = node_argument(command)
+    if node is None:
+        raise UsageError(
+            f"the command '{command[0]}' names no node",
+            "Its enclave is that of the node's name in the policy, which `--ros-args -r "
+            "__node:=NAME` gives.",
+            "Give the node a name in the launch file, or start this command in an enclave of its "
+            "own: `sros run ROOT NAME -- COMMAND`.",
+        )
+    ns, name = node
+    full = f"/{ns.strip('/')}/{name}".replace("//", "/")
+    enclaves = read_policy(file).enclaves_of_node(ns, name)
+    if len(enclaves) != 1:
+        names = ", ".join(enclave.path for enclave in enclaves[:3])
+        what = f"in {len(enclaves)} enclaves, such as {names}" if enclaves else "in no enclave"
+        raise UsageError(
+            f"the policy '{file}' has the node {full} {what}",
+            "A process runs in one enclave.",
+            f'Give it a profile in one enclave: `<profile ns="{ns}" node="{name}">`.',
+        )
+    return enclaves[0].path

@@ -35,7 +35,14 @@ from sros_tool.cli.common import (
     verb,
     words_argument,
 )
-from sros_tool.enclave_environment import INSTALLED, RMWS, container_text, target_path
+from sros_tool.enclave_environment import (
+    INSTALLED,
+    RMWS,
+    container_text,
+    enclave_of_node,
+    node_units,
+    target_path,
+)
 from sros_tool.errors import Note, UnavailableError, UsageError
 from sros_tool.runtime.environment import COMPOSE, CONTAINER_FORMS, KUBERNETES, SECRET
 from sros_tool.runtime.units import Job
@@ -43,7 +50,7 @@ from sros_tool.terminal import echo, echo_document, echo_lines
 from sros_tool.values import FileChange
 
 if TYPE_CHECKING:
-    from sros_tool.errors import Note
+    from sros_tool.enclave_environment import EnclaveEnvironment
 
 _COMMAND = "sros.command"
 """The key of ``ctx.meta`` with the words after ``--`` of a `_WithCommand`."""
@@ -328,7 +335,7 @@ def run(
     command = [*rest[0 if policy else 1 :], *ctx.meta[_COMMAND]]
     if not command:
         raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
-    name = _enclave_of_node(policy, command) if policy else rest[0] if rest else ""
+    name = enclave_of_node(policy, command) if policy else rest[0] if rest else ""
     if (other := named_enclave(command)) and other != name:
         raise UsageError(
             f"the command names the enclave {other}, and sros would run it in {name}",
@@ -371,39 +378,6 @@ def run(
 def _is_demo(command: Sequence[str]) -> bool:
     """Return whether a command is a node of `sros demo`, which names its enclave itself."""
     return Path(command[0]).name == "sros" and list(command[1:2]) == ["demo"]
-
-
-def _enclave_of_node(file: Path, command: Sequence[str]) -> str:
-    """Return the enclave in which a policy has the node that a command starts.
-
-    Raises:
-        UsageError: the command names no node, or the policy has it in none or several enclaves.
-        PolicyError: the policy cannot be read.
-    """
-    from sros_tool.policy.document import read_policy
-    from sros_tool.runtime.environment import node_argument
-
-    node = node_argument(command)
-    if node is None:
-        raise UsageError(
-            f"the command '{command[0]}' names no node",
-            "Its enclave is that of the node's name in the policy, which `--ros-args -r "
-            "__node:=NAME` gives.",
-            "Give the node a name in the launch file, or start this command in an enclave of its "
-            "own: `sros run ROOT NAME -- COMMAND`.",
-        )
-    ns, name = node
-    full = f"/{ns.strip('/')}/{name}".replace("//", "/")
-    enclaves = read_policy(file).enclaves_of_node(ns, name)
-    if len(enclaves) != 1:
-        names = ", ".join(enclave.path for enclave in enclaves[:3])
-        what = f"in {len(enclaves)} enclaves, such as {names}" if enclaves else "in no enclave"
-        raise UsageError(
-            f"the policy '{file}' has the node {full} {what}",
-            "A process runs in one enclave.",
-            f'Give it a profile in one enclave: `<profile ns="{ns}" node="{name}">`.',
-        )
-    return enclaves[0].path
 
 
 @verb("completion")
@@ -513,15 +487,10 @@ def units(
       $ sros units keystore --match '/arm/*' units  # /etc/sros/nodes/arm/...
       $ sros units keystore --job renew --job check --job metrics units
     """
-    from sros_tool.keystore.layout import enclaves_below
     from sros_tool.runtime.units import (
-        TEMPLATE,
         WrittenUnits,
         job_units,
-        node_settings,
-        node_template,
         unit_changes,
-        unit_instance,
         write_units,
     )
 
@@ -552,21 +521,22 @@ def units(
     if rest[1:] or several:
         names = chosen_enclaves(root, rest[:-1], patterns, robots, every=every)
         place = target or Path(INSTALLED)
-        files[TEMPLATE] = node_template(user or _NODE_USER)
+
+        def secure(name: str) -> EnclaveEnvironment:
+            return enclave_environment(
+                root, name, domain, rmw, accept_key=accept_readable_key, target=place
+            )
+
         with progress("checking"):
-            for name in names:
-                secured = enclave_environment(
-                    root, name, domain, rmw, accept_key=accept_readable_key, target=place
-                )
-                notes += [*secured.notes, *secured.enclave_notes]
-                files[f"sros@{unit_instance(name)}.service.d/enclave.conf"] = node_settings(
-                    name,
-                    secured.variables,
-                    str(place),
-                    command=command,
-                    below=enclaves_below(root, name),
-                    sros=program or "",
-                )
+            files, notes = node_units(
+                root,
+                names,
+                secure,
+                target=place,
+                user=user or _NODE_USER,
+                command=command,
+                sros=program or "",
+            )
     elif command:
         raise UsageError("COMMAND is for nodes, and no enclave is named")
     for job in jobs:
