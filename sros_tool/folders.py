@@ -9,7 +9,6 @@ leads out of the folder.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import os
 import stat
@@ -18,9 +17,12 @@ from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import TYPE_CHECKING, BinaryIO, Self
 
 from sros_tool.errors import KeystoreError
+
+if TYPE_CHECKING:
+    import ctypes
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -405,7 +407,7 @@ def exchange(here: int, one: str, there: int, other: str) -> bool:
     names = os.fsencode(one), os.fsencode(other)
     if rename(here, names[0], there, names[1], _RENAME_EXCHANGE) == 0:
         return True
-    number = ctypes.get_errno()
+    number = _last_error()
     if number in _NOT_SUPPORTED:
         return False
     raise OSError(number, os.strerror(number), one, None, other)
@@ -415,7 +417,7 @@ def flush_file_system(handle: int) -> None:
     """Flush the file system that an open folder is on."""
     try:
         if _c_library().syncfs(handle) != 0:
-            number = ctypes.get_errno()
+            number = _last_error()
             raise OSError(number, os.strerror(number))
     except AttributeError:  # a C library without syncfs
         os.sync()
@@ -423,4 +425,13 @@ def flush_file_system(handle: int) -> None:
 
 @lru_cache(maxsize=1)
 def _c_library() -> ctypes.CDLL:
+    import ctypes  # what only reads needs none
+
     return ctypes.CDLL(None, use_errno=True)
+
+
+def _last_error() -> int:
+    """Return the error of the last call of the C library in this thread."""
+    import ctypes
+
+    return ctypes.get_errno()

@@ -10,17 +10,20 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
 from sros_tool.fleet.enclaves import MAX_ENCLAVES, group_of, path_for
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import check_enclave_name, check_namespace, expression_problem, is_expression
 from sros_tool.policy.document import PolicyFiles, read_policy
-from sros_tool.policy.minimize import MinimizedPolicy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Source, with_profiles
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.placeholders import Parts, fill, has_placeholder, parts_of, placeholders_of
 from sros_tool.policy.rights import Right, Rules, parts, policy_rights, unfolded
+
+if TYPE_CHECKING:
+    from sros_tool.policy.minimize import MinimizedPolicy
 
 _MOST_NAMES = 200_000  # of one enclave: a signed document cannot have more
 
