@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import platform
+import resource
 import statistics
 import subprocess
 import sys
@@ -124,6 +125,12 @@ def _timed(action: Callable[[int], object], rounds: int) -> float:
     return statistics.median(times)
 
 
+def _cpu_seconds() -> float:
+    """Return the CPU time of this process and of those that it started and that have ended."""
+    used = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(each.ru_utime + each.ru_stime for each in used)
+
+
 def _artifacts(folder: Path, count: int, rounds: int) -> list[Row]:
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
     from sros_tool.keystore.template import load_template
@@ -139,17 +146,22 @@ def _artifacts(folder: Path, count: int, rounds: int) -> list[Row]:
 
     for index in range(rounds):
         create_keystore(folder / f"ks{index}", template=template, now=now)
+    began = _cpu_seconds()
     made = _timed(lambda index: make(folder / f"ks{index}"), rounds)
+    made_cpu = (_cpu_seconds() - began) / rounds
     again = _timed(lambda index: make(folder / f"ks{index}"), rounds)
     files = sizes_of(folder / "ks0/enclaves/robot0/part")
     for index in range(rounds):
         (folder / f"floor{index}").mkdir()
+    began = _cpu_seconds()
     floor = _timed(lambda i: make_enclaves(folder / f"floor{i}", files, count), rounds)
+    floor_cpu = (_cpu_seconds() - began) / rounds
     task = f"policy of {count} enclaves, {RULES} rules each -> all artifacts"
     again_task = "... again: nothing changes"
     kept = made <= 2 * floor and made < 1.5
     return [
         Row(task, made, floor, "2 x floor and 1.5 s", kept),
+        Row("... seconds of CPU", made_cpu, floor_cpu, "3.5 x floor", made_cpu <= 3.5 * floor_cpu),
         Row(again_task, again, floor, "-", True),
     ]
 
