@@ -9,13 +9,12 @@ exception.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import Note, UsageError
 
 if TYPE_CHECKING:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from shlex import quote
 from typing import TYPE_CHECKING
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.reader import of_one_state
 from sros_tool.owners import other_writers

@@ -15,11 +15,11 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import defaultdict, deque
 from collections.abc import Collection, Container, Iterable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from typing import NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import Governance
 from sros_tool.names import ACTION_SEPARATOR, READING_SERVICES, SERVICE_ENDS, is_expression
 from sros_tool.policy.model import DENY

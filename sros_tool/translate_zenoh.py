@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
 from sros_tool.names import check_enclave_name, expression_problem, is_expression
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source

@@ -7,10 +7,10 @@ callers pass the current time.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import UsageError
 
 BACKDATE = timedelta(hours=24)

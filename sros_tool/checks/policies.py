@@ -6,7 +6,7 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from itertools import islice
@@ -26,7 +26,6 @@ from sros_tool.checks.kind import (
     by_cause,
     some_names,
 )
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import (

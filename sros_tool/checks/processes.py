@@ -6,6 +6,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from enum import StrEnum
 from math import isfinite
@@ -26,7 +27,6 @@ from sros_tool.checks.environment import (
     value_text,
 )
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import Moments, Vendor
 from sros_tool.dds.permissions import Grant, parse_permissions

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib import import_module
@@ -20,7 +20,6 @@ from sros_tool.checks.kind import (
     by_cause,
     by_id,
 )
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import UsageError
 from sros_tool.wording import counted
 

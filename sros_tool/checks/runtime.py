@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
 from enum import StrEnum
 from pathlib import Path
@@ -12,7 +12,6 @@ from sros_tool.checks.environment import variable_findings, zenoh_environment_fi
 from sros_tool.checks.keystores.keystore import joined
 from sros_tool.checks.kind import ERROR, Finding, FindingKind
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
-from sros_tool.dataclass import dataclass
 from sros_tool.runtime.processes import RunningProcesses
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
 from sros_tool.runtime.variables import ENABLE, KEYSTORE

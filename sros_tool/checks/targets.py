@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (

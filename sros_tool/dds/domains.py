@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import UsageError
 
 MAX_DOMAIN = 230

@@ -7,12 +7,12 @@ omg_shared_ca_permissions of 20170901).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import combinations
 
 from lxml import etree
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainRange, DomainSet
 from sros_tool.errors import DocumentError, Note
 from sros_tool.validity import Window, iso, parse_iso

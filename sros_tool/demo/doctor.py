@@ -21,6 +21,7 @@ import socket
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime
 from os import getuid
 from pathlib import Path
@@ -28,7 +29,6 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from sros_tool import __version__
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.scenarios.communication import ISOLATION

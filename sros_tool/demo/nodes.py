@@ -11,11 +11,11 @@ import math
 import os
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
-from sros_tool.dataclass import dataclass
 from sros_tool.runtime.events import EventKind, EventWriter
 
 _COMPOSED_SERVICE = "/add_two_ints"

@@ -11,14 +11,13 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.demo.backend import (
     AUTO,

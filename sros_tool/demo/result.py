@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Annotated, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.demo.backend import CYCLONE, RCLPY, ZENOH
 from sros_tool.demo.casting import CastMember
 from sros_tool.demo.scenarios.model import (

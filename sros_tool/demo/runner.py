@@ -19,11 +19,10 @@ import time
 import uuid
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.keystores import KeystoreSet
 from sros_tool.demo.result import (

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Annotated, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import (
     AccessVerb,

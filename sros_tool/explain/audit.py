@@ -15,12 +15,11 @@ not appear, and everything in the graph that no enclave could be asked about.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet

@@ -12,10 +12,9 @@ rights that it should not have.  So each denial says which process printed it, a
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, UsageError
 from sros_tool.files import policies_dir

@@ -9,14 +9,13 @@ from __future__ import annotations
 import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import islice
 from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, SrosError, UsageError

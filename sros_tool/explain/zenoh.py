@@ -7,7 +7,7 @@ and the session itself decide on a right, in peer mode the sessions of all other
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import StrEnum
 from functools import cache
@@ -15,7 +15,6 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.explain.answer import Answer, Evaluator, PolicyChange, StatedInPolicy

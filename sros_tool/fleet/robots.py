@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from ipaddress import ip_address
 from types import MappingProxyType
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError
 
 MAX_ROBOTS = 10_000

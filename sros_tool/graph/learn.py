@@ -16,13 +16,12 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Rule, name_notes
 from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError

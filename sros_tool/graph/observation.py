@@ -19,9 +19,9 @@ import select
 import sys
 import time
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.values import Words, shows
 
 PUBLISH, SUBSCRIBE = "publish", "subscribe"

@@ -13,11 +13,11 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, InvalidNameError
 from sros_tool.files import staged_file
 from sros_tool.fleet.robots import name_problem

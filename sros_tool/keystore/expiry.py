@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from shlex import quote
 from typing import NamedTuple
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.reader import Keystore

@@ -11,13 +11,12 @@ import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import SrosError
 from sros_tool.fleet.enclaves import Unrecorded, enclaves_of, robot_of, unrecorded_enclaves
 from sros_tool.fleet.robots import Fleet, Robot

@@ -23,7 +23,7 @@ from array import array
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from datetime import datetime
 from functools import lru_cache
 from itertools import chain
@@ -35,7 +35,6 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import KeystoreError, PkiError, SrosError
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, SETTINGS
 from sros_tool.pki import smime

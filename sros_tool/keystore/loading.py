@@ -7,6 +7,7 @@ are found by `sros_tool.keystore.reader` and not checked here again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
 from itertools import dropwhile
@@ -15,7 +16,6 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, rsa
 from cryptography.x509.oid import SignatureAlgorithmOID
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import MEASURED, Hashes, Keys, Signers, Vendor, VendorTraits
 from sros_tool.errors import PkiError
 from sros_tool.faults import Fault

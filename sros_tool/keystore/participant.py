@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from functools import lru_cache
 from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import (

@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import field
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property, lru_cache, wraps
 from pathlib import Path
@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Concatenate, Generic, ParamSpec, TypeVar, over
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import rsa
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import parse_toml, read_toml, templates_dir

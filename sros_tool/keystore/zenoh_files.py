@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import Enum, StrEnum
 from pathlib import Path
@@ -19,7 +19,6 @@ from typing import NamedTuple, TypeVar
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant, parse_permissions
 from sros_tool.errors import KeystoreError, PolicyError, SrosError, UsageError, check_meaning

@@ -7,6 +7,7 @@ import re
 import secrets
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import Enum
 from functools import cache, lru_cache
@@ -26,7 +27,6 @@ from cryptography.x509.oid import (
     SignatureAlgorithmOID,
 )
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki import pem as pem_file

@@ -1,7 +1,7 @@
 """The little of DER (X.690) that `cryptography` leaves to its users.
 
-`cryptography` cannot yet verify CMS signatures: the reader extracts the parts that its verification
-primitives need.  The writer is for signatures, and for keys that are encrypted by scrypt.
+`cryptography` creates CMS signatures but cannot yet verify them: the reader extracts the parts that
+its verification primitives need.  The writer is for keys that are encrypted by scrypt.
 """
 
 from __future__ import annotations

@@ -12,11 +12,9 @@ in the same way are read, and of CMS, only DER (tests/integration/forged_signatu
 from __future__ import annotations
 
 import base64
-import hashlib
 import re
-import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TypeVar
 
@@ -24,10 +22,8 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
-from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import PublicKeyAlgorithmOID
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki.certificates import digest as fingerprint
@@ -60,30 +56,7 @@ _PARTS = 4
 _SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
 _DATA = der.encode_oid("1.2.840.113549.1.7.1")
 _MESSAGE_DIGEST = der.encode_oid("1.2.840.113549.1.9.4")
-_SIGNING_TIME = der.encode_oid("1.2.840.113549.1.9.5")
 _NULL = 0x05
-
-
-def _sequence(dotted: str, *parts: bytes) -> bytes:
-    """Encode a sequence that begins with an object identifier."""
-    return der.encode(der.SEQUENCE, der.encode(der.OID, der.encode_oid(dotted)), *parts)
-
-
-def _attribute(oid: bytes, value: bytes) -> bytes:
-    """Encode an attribute with one value."""
-    return der.encode(der.SEQUENCE, der.encode(der.OID, oid), der.encode(der.SET, value))
-
-
-_SHA_256 = _sequence("2.16.840.1.101.3.4.2.1", der.encode(_NULL))
-_RSA = _sequence("1.2.840.113549.1.1.1", der.encode(_NULL))
-_ECDSA_WITH_SHA_256 = _sequence("1.2.840.10045.4.3.2")
-_CONTENT_TYPE = _attribute(der.encode_oid("1.2.840.113549.1.9.3"), der.encode(der.OID, _DATA))
-_AES_256, _AES_192, _AES_128 = (f"2.16.840.1.101.3.4.1.{number}" for number in (42, 22, 2))
-_CAPABILITIES = _attribute(
-    der.encode_oid("1.2.840.113549.1.9.15"),
-    der.encode(der.SEQUENCE, *map(_sequence, (_AES_256, _AES_192, _AES_128))),
-)
-"""The ciphers that the signer reads, as OpenSSL states them; nobody encrypts to a CA."""
 _ANY_VALUES = (
     der.SEQUENCE, der.OCTET_STRING, der.OID, der.UTC_TIME, der.GENERALIZED_TIME, _NULL
 )  # fmt: skip
@@ -115,10 +88,18 @@ _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
 
 def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
     """Return the S/MIME message of ``document``, signed with ``key`` of ``certificate``."""
-    import secrets  # reading does not need it, and is frequent
+    import secrets  # reading needs none of these, and is frequent
 
+    from cryptography.hazmat.primitives.serialization import Encoding, pkcs7
+
+    options = (pkcs7.PKCS7Options.DetachedSignature, pkcs7.PKCS7Options.Binary)
     content = _TEXT_HEADER + document.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n")
-    signature = _signed_data(content, certificate, key)
+    signature = (
+        pkcs7.PKCS7SignatureBuilder()
+        .set_data(content)
+        .add_signer(certificate, key, hashes.SHA256())
+        .sign(Encoding.DER, options)
+    )
     boundary = b"----" + secrets.token_hex(16).upper().encode()
     encoded = base64.encodebytes(signature).replace(b"\n", b"\r\n")
     return b"".join((
@@ -134,59 +115,6 @@ def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> byt
         encoded,
         b"\r\n--", boundary, b"--\r\n\r\n",
     ))  # fmt: skip
-
-
-def _signed_data(content: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
-    """Return the detached CMS signature of ``content`` (RFC 5652, 5.1), as `cryptography` makes it.
-
-    Its own writer takes several times as long, and imports all of ``email`` first.
-    """
-    attributes = b"".join((
-        _CONTENT_TYPE,
-        _attribute(_SIGNING_TIME, _encoded_time(time.gmtime())),
-        _attribute(_MESSAGE_DIGEST, der.encode(der.OCTET_STRING, hashlib.sha256(content).digest())),
-        _CAPABILITIES,
-    ))  # fmt: skip
-    signed, digest = der.encode(der.SET, attributes), hashes.SHA256()
-    if isinstance(key, rsa.RSAPrivateKey):
-        algorithm, value = _RSA, key.sign(signed, padding.PKCS1v15(), digest)
-    else:
-        algorithm, value = _ECDSA_WITH_SHA_256, key.sign(signed, ec.ECDSA(digest))
-    before, issuer_and_serial = _of_signer(certificate)
-    signer = der.encode(
-        der.SEQUENCE,
-        der.encode_integer(1),
-        issuer_and_serial,
-        _SHA_256,
-        der.encode(der.CONTEXT_0, attributes),
-        algorithm,
-        der.encode(der.OCTET_STRING, value),
-    )
-    signed_data = der.encode(der.SEQUENCE, before, der.encode(der.SET, signer))
-    return der.encode(
-        der.SEQUENCE, der.encode(der.OID, _SIGNED_DATA), der.encode(der.CONTEXT_0, signed_data)
-    )
-
-
-@lru_cache(maxsize=8)
-def _of_signer(certificate: x509.Certificate) -> tuple[bytes, bytes]:
-    """Return what stands before all signatures of a signer, and its issuer and serial number."""
-    fields = der.children(der.first(certificate.tbs_certificate_bytes).content)
-    serial, _, issuer = (fields if fields[0].tag == der.INTEGER else fields[1:])[:3]
-    before = b"".join((
-        der.encode_integer(1),
-        der.encode(der.SET, _SHA_256),
-        der.encode(der.SEQUENCE, der.encode(der.OID, _DATA)),
-        der.encode(der.CONTEXT_0, certificate.public_bytes(Encoding.DER)),
-    ))  # fmt: skip
-    return before, der.encode(der.SEQUENCE, issuer.whole, serial.whole)
-
-
-def _encoded_time(moment: time.struct_time) -> bytes:
-    """Encode a time in UTC as CMS wants it (RFC 5652, 11.3)."""
-    if moment.tm_year < 2050:
-        return der.encode(der.UTC_TIME, time.strftime("%y%m%d%H%M%SZ", moment).encode())
-    return der.encode(der.GENERALIZED_TIME, time.strftime("%Y%m%d%H%M%SZ", moment).encode())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

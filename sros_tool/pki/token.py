@@ -7,7 +7,7 @@ import os
 import secrets as random
 import stat
 from collections.abc import Callable, Sequence, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote as shell_quote
 from typing import Any
@@ -19,7 +19,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_dss_signature
 from cryptography.hazmat.primitives.serialization import load_der_public_key
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, PkiError, UnavailableError, UsageError
 from sros_tool.owners import file_of_root
 from sros_tool.xml import read_bytes

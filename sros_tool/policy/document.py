@@ -23,7 +23,7 @@ import os
 import re
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
@@ -31,7 +31,6 @@ from urllib.parse import unquote
 
 from lxml import etree
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError, UsageError
 from sros_tool.names import check_enclave_name, check_namespace, expand, expression_problem
 from sros_tool.policy.model import (

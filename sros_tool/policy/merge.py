@@ -14,14 +14,13 @@ import codecs
 import re
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
 from lxml import etree
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, Note, PolicyError
 from sros_tool.names import check_namespace, expand
 from sros_tool.policy.document import instruction_text, read_policy

@@ -14,10 +14,9 @@ import re
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import PolicyError
 from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import (

@@ -10,10 +10,8 @@ in the same part of the name, because ``/r1*`` would match the names of a robot 
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
-
-from sros_tool.dataclass import dataclass
 
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _KIND = re.compile(r"(robot|namespace)(s?)(?::([A-Za-z_][A-Za-z0-9_]{0,63}))?", re.ASCII)

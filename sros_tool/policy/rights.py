@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.names import ACTION_PARTS, GOAL, DdsNames, dds_names, expand
 from sros_tool.policy.model import (
     ALLOW,

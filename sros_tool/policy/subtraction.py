@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from itertools import product
 from math import prod
 from string import ascii_letters, digits
 from typing import NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.policy.patterns import covers, overlap
 
 IN_PART = "#"

@@ -11,13 +11,12 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
 from lxml import etree
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.folders import Folder
 from sros_tool.policy.document import FALLBACKS, INCLUDES, MissingFileError, read_policy

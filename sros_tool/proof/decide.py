@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import lru_cache
 
 from sros_tool.automata import NameSet, SearchLimit
-from sros_tool.dataclass import dataclass
 from sros_tool.names import (
     ROS_DISCOVERY_TOPIC,
     SERVICE_ENDS,

@@ -7,11 +7,10 @@ requirements of the new file demand at least as much, under whatever name and in
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import DROPPED
-from sros_tool.dataclass import dataclass
 from sros_tool.policy.model import Level
 from sros_tool.policy.patterns import covers, overlap
 from sros_tool.proof.requirements import (

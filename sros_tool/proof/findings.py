@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import ASSUMED, NOT_ON_ZENOH, VACUOUS, VIOLATED
-from sros_tool.dataclass import dataclass
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (
     READING_SERVICES,

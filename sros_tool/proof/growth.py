@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice, product
 from typing import Annotated, NamedTuple
 
 from sros_tool.automata import NameSet, SearchLimit
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.expressions import names_of

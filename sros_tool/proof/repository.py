@@ -14,10 +14,10 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, UnavailableError, UsageError
 
 FOLDER, LINK, SUBMODULE = "40000", "120000", "160000"

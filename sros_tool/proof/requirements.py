@@ -16,10 +16,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError
 from sros_tool.files import read_toml
 from sros_tool.names import expression_problem, is_expression

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,6 @@ from sros_tool.checks.kind import WARNING, Finding
 from sros_tool.checks.registry import ChosenFindings, FindingFilter
 from sros_tool.checks.requirements import VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, PolicyError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for

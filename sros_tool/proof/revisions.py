@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, UsageError
 from sros_tool.policy.document import MissingFileError, is_policy
 from sros_tool.policy.model import Source

@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from itertools import product
 from pathlib import Path
 from shlex import quote
 
 from sros_tool.automata import NameSet
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.grants import also_fitting

@@ -12,13 +12,13 @@ import re
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import count
 from string import ascii_letters, digits
 from types import MappingProxyType
 
 from sros_tool.automata import Automaton, Letters, NameSet, SearchLimit
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.expressions import names_of

@@ -11,9 +11,9 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 
-from sros_tool.dataclass import dataclass
 from sros_tool.keystore.comparison import Effect, SettingChange
 from sros_tool.zenoh.configuration import Mode, render_configuration
 from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration

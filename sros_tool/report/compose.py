@@ -10,9 +10,8 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.keystore.reader import Keystore
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression

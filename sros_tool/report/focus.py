@@ -13,11 +13,10 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import UsageError
 from sros_tool.keystore.selection import likely_names

@@ -23,11 +23,10 @@ from collections.abc import (
     Sequence,
     Set,
 )
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.fleet.robots import Robot
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.compose import edge_order, namespace_of

@@ -10,14 +10,13 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, SrosError, UsageError

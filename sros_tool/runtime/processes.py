@@ -23,12 +23,11 @@ import stat
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.owners import other_writers
 from sros_tool.runtime.cyclone import ENCLAVE_FILES
 from sros_tool.runtime.environment import (

@@ -9,10 +9,9 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 
 RMW = "RMW_IMPLEMENTATION"

@@ -10,14 +10,13 @@ with the wheel 1.10.2.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from functools import cached_property, lru_cache
 from itertools import product
 from typing import NamedTuple
 
 from sros_tool.automata import NameSet
-from sros_tool.dataclass import dataclass
 from sros_tool.zenoh.key_expressions import KeyExpressions, includes, names_of
 
 

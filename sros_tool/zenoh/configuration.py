@@ -11,12 +11,12 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
 from json.encoder import encode_basestring_ascii
 from typing import NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError
 from sros_tool.zenoh.access import AccessControl, AccessRule, Flow, Message, RemoteRights
 

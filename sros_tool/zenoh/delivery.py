@@ -9,9 +9,9 @@ the other, and is compared on random rules (``tests/integration/test_zenoh_deliv
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
-from sros_tool.dataclass import dataclass
 from sros_tool.values import shows
 from sros_tool.zenoh.access import AccessDecision, Enforcement, Flow, Message, Remote
 from sros_tool.zenoh.configuration import Mode

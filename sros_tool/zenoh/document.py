@@ -10,12 +10,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import StrEnum
 from math import prod
 from typing import TypeVar
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError
 from sros_tool.zenoh.access import (
     PROPERTIES,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from shlex import quote
@@ -13,7 +14,6 @@ from sros_tool.checks.keystores.enclaves import WAITS
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, Finding, FindingKind
 from sros_tool.checks.registry import FindingFilter
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.delivery.archive import SUFFIXES

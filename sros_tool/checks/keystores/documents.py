@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import chain, islice
 from math import isfinite
@@ -17,7 +18,6 @@ from sros_tool.checks.keystores.enclaves import grant_of, plain
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import check_topic_names
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, Moments, Vendor
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeVar
 
@@ -14,7 +15,6 @@ from sros_tool.checks.keystores.documents import DIFFERS as GOVERNANCE_DIFFERS
 from sros_tool.checks.keystores.enclaves import grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import Grant, mistaken_names, some_pairs
 from sros_tool.errors import SrosError

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime
 
 from sros_tool.checks.kind import Finding, Severity
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import SrosError
 from sros_tool.keystore.expiry import Lifetime, survey
 from sros_tool.keystore.layout import (

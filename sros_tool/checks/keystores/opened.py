@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from functools import cache, cached_property
 from pathlib import Path
@@ -14,7 +14,6 @@ from typing import TypeVar
 from cryptography import x509
 
 from sros_tool.checks.kind import ERROR, FindingKind
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet

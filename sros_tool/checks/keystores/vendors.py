@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from sros_tool.checks.keystores.documents import PARTITIONS, UNREACHABLE
 from sros_tool.checks.keystores.enclaves import fault_remedy, grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.keystores.topic_names import NO_ROS_NAME, has_foreign_letters, is_for_ros
 from sros_tool.checks.kind import ERROR, WARNING, Cause, Finding, FindingKind, some_names
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import MEASURED, Vendor

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from enum import Enum, auto
 from functools import cache, cached_property, lru_cache
@@ -17,7 +17,6 @@ from itertools import groupby, takewhile
 from string import ascii_letters, digits
 from typing import TYPE_CHECKING, NamedTuple
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome, Refusal
 from sros_tool.dds.decision.grants import ComparisonCrash, certified_text, read_moment, same_subject
 from sros_tool.dds.decision.matching import ExpressionIndex, matches

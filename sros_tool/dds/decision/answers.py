@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.governance import TopicRule
 from sros_tool.values import shows
 

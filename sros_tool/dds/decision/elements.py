@@ -7,12 +7,11 @@ Source: DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_c
 from __future__ import annotations
 
 import re
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from lxml import etree
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import Outcome, Refusal
 from sros_tool.dds.governance import (
     DomainRule,

@@ -7,10 +7,8 @@ say.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum, StrEnum, auto
-
-from sros_tool.dataclass import dataclass
 
 
 class Style(Enum):

@@ -7,10 +7,9 @@ which prove that a silence is not a crash.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from sros_tool.dataclass import dataclass
 from sros_tool.demo.forger import Forge, Undefended
 from sros_tool.policy.model import Policy
 

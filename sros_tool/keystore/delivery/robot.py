@@ -6,7 +6,7 @@ import hashlib
 import re
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
@@ -14,7 +14,6 @@ from typing import Annotated, NamedTuple
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError, UsageError
 from sros_tool.files import write_new_file

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
@@ -12,7 +13,6 @@ from typing import Annotated, NamedTuple
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import name_notes
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError

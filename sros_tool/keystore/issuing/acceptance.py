@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.answers import Decision
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.dds.domains import DomainSet

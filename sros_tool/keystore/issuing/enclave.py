@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
@@ -19,7 +19,6 @@ from typing import TypeVar
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import (
     Grant,
@@ -113,7 +112,7 @@ class Issued:
 
     issuance: Issuance
     certificate: x509.Certificate
-    permissions: Permissions = Permissions(())
+    permissions: Permissions = field(default_factory=lambda: Permissions(()))
     document: bytes = b""
     short_lived: bool = False
 

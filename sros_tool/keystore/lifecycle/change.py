@@ -8,7 +8,7 @@ the vendors, and put everything in place at once.  A verb says what is to be; th
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
@@ -87,7 +85,7 @@ class Changed:
     works_until: datetime | None = None
     revoked: int = 0
     restart: tuple[str, ...] = ()
-    zenoh: KeptZenoh = KeptZenoh()
+    zenoh: KeptZenoh = field(default_factory=KeptZenoh)
     remarks: tuple[Note, ...] = ()
     notes: tuple[Note, ...] = ()
 

@@ -6,14 +6,13 @@ import hashlib
 from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
 from types import MappingProxyType
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.permissions import name_notes, parse_permissions
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.keystore.fleet import EnclaveDomains

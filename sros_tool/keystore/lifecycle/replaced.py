@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError

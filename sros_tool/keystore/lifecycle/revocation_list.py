@@ -12,13 +12,12 @@ import hashlib
 import os
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from shlex import quote
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.keystore.issuing.authority import Authority, write_bundle
 from sros_tool.keystore.issuing.keyring import Keyring

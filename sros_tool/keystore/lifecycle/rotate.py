@@ -11,7 +11,7 @@ import secrets
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
@@ -19,7 +19,6 @@ from typing import Any
 
 from cryptography import x509
 
-from sros_tool.dataclass import dataclass
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError

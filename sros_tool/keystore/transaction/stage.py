@@ -19,9 +19,9 @@ import re
 import stat
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, overload
 
-from sros_tool.dataclass import dataclass
 from sros_tool.errors import KeystoreError
 from sros_tool.folders import Folder
 from sros_tool.keystore.layout import STAGE, is_layout_path
