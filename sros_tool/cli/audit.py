@@ -55,12 +55,12 @@ if TYPE_CHECKING:
     "--patch",
     type=PATH,
     metavar="FILE",
-    help="Write the rights to add as a policy, for merge_policy.",
+    help="Write the missing rights to FILE, as a policy for merge_policy.",
 )
 @click.option(
     "--partial",
     is_flag=True,
-    help="Accept that nodes were not seen or not judged: the exit status is that of the rest.",
+    help="Let the exit status tell only of the nodes that were seen and judged.",
 )
 @fleet_option("The robots that the placeholders of POLICY stand for.")
 @force_option
@@ -100,8 +100,8 @@ def audit(
       $ sros merge_policy robot.xml missing.xml --in-place
 
     Exit status: 0 if nothing would be denied and every node of POLICY or KEYSTORE was seen; 1 if
-    something would be denied or, without --partial, was not seen or not judged; 2 if nothing could
-    be asked.
+    something would be denied or, without --partial, was not seen or not judged; 2 if the audit
+    could not be done.
     """
     from sros_tool.explain import audit as audits
     from sros_tool.fleet.fleet_file import read_fleet

@@ -101,7 +101,8 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     type=click.Choice(["note", "warning", "error", "never"]),
     default="warning",
     show_default=True,
-    help="Lowest severity that makes the exit status 1; a lower one than --severity is shown, too.",
+    help="Lowest severity that makes the exit status 1. Findings of this severity are shown, "
+    "whatever --severity says.",
 )
 @click.option(
     "--strict", is_flag=True, help="Report findings that the keystore's template accepts."
@@ -128,7 +129,7 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     type=PATH,
     multiple=True,
     metavar="FILE",
-    help="Report what this earlier file demanded, and --requirements does not.",
+    help="Report the requirements of this earlier file that --requirements no longer has.",
 )
 @click.option(
     "--template",
@@ -144,7 +145,8 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
 @click.option(
     "--vendor",
     type=click.Choice([*(vendor.value for vendor in MEASURED), "zenoh"]),
-    help="Leave out findings that concern only other DDS vendors, or only DDS.",
+    help="Report only findings that concern this DDS vendor, or with zenoh only those that concern "
+    "Zenoh.",
 )
 @click.option(
     "--domain", metavar="ID", help="The ROS domain that the enclaves must be able to join."
@@ -179,7 +181,8 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
 @click.option(
     "--needs-renewal",
     metavar="DURATION|PERCENT",
-    help="List only enclaves that expire within 30d, or have used 66% of their validity.",
+    help="List only the enclaves that expire within DURATION (30d), or have used PERCENT of their "
+    "validity (66%).",
 )
 def check(
     targets: tuple[Path, ...],
@@ -224,10 +227,10 @@ def check(
       $ sros check robot.xml --requirements robot.requirements.toml
 
     Findings that the keystore's template accepts count as notes and share one line; with --strict,
-    for example in CI, they count like all others. Where security is not enabled at all,
-    `check runtime` shows a note, which counts with --fail-on note. Exit status: 1 if a finding of
-    the --fail-on severity or higher is shown, 2 if the only ones are about processes that could
-    not be looked at, else 0.
+    for example in CI, they count like all others. Where security is not enabled at all, `check
+    runtime` shows a note, which counts with --fail-on note. Exit status: 1 if a finding of the
+    --fail-on severity or higher is shown; 2 if all of these only say that a process could not be
+    looked at; else 0.
     """
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
@@ -677,8 +680,8 @@ _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "report",
     metavar="FILE",
     type=PATH,
-    help="Also write FILE to attach to a question: versions, environment, findings; no secrets, "
-    "and no names of hosts, users, paths.",
+    help="Also write FILE, to attach to a bug report: versions, environment and findings, without "
+    "secrets and without names of hosts, users and paths.",
 )
 @force_option
 @json_option
@@ -822,7 +825,9 @@ def _watch_processes(
 )
 @fleet_option("The robots that the placeholders of the policies stand for.")
 @click.option(
-    "--runtime", is_flag=True, help="Also count the running processes, by what they run with."
+    "--runtime",
+    is_flag=True,
+    help="Also count the ROS processes that run here, by the state of their security.",
 )
 @dry_run_option
 @json_option

@@ -146,9 +146,9 @@ def demo(
     it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), all scenarios
     run, in about 25 s.
 
-    With a ROLE, it is one node instead, in the environment that is there, until Ctrl-C: a talker or
-    a listener on Cyclone DDS (or rclpy, or Zenoh, which also needs a router), to see by hand who
-    hears whom. It says at once whether it is secured. Only --backend and --topic go with it.
+    With talker, listener or router, run only this node until Ctrl-C, with the environment variables
+    that are set, to see by hand who hears whom: on Cyclone DDS, rclpy, or Zenoh, which also needs a
+    router. The node says at once whether it is secured. Only --backend and --topic go with it.
 
     Example:
       $ sros demo --topic /camera/image
@@ -169,11 +169,11 @@ def demo(
       ready
       sent   Hello World: 1
 
-    Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1.
-    A row marked "open" shows an attack that is known to succeed, and counts as expected. OPEN
-    marks an attack that succeeds because of your own keystore (--keystore), and would fail with
-    narrow permissions and the template production: the exit status is 1 unless --accept-open
-    names the row. With --keystore it is 2 if an attack could not be tried that has to fail.
+    Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1. A row
+    marked "open" shows an attack that is known to succeed, and counts as expected. OPEN marks an
+    attack that succeeds because of your own keystore (--keystore), and would fail with narrow
+    permissions and the template production: the exit status is 1 unless --accept-open names the
+    row. With --keystore it is 2 if an attack that has to fail could not be tried.
     """
     if role is not None:
         _run_by_hand(ctx, role, backend, topic)

@@ -270,7 +270,9 @@ def verify(
 @verb("create_request")
 @click.argument("name")
 @keystore_argument("folder", "[DIR]")
-@click.option("--again", is_flag=True, help="Make the request again, for the existing key.")
+@click.option(
+    "--again", is_flag=True, help="Write the signing request again, for the existing key."
+)
 @key_option
 @dry_run_option
 @json_option
@@ -279,8 +281,9 @@ def create_request(
 ) -> None:
     """On a robot: create the key of the enclave NAME in the folder DIR, and a signing request.
 
-    The key never leaves DIR, or with --key the robot's PKCS#11 token: DIR then has only its place.
-    The PIN comes from pin-source= in URI, $SROS_PKCS11_PIN or a prompt.
+    The key never leaves DIR. With --key, it is made on the robot's PKCS#11 token, which it never
+    leaves; DIR then holds only its URI. The PIN comes from the URI's pin-source=, from
+    $SROS_PKCS11_PIN or from a prompt.
 
     Send the request to the keystore, where `sros sign_request` answers it; `sros import` installs
     the answer next to the key.
@@ -340,16 +343,17 @@ def create_request(
 @click.option(
     "--no-answer",
     is_flag=True,
-    help="Make no answers, for delivery with `distribute_key --keyless`.  REQUEST may have several "
-    "requests: all are signed, or none; those whose key has a certificate stay as they are.",
+    help="Sign, but write no answer: deliver with `distribute_key --keyless`.  REQUEST may then "
+    "hold several requests: all are signed, or none; one whose key already has a certificate "
+    "changes nothing.",
 )
 @click.option(
     "--enclave",
     "only",
     multiple=True,
     metavar="NAME",
-    help="Refuse a request for another enclave; a revoked one is signed only if it is named here. "
-    "Once for each request, in their order.",
+    help="The enclave that REQUEST must be for. A revoked enclave gets a new certificate only if "
+    "it is named here. For several requests, once for each, in their order.",
 )
 @allow_refusal_option
 @click.option(

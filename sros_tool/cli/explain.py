@@ -189,8 +189,8 @@ def _refuse_ignored(mode: str) -> None:
 @click.option(
     "--infrastructure",
     is_flag=True,
-    help="With --reach, count /parameter_events too, which all nodes share, and requests that only"
-    " ask, such as get_parameters.",
+    help="With --reach, also follow /parameter_events, which all nodes share, and requests that "
+    "only read, such as get_parameters.",
 )
 @click.option(
     "--log",
@@ -221,10 +221,10 @@ def explain(
 ) -> int:
     r"""Show whether DDS or Zenoh lets an enclave do something, by which rule, and how to change it.
 
-    call and serve apply to services, execute to actions; call and serve apply to an action if the
-    rights have an action NAME and no service NAME; --type decides it. ROOT is a keystore, here or
-    on a robot; ENCLAVE can also be an enclave's folder. With --policy and no keystore, the policy
-    itself is explained, before anything is signed.
+    call and serve are about services, execute is about actions. If the rights name an action NAME
+    and no service NAME, call and serve are about the action; --type decides. ROOT is a keystore,
+    here or on a robot; ENCLAVE can also be an enclave's folder. With --policy and no keystore, the
+    policy itself is explained, before anything is signed.
 
     The exit status is 0 if it is allowed (with --who: to any enclave), and 1 if it is denied; with
     --log, 1 if the log reports a fault.

@@ -49,7 +49,7 @@ class _Fleet(Verb, click.Group):
 
 @click.group("fleet", cls=_Fleet)
 def fleet() -> None:
-    """Show the robots of a fleet, and what they have.
+    """Show the robots of a fleet, and which files of their enclaves they have.
 
     Example:
       $ sros fleet status keystore
@@ -98,10 +98,10 @@ def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
 @keystore_argument("folder", "[DIR]")
 @click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
 def _report(folder: Path, robot: str) -> None:
-    """On a robot: print what it has, for `sros fleet confirm` at the keystore.
+    """On a robot: print which files of its enclaves it has, for `sros fleet confirm`.
 
-    It is JSON with the SHA-256 of each file of the enclaves in DIR but their keys, and the time.
-    docs/json.md describes it under confirmation.
+    The report is JSON: the time, and the SHA-256 of each file of the enclaves in DIR except their
+    keys. docs/json.md describes it under confirmation.
 
     Example:
       $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
@@ -129,7 +129,7 @@ def _report(folder: Path, robot: str) -> None:
 @dry_run_option
 @json_option
 def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -> None:
-    """Keep in the keystore ROOT what a robot says that it has.
+    """Store a robot's report of its files in the keystore ROOT.
 
     FILE is what `sros fleet report` or the Ansible collection made on the robot; - is standard
     input. It replaces the last one of the robot, and proves nothing about it: `sros fleet status`
@@ -182,7 +182,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
 
 @fleet.command("status")
 @keystore_argument()
-@robot_option("Only this robot of the fleet, with all that it has.")
+@robot_option("Show only this robot of the fleet, with each of its files.")
 @click.option(
     "--max-age",
     metavar="DURATION",
@@ -203,12 +203,12 @@ def _status(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Show what each robot of the keystore ROOT has, by what it last confirmed.
+    """Compare the files that each robot last confirmed with those that it should have.
 
-    What a robot confirmed is compared with what an export would give it now. A file is current;
-    earlier, which the keystore issued for the enclave before; another's; revoked; missing; or
-    unknown, which the keystore never issued. Files on a robot take effect when its processes are
-    restarted, which a confirmation does not tell.
+    A robot should have what an export from the keystore ROOT would give it now. A file is current;
+    earlier (issued for this enclave before); another's (issued for another enclave); revoked;
+    missing; or unknown (never issued by this keystore). Processes use new files only after a
+    restart, which a confirmation does not show.
 
     Example:
       $ sros fleet status keystore

@@ -413,7 +413,8 @@ if TYPE_CHECKING:
 @click.option(
     "--ca-validity",
     metavar="SPAN",
-    help="How long the CAs are valid: 5y, until 2031-01-01, or from 2026-12-01/5y.",
+    help="How long the CAs are valid: a duration (5y), an end date (2031-01-01), or a start and "
+    "one of both (2026-12-01/5y).",
 )
 @click.option("--validity", metavar="SPAN", help="How long certificates are valid.")
 @click.option("--permissions-validity", metavar="SPAN", help="How long permissions are valid.")
@@ -613,30 +614,29 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
     "rules",
     multiple=True,
     metavar="RULE",
-    help="Protect a name of its own: 'topic /camera/* data=NONE metadata=SIGN'.",
+    help="Protect a topic, service or action in its own way: 'topic /camera/* data=NONE "
+    "metadata=SIGN'.",
 )
 @click.option(
     "--drop-rule",
     "dropped",
     multiple=True,
     metavar="RULE",
-    help="Remove the protection of a name: 'topic /camera/*'.",
+    help="Remove such a rule: 'topic /camera/*'.",
 )
 @click.option("--domain", metavar="IDS", help="The ROS domains of its enclaves: 0 or 0,7 or 10-19.")
+@click.option("--take-edits", is_flag=True, help="Apply the edits in sros.toml or governance.xml.")
 @click.option(
-    "--take-edits", is_flag=True, help="Carry out what sros.toml or governance.xml now says."
-)
-@click.option(
-    "--discard-edits", is_flag=True, help="Write sros.toml and governance.xml as they were."
+    "--discard-edits", is_flag=True, help="Undo the edits in sros.toml and governance.xml."
 )
 @click.option(
     "--trust-records",
     is_flag=True,
-    help="Take the rights on trust that a ledger of version 0.1 has without a chain.",
+    help="Trust the rights in a ledger of version 0.1, which has no chain that protects them.",
 )
 @click.option("--next", "next_stage", is_flag=True, help="Do only the next stage.")
 @click.option(
-    "--allow-looser", is_flag=True, help="Allow that something becomes possible that was not."
+    "--allow-looser", is_flag=True, help="Allow changes that make something possible that was not."
 )
 @_revoke_old_option
 @allow_refusal_option
@@ -661,8 +661,8 @@ def update_keystore(
 ) -> int:
     r"""Change the settings of the keystore ROOT, and sign again what follows from them.
 
-    The keys are those of sros.toml. What becomes looser and what tighter is shown, and a looser
-    keystore has to be allowed. Keys of enclaves stay, and so do the rights of policies.
+    KEY is a setting of sros.toml. What becomes looser and what tighter is shown, and what becomes
+    looser has to be allowed. The enclaves keep their keys and their rights.
 
     By default all is changed at once. With --next, in two stages: first the certificates and
     permissions, after which processes are restarted one by one; then, with the same command, the

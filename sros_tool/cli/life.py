@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 @click.option(
     "--all-expiring",
     metavar="DURATION|PERCENT",
-    help="Also renew enclaves that expire within 30d, or have used 66% of their validity; "
-    "enclaves that are short-lived have to be named.",
+    help="Also renew the enclaves that expire within DURATION (30d), or have used PERCENT of their "
+    "validity (66%), but not those that were made short-lived: name these.",
 )
 @click.option("--new-key", is_flag=True, help="Create new keys as well.")
 @key_option
@@ -79,7 +79,7 @@ def renew(
     expire.  With --revoke-old, processes that load the new crl.pem refuse them: restart the
     renewed processes first, then all others.
 
-    With --key, the enclaves NAME... get other keys, on a token; a key.pem that one had is removed.
+    With --key, the enclaves NAME... get new keys on a token, and their key.pem files are removed.
 
     Example:
       $ sros renew keystore /talker
@@ -349,7 +349,8 @@ _DONE = {
 @click.option(
     "--allow-unconfirmed",
     is_flag=True,
-    help="Go on although robots of the fleet have not confirmed the stage: they are cut off.",
+    help="Go on although some robots of the fleet have not confirmed the stage; those robots are "
+    "cut off.",
 )
 @allow_refusal_option
 @json_option

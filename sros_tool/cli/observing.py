@@ -305,7 +305,8 @@ class _Words(Watching):
 @click.option(
     "--enclave-per-node",
     is_flag=True,
-    help="Give each process whose enclave the graph does not show one with the name of its node.",
+    help="Put each process whose enclave the ROS graph does not show into an enclave that is named "
+    "after its node.",
 )
 @click.option("--flat", is_flag=True, help="Write one file, without includes of common parts.")
 @click.option(
@@ -354,9 +355,9 @@ def generate_policy(
     FILE keeps its content; new rights are added to it. Read the result before you enforce it: on a
     robot that is not secured yet, an attacker's nodes are observed, too.
 
-    A log proves less: a process can print any line, and so ask for rights. Rights from a log are
-    shown with the lines that ask for them, and are written only with --accept; the exit status is 2
-    if that is missing. Without FILE, the rights are printed as a policy, for merge_policy.
+    With --from-log, the rights are those that logs report as denied. Any process can print such a
+    line, so they are shown with the lines that report them, and written only with --accept; without
+    it, the exit status is 2. Without FILE, they are printed as a policy, for merge_policy.
 
     Example:
       $ sros generate_policy robot.xml

@@ -183,9 +183,9 @@ def diff_policy(
 
     A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or
     configurations of Zenoh such as router.json5. Permissions and rules of Zenoh are shown in ROS
-    terms; the signature of permissions is verified if the permissions CA is next to them. If A or
-    B is only for some enclaves, these are compared. Of a fleet, lines that differ only in the robot
-    are one. Of two policies, the protection that they demand is compared, too.
+    terms; the signature of permissions is verified if the permissions CA is next to them. If A or B
+    covers only some enclaves, only these are compared. Lines that differ only in the robot of a
+    fleet are shown as one. Of two policies, the protection that they demand is compared, too.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 

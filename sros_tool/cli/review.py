@@ -91,7 +91,7 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     default="HEAD",
     show_default=True,
     metavar="COMMIT",
-    help="The commit that is reviewed: HEAD, a full id or a full reference.",
+    help="The commit to review: HEAD, a full id or a full reference.",
 )
 @_paths_option("policy", "PATH", "A policy, or a folder of policies, of the robot or fleet.")
 @_paths_option("requirements", "PATH", "A file of requirements on the policies and keystores.")
@@ -165,9 +165,9 @@ def review(
     Checks what the commit HEAD has, decides its requirements and those that it drops, and compares
     all access with that of the commit BASE. PATHs are from the top of the repository.
 
-    Both commits are read from git itself: nothing is checked out, no file of the work tree is read
-    but to say that it differs, no link of a commit is followed, and nothing that the repository has
-    or configures is run. What was not looked at is in the result.
+    Both commits are read from git itself: nothing is checked out, files of the work tree are read
+    only to say that they differ, no link of a commit is followed, and nothing that the repository
+    has or configures is run. What was not looked at is in the result.
 
     Example:
       $ sros review --base refs/remotes/origin/main --policy robot/robot.xml

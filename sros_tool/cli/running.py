@@ -184,12 +184,12 @@ def env(
     r"""Print the environment variables that make a process run in the enclave NAME.
 
     The strategy is Enforce: a process that cannot run in the enclave does not start. If the
-    variables cannot be given, those that are printed let no node start. With rmw_zenoh_cpp, which
-    ignores ROS_SECURITY_*, they also name the configuration that `sros zenoh` wrote, and replace
-    those of Zenoh that are set.
+    variables cannot be given, what is printed instead keeps every node from starting. With
+    rmw_zenoh_cpp, which ignores ROS_SECURITY_*, they also name the configuration that `sros zenoh`
+    wrote, and override variables of Zenoh that are set.
 
     A container gets the files of the enclave from an export in DIR (Compose), or from a Secret
-    (Kubernetes). Without --image, what is printed is to be merged with a definition that has one.
+    (Kubernetes). Without --image, merge the output with a definition that names an image.
 
     Example:
       $ eval "$(sros env keystore /talker)"
@@ -290,7 +290,8 @@ class _WithCommand(Verb):
     "--policy",
     metavar="FILE",
     type=PATH,
-    help="Take the enclave in which FILE has the node that COMMAND starts, in place of NAME.",
+    help="Instead of NAME: use the enclave in which the policy FILE has the node that COMMAND "
+    "starts.",
 )
 @_DOMAIN
 @_RMW
@@ -311,7 +312,7 @@ def run(
     The enclave is checked first, so that problems are reported here and not by an obscure message
     of the middleware. A COMMAND that is known to start a ROS node (`ros2 run`, or an executable of
     a ROS package) gets the arguments `--ros-args --enclave NAME`, so that the ROS graph shows the
-    enclave; with rmw_zenoh_cpp nobody accepts a node in the graph without it.
+    enclave; with rmw_zenoh_cpp, others do not accept a node without them into their graph.
 
     With --policy, COMMAND gives its node a name: `--ros-args -r __node:=NAME -r __ns:=NAMESPACE`,
     as launch files do.
@@ -418,9 +419,10 @@ class _WithCommandAfterDashes(_WithCommand):
     "jobs",
     multiple=True,
     type=click.Choice([job.value for job in Job]),
-    help="A timer that renews what expires within 30 days, checks the keystore each day, or "
-    "writes metrics every 15 minutes: of the keystore, or of `sros fleet status` (fleet); guard is "
-    "no timer, and watches all ROS processes of the machine, as root.  Can be repeated.",
+    help="renew: renew what expires within 30 days. check: check the keystore each day. "
+    "metrics: write its metrics every 15 minutes. fleet: the same with those of `sros fleet "
+    "status`. guard: watch all ROS processes of the machine, as root and without a timer.  "
+    "Can be repeated.",
 )
 @click.option(
     "--target",
@@ -445,7 +447,7 @@ class _WithCommandAfterDashes(_WithCommand):
     "--passphrase-file",
     "passphrase",
     metavar="FILE",
-    help="With --job renew: the file there with the passphrase of the CA keys.",
+    help="With --job renew: the file with the passphrase of the CA keys, where the job runs.",
 )
 @_DOMAIN
 @_RMW
@@ -475,8 +477,8 @@ def units(
     """Write units of systemd to FOLDER: nodes in the enclaves NAME..., and timers (--job).
 
     A node runs in its enclave or not at all, sees the keys of no other enclave, and gets no right
-    that a ROS node does not need. COMMAND is its program; without it, that is a file with the path
-    of the enclave in /etc/sros/nodes.
+    that a ROS node does not need. COMMAND is its program; the default is the file in
+    /etc/sros/nodes that has the path of the enclave.
 
     Examples:
       $ sros units keystore /talker units -- /opt/robot/talker.sh

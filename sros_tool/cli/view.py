@@ -103,7 +103,8 @@ def _complete_focus(
     "words",
     multiple=True,
     metavar="NAME...",
-    help="Draw only what leads to this topic, service, action or enclave, and what it leads to.",
+    help="Draw only what can influence this topic, service, action or enclave, and what it can "
+    "influence.",
     shell_complete=_complete_focus,
 )
 @click.option(
@@ -143,9 +144,9 @@ def view(
 
     A SOURCE is a policy file, a keystore (its signed permissions), the folder of an enclave, its
     permissions, a Zenoh configuration (router.json5), or the output of `sros generate_policy
-    --json`. Two policies are compared as before and after, a policy and a keystore for drift, and
-    a Zenoh configuration with what it should allow. --observed compares the rights in SOURCE
-    with those that are used. --focus answers who may use a name, and who influences these.
+    --json`. Two policies are compared as before and after, a policy and a keystore for drift, and a
+    Zenoh configuration with what it should allow. --observed compares the rights in SOURCE with
+    those that are used. --focus shows who may use a name, and who can influence those enclaves.
 
     The page is one file that needs no network. No format contains keys or paths of this machine.
 

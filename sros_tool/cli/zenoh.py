@@ -73,7 +73,7 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     "existing",
     type=PATH,
     metavar="FILE",
-    help="Say what an existing configuration of Zenoh allows whom, and where it is open.",
+    help="Show whom an existing configuration of Zenoh allows what, and where it lets anybody in.",
 )
 @output_option("With --from: write what it allows as a policy to FILE.")
 @force_option
@@ -110,9 +110,9 @@ def zenoh(
       $ sros zenoh keystore --check
       $ sros zenoh --from session.json5 -o policy.xml
 
-    Exit status: 0 written, or up to date; with --check 1 if a file is missing or
-    out of date; with --from 1 if the file is open or does not work; 2 if it could
-    not be done, such as for rights that Zenoh cannot enforce.
+    Exit status: 0 written, or up to date; with --check 1 if a file is missing or out of date; with
+    --from 1 if the configuration lets anybody in or does not work; 2 if it could not be done, such
+    as for rights that Zenoh cannot enforce.
     """
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
     from sros_tool.keystore.lifecycle.update import set_zenoh
