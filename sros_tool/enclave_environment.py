@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from shlex import quote
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.reader import Keystore, OpenedEnclave
     from sros_tool.keystore.zenoh_files import OpenedZenoh
     from sros_tool.pki.token import TokenUri
+    from sros_tool.zenoh.configuration import Configuration
 
 RMWS = (
     "rmw_connextdds",
@@ -434,7 +435,59 @@ def _zenoh_environment(
             "topics and services."
         )
         needed = (Note("zenoh.enclave-argument", text),)
-    return EnclaveEnvironment(variables, tuple(replaced_notes(environment, variables)), needed)
+    notes = (
+        *replaced_notes(environment, variables),
+        *_router_notes(zenoh.configurations.get(SESSION_FILE)),
+    )
+    return EnclaveEnvironment(variables, notes, needed)
+
+
+def _router_notes(session: Configuration | None) -> Iterator[Note]:
+    """Yield a note if a session connects to a router of this machine that does not run.
+
+    A client waits for it without a word; a peer of rmw_zenoh starts, and says it itself.
+    """
+    from sros_tool.zenoh.configuration import Mode
+
+    if session is None or session.mode is not Mode.CLIENT:
+        return
+    endpoints = [endpoint.rpartition("/")[2] for endpoint in session.connect]
+    addresses = [endpoint.rpartition(":") for endpoint in endpoints]
+    if any(host not in _THIS_MACHINE or _listens_here(int(port)) for host, _, port in addresses):
+        return
+    router = session.access_control.remotes[0].common_name if session.access_control.remotes else ""
+    yield Note(
+        "zenoh.no-router",
+        f"nothing listens at {', '.join(endpoints)}, where the router {router} has to: a node "
+        "waits for it, and says nothing until then. Start the router in its own enclave.",
+    )
+
+
+_THIS_MACHINE = ("localhost", "127.0.0.1", "[::1]")
+_LISTENING = "0A"
+"""The state of a listening socket in the kernel's tables of TCP sockets."""
+
+
+def _listens_here(port: int) -> bool:
+    """Return whether a TCP port of this machine has a listener, also if that cannot be seen.
+
+    No connection is made: each one that is given up would pause the listener of a router.
+    """
+    listening: set[int] = set()
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        try:
+            with open(table, encoding="ascii") as lines:
+                sockets = [line.split() for line in lines][1:]
+        except FileNotFoundError:  # such as without IPv6
+            continue
+        except (OSError, ValueError):
+            return True
+        listening |= {
+            int(local.rpartition(":")[2], 16)
+            for _, local, _, state, *_ in sockets
+            if state == _LISTENING
+        }
+    return port in listening
 
 
 # ── containers ─────────────────────────────────────────────────────────────────────────────

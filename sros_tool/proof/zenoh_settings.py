@@ -103,8 +103,9 @@ _HARMLESS = re.compile(
     r"metadata(?:/.*)?|timestamping/.*|queries_default_timeout|open/.*|stats/.*"
     r"|transport/unicast/.*|transport/link/[tr]x/.*|transport/link/tls/so_(?:snd|rcv)buf"
     r"|(?:listen|connect)/(?:timeout_ms|exit_on_failure|retry)(?:/.*)?|scouting/(?:timeout|delay)"
+    r"|scouting/gossip/autoconnect_strategy/.*|routing/router/peers_failover_brokering"
 )
-"""Settings that give nobody anything: times, sizes, and words."""
+"""Settings that give nobody anything: times, sizes, words, and who of two peers connects first."""
 _GIVING = (
     (re.compile(r"plugins(?:/.*)?"), "a plugin answers others by its own rules"),
     (re.compile(r"plugins_loading(?:/.*)?"), "it loads plugins, which answer others"),

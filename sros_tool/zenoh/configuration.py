@@ -12,10 +12,10 @@ import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from enum import StrEnum
+from enum import Enum, StrEnum
 from functools import lru_cache
 from json.encoder import encode_basestring_ascii
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sros_tool.errors import DocumentError
 from sros_tool.zenoh.access import AccessControl, AccessRule, Flow, Message, RemoteRights
@@ -54,6 +54,18 @@ class ZenohNetwork:
 
 _QUERY_MILLISECONDS = 600_000
 """How long rmw_zenoh waits for a reply; Zenoh's own default of 10 s would end long calls."""
+_MICROSECONDS_UNTIL_CLOSED = 60_000_000
+"""How long a session of rmw_zenoh waits for a process that takes no message before it leaves it."""
+
+
+class SettingsEdition(Enum):
+    """Which settings a file has that have nothing to do with security."""
+
+    FEW = "few"
+    """The few that the files had at first: sessions ended where rmw_zenoh waits for the router."""
+    OF_RMW_ZENOH = "of rmw_zenoh"
+    """All those of rmw_zenoh (0.1.9, 0.2.10, 0.6.7, 0.10.5, which have the same) that differ from
+    Zenoh's own, and a session waits for its router."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +80,13 @@ class Configuration:
     connect: tuple[str, ...]
     access_control: AccessControl
 
-    def render(self) -> bytes:
+    def render(self, settings: SettingsEdition = SettingsEdition.OF_RMW_ZENOH) -> bytes:
         """Return the file: JSON, the same for equal configurations.
 
         TLS has no files yet: a session that is not told where its key is does not open.
         """
         rights = [render_rights(each) for each in self.access_control.remotes]
-        return render_configuration(self.mode, self.listen, self.connect, rights)
+        return render_configuration(self.mode, self.listen, self.connect, rights, settings)
 
 
 class RenderedRights(NamedTuple):
@@ -90,6 +102,7 @@ def render_configuration(
     listen: tuple[str, ...],
     connect: tuple[str, ...],
     rights: Iterable[RenderedRights],
+    settings: SettingsEdition = SettingsEdition.OF_RMW_ZENOH,
 ) -> bytes:
     """Return what `Configuration.render` does, from the rendered rights of all remote enclaves."""
     every = [*rights]
@@ -98,14 +111,16 @@ def render_configuration(
         lines = ",\n".join(each[number] for each in every if each[number])
         lists.append(f'  "{name}": [\n{lines}\n  ]' if lines else f'  "{name}": [\n  ]')
     control = ",\n".join(('  "enabled": true', '  "default_permission": "deny"', *lists))
-    rest = _rest(mode, listen, connect)
+    rest = _rest(mode, listen, connect, settings)
     return f'{rest},\n "access_control": {{\n{control}\n }}\n}}\n'.encode()
 
 
 @lru_cache
-def _rest(mode: Mode, listen: tuple[str, ...], connect: tuple[str, ...]) -> str:
+def _rest(
+    mode: Mode, listen: tuple[str, ...], connect: tuple[str, ...], settings: SettingsEdition
+) -> str:
     """Return all but the access control, without the brace at the end."""
-    document = {
+    document: dict[str, Any] = {
         "mode": mode.value,
         "connect": {"endpoints": list(connect)},
         "listen": {"endpoints": list(listen)},
@@ -137,7 +152,34 @@ def _rest(mode: Mode, listen: tuple[str, ...], connect: tuple[str, ...]) -> str:
         },
         "adminspace": {"enabled": False},
     }
+    if settings is SettingsEdition.OF_RMW_ZENOH:
+        _add_settings_of_rmw_zenoh(document, mode)
     return json.dumps(document, indent=1).removesuffix("\n}")
+
+
+def _add_settings_of_rmw_zenoh(document: dict[str, Any], mode: Mode) -> None:
+    transport = document["transport"]
+    # Hundreds of nodes that start together all get their connection, although each takes a while.
+    transport["unicast"] = {
+        "open_timeout": 60_000,
+        "accept_timeout": 60_000,
+        "accept_pending": 10_000,
+        "max_sessions": 10_000,
+    }
+    sending: dict[str, Any] = {"lease": 60_000, "keep_alive": 2}
+    transport["link"]["tx"] = sending
+    strategy = {"to_router": "always", "to_peer": "greater-zid" if mode is Mode.PEER else "always"}
+    if mode is Mode.ROUTER:
+        document["routing"] = {"router": {"peers_failover_brokering": False}}
+    else:
+        # A number of microseconds, although all others are in milliseconds.
+        block = {"wait_before_close": _MICROSECONDS_UNTIL_CLOSED}
+        sending["queue"] = {"congestion_control": {"block": block}}
+    if mode is Mode.CLIENT:
+        # A client of Zenoh ends if its router is not there yet; rmw_zenoh waits for the router.
+        document["connect"]["timeout_ms"] = -1
+    else:
+        document["scouting"]["gossip"]["autoconnect_strategy"] = {mode.value: strategy}
 
 
 def render_rights(remote: RemoteRights) -> RenderedRights:
@@ -194,7 +236,7 @@ def parse_rendered(data: bytes, name: str) -> Configuration:
             tuple(document["connect"]["endpoints"]),
             AccessControl(remotes),
         )
-        same = found.render() == data
+        same = any(found.render(each) == data for each in SettingsEdition)
     except (ValueError, KeyError, IndexError, TypeError, RecursionError):
         same = False
     if not same:

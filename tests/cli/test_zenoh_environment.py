@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
 import sys
 from pathlib import Path
 
@@ -51,6 +52,18 @@ def test_the_variables_of_a_session_and_of_a_router(keystore: Path) -> None:
     assert shown["variables"]["ZENOH_ROUTER_CONFIG_URI"] == router
     assert shown["variables"]["ZENOH_SESSION_CONFIG_URI"] == NO_CONFIGURATION
     assert shown["notes"] == []
+
+
+def test_a_client_whose_router_does_not_run_is_told_that_its_node_waits(keystore: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as router:
+        endpoint = f"localhost:{router.getsockname()[1]}"
+        sros("zenoh", keystore, "--mode", "client", "--endpoint", endpoint).ok()
+        assert "zenoh.no-router" not in sros("env", keystore, "/a", *ZENOH).ok().err
+    said = sros("env", keystore, "/a", *ZENOH).ok().err
+    assert f"note [zenoh.no-router]: nothing listens at {endpoint}, where the router /rou" in said
+    assert "zenoh.no-router" not in sros("env", keystore, "/router", *ZENOH).ok().err
+    sros("zenoh", keystore, "--endpoint", "robot.example:7447").ok()  # another machine: not asked
+    assert "zenoh.no-router" not in sros("env", keystore, "/a", *ZENOH).ok().err
 
 
 def test_the_environment_chooses_too_and_the_option_wins(keystore: Path) -> None:

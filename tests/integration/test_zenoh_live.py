@@ -95,6 +95,15 @@ def test_only_a_certificate_of_the_keystore_gets_a_connection(keystores: Path) -
     }
 
 
+def test_sessions_wait_for_their_router_and_find_it_again(keystores: Path) -> None:
+    assert play("starting", keystores, "client") == {
+        "opened before the router": False,
+        "all opened": True,
+        "heard": True,
+        "heard after the router's restart": True,
+    }
+
+
 def test_another_enclave_cannot_play_the_router(keystores: Path) -> None:
     assert play("routers", keystores, "client") == {"/other": False, "/router": True}
 

@@ -37,6 +37,8 @@ def configuration(kind: str) -> object:
         if key and value:
             with suppress(zenoh.ZError):
                 config.insert_json5(key, value)
+    if kind != "router":  # as written, it would wait for a router that refuses it for ever
+        config.insert_json5("connect/timeout_ms", "4000")
     return config
 
 

@@ -12,6 +12,7 @@ import json
 import os
 import random
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -271,7 +272,7 @@ def entrances(keystore: Path, foreign: Path) -> dict[str, Any]:
                     found[name] = bool(list(session.info.routers_zid()))
             except zenoh.ZError:
                 found[name] = False
-        without = json.loads((keystore / "enclaves/talker/session.json5").read_text())
+        without = document | {"connect": {"endpoints": endpoints, **hurried}}
         try:
             with zenoh.open(zenoh.Config.from_json5(json.dumps(without))):
                 found["without paths"] = True
@@ -302,6 +303,43 @@ def passed_on(keystore: Path, router: str) -> bool:
             until(lambda: bool(heard), lambda: talker.put(key("/chatter"), "chatter"))
         del kept
         return bool(heard)
+
+
+def starting(keystore: Path, number: int) -> dict[str, bool]:
+    """Start sessions before their router, all at once, then the router, twice."""
+    told: dict[str, bool] = {}
+    with world(keystore, rules=True) as at:
+        talker, listener = (
+            threading.Thread(target=lambda name=each: opened.update({name: at.open(name)}))
+            for each in ("/talker", "/listener")
+        )
+        others = [threading.Thread(target=at.open, args=("/other",)) for _ in range(number - 2)]
+        opened: dict[str, Any] = {}
+        starting = [talker, listener, *others]
+        for each in starting:
+            each.start()
+        time.sleep(PAUSE)
+        told["opened before the router"] = len(at.sessions) > 0
+        router = at.open("/router", "router.json5")
+        for each in starting:
+            each.join(WITHIN)
+        told["all opened"] = len(at.sessions) == number + 1
+        heard: set[str] = set()
+        kept = opened["/listener"].declare_subscriber(
+            key("/chatter"), lambda each: heard.add(text(each))
+        )
+
+        def say(what: str) -> bool:
+            put = opened["/talker"].put
+            return until(lambda: what in heard, lambda: put(key("/chatter"), what))
+
+        told["heard"] = say("first")
+        at.sessions.remove(router)
+        router.close()
+        at.open("/router", "router.json5")
+        told["heard after the router's restart"] = say("second")
+        del kept
+    return told
 
 
 MESSAGES = {
@@ -418,6 +456,7 @@ PLAYS: dict[str, Callable[[Path, Path], Any]] = {
     "open": lambda keystore, _: communicate(keystore, rules=False),
     "entrances": entrances,
     "decisions": lambda keystore, _: decisions(keystore, 1000 if LONG else 200),
+    "starting": lambda keystore, _: starting(keystore, 300 if LONG else 20),
     "routers": lambda keystore, _: {
         each: passed_on(keystore, each) for each in ("/other", "/router")
     },

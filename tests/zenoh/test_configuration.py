@@ -7,7 +7,7 @@ import json
 import pytest
 
 from sros_tool.zenoh.access import AccessControl, AccessRule, Flow, Message, RemoteRights
-from sros_tool.zenoh.configuration import Configuration, Mode, parse_rendered
+from sros_tool.zenoh.configuration import Configuration, Mode, SettingsEdition, parse_rendered
 
 PUT = (Message.PUT, Message.DELETE)
 RIGHTS = RemoteRights(
@@ -20,9 +20,13 @@ RIGHTS = RemoteRights(
 
 
 @pytest.mark.parametrize("remotes", [(), (RIGHTS,), (RIGHTS, RemoteRights("/b", ()))])
-def test_it_reads_back_as_it_was(remotes: tuple[RemoteRights, ...]) -> None:
-    written = Configuration(Mode.PEER, ("tls/a:1",), ("tls/b:2",), AccessControl(remotes))
-    data = written.render()
+@pytest.mark.parametrize("settings", SettingsEdition)
+@pytest.mark.parametrize("mode", Mode)
+def test_it_reads_back_as_it_was(
+    mode: Mode, settings: SettingsEdition, remotes: tuple[RemoteRights, ...]
+) -> None:
+    written = Configuration(mode, ("tls/a:1",), ("tls/b:2",), AccessControl(remotes))
+    data = written.render(settings)
     assert parse_rendered(data, "file") == written
     control = json.loads(data)["access_control"]
     assert (control["enabled"], control["default_permission"]) == (True, "deny")
