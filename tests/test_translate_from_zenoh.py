@@ -16,7 +16,7 @@ from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Rules, folded, policy_rights
-from sros_tool.translate_zenoh import (
+from sros_tool.translate_zenoh.rights import (
     RightsBehindRules,
     name_of_key,
     policy_of,

@@ -19,9 +19,10 @@ from sros_tool.policy.model import ALLOW, Enclave, Group, Profile, Profiles, Qua
 from sros_tool.policy.model import DENY as DENY_
 from sros_tool.policy.model import RIGHTS as RIGHTS_OF
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.rights import Right, Rules
+from sros_tool.policy.rights import NodeName, Right, Rules, nodes_of_rights
 from sros_tool.translate import permissions_for
-from sros_tool.translate_zenoh import (
+from sros_tool.translate_zenoh.graph import nodes_in_rules
+from sros_tool.translate_zenoh.rights import (
     StatedRight,
     as_router,
     chunks_of,
@@ -162,21 +163,10 @@ def test_an_action_is_its_services_and_topics(tmp_path: Path) -> None:
         assert allowed(IN, Message.PUT, name) and not allowed(OUT, Message.PUT, name)
 
 
-def test_a_token_of_the_graph_names_its_own_enclave(tmp_path: Path) -> None:
+def test_whoever_asks_for_the_graph_asks_for_all_of_it(tmp_path: Path) -> None:
     control = AccessControl((remote_rights(enclave(tmp_path, publish("/x")), 0),))
-
-    def allowed(flow: Flow, message: Message, key: str) -> bool:
-        return control.allows("/robot/n", flow, message, key)
-
-    token = Message.LIVELINESS_TOKEN
-    assert allowed(IN, token, "@ros2_lv/0/z/0/0/NN/%robot%n/%/n")
-    assert allowed(IN, token, "@ros2_lv/0/z/0/1/MP/%robot%n/%/n/%x/t/h/q")
-    assert not allowed(IN, token, "@ros2_lv/0/z/0/0/NN/%robot%other/%/n")
-    assert not allowed(IN, token, "@ros2_lv/0/z/0/0/NN/*/%/n")
-    assert not allowed(IN, token, "@ros2_lv/1/z/0/0/NN/%robot%n/%/n")
-    assert allowed(OUT, token, "@ros2_lv/0/z/0/0/NN/%robot%other/%/n")
-    assert allowed(IN, Message.LIVELINESS_QUERY, "@ros2_lv/0/**")
-    assert not allowed(IN, Message.LIVELINESS_QUERY, "@ros2_lv/**")
+    assert control.allows("/robot/n", IN, Message.LIVELINESS_QUERY, "@ros2_lv/0/**")
+    assert not control.allows("/robot/n", IN, Message.LIVELINESS_QUERY, "@ros2_lv/**")
 
 
 DENY = '<topics {}="DENY"><topic>{}</topic></topics>'
@@ -379,3 +369,96 @@ def test_a_session_trusts_its_router_with_its_own_rights_alone(tmp_path: Path) -
     assert router.allows("/a", IN, *put_x) and router.allows("/b", IN, *put_y)
     assert not router.allows("/a", IN, *put_y)
     assert not router.allows("/router", IN, *put_x)
+
+
+# ── the graph ──────────────────────────────────────────────────────────────────────────────
+
+NODES = """
+<profile ns="/" node="n"><topics publish="ALLOW"><topic>chatter</topic></topics></profile>
+<profile ns="/arm/left" node="camera_*">
+  <topics publish="ALLOW" subscribe="ALLOW"><topic>image*</topic></topics>
+  <topics publish="DENY"><topic>image_secret</topic><topic>image/*/raw</topic></topics>
+  <services reply="ALLOW"><service>~/get_parameters</service></services>
+  <actions call="ALLOW"><action>/dock</action></actions>
+</profile>
+"""
+TOKENS = {  # what a token announces, and whether it may
+    "NN/%e/%/n": True,
+    "NN/%e/%arm%left/camera_1": True,
+    "NN/%e/%/camera_1": False,
+    "NN/%e/%arm/camera_1": False,
+    "NN/%e/%arm%left/n": False,
+    "NN/%e/%/other": False,
+    "NN/%f/%/n": False,
+    "NN/%e/%/*": False,
+    "NN/*/%/n": False,
+    "MP/%e/%/n/%chatter/t/h/q": True,
+    "MP/%e/%/n/%chatter/t/h/q/more": True,
+    "MS/%e/%/n/%chatter/t/h/q": False,
+    "MP/%e/%/n/%other/t/h/q": False,
+    "MP/%e/%/other/%chatter/t/h/q": False,
+    "MP/%e/%arm%left/camera_1/%arm%left%image/t/h/q": True,
+    "MP/%e/%arm%left/camera_1/%arm%left%image%raw/t/h/q": True,
+    "MP/%e/%arm%left/camera_1/%arm%left%image%left%raw/t/h/q": False,
+    "MS/%e/%arm%left/camera_1/%arm%left%image%left%raw/t/h/q": True,
+    "MP/%e/%arm%left/camera_1/%arm%left%image_secret/t/h/q": False,
+    "SS/%e/%arm%left/camera_1/%arm%left%camera_1%get_parameters/t/h/q": True,
+    "SS/%e/%arm%left/camera_1/%arm%left%camera_1%set_parameters/t/h/q": False,
+    "SC/%e/%/n/%dock%_action%send_goal/t/h/q": True,
+    "SS/%e/%/n/%dock%_action%send_goal/t/h/q": False,
+    "MS/%e/%/n/%dock%_action%status/t/h/q": True,
+    "MP/%e/%/n/**": False,
+}
+
+
+def test_tokens_are_bound_to_the_nodes_and_names_of_the_policy(tmp_path: Path) -> None:
+    file = tmp_path / "policy.xml"
+    file.write_text(
+        '<policy version="0.2.0"><enclaves><enclave path="/e"><profiles>'
+        f"{NODES}</profiles></enclave></enclaves></policy>"
+    )
+    rights = remote_rights(read_policy(file).enclaves[0], 0)
+    router, session = AccessControl((rights,)), AccessControl((as_router("/router", rights),))
+    for token, expected in TOKENS.items():
+        place = (Message.LIVELINESS_TOKEN, f"@ros2_lv/0/zid/0/1/{token}")
+        assert router.allows("/e", IN, *place) is expected, token
+        assert session.allows("/router", OUT, *place) is expected, token
+        assert router.allows("/e", OUT, *place), "everybody may see everything"
+        assert not router.allows("/e", IN, place[0], place[1].replace("/0/", "/1/", 1))
+    assert set(nodes_in_rules(rights.rules, "/e")) >= {
+        NodeName("/", "n"), NodeName("/arm/left", "camera_*"),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("services", "nodes"),
+    [
+        (["/a/n/get_parameters"], [("/a", "n")]),
+        (["/n/describe_parameters", "/n/add"], [("/", "n")]),
+        (["/n_*/list_parameters"], [("/", "n_*"), ("/n_*", "*")]),
+        (["/*"], [("/", "*"), ("/*", "*")]),
+        (["/add"], []),
+    ],
+)
+def test_services_of_a_node_show_its_name(
+    services: list[str], nodes: list[tuple[str, str]]
+) -> None:
+    rights = [Right("/e", ALLOW, "reply", each) for each in services]
+    assert list(nodes_of_rights(rights)) == nodes
+    stated = [StatedRight(each, Source("p", 0)) for each in rights]
+    told = nodes_in_rules(remote_of("/e", {0: stated}).rules, "/e")
+    assert AccessControl((remote_of("/e", {0: stated}),)).allows(
+        "/e", IN, Message.LIVELINESS_TOKEN, "@ros2_lv/0/z/0/0/NN/%e/%x%y/other"
+    ) is (services in (["/*"], ["/add"])), "any node, if none is known"
+    assert remote_of("/e", {0: stated}, told) == remote_of("/e", {0: stated})
+
+
+def test_many_nodes_with_many_names_announce_them_as_any_node() -> None:
+    nodes = [NodeName("/", f"n{each}") for each in range(70)]
+    names = [f"/x{each}" for each in range(70)]
+    stated = [StatedRight(Right("/e", ALLOW, "publish", n), Source("p", 0)) for n in names]
+    control = AccessControl((remote_of("/e", {0: stated}, nodes),))
+    token = Message.LIVELINESS_TOKEN
+    assert control.allows("/e", IN, token, "@ros2_lv/0/z/0/0/MP/%e/%/other/%x1/t/h/q")
+    assert not control.allows("/e", IN, token, "@ros2_lv/0/z/0/0/MP/%e/%/n1/%y/t/h/q")
+    assert not control.allows("/e", IN, token, "@ros2_lv/0/z/0/0/NN/%e/%/other")

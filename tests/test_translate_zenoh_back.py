@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sros_tool.policy.patterns import covers
-from sros_tool.translate_zenoh import chunks_of, ros_names
+from sros_tool.translate_zenoh.rights import chunks_of, ros_names
 from sros_tool.zenoh.key_expressions import canonical
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, NamedTuple
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import DocumentError
 from sros_tool.policy.patterns import ComparisonLimit
-from sros_tool.translate_zenoh import RightsBehindRules, is_self_limiting
+from sros_tool.translate_zenoh.rights import RightsBehindRules, is_self_limiting
 from sros_tool.values import DryRun, FileChange, Notes, Words
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes

@@ -34,7 +34,7 @@ from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
     from sros_tool.keystore.template import Template
-    from sros_tool.translate_zenoh import RightsBehindRules
+    from sros_tool.translate_zenoh.rights import RightsBehindRules
     from sros_tool.zenoh.configuration import ZenohNetwork
     from sros_tool.zenoh.document import ConfigurationDocument
 
@@ -216,7 +216,7 @@ def _show_from(
     from sros_tool.checks.kind import ERROR, WARNING
     from sros_tool.checks.zenoh import ReadConfiguration, document_findings, subject_rights
     from sros_tool.policy.document import write_policy
-    from sros_tool.translate_zenoh import policy_of, rights_behind
+    from sros_tool.translate_zenoh.rights import policy_of, rights_behind
     from sros_tool.xml import read_bytes
     from sros_tool.zenoh.document import parse_configuration
 
@@ -325,7 +325,7 @@ def _why_no_policy(subjects: Sequence[RightsBehindRules]) -> str:
 
 def _left_out(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
     """Yield notes about what the rules allow or deny, and the policy does not state."""
-    from sros_tool.translate_zenoh import enclave_of
+    from sros_tool.translate_zenoh.rights import enclave_of
 
     for rights in subjects:
         if (rights.rights or rights.unsaid) and not enclave_of(rights):

@@ -58,7 +58,7 @@ from sros_tool.runtime.vendor_log import (
     zenoh_text,
 )
 from sros_tool.translate import grant_rights
-from sros_tool.translate_zenoh import name_of_key
+from sros_tool.translate_zenoh.rights import name_of_key
 from sros_tool.values import shows
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))

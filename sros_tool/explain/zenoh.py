@@ -39,6 +39,7 @@ from sros_tool.keystore.zenoh_files import Drift, is_signed, signed_path, zenoh_
 from sros_tool.pki.certificates import common_name_of, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, parts
+from sros_tool.translate_zenoh.graph import example_token
 from sros_tool.values import shows
 from sros_tool.zenoh.access import Enforcement, Message
 from sros_tool.zenoh.configuration import Mode
@@ -454,7 +455,14 @@ class ZenohEvaluator:
     def _graph(self, own: ZenohProcess, other: ZenohProcess) -> tuple[Delivery, Delivery]:
         """Return how a node is announced in the graph, and how it sees all others."""
         everything = f"@ros2_lv/{self.domain}/**"
-        node = f"@ros2_lv/{self.domain}/zid/0/0/NN/{own.name.replace('/', '%')}/%/node"
+        assert self.router.process
+        stated = (
+            key
+            for rule in self.router.process.access.rules_of(own.name)
+            if rule.allows and Message.LIVELINESS_TOKEN in rule.messages
+            for key in rule.key_expressions
+        )
+        node = example_token(self.domain, own.name, stated)
         return token((own, other), node, everything), token((other, own), everything, everything)
 
     def _reached(self, own: ZenohFile, wanted: Sequence[Right]) -> Iterator[Reached]:

@@ -56,7 +56,7 @@ from sros_tool.pki.keys import algorithm, holds_private_key, load_key
 from sros_tool.pki.token import TokenUri, read_token_file
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.translate import ros_rights
-from sros_tool.translate_zenoh import domains_of, stated_names
+from sros_tool.translate_zenoh.rights import domains_of, stated_names
 from sros_tool.validity import iso
 from sros_tool.values import Words, shows
 from sros_tool.xml import parse, read_bytes

@@ -85,6 +85,9 @@ class Entry:
     """Number of an answer, which orders it, or the last line of a gap; else 0."""
     settings: str = ""
     """The settings of the keystore, as TOML."""
+    nodes: str = ""
+    """Nodes that the policy of permissions names, and that these do not show: namespace and name of
+    each."""
     previous: str = ""
     """SHA-256 of the line before."""
 
@@ -183,6 +186,7 @@ def document_entry(
     subject: str = "",
     validity: Window | None = None,
     policy: str = "",
+    nodes: str = "",
     number: int = 0,
 ) -> Entry:
     """Return the entry of a signed document."""
@@ -195,6 +199,7 @@ def document_entry(
         not_before=iso(validity.not_before) if validity else "",
         not_after=iso(validity.not_after) if validity else "",
         policy=policy,
+        nodes=nodes,
         number=number,
     )
 
@@ -543,7 +548,7 @@ def _parse(line: bytes) -> Entry | None:
     (time, what, enclave, subject, serial, sha256, begin, end, policy, reason, key) = found.groups(
         ""
     )[:11]
-    number, settings, previous = found.groups("")[11:]
+    number, settings, nodes, previous = found.groups("")[11:]
     # Texts that many lines have are in the memory once.
     return Entry(
         intern(time),
@@ -559,6 +564,7 @@ def _parse(line: bytes) -> Entry | None:
         key,
         int(number or 0),
         settings,
+        intern(nodes),
         previous,
     )
 

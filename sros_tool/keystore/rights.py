@@ -203,7 +203,7 @@ def is_zenoh(data: bytes) -> bool:
 
 
 def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
-    from sros_tool.translate_zenoh import rights_in_rules
+    from sros_tool.translate_zenoh.rights import rights_in_rules
 
     access = document.access
     found = rights_in_rules(access)
@@ -473,15 +473,16 @@ def policy_difference(
 
 
 @dataclass(frozen=True, slots=True)
-class EarlierRights:
-    """The rights in permissions that were signed before.
+class SignedRights:
+    """The rights in signed permissions.
 
     ``policy`` is the SHA-256 of the policy that they were made from, or "" if the ledger does not
-    have it.
+    have it; ``nodes`` are those of the policy that they do not show, as in the ledger.
     """
 
     grant: Grant
     policy: str
+    nodes: str = ""
 
 
 class RecordedRights:
@@ -503,12 +504,16 @@ class RecordedRights:
         self._last = {each.enclave: each for each in ledger.entries if each.what == "permissions"}
         self._certain = {each.enclave for each in ledger.certain if each.what == "permissions"}
 
-    def of(self, name: str, digest: str, grant: Grant) -> EarlierRights:
+    def of(self, name: str, digest: str, grant: Grant) -> SignedRights:
         """Return the rights in the permissions of an enclave, to sign them again.
 
         ``grant`` are the rights; otherwise as `policy`.
         """
-        return EarlierRights(grant, self.policy(name, digest))
+        return SignedRights(grant, self.policy(name, digest), self.nodes(name))
+
+    def nodes(self, name: str) -> str:
+        """Return the nodes of the last permissions of an enclave, as the ledger has them."""
+        return self._last[name].nodes if name in self._last else ""
 
     def latest(self, name: str, digest: str) -> Entry | None:
         """Return the entry of permissions if they are certainly the last ones of an enclave.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -32,15 +33,22 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave
-from sros_tool.keystore.rights import RecordedRights
+from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Source
-from sros_tool.policy.rights import Right, Rules, parts
+from sros_tool.policy.rights import Right, Rules, nodes_from_text, parts
 from sros_tool.translate import grant_rights
-from sros_tool.translate_zenoh import StatedRight, as_router, domains_of, remote_of, remote_rights
+from sros_tool.translate_zenoh.graph import nodes_in_rules
+from sros_tool.translate_zenoh.rights import (
+    StatedRight,
+    as_router,
+    domains_of,
+    remote_of,
+    remote_rights,
+)
 from sros_tool.zenoh.access import AccessControl, Flow, Message, RemoteRights, joined
 from sros_tool.zenoh.configuration import (
     Configuration,
@@ -186,8 +194,10 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
     control = configuration.access_control
     domains = _joined_domains(state.grant, domains_of(control))
     stated = {each: _recorded_rights(name, state.grant, each) for each in domains}
+    # Only the keystore knows which nodes a policy names: here it is what the permissions CA signed.
+    nodes = nodes_in_rules((rule for each in control.remotes for rule in each.rules), name)
     try:
-        own = remote_of(name, stated)
+        own = remote_of(name, stated, nodes)
     except SrosError as error:
         return f"Zenoh cannot state the permissions of the enclave: {error.what}"
     # The router may do what the enclave lets it, and another process of the enclave the same.
@@ -234,12 +244,12 @@ class ZenohDocuments:
 class ZenohChange:
     """What a transaction changes in the enclaves of a keystore, as far as Zenoh depends on it.
 
-    ``issued`` are the grants of enclaves with new permissions, ``gone`` the enclaves that are
+    ``issued`` are the new permissions of enclaves, ``gone`` the enclaves that are
     revoked, ``replaced`` those whose earlier certificates are.  ``stated`` are the policies of the
     enclaves, by whose lines errors are told.
     """
 
-    issued: Mapping[str, Grant] = field(default_factory=dict)
+    issued: Mapping[str, SignedRights] = field(default_factory=dict)
     gone: Collection[str] = ()
     replaced: Collection[str] = ()
     stated: Mapping[str, Enclave | None] = field(default_factory=dict)
@@ -465,7 +475,7 @@ class _RightsReader:
         grants = for_each(
             verified, lambda name: self._grant(name, signed[name].document, certificates[name])
         )
-        grants |= issued
+        grants |= {name: each.grant for name, each in issued.items()}
         joined = for_each(grants, lambda name: self._joined(grants[name]))
         stated = {
             name: {domain: _recorded_rights(name, grants[name], domain) for domain in domains}
@@ -526,9 +536,13 @@ class _RightsReader:
             raise KeystoreError("its permissions are for no domain of the network")
         return domains
 
+    def _nodes(self, name: str) -> str:
+        issued = self._change.issued.get(name)
+        return issued.nodes if issued else self._recorded.nodes(name)
+
     def _remote(self, name: str, stated: Mapping[int, Sequence[StatedRight]]) -> RemoteRights:
         try:
-            return remote_of(name, stated)
+            return remote_of(name, stated, nodes_from_text(self._nodes(name)))
         except PolicyError:
             if policy := self._change.stated.get(name):
                 remote_rights(policy, min(stated))  # names the line of the policy
@@ -542,6 +556,9 @@ _PROOF = {
     "reply": (Flow.EGRESS, Message.QUERY),
 }
 """The message that is the use of each right; on purpose not taken from the translation."""
+_ANNOUNCED = {"NN": "", "MP": "publish", "MS": "subscribe", "SC": "request", "SS": "reply"}
+"""What each kind of graph token announces: a node, or the use of a right to a name."""
+_TOKEN = re.compile(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^/]+)/\*\*)?")
 
 
 def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[StatedRight]]) -> None:
@@ -551,8 +568,15 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
     """
     control = AccessControl((remote,))
     passing = {right: control.passing(enclave, *use) for right, use in _PROOF.items()}
+    tokens = control.passing(enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
+    announced = _announced(tokens, enclave)
+    foreign = announced is None
+    check_meaning(foreign, False, f"that {enclave} announces nodes of another enclave")
     if _are_exactly(passing, stated):
+        more = announced != _to_announce(stated)
+        check_meaning(more, False, f"that {enclave} announces names that it has no right to")
         return
+    announcing = _announcing(enclave, control)
     for domain, rights in stated.items():
         rules = Rules([each.right for each in rights])
         names = {(e.right.kind, name) for e in rights for name in _examples(e.right.name)}
@@ -561,6 +585,8 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
                 told = passing[right].include(f"{domain}{name}/type/hash")
                 if told != (meant := rules.allow(enclave, right, name)):
                     check_meaning(told, meant, f"the right of {enclave} to {right} {name}")
+                if announcing(domain, right, name) != meant:
+                    check_meaning(not meant, meant, f"that {enclave} announces {right} {name}")
 
 
 def _are_exactly(
@@ -582,6 +608,50 @@ def _are_exactly(
         keys[right] == {each for each in found.all if not each.endswith("/@adv/**")}
         for right, found in passing.items()
     )
+
+
+def _announced(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str, str]] | None:
+    """Return what graph tokens announce: domain, right and name, which are "" for a node.
+
+    Return None if they are not all in the enclave's own name.
+    """
+    found = set()
+    for key in tokens.all:
+        if not key.endswith("/@adv/**"):
+            token = _TOKEN.fullmatch(key)
+            if not token or token[3] != enclave.replace("/", "%"):
+                return None
+            found.add((token[1], _ANNOUNCED[token[2]], (token[4] or "").replace("%", "/")))
+    return found
+
+
+def _to_announce(stated: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, str, str]]:
+    """Return what rights to names without wildcards let an enclave announce, as `_announced`."""
+    return {(str(domain), "", "") for domain in stated} | {
+        (str(domain), right, name)
+        for domain, rights in stated.items()
+        for (_, _, right, name), _ in rights
+    }
+
+
+def _announcing(enclave: str, control: AccessControl) -> Callable[[int, str, str], bool]:
+    """Return whether rules let some node of an enclave announce the use of a right to a name."""
+    kinds = {right: kind for kind, right in _ANNOUNCED.items()}
+    tokens = control.passing(enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
+    places = {
+        tuple(each.replace("$*", "a").replace("*", "a") for each in key.split("/")[6:9])
+        for key in tokens.all
+        if key.startswith("@ros2_lv/") and "/NN/" in key
+    }
+
+    def is_announced(domain: int, right: str, name: str) -> bool:
+        names = [[*place, name.replace("/", "%"), "type/hash/qos"] for place in places]
+        keys = ("/".join((f"@ros2_lv/{domain}/z/0/1", kinds[right], *each)) for each in names)
+        return any(
+            control.allows(enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN, key) for key in keys
+        )
+
+    return is_announced
 
 
 def _examples(name: str) -> Iterable[str]:

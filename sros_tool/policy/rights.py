@@ -275,3 +275,83 @@ def compare(
             if by := rules.covering(right):
                 covered[right] = tuple(sorted(folded(by), key=order))
     return RightsDifference(only_first, only_second, covered)
+
+
+# ── the nodes of an enclave ────────────────────────────────────────────────────────────────
+
+OWN_SERVICES = (
+    "describe_parameters",
+    "get_parameter_types",
+    "get_parameters",
+    "get_type_description",
+    "list_parameters",
+    "set_parameters",
+    "set_parameters_atomically",
+)
+"""The services that every node has, below its own name (rclcpp and rclpy of ROS 2 Jazzy)."""
+_SHOWING = frozenset(f"~/{service}" for service in OWN_SERVICES)
+
+
+class NodeName(NamedTuple):
+    """The namespace and the name of a node, perhaps with wildcards."""
+
+    ns: str
+    name: str
+
+
+def nodes_of(enclave: Enclave) -> tuple[NodeName, ...]:
+    """Return the nodes of an enclave, as the profiles of its policy name them."""
+    return tuple(dict.fromkeys(map(_node_of, enclave.all_profiles())))
+
+
+def nodes_not_shown(enclave: Enclave) -> tuple[NodeName, ...]:
+    """Return the nodes of a policy's enclave that its rights do not show, as `nodes_of_rights`."""
+    hidden = (profile for profile in enclave.all_profiles() if not any(map(_shows, profile.groups)))
+    return tuple(dict.fromkeys(map(_node_of, hidden)))
+
+
+def _node_of(profile: Profile) -> NodeName:
+    ns = profile.ns.strip("/")
+    # A namespace that begins with a wildcard has no "/" before it.
+    return NodeName(ns if ns.startswith("*") else f"/{ns}", profile.node)
+
+
+def _shows(group: Group) -> bool:
+    return ("reply", ALLOW) in group.rights and not _SHOWING.isdisjoint(group.names)
+
+
+def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
+    """Return the nodes whose own services an enclave may offer: those that it may be."""
+    found: dict[NodeName, None] = {}
+    for _, qualifier, right, name in rights:
+        if right == "reply" and qualifier is ALLOW:
+            base, _, service = name.rpartition("/")
+            bases = [base] if service in OWN_SERVICES else []
+            if name.endswith("*"):
+                bases += [name, name.removesuffix("/*")]
+            found.update(dict.fromkeys(node for base in bases for node in _nodes(base)))
+    return tuple(found)
+
+
+def _nodes(name: str) -> Iterator[NodeName]:
+    """Yield the nodes whose namespace and name together match ``name``.
+
+    A star may stand for the "/" between both, too.
+    """
+    ns, _, last = name.rpartition("/")
+    if last:
+        yield NodeName(ns or "/", last)
+    for at, letter in enumerate(last):
+        if letter == "*":
+            yield NodeName(f"{ns}/{last[: at + 1]}", last[at:])
+
+
+def nodes_as_text(nodes: Iterable[NodeName]) -> str:
+    """Return nodes as the ledger has them: namespace and name, with commas between nodes."""
+    return ", ".join(f"{node.ns} {node.name}" for node in nodes)
+
+
+def nodes_from_text(text: str) -> tuple[NodeName, ...]:
+    """Return the nodes of `nodes_as_text`."""
+    pairs = (node.partition(" ") for node in text.split(", ") if node)
+    return tuple(NodeName(ns, name) for ns, _, name in pairs)

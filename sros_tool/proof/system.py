@@ -67,7 +67,7 @@ from sros_tool.proof.worlds import (
     zenoh_message,
 )
 from sros_tool.translate import governance_for, permissions_for, protected_topics
-from sros_tool.translate_zenoh import remote_rights, stated_rights
+from sros_tool.translate_zenoh.rights import remote_rights, stated_rights
 from sros_tool.validity import window
 from sros_tool.zenoh.access import AccessControl, Enforcement
 

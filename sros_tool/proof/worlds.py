@@ -27,7 +27,7 @@ from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.names import SERVICE_ENDS, is_expression
 from sros_tool.policy.model import ALLOW, Level
 from sros_tool.policy.rights import Right
-from sros_tool.translate_zenoh import StatedRight
+from sros_tool.translate_zenoh.rights import StatedRight
 from sros_tool.zenoh.access import Enforcement, Flow, Message, Remote
 from sros_tool.zenoh.key_expressions import names_of as names_of_keys
 

@@ -1,8 +1,9 @@
 """Access control of Zenoh: rules for remote processes, and what they decide.
 
-`AccessControl` is what sros writes: only permission, only by certificate; what no rule allows is
-denied.  A denial inside a wider permission holds neither against a query nor against a put with a
-wildcard key (measured with 1.10.2).  `Enforcement` is what any configuration may state.
+`AccessControl` is what sros writes: only by certificate; what no rule allows is denied.  A denial
+inside a wider permission holds neither against a query nor against a put with a wildcard key, but
+for the tokens of the graph, which nobody reads as wildcards (measured with 1.10.2).
+`Enforcement` is what any configuration may state.
 Sources: zenoh.io "Access Control"; zenoh 1.9, access_control.rs and authorization.rs; compared
 with the wheel 1.10.2.
 """
@@ -48,15 +49,20 @@ class Flow(StrEnum):
 
 
 class AccessRule(NamedTuple):
-    """Messages that are allowed in one direction, on keys that ``key_expressions`` include."""
+    """Messages that are allowed in one direction, on keys that ``key_expressions`` include.
+
+    Only graph tokens are ever denied (not ``allows``): a token has no wildcards for anybody who
+    reads it, so that the denial of some within others holds.
+    """
 
     flow: Flow
     messages: tuple[Message, ...]
     key_expressions: tuple[str, ...]
+    allows: bool = True
 
     def mirrored(self) -> AccessRule:
         """Return the rule that the remote process needs for the same messages."""
-        return AccessRule(self.flow.opposite(), self.messages, self.key_expressions)
+        return self._replace(flow=self.flow.opposite())
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,18 +89,32 @@ class AccessControl:
         ``key`` is the key or the key expression that the message names: a rule applies to it only
         as a whole, so that a wider subscription, query or put is dropped and not cut down.
         """
-        return any(
-            _include(each.key_expressions, key) for each in self._rules(common_name, flow, message)
-        )
+        rules = [
+            each.allows
+            for each in self._rules(common_name, flow, message)
+            if _include(each.key_expressions, key)
+        ]
+        return bool(rules) and all(rules)
 
     def passing(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
-        """Return the key expressions of all rules for a message, to ask about many keys."""
-        rules = self._rules(common_name, flow, message)
-        return KeyExpressions(each for rule in rules for each in rule.key_expressions)
+        """Return the key expressions that are allowed for a message, to ask about many keys."""
+        return self._expressions(common_name, flow, message, allows=True)
 
     def keys(self, common_name: str, flow: Flow, message: Message) -> NameSet:
         """Return the set of all keys with which a message passes."""
-        return names_of(self.passing(common_name, flow, message).all)
+        allowed, denied = (
+            names_of(self._expressions(common_name, flow, message, allows=each).all)
+            for each in (True, False)
+        )
+        return allowed - denied
+
+    def _expressions(
+        self, common_name: str, flow: Flow, message: Message, *, allows: bool
+    ) -> KeyExpressions:
+        rules = self._rules(common_name, flow, message)
+        return KeyExpressions(
+            each for rule in rules if rule.allows is allows for each in rule.key_expressions
+        )
 
     def _rules(self, common_name: str, flow: Flow, message: Message) -> Iterator[AccessRule]:
         for remote in self.remotes:
@@ -125,12 +145,12 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     Rules of the same direction and messages become one; key expressions that others of the same
     rule include are left out.
     """
-    found: dict[tuple[Flow, tuple[Message, ...]], set[str]] = {}
-    for rule in rules:
-        found.setdefault((rule.flow, rule.messages), set()).update(rule.key_expressions)
+    found: dict[tuple[Flow, tuple[Message, ...], bool], set[str]] = {}
+    for flow, messages, keys, allows in rules:
+        found.setdefault((flow, messages, allows), set()).update(keys)
     return in_order(
-        AccessRule(flow, messages, _needed(frozenset(keys)))
-        for (flow, messages), keys in found.items()
+        AccessRule(flow, messages, _needed(frozenset(keys)), allows)
+        for (flow, messages, allows), keys in found.items()
     )
 
 
@@ -141,7 +161,9 @@ def _needed(keys: frozenset[str]) -> tuple[str, ...]:
 
 def in_order(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     """Return rules of different directions and messages in the order of `joined`."""
-    return tuple(sorted(rules, key=lambda each: _place(each.flow, each.messages)))
+    return tuple(
+        sorted(rules, key=lambda each: (*_place(each.flow, each.messages), not each.allows))
+    )
 
 
 _ORDER = {message: number for number, message in enumerate(Message)}
@@ -271,7 +293,10 @@ class Enforcement:
             if each.cert_common_names is not None and len(stated) > 1:
                 more = ", ".join(sorted(stated - {"cert_common_names"}))
                 return f"its subject {each.id[:80]!r} has conditions besides the name: {more}"
-        if any(not each.allows for each in self.rules):
+        if any(
+            not each.allows and set(each.messages) != {Message.LIVELINESS_TOKEN}
+            for each in self.rules
+        ):
             return "it has denials, which do not hold for messages with wildcards"
         for each in self.subjects:
             if key := self._only_history(each.id):

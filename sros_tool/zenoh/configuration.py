@@ -182,12 +182,16 @@ def _add_settings_of_rmw_zenoh(document: dict[str, Any], mode: Mode) -> None:
         document["scouting"]["gossip"]["autoconnect_strategy"] = {mode.value: strategy}
 
 
+_PERMISSIONS = {True: "allow", False: "deny"}
+
+
 def render_rights(remote: RemoteRights) -> RenderedRights:
     """Return the lines of a remote enclave, as each file of a network in peer mode has them."""
     name = remote.common_name
     ids = [f"{name}#{number}" for number in range(len(remote.rules))]
     rules = (
-        f'   {{"id": {_list([each])[1:-1]}, "permission": "allow", "flows": ["{rule.flow}"], '
+        f'   {{"id": {_list([each])[1:-1]}, "permission": "{_PERMISSIONS[rule.allows]}", '
+        f'"flows": ["{rule.flow}"], '
         f'"messages": {_known(rule.messages)}, "key_exprs": {_known(rule.key_expressions)}}}'
         for each, rule in zip(ids, remote.rules, strict=True)
     )
@@ -223,6 +227,7 @@ def parse_rendered(data: bytes, name: str) -> Configuration:
                 Flow(each["flows"][0]),
                 tuple(map(Message, each["messages"])),
                 tuple(each["key_exprs"]),
+                each["permission"] == _PERMISSIONS[True],
             )
             for each in control["rules"]
         }

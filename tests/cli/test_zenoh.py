@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,12 @@ import pytest
 from sros_tool.keystore import zenoh_files
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
-from sros_tool.translate_zenoh import StatedRight, remote_of
+from sros_tool.policy.rights import NodeName
+from sros_tool.translate_zenoh.rights import StatedRight, remote_of
 from sros_tool.zenoh.access import AccessRule, Flow, Message, RemoteRights
 from tests.support.harness import policy_text, publish, snapshot, sros
 
+TOKEN = (Message.LIVELINESS_TOKEN,)
 SESSION, ROUTER = "enclaves/a/session.json5", "enclaves/router/router.json5"
 SIGNED = {SESSION: "enclaves/a/session.p7s", ROUTER: "enclaves/router/router.p7s"}
 
@@ -229,16 +231,24 @@ def test_a_signature_of_another_keystore_does_not_count(folder: Path) -> None:
     assert (checked.status, checked.out) == (1, f"out of date: ks/{SESSION}\n")
 
 
-@pytest.mark.parametrize("lost", [True, False])
+@pytest.mark.parametrize("wrong", ["lost", "wider", "announces more", "another enclave's"])
 def test_rules_that_are_not_the_permissions_are_not_written(
-    lost: bool, folder: Path, monkeypatch: pytest.MonkeyPatch
+    wrong: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def wrong(enclave: str, stated: Mapping[int, Sequence[StatedRight]]) -> RemoteRights:
-        rights = remote_of(enclave, stated)
-        wider = AccessRule(Flow.EGRESS, (Message.PUT,), ("0/**",))
-        return replace(rights, rules=rights.rules[1:] if lost else (*rights.rules, wider))
+    more = {
+        "wider": AccessRule(Flow.EGRESS, (Message.PUT,), ("0/**",)),
+        "announces more": AccessRule(Flow.INGRESS, TOKEN, ("@ros2_lv/0/*/*/*/MP/%a/%/n/%y/**",)),
+        "another enclave's": AccessRule(Flow.INGRESS, TOKEN, ("@ros2_lv/0/*/*/*/NN/%b/%/n",)),
+    }
 
-    monkeypatch.setattr(zenoh_files, "remote_of", wrong)
+    def made(
+        enclave: str, stated: Mapping[int, Sequence[StatedRight]], nodes: Iterable[NodeName]
+    ) -> RemoteRights:
+        rights = remote_of(enclave, stated, nodes)
+        rules = rights.rules[1:] if wrong == "lost" else (*rights.rules, more[wrong])
+        return replace(rights, rules=rules)
+
+    monkeypatch.setattr(zenoh_files, "remote_of", made)
     before = snapshot(folder)
     ended = sros("zenoh", "ks", cwd=folder)
     assert (ended.status, "would not have the intended content" in ended.err) == (2, True)

@@ -55,7 +55,7 @@ from sros_tool.policy.rights import policy_rights
 from sros_tool.prometheus import render_metrics
 from sros_tool.report.sources import read_source
 from sros_tool.translate import ros_rights
-from sros_tool.translate_zenoh import policy_of, rights_behind
+from sros_tool.translate_zenoh.rights import policy_of, rights_behind
 from sros_tool.validity import Window, iso
 from sros_tool.zenoh.document import parse_configuration
 from tests.fuzz.corpus import PASSPHRASE, Corpus

@@ -29,7 +29,7 @@ from sros_tool.proof.decide import Use, decide
 from sros_tool.proof.requirements import Must
 from sros_tool.proof.system import policy_system
 from sros_tool.translate import governance_for, permissions_for
-from sros_tool.translate_zenoh import remote_rights
+from sros_tool.translate_zenoh.rights import remote_rights
 from sros_tool.validity import window
 from sros_tool.zenoh.access import AccessControl
 from sros_tool.zenoh.configuration import Configuration, Mode

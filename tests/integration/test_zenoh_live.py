@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import sys
 from pathlib import Path
@@ -40,7 +41,9 @@ POLICY = policy_text(
 def keystores(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two keystores with the same enclaves, of different CAs."""
     folder = tmp_path_factory.mktemp("zenoh")
-    (folder / "policy.xml").write_text(POLICY)
+    # Each node has the name of its enclave.
+    named = re.sub(r'(path="/(\w+)"><profiles><profile ns="/" node=)"n"', r'\1"\2"', POLICY)
+    (folder / "policy.xml").write_text(named)
     for name in ("ks", "foreign"):
         sros("create_keystore", folder / name, "--template", "production").ok()
         sros("create_enclave", folder / name, "/router").ok()
@@ -70,6 +73,8 @@ def test_who_may_communicates_and_nobody_else(keystores: Path, mode: str) -> Non
         "executed": ["client"],
         "answered": ["server"],
         "nodes": ["other", "talker"],
+        "graph": ["other", "server", "talker"],
+        "announced": ["other MP %elsewhere", "server SS %add"],
         "history": ["map"],
         "same_enclave": ["twin"],
     }
@@ -82,6 +87,7 @@ def test_without_the_rules_each_of_these_attacks_succeeds(keystores: Path) -> No
     assert "other" in observed["executed"]
     assert "thief" in observed["answered"]
     assert "spoofed" in observed["nodes"]
+    assert "other MP %chatter" in observed["announced"]
 
 
 def test_only_a_certificate_of_the_keystore_gets_a_connection(keystores: Path) -> None:

@@ -26,7 +26,8 @@ from typing import Any
 import zenoh
 
 from sros_tool.runtime.netns import enter_isolation, try_isolation
-from tests.integration.zenoh_world import key, nodes, text, token, until, world
+from sros_tool.translate_zenoh.graph import example_token
+from tests.integration.zenoh_world import key, text, tokens_of, until, world
 from tests.support.children import PATIENCE
 
 ROUTER = "/router"
@@ -222,10 +223,19 @@ def observed(keystore: Path, matrix: Matrix, *, enforced: bool) -> dict[str, Any
         example = next(iter(matrix.rights))[1:]
         document = json.loads((keystore / "enclaves" / example / "session.json5").read_text())
         direct = document["mode"] == "peer"
-        tokens = [token(session, each.enclave, str(number))
-                  for number, (each, session) in enumerate(sessions.items())]  # fmt: skip
-        everybody = {str(number) for number in range(len(sessions))}
-        up = all(until(lambda s=s: nodes(s) >= everybody) for s in sessions.values())  # type: ignore[misc]
+        router = json.loads((keystore / "enclaves" / ROUTER[1:] / "router.json5").read_text())
+        keys = [key for rule in router["access_control"]["rules"] for key in rule["key_exprs"]]
+        tokens = [
+            session.liveliness().declare_token(
+                example_token(0, each.enclave, keys).replace("/zid/", f"/{session.info.zid()}/")
+            )
+            for each, session in sessions.items()
+        ]
+        everybody = {str(session.info.zid()) for session in sessions.values()}
+        up = all(
+            until(lambda s=s: {each[2] for each in tokens_of(s)} >= everybody)  # type: ignore[misc]
+            for s in sessions.values()
+        )
         heard = publish_all(matrix, sessions, direct)
         executed, replied = call_all(matrix, sessions, direct)
         del tokens

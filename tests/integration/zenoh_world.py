@@ -34,6 +34,14 @@ PAUSE = 0.5
 
 ITS_OWN = {"other", "wildcard", "wildcards", "thief"}
 """What a session says to itself: no rule stands in between."""
+FALSE_TOKENS = (
+    ("/talker", "spoofed"),
+    ("/other", "talker"),
+    ("/other", "other", "MP /chatter"),
+    ("/other", "other", "SS /add"),
+    ("/other", "talker", "MP /elsewhere"),
+)
+"""What /other announces falsely: enclave, node, and what the node has."""
 _SIDES = ("connect", "listen")
 
 
@@ -135,16 +143,56 @@ def serve(session: zenoh.Session, name: str, who: str, executed: set[str]) -> An
     return session.declare_queryable(key(name), answer, complete=True)
 
 
-def token(session: zenoh.Session, enclave: str, node: str) -> Any:
-    """Announce a node in the graph, under the name of an enclave."""
-    place = f"@ros2_lv/0/{session.info.zid()}/0/0/NN/{enclave.replace('/', '%')}/%/{node}"
-    return session.liveliness().declare_token(place)
+def token(
+    session: zenoh.Session, enclave: str, node: str, announced: str = "NN", zid: str = ""
+) -> Any:
+    """Announce a node in the graph, or what it has (`MP /chatter`), in the name of an enclave."""
+    kind, _, name = announced.partition(" ")
+    place = f"{enclave.replace('/', '%')}/%/{node}"
+    if name:
+        place += f"/{name.replace('/', '%')}/{TYPE}/::,7:,:,:,,"
+    zid = zid or str(session.info.zid())
+    return session.liveliness().declare_token(f"@ros2_lv/0/{zid}/0/0/{kind}/{place}")
+
+
+class Graph:
+    """The nodes that a session discovers, each with what it has, as rmw_zenoh keeps them.
+
+    Session, number, namespace and name make a node: nobody looks at the enclave.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.found: dict[tuple[str, ...], set[str]] = {}
+        self._kept = session.liveliness().declare_subscriber(GRAPH, self._change, history=True)
+
+    def _change(self, sample: Any) -> None:
+        _, _, zid, number, _, kind, _, *node = str(sample.key_expr).split("/")
+        place, name = (zid, number, *node[:2]), " ".join([kind, *node[2:3]])
+        if sample.kind == zenoh.SampleKind.PUT:
+            self.found.setdefault(place, set()).add(name)
+        elif kind == "NN":
+            self.found.pop(place, None)
+        else:
+            self.found.get(place, set()).discard(name)
+
+    def nodes(self) -> set[str]:
+        return {place[3] for place in self.found}
+
+    def announced(self) -> set[str]:
+        """What nodes have, as `MP %chatter`, each after the name of the node."""
+        found = {(place[3], name) for place, names in self.found.items() for name in names}
+        return {f"{node} {name}" for node, name in found if name != "NN"}
 
 
 def nodes(session: zenoh.Session) -> set[str]:
     """The nodes of the graph that a session sees."""
+    return {each[8] for each in tokens_of(session) if each[5] == "NN"}
+
+
+def tokens_of(session: zenoh.Session) -> list[list[str]]:
+    """The parts of all tokens that a session sees."""
     found = session.liveliness().get(GRAPH, timeout=5.0)
-    return {str(each.ok.key_expr).split("/")[-1] for each in found if each.ok is not None}
+    return [str(each.ok.key_expr).split("/") for each in found if each.ok is not None]
 
 
 def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
@@ -172,9 +220,18 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             serve(server, "/add", "server", executed),
             serve(other, "/add", "thief", stolen),
             token(talker, "/talker", "talker"),
-            token(other, "/talker", "spoofed"),
+            token(server, "/server", "server", "SS /add"),
+            *(token(other, *each) for each in FALSE_TOKENS),
             token(other, "/other", "other"),
         ]
+        graph = Graph(listener)
+        until(lambda: "talker" in graph.nodes())
+        erasing = token(other, "/other", "talker", zid=str(talker.info.zid()))
+        if not rules:  # a token that nobody was told of takes nothing away
+            until(lambda: len([each for each in graph.found if each[3] == "talker"]) == 2)
+        erasing.undeclare()
+        kept.append(token(other, "/other", "other", "MP /elsewhere"))
+        until(lambda: "other MP %elsewhere" in graph.announced())
         kept += [
             zenoh.ext.declare_advanced_publisher(
                 keeper, key("/map"), cache=zenoh.ext.CacheConfig(max_samples=1)
@@ -226,6 +283,8 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             "executed": sorted(executed),
             "answered": sorted(answered),
             "nodes": sorted(seen),
+            "graph": sorted(graph.nodes()),
+            "announced": sorted(graph.announced()),
             "history": sorted(late),
             "same_enclave": sorted(twin),
         }

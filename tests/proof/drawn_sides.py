@@ -53,7 +53,7 @@ from sros_tool.policy.model import (
 )
 from sros_tool.policy.rights import policy_rights
 from sros_tool.translate import governance_for, permissions_for
-from sros_tool.translate_zenoh import remote_of, stated_rights
+from sros_tool.translate_zenoh.rights import remote_of, stated_rights
 from sros_tool.validity import window
 from sros_tool.zenoh.access import Enforcement, Flow, Message, Remote
 from sros_tool.zenoh.configuration import Mode, render_configuration, render_rights

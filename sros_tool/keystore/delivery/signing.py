@@ -69,7 +69,7 @@ from sros_tool.keystore.outcomes import (
     trusted_authorities,
 )
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.rights import EarlierRights
+from sros_tool.keystore.rights import SignedRights
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import (
     SigningRequest,
@@ -366,7 +366,7 @@ class _Signer:
         else:
             self._new.append(name)
             change.notes += known.revoked_before_notes([name])
-        rights: EarlierRights | StatedRights
+        rights: SignedRights | StatedRights
         if present and stated is None:
             rights = _earlier_rights(change, name, present)
         else:
@@ -392,7 +392,7 @@ class _Signer:
         """Write what follows for the files of Zenoh, after all requests."""
         change = self._change
         change.notes += [*self._writer.notes, *change.edit_notes()]
-        change.keep_zenoh(self._writer.grants, stated=self._certified)
+        change.keep_zenoh(self._writer.signed, stated=self._certified)
         change.notes += self.name_notes()
         change.entries += self._writer.entries
 
@@ -517,7 +517,7 @@ def _lost_rights(
     return [Note("request.rights-lost", f"{lost} {text} {again}")]
 
 
-def _earlier_rights(change: KeystoreChange, name: str, present: x509.Certificate) -> EarlierRights:
+def _earlier_rights(change: KeystoreChange, name: str, present: x509.Certificate) -> SignedRights:
     """Return the rights in an enclave's present permissions, after verifying their signature."""
     subject = text_of(present.subject)
     old = change.keystore.signed_grant(name, subject)

@@ -21,7 +21,6 @@ from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import (
-    Grant,
     Permissions,
     document_notes,
     parse_permissions,
@@ -47,7 +46,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
 )
 from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
-from sros_tool.keystore.rights import EarlierRights
+from sros_tool.keystore.rights import SignedRights
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.parallel import Progress, tick
@@ -56,6 +55,7 @@ from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem
 from sros_tool.pki.token import TokenKey
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Policy
+from sros_tool.policy.rights import nodes_as_text, nodes_not_shown
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window, iso, window
 
@@ -98,7 +98,7 @@ class Issuance:
 
     name: str
     identity: NewIdentity | x509.Certificate
-    rights: StatedRights | EarlierRights | None
+    rights: StatedRights | SignedRights | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +159,7 @@ class EnclaveWriter:
         keys_on_token: bool = False,
     ) -> None:
         self.entries: list[Entry] = []
-        self.grants: dict[str, Grant] = {}
+        self.signed: dict[str, SignedRights] = {}
         self._transaction = transaction
         self._template = template
         self._now = now
@@ -206,7 +206,10 @@ class EnclaveWriter:
         validity = validity.within(validity_of(certificate))
         permissions = _permissions(rights, subject, validity)
         message = self._sign(name, permissions)
-        policy = rights.policy if isinstance(rights, EarlierRights) else rights.enclave.digest
+        if isinstance(rights, SignedRights):
+            policy, nodes = rights.policy, rights.nodes
+        else:
+            policy, nodes = rights.enclave.digest, nodes_as_text(nodes_not_shown(rights.enclave))
         self.entries.append(
             document_entry(
                 self._now,
@@ -216,10 +219,12 @@ class EnclaveWriter:
                 subject=subject,
                 validity=validity,
                 policy=policy,
+                nodes=nodes,
             )
         )
         if self._template.zenoh:
-            (self.grants[name],) = permissions.grants
+            (grant,) = permissions.grants
+            self.signed[name] = SignedRights(grant, policy, nodes)
         short = self._template.longest_validity(name) is not None
         return Issued(issuance, certificate, permissions, message, short_lived=short)
 
@@ -290,22 +295,24 @@ class EnclaveWriter:
         """
         own_process = os.getpid()
 
-        def work_on(part: Sequence[str]) -> tuple[list[Result], list[Entry], dict[str, Grant]]:
+        def work_on(
+            part: Sequence[str],
+        ) -> tuple[list[Result], list[Entry], dict[str, SignedRights]]:
             first, results = len(self.entries), []
             for name in part:
                 results.append(work(name))
                 tick()
                 if progress and os.getpid() == own_process:
                     progress(name)
-            grants = {name: self.grants[name] for name in part if name in self.grants}
-            return results, self.entries[first:], grants
+            signed = {name: self.signed[name] for name in part if name in self.signed}
+            return results, self.entries[first:], signed
 
         slices = self._transaction.on_all_cores(names, work_on, alone=self._key_on_token)
         found: dict[str, Result] = {}
-        for index, (part, (results, entries, grants)) in enumerate(slices):
+        for index, (part, (results, entries, signed)) in enumerate(slices):
             if index:  # this process did the first slice, forked workers did the others
                 self.entries += entries
-                self.grants |= grants
+                self.signed |= signed
                 for name in part if progress else ():
                     progress(name)  # type: ignore[misc]
             found |= zip(part, results, strict=True)
@@ -313,10 +320,10 @@ class EnclaveWriter:
 
 
 def _permissions(
-    rights: StatedRights | EarlierRights, subject: str, validity: Window
+    rights: StatedRights | SignedRights, subject: str, validity: Window
 ) -> Permissions:
     """Return permissions with ``rights`` for a subject (RFC 4514 text) and a validity."""
-    if isinstance(rights, EarlierRights):
+    if isinstance(rights, SignedRights):
         begin, end = iso(validity.not_before), iso(validity.not_after)
         grant = replace(rights.grant, subject=subject, not_before=begin, not_after=end)
         return Permissions((grant,))

@@ -21,7 +21,6 @@ from cryptography import x509
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
-from sros_tool.dds.permissions import Grant
 from sros_tool.errors import Note
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import checked_fleet, write_fleet
@@ -36,7 +35,7 @@ from sros_tool.keystore.ledger import Entry, Ledger, append
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
 from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore, check_domain
-from sros_tool.keystore.rights import RecordedRights
+from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.settings import edit_notes
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
@@ -313,7 +312,7 @@ class KeystoreChange:
 
     def keep_zenoh(
         self,
-        issued: Mapping[str, Grant],
+        issued: Mapping[str, SignedRights],
         *,
         gone: frozenset[str] = frozenset(),
         replaced: Sequence[str] = (),

@@ -108,7 +108,7 @@ def write_enclaves(
     superseded = [made.superseded for made in done.values() if made.superseded]
     change.revoke(superseded)
     change.keep_zenoh(
-        writer.grants, replaced=[old.name for old in superseded], stated=wanted, created=created
+        writer.signed, replaced=[old.name for old in superseded], stated=wanted, created=created
     )
     change.record()
     change.finish(aim="replace the permissions" if superseded else "")

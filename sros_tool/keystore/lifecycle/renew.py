@@ -28,7 +28,7 @@ from sros_tool.keystore.issuing.tokens import EnclaveTokens, token_notes, token_
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_enclave, has_key
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import Superseded
-from sros_tool.keystore.rights import EarlierRights, RecordedRights
+from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.selection import no_such_enclave
 from sros_tool.names import check_enclave_name
 from sros_tool.parallel import Progress
@@ -112,7 +112,7 @@ def renew(
         if revoke_old:
             change.revoke(replaced)
         if replaced:
-            change.keep_zenoh(writer.grants, replaced=renewed if change.revoked else ())
+            change.keep_zenoh(writer.signed, replaced=renewed if change.revoked else ())
         change.record()
         change.finish(aim="renew with --revoke-old" if revoke_old else "")
     ends = [each.not_after for each in replaced if each.not_after >= now and not change.revoked]
@@ -218,7 +218,7 @@ class _Renewer:
 
 def checked_rights(
     state: Credentials, authorities: Authorities, recorded: RecordedRights
-) -> EarlierRights:
+) -> SignedRights:
     """Return the rights of an enclave, after verifying its files, to sign them again.
 
     Raises:

@@ -68,7 +68,7 @@ from sros_tool.keystore.lifecycle.rotation import (
     retired_key,
 )
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.rights import EarlierRights
+from sros_tool.keystore.rights import SignedRights
 from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import Progress
@@ -541,7 +541,7 @@ class _Rotator:
         change.notes += writer.notes
         if permissions:
             change.permissions = permissions.new
-            change.keep_zenoh(writer.grants)
+            change.keep_zenoh(writer.signed)
         if identity:
             change.notes += change.known.shared_notes(change.names)
 
@@ -669,7 +669,7 @@ def _issuance(
 
 def _verified_rights(
     change: KeystoreChange, name: str, subject: str, permissions: _Successor
-) -> EarlierRights:
+) -> SignedRights:
     root = change.root
     old = change.keystore.signed_grant(name, subject)
     old.signed.verify(permissions.old[0])

@@ -72,7 +72,7 @@ from sros_tool.keystore.lifecycle.replaced import (
 )
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.rights import EarlierRights, RecordedRights
+from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.settings import (
     PresentSettings,
     edit_remedy,
@@ -448,7 +448,7 @@ class _Updater:
         change.notes += self._writer.notes if reissued else ()
         if done:
             replaced = [old.name for old in superseded] if revoked else ()
-            change.keep_zenoh(self._writer.grants, replaced=replaced)
+            change.keep_zenoh(self._writer.signed, replaced=replaced)
         change.record()
         rights = tuple(each.rights.revoked() if revoked else each.rights for each in reissued)
         settings = (
@@ -523,7 +523,7 @@ class _Updater:
         certificate = self._certificates or self._expires_otherwise(name)
         if not (self._permissions or replaces_default or certificate):
             return None
-        rights: EarlierRights | StatedRights
+        rights: SignedRights | StatedRights
         if replaces_default:
             enclave = default_rights(self._goal.settings, name)
             rights = StatedRights(enclave, self._after.of(name))
@@ -554,7 +554,7 @@ class _Updater:
         )
         return NewIdentity(enclave_subject(name, unique=unique), public)
 
-    def _has_default_rights(self, state: Credentials, earlier: EarlierRights) -> bool:
+    def _has_default_rights(self, state: Credentials, earlier: SignedRights) -> bool:
         """Return whether an enclave has the rights of no policy, and these change."""
         before, after = self._present.settings, self._goal.settings
         if before.default_permissions == after.default_permissions:

@@ -19,7 +19,17 @@ from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
 from sros_tool.names import check_enclave_name, expression_problem, is_expression
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers
-from sros_tool.policy.rights import KIND_OF, RIGHT_ORDER, Right, folded, parts, placed_rights
+from sros_tool.policy.rights import (
+    KIND_OF,
+    RIGHT_ORDER,
+    NodeName,
+    Right,
+    folded,
+    nodes_of,
+    nodes_of_rights,
+    parts,
+    placed_rights,
+)
 from sros_tool.policy.subtraction import (
     IN_PART,
     CannotSubtract,
@@ -27,6 +37,7 @@ from sros_tool.policy.subtraction import (
     listed,
     subtract,
 )
+from sros_tool.translate_zenoh.graph import graph_rules
 from sros_tool.zenoh.access import (
     AccessControl,
     AccessRule,
@@ -48,7 +59,6 @@ _ANY_TYPE = "/*/*"
 _TYPE_CHUNKS = _ANY_TYPE[1:].split("/")
 _ADVANCED = f"@adv/{ANY_CHUNKS}"
 """What belongs to a topic with history (TRANSIENT_LOCAL), below its key."""
-_GRAPH = "@ros2_lv"
 _MOST_KEYS = 4096
 """Most key expressions for the wildcards of one right of an enclave.
 
@@ -107,21 +117,28 @@ def stated_rights(enclave: Enclave) -> tuple[StatedRight, ...]:
 
 def remote_rights(enclave: Enclave, domain: int) -> RemoteRights:
     """Return what a process allows to processes of ``enclave`` in a ROS domain: `remote_of`."""
-    return remote_of(enclave.path, {domain: stated_rights(enclave)})
+    return remote_of(enclave.path, {domain: stated_rights(enclave)}, nodes_of(enclave))
 
 
-def remote_of(enclave: str, stated: Mapping[int, Iterable[StatedRight]]) -> RemoteRights:
+def remote_of(
+    enclave: str,
+    stated: Mapping[int, Sequence[StatedRight]],
+    nodes: Iterable[NodeName] = (),
+) -> RemoteRights:
     """Return what a process allows to processes of an enclave with rights ``stated`` by ROS domain.
 
-    That includes the graph, which every node needs: to announce nodes, topics and services under
-    the name of its own enclave, and to see those of all others.
+    That includes the graph, which every node needs: to announce ``nodes`` of the enclave, and those
+    whose own services it may offer, with the topics and services that it has rights to, and to see
+    those of all others.  If no node is known at all, it may be any.
 
     Raises:
         PolicyError: a right is one that rules of Zenoh cannot state; the text names the place.
     """
     rules: list[AccessRule] = []
     for domain, rights in stated.items():
-        rules += _graph_rules(enclave, domain)
+        of_names = [each.right for each in rights]
+        known = dict.fromkeys((*nodes, *nodes_of_rights(of_names)))
+        rules += graph_rules(enclave, domain, of_names, known)
         for right, keys in _allowed_keys(domain, rights):
             below = tuple([f"{key}/{_ADVANCED}" for key in keys])
             rules += [
@@ -129,21 +146,6 @@ def remote_of(enclave: str, stated: Mapping[int, Iterable[StatedRight]]) -> Remo
                 for flow, messages, history in (_MESSAGES[right] if keys else ())
             ]
     return RemoteRights(enclave, joined(rules))
-
-
-def _graph_rules(enclave: str, domain: int) -> Iterator[AccessRule]:
-    """Yield the rules for liveliness tokens: a token names the enclave, and nobody else's passes.
-
-    The right to ask has to be for exactly the expression that rmw_zenoh asks for.
-    """
-    everything = f"{_GRAPH}/{domain}/**"
-    # Session, node, number of the entity, kind; then the enclave, with % for each slash.
-    own = f"{_GRAPH}/{domain}/*/*/*/*/{enclave.replace('/', '%')}/**"
-    yield AccessRule(_IN, (_M.LIVELINESS_TOKEN,), (own,))
-    yield AccessRule(_OUT, (_M.LIVELINESS_TOKEN,), (everything,))
-    asking = (_M.LIVELINESS_QUERY, _M.DECLARE_LIVELINESS_SUBSCRIBER)
-    yield AccessRule(_IN, asking, (everything,))
-    yield AccessRule(_OUT, asking, (everything,))
 
 
 def domains_of(control: AccessControl) -> set[int]:

@@ -1,0 +1,170 @@
+"""Graph tokens of rmw_zenoh: what a node may announce by its rights, and under which names.
+
+A node, publisher, subscription, server or client is announced by a liveliness token
+``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/ENCLAVE/NAMESPACE/NAME[/TOPIC/TYPE/HASH/QOS]``, each name
+with ``%`` for ``/`` (ros2/rmw_zenoh, docs/design.md).  The graph of a process removes what is
+undeclared by session, node, namespace and name, and never looks at the enclave (graph_cache.cpp):
+so a token has to be bound to all names in it.
+
+A name is one part of a token, so ``$*`` means there what ``*`` means to ROS, and a denial is exact:
+a process reads a token with wildcards as it is written, as the name of nobody's node or topic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+from sros_tool.names import is_expression
+from sros_tool.policy.model import ALLOW
+from sros_tool.policy.patterns import Names, overlap
+from sros_tool.policy.rights import OWN_SERVICES, NodeName, Right
+from sros_tool.policy.subtraction import CannotSubtract, listed
+from sros_tool.zenoh.access import AccessRule, Flow, Message
+from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical
+
+_GRAPH = "@ros2_lv"
+_NODE = "NN"
+_KINDS = {"publish": "MP", "subscribe": "MS", "reply": "SS", "request": "SC"}
+"""The kind of what a right lets a node announce."""
+_MOST_TOKENS = 4096
+"""Most key expressions for the tokens of one right of an enclave."""
+_ANNOUNCING = (Message.LIVELINESS_TOKEN,)
+_ASKING = (Message.LIVELINESS_QUERY, Message.DECLARE_LIVELINESS_SUBSCRIBER)
+_ANY_NODE = NodeName("*", "*")
+
+
+def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName, ...]:
+    """Return the nodes that rules of `graph_rules` let an enclave announce."""
+    found: dict[NodeName, None] = {}
+    for rule in rules:
+        if rule.messages == _ANNOUNCING and rule.allows:
+            for key in rule.key_expressions:
+                chunks = key.split("/")
+                if chunks[0] == _GRAPH and chunks[5:7] == [_NODE, _part(enclave)]:
+                    names = [each.replace(ANY_PART, "*").replace("%", "/") for each in chunks[7:]]
+                    found[NodeName(*names)] = None
+    return tuple(found)
+
+
+def graph_rules(
+    enclave: str, domain: int, rights: Iterable[Right], nodes: Iterable[NodeName]
+) -> Iterator[AccessRule]:
+    """Yield what a process allows to processes of an enclave, as far as the graph is concerned.
+
+    They may announce ``nodes``, or any if there are none, with what ``rights`` allow, in the name
+    of their own enclave; and see everything.  The right to ask has to be for exactly the expression
+    that rmw_zenoh asks for.  ``rights`` are to topics and services.
+    """
+    tokens = _Tokens(enclave, domain, [*nodes] or [_ANY_NODE])
+    allowed, denied = tokens.of(rights)
+    everything = f"{_GRAPH}/{domain}/{ANY_CHUNKS}"
+    yield AccessRule(Flow.INGRESS, _ANNOUNCING, allowed)
+    if denied:
+        yield AccessRule(Flow.INGRESS, _ANNOUNCING, denied, allows=False)
+    yield AccessRule(Flow.EGRESS, _ANNOUNCING, (everything,))
+    yield AccessRule(Flow.INGRESS, _ASKING, (everything,))
+    yield AccessRule(Flow.EGRESS, _ASKING, (everything,))
+
+
+class _Tokens:
+    """The tokens of an enclave in a ROS domain."""
+
+    def __init__(self, enclave: str, domain: int, nodes: Iterable[NodeName]) -> None:
+        self._begin = f"{_GRAPH}/{domain}/*/*/*"
+        self._enclave = _part(enclave)
+        named = (
+            NodeName(ns, name)
+            for node in nodes
+            for ns in _listed(node.ns)
+            for name in _listed(node.name)
+            if "/" not in name
+        )
+        self._nodes = tuple(dict.fromkeys(_place(each) for each in named))
+        self._of_names = {
+            f"{'' if ns == '%' else ns}%{name}": f"{ns}/{name}"
+            for ns, _, name in (each.partition("/") for each in self._nodes)
+            if "*" not in ns + name
+        }
+
+    def of(self, rights: Iterable[Right]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the key expressions that are allowed, and those of them that are denied."""
+        sides: dict[bool, dict[str, dict[str, None]]] = {True: {}, False: {}}
+        for _, qualifier, right, name in rights:
+            sides[qualifier is ALLOW].setdefault(right, {})[name] = None
+        allowed = [self._key(_NODE, node) for node in self._nodes]
+        denied: list[str] = []
+        for right, names in sides[True].items():
+            without = dict.fromkeys(
+                e for name in sides[False].get(right, ()) for e in _listed(name)
+            )
+            stated = dict.fromkeys(each for name in names for each in _listed(name))
+            if without:
+                never = Names(without)
+                stated = {n: None for n in stated if is_expression(n) or not never.meets(n)}
+            wild = [each for each in stated if is_expression(each)]
+            allowed += self._announced(right, stated)
+            denied += [
+                self._key(_KINDS[right], "*/*", part, ANY_CHUNKS)
+                for name in without
+                if any(overlap(each, name) for each in wild)
+                for part in _parts(name)
+            ]
+        return tuple(allowed), tuple(denied)
+
+    def _announced(self, right: str, names: Mapping[str, None]) -> list[str]:
+        """Return the tokens of names, each of every node that may have it."""
+        parts = [part for name in names for part in _parts(name)]
+        owners = {part: self._owner(right, part) for part in parts}
+        everybody = self._nodes
+        if len(everybody) * sum(not each for each in owners.values()) > _MOST_TOKENS:
+            everybody = ("*/*",)
+        return [
+            self._key(_KINDS[right], node, part, ANY_CHUNKS)
+            for part, owner in owners.items()
+            for node in ((owner,) if owner else everybody)
+        ]
+
+    def _owner(self, right: str, part: str) -> str:
+        """Return the node that alone offers a service, because it is its own; "" if it is not."""
+        node, _, service = part.rpartition("%")
+        return self._of_names.get(node, "") if right == "reply" and service in OWN_SERVICES else ""
+
+    def _key(self, kind: str, node: str, *rest: str) -> str:
+        return "/".join((self._begin, kind, self._enclave, node, *rest))
+
+
+def _listed(name: str) -> list[str]:
+    """Return expressions with ``*`` alone; more than can be listed become wider ones."""
+    try:
+        return listed(name, _MOST_TOKENS)
+    except CannotSubtract:  # the keys of the name cannot be listed either, and are refused
+        return []
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """Return a name as tokens have it: a star at its beginning may also stand for nothing."""
+    if name.startswith("*"):
+        rest = name.lstrip("*")
+        return (*([_part(rest)] if rest.startswith("/") else []), _part(f"/*{rest}"))
+    return (_part(name),)
+
+
+def _place(node: NodeName) -> str:
+    """Return the namespace and the name of a node as tokens have them."""
+    return f"{_part(node.ns)}/{_part(node.name)}"
+
+
+def _part(name: str) -> str:
+    """Return a name as the part of a token."""
+    return canonical((name.replace("/", "%").replace("*", ANY_PART) or "%",))
+
+
+def example_token(domain: int, enclave: str, key_expressions: Iterable[str]) -> str:
+    """Return the token of a node of an enclave: if there is one, of those that are allowed."""
+    begin = f"{_GRAPH}/{domain}/"
+    for key in key_expressions:
+        chunks = key.split("/")
+        if key.startswith(begin) and chunks[5:7] == [_NODE, _part(enclave)]:
+            names = ("node" if each == "*" else each.replace(ANY_PART, "") for each in chunks[7:])
+            return "/".join((f"{begin}zid/0/0", _NODE, _part(enclave), *names))
+    return f"{begin}zid/0/0/{_NODE}/{_part(enclave)}/%/node"
