@@ -33,6 +33,7 @@ from sros_tool.translate_zenoh.rights import (
 from sros_tool.validity import Window
 from sros_tool.zenoh.access import AccessControl, Flow, Message
 from sros_tool.zenoh.key_expressions import canonical, includes
+from sros_tool.zenoh.releases import RELEASES
 from tests.support.children import LONG
 from tests.support.harness import policy_text, publish
 
@@ -49,6 +50,11 @@ def enclave(tmp_path: Path, groups: str, path: str = "/robot/n") -> Enclave:
 
 def keys(name: str) -> list[str]:
     return [canonical(("0", *each, "*", "*")) for each in chunks_of(name)]
+
+
+def right_to(right: str, name: str) -> AccessControl:
+    stated = StatedRight(Right("/n", ALLOW, right, name), Source("a policy", 1))
+    return AccessControl((remote_of("/n", {0: [stated]}),))
 
 
 @pytest.mark.parametrize(
@@ -70,6 +76,9 @@ def test_names(name: str, expected: list[str]) -> None:
     assert keys(name) == expected
 
 
+BELOW = [f"/{each.replace('*', '0a1b')}" for of in RELEASES for each in of.below_topics]
+"""What some release has below the key of a topic."""
+BELOW = ["", *dict.fromkeys(BELOW)]
 NAMES = [
     "/" + "/".join(parts)
     for count in (1, 2, 3)
@@ -86,10 +95,15 @@ def test_a_wildcard_matches_the_same_names_in_both_worlds() -> None:
             continue
         tried += 1
         expressions = keys(text)
+        put = right_to("publish", text).passing("/n", IN, Message.PUT)
+        query = right_to("request", text).passing("/n", IN, Message.QUERY)
         for name in NAMES:
             key = f"0{name}/{TYPE}"
+            meant = matches(text, name)
             said = any(includes(each, key) for each in expressions)
-            assert said == matches(text, name), (text, name, expressions)
+            assert said == query.include(key) == meant, (text, name, expressions)
+            for below in BELOW:
+                assert put.include(key + below) == meant, (text, name, below, put.all)
 
 
 RIGHTS = {

@@ -40,6 +40,7 @@ from sros_tool.pki.certificates import common_name_of, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, parts
 from sros_tool.translate_zenoh.graph import example_token
+from sros_tool.translate_zenoh.rights import ANY_TYPE, untyped
 from sros_tool.values import shows
 from sros_tool.zenoh.access import Enforcement, Message
 from sros_tool.zenoh.configuration import Mode
@@ -58,8 +59,6 @@ from sros_tool.zenoh.key_expressions import includes
 
 _OF_TLS = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)
 """The files of an enclave that a process on Zenoh needs; those of DDS do not count."""
-_ANY_TYPE = "type/hash"
-"""Type and hash at the end of a key: rules that sros writes hold for all of them."""
 
 
 class _Outcome(StrEnum):
@@ -441,7 +440,7 @@ class ZenohEvaluator:
 
     def _delivery(self, way: Route, right: Right, key: str = "") -> Delivery:
         """Return the delivery for a right of the first process of a way, on its key or another."""
-        key = key or f"{self.domain}{right.name}/{_ANY_TYPE}"
+        key = key or f"{self.domain}{right.name}/{ANY_TYPE}"
         match right.right:
             case "publish":
                 return publication(way, key)
@@ -517,7 +516,7 @@ class ZenohEvaluator:
         rules = file.process.access.rules if file.process else ()
         keys = next(rule.key_expressions for rule in rules if rule.id in check.decision.rules)
         wide = next((key for key in keys if includes(key, check.key)), "")
-        return wide if "*" in wide.removesuffix("/*/*") else ""
+        return wide if "*" in untyped(wide).removesuffix("/*/*") else ""
 
 
 def _unrestricted(name: str, mode: Mode) -> ZenohProcess:

@@ -43,6 +43,7 @@ from sros_tool.policy.rights import Right, Rules, nodes_from_text, parts
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh.graph import nodes_in_rules
 from sros_tool.translate_zenoh.rights import (
+    ANY_TYPE,
     StatedRight,
     as_router,
     domains_of,
@@ -582,7 +583,7 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
         names = {(e.right.kind, name) for e in rights for name in _examples(e.right.name)}
         for kind, name in names:
             for right in RIGHTS[kind]:
-                told = passing[right].include(f"{domain}{name}/type/hash")
+                told = passing[right].include(f"{domain}{name}/{ANY_TYPE}")
                 if told != (meant := rules.allow(enclave, right, name)):
                     check_meaning(told, meant, f"the right of {enclave} to {right} {name}")
                 if announcing(domain, right, name) != meant:
@@ -603,9 +604,14 @@ def _are_exactly(
         for (_, qualifier, right, name), _ in rights:
             if qualifier is not ALLOW:
                 return False
-            keys[right].add(f"{domain}{name}/*/*")
+            keys[right].add(f"{domain}{name}")
     return all(
-        keys[right] == {each for each in found.all if not each.endswith("/@adv/**")}
+        keys[right]
+        == {
+            each.removesuffix("/**").removesuffix("/$*::$*/*")
+            for each in found.all
+            if not each.endswith("/@adv/**")
+        }
         for right, found in passing.items()
     )
 

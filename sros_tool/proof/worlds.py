@@ -27,7 +27,7 @@ from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.names import SERVICE_ENDS, is_expression
 from sros_tool.policy.model import ALLOW, Level
 from sros_tool.policy.rights import Right
-from sros_tool.translate_zenoh.rights import StatedRight
+from sros_tool.translate_zenoh.rights import ANY_TYPE, StatedRight, untyped
 from sros_tool.zenoh.access import Enforcement, Flow, Message, Remote
 from sros_tool.zenoh.key_expressions import names_of as names_of_keys
 
@@ -407,9 +407,9 @@ _USES: dict[tuple[bool, str], tuple[tuple[Flow, Message], ...]] = {
 
 Each has to pass: replies without the offer to reply belong to the history of topics.
 """
-_TYPE = ("/type", "/hash")
+_TYPE = f"/{ANY_TYPE}"
 """Type and hash at the end of a key: rules that sros writes hold for all of them."""
-_ANY_TYPE = "/*/*"
+_UNTYPED = "/*/*"
 
 
 def dds_access(access: Access) -> TopicAccess:
@@ -510,16 +510,17 @@ _DOMAIN = re.compile(r"(?:0|[1-9][0-9]{0,8})\Z", re.ASCII)
 def _topics(key: str, domain: int, begin: str) -> NameSet:
     """Return the topics with a prefix that stand for what a key expression includes."""
     end, space = _ENDS[begin], str(domain)
-    name = key.removesuffix(_ANY_TYPE).removeprefix(space)
-    if len(name) == len(key) - len(space) - len(_ANY_TYPE) and "*" not in name:
+    key = untyped(key)
+    name = key.removesuffix(_UNTYPED).removeprefix(space)
+    if len(name) == len(key) - len(space) - len(_UNTYPED) and "*" not in name:
         return NameSet((f"{begin}{name}{end}",)) if name.startswith("/") else NameSet()
     around = names_of_keys((key,)).around()
     assert around
-    inner = (automaton.between(space, "".join(_TYPE)) for automaton in around.automata)
+    inner = (automaton.between(space, _TYPE) for automaton in around.automata)
     exact = (
-        f"{begin}{each[len(space) : -len(''.join(_TYPE))]}{end}"
+        f"{begin}{each[len(space) : -len(_TYPE)]}{end}"
         for each in around.exact
-        if each.startswith(f"{space}/") and each.endswith("".join(_TYPE))
+        if each.startswith(f"{space}/") and each.endswith(_TYPE)
     )
     return NameSet(exact, (each.surrounded(begin, end) for each in inner))
 
@@ -533,5 +534,5 @@ def zenoh_message(topic: str, domain: int, *, writes: bool) -> list[tuple[Flow, 
     end = _ENDS.get(begin)
     if end is None or not topic[2:].startswith("/") or not topic.endswith(end):
         return []
-    key = f"{domain}{topic[2 : len(topic) - len(end)]}{''.join(_TYPE)}"
+    key = f"{domain}{topic[2 : len(topic) - len(end)]}{_TYPE}"
     return [(flow, message, key) for flow, message in _USES[writes, begin]]

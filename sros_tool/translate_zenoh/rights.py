@@ -53,10 +53,22 @@ from sros_tool.zenoh.access import (
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import ConfigurationDocument
 from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical, includes, intersects
+from sros_tool.zenoh.releases import RELEASES
 
-_ANY_TYPE = "/*/*"
-"""The type and its hash, with which the keys of topics and services end: rules do not check it."""
-_TYPE_CHUNKS = _ANY_TYPE[1:].split("/")
+_TYPE = ("$*::$*", "*")
+"""The type and its hash, with which the keys of topics and services end: rules do not check them.
+
+Every type has "::" and no part of a ROS name has it, so wherever a wildcard of the name ends, what
+stands below the key of another name is no key of this one.
+"""
+_IN_TYPES = "::"
+_UNTYPED = ("*", "*")
+"""What rules that others wrote have in place of `_TYPE`."""
+ANY_TYPE = "any::type/hash"
+"""A type and its hash for which rules that sros writes decide as for every other."""
+_BELOW_TOPICS = (ANY_CHUNKS,) if any(each.below_topics for each in RELEASES) else ()
+_BELOW = {"publish": _BELOW_TOPICS, "subscribe": _BELOW_TOPICS}
+"""What belongs to a right below its keys, whatever the release of rmw_zenoh."""
 _ADVANCED = f"@adv/{ANY_CHUNKS}"
 """What belongs to a topic with history (TRANSIENT_LOCAL), below its key."""
 _MOST_KEYS = 4096
@@ -178,10 +190,19 @@ def stated_names(rules: Iterable[AccessRule]) -> list[tuple[str, str]]:
 
 def _name_in(key: str) -> str:
     """Return the name in the key expression of a right, without domain, type and hash."""
-    chunks = key.split("/")[1:]
+    chunks = untyped(key).split("/")[1:]
     last = chunks[-1:] if chunks[-1] == ANY_CHUNKS else []  # canonical: behind type and hash
-    name = chunks[: len(chunks) - len(last) - len(_TYPE_CHUNKS)]
+    name = chunks[: len(chunks) - len(last) - len(_UNTYPED)]
     return "/".join(["", *name, *last])
+
+
+def untyped(key: str) -> str:
+    """Return the key expression of a right as others write it: any type, and nothing below it."""
+    for below in ((), (ANY_CHUNKS,)):
+        end = "/".join(("", *_TYPE, *below))
+        if key.endswith(end):
+            return canonical((*key.removesuffix(end).split("/"), *_UNTYPED))
+    return key
 
 
 def as_router(router: str, own: RemoteRights) -> RemoteRights:
@@ -216,7 +237,8 @@ def _allowed_keys(
         side.setdefault(right, {}).setdefault(name, source)
     for right, places in sorted(allowed.items()):
         if right not in denied and _EXACT_NAMES.fullmatch("".join(places)):
-            yield right, tuple([f"{domain}{name}{_ANY_TYPE}" for name in places])
+            end = "/".join(("", *_TYPE, *_BELOW.get(right, ())))
+            yield right, tuple([f"{domain}{name}{end}" for name in places])
             continue
         for name, place in (*places.items(), *denied.get(right, {}).items()):
             if _NO_KEY.search(name):
@@ -228,11 +250,12 @@ def _allowed_keys(
             if not is_expression(name):
                 found.update(() if denials.meet(name) else chunks_of(name))
                 continue
-            chunks = denials.taken_from(name, place, left)
-            left -= len(chunks)
-            found |= chunks
+            taken = denials.taken_from(name, place, left)
+            left -= len(taken)
+            found |= taken
         names = _with_what_is_below(found)
-        yield right, tuple([canonical((str(domain), *each, *_TYPE_CHUNKS)) for each in names])
+        chunks = (*_TYPE, *_BELOW.get(right, ()))
+        yield right, tuple([canonical((str(domain), *each, *chunks)) for each in names])
 
 
 class _Denials:
@@ -443,7 +466,7 @@ def ros_names(key: str) -> tuple[str, ...]:
 
     The first chunk is the ROS domain, and the last two are the type and its hash.
     """
-    chunks = _without_type(key.split("/")[1:])
+    chunks = _without_type(untyped(key).split("/")[1:])
     if chunks.count(ANY_CHUNKS) > _MOST_ANY_CHUNKS or any(
         chunk.startswith("@") for chunk in chunks
     ):
@@ -481,10 +504,8 @@ def _without_type(chunks: list[str]) -> list[str]:
 # ── rules that others wrote, in ROS terms ───────────────────────────────────────────────────
 
 _BELOW_KEYS = "@adv"
-_TYPE_PARTS = ("*", "*")
-"""The type and its hash, with which the keys of topics and services end."""
 _MOST_NAMES = 65536
-_EVERY_NAME = ("*", *_TYPE_PARTS, ANY_CHUNKS)
+_EVERY_NAME = ("*", *_UNTYPED, ANY_CHUNKS)
 _DOMAIN = re.compile(r"\*|0|[1-9][0-9]{0,2}")
 """The first part of a key of rmw_zenoh: what does not begin with a domain has no ROS name."""
 
@@ -496,9 +517,12 @@ def name_of_key(key: str) -> tuple[str, str]:
     """
     domain, _, rest = key.partition("/")
     chunks = rest.partition(f"/{_BELOW_KEYS}")[0].split("/")
-    if domain.startswith("@") or len(chunks) <= len(_TYPE_PARTS):
+    end = next(
+        (at for at, chunk in enumerate(chunks) if _IN_TYPES in chunk), len(chunks) - len(_UNTYPED)
+    )
+    if domain.startswith("@") or end <= 0:
         return domain, ""
-    return domain, "/" + "/".join(chunks[: -len(_TYPE_PARTS)])
+    return domain, "/" + "/".join(chunks[:end])
 
 
 @dataclass(frozen=True, slots=True)
@@ -596,7 +620,7 @@ def _rights(
     def keys(flow: Flow, message: Message, *, allows: bool = True) -> list[str]:
         seen = flow.opposite() if own else flow
         stated = (
-            key
+            untyped(key)
             for rule in rules
             if rule.allows is allows and seen in rule.flows and message in rule.messages
             for key in rule.key_expressions
@@ -629,7 +653,7 @@ def _keys_of(domain: str, name: str) -> tuple[str, ...]:
             f"Its wildcards stand for more than {_MOST_NAMES} key expressions.",
             "Name it with fewer wildcards.",
         )
-    return tuple(canonical((domain, *chunks, *_TYPE_PARTS)) for chunks in chunks_of(name))
+    return tuple(canonical((domain, *chunks, *_UNTYPED)) for chunks in chunks_of(name))
 
 
 class _ByPrefix:
@@ -708,10 +732,10 @@ def _candidates(key: str) -> Iterator[tuple[str, str]]:
     if not _DOMAIN.fullmatch(domain) or not chunks:
         return
     if chunks[-1] != ANY_CHUNKS:
-        yield from ((domain, each) for each in _texts(chunks[: -len(_TYPE_PARTS)]))
+        yield from ((domain, each) for each in _texts(chunks[: -len(_UNTYPED)]))
         return
     body = chunks[:-1]
-    for dropped in range(len(_TYPE_PARTS) + 1):
+    for dropped in range(len(_UNTYPED) + 1):
         base = body[: len(body) - dropped]
         if dropped > len(body) or set(body[len(base) :]) - {"*"}:
             break
@@ -738,10 +762,10 @@ def _pieces(key: str) -> list[str]:
     if not chunks or chunks[-1] != ANY_CHUNKS:
         return [canonical((domain, *chunks))]
     base = chunks[:-1]
-    if tuple(base[-len(_TYPE_PARTS) :]) == _TYPE_PARTS:
-        base = base[: -len(_TYPE_PARTS)]
+    if tuple(base[-len(_UNTYPED) :]) == _UNTYPED:
+        base = base[: -len(_UNTYPED)]
     below = canonical((domain, *base, *_EVERY_NAME))
-    return [canonical((domain, *base, *_TYPE_PARTS)), below] if base else [below]
+    return [canonical((domain, *base, *_UNTYPED)), below] if base else [below]
 
 
 # ── as a policy ────────────────────────────────────────────────────────────────────────────

@@ -40,7 +40,7 @@ class Check:
     message: Message
     """The kind of message, as Zenoh's rules name it."""
     key: str
-    """Its key; `type/hash` stands for every type."""
+    """Its key; `any::type/hash` stands for every type."""
     decision: AccessDecision
 
     @property

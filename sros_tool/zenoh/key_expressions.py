@@ -18,7 +18,7 @@ from sros_tool.names import has_parts
 ANY_PART, ANY_CHUNKS = "$*", "**"
 _ANY_CHUNK = "*"
 _MANY = 65536
-_SAME_DEPTH = re.compile(r"(?:/\*)*(?:/@[^*]*(?:/\*\*)?)?")
+_SAME_DEPTH = re.compile(r"(?:/\*)*(?:/\$\*::\$\*/\*(?:/\*\*)?)?(?:/@[^*]*(?:/\*\*)?)?")
 """The wildcards at the end of expressions, by which none includes one with another beginning."""
 _MOST_COMPARED = 100_000
 """Most comparisons to leave out what is not needed: parts of a second."""

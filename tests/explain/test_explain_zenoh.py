@@ -115,7 +115,7 @@ def test_each_link_is_shown_with_who_enforces_it_by_which_rule(made: Path) -> No
     assert shown.out.startswith(
         "yes: /talker may publish topic /chatter, on Zenoh in client mode (as asked)\n"
     )
-    assert "put 0/chatter/type/hash: leaving /talker by rule /router#" in shown.out
+    assert "put 0/chatter/any::type/hash: leaving /talker by rule /router#" in shown.out
     assert ", entering /router by rule /talker#" in shown.out
     assert "heard by  /listener, /recorder" in shown.out
 
@@ -131,7 +131,9 @@ def test_the_line_of_the_policy_is_shown(made: Path) -> None:
 def test_what_a_wildcard_reaches(made: Path, mode: str) -> None:
     """A put on all of /cam* gets to whom may subscribe to as much, and to nobody else."""
     found = zenoh(made / mode, "/wide", "publish", "/camera")
-    assert found["wildcards"] == [{"expression": "0/cam$*/*/*/**", "reaches": ["/recorder"]}]
+    assert found["wildcards"] == [
+        {"expression": "0/cam$*/**/$*::$*/*/**", "reaches": ["/recorder"]}
+    ]
     exact = zenoh(made / mode, "/talker", "publish", "/chatter")
     assert exact["wildcards"] == []
 
@@ -140,11 +142,11 @@ def test_what_a_wildcard_reaches(made: Path, mode: str) -> None:
 def test_who_may(made: Path, mode: str) -> None:
     found = zenoh(made / mode, "--who", "subscribe", "/chatter")
     able = {each["enclave"]: each["wildcard"] for each in found["enclaves"] if each["allowed"]}
-    assert able == {"/listener": None, "/recorder": "0/*/*/*/**"}
+    assert able == {"/listener": None, "/recorder": "0/*/**/$*::$*/*/**"}
     shown = explain(made / mode, "--who", "subscribe", "/chatter", "--vendor", "zenoh").ok()
     assert (
-        "/recorder  by the wildcard 0/*/*/*/**\n2 of 6 enclaves may subscribe topic /chatter\n"
-        in shown.out
+        "/recorder  by the wildcard 0/*/**/$*::$*/*/**\n"
+        "2 of 6 enclaves may subscribe topic /chatter\n" in shown.out
     )
     assert explain(made / mode, "--who", "call", "/nope", "--vendor", "zenoh").status == 1
 
@@ -172,7 +174,7 @@ def test_the_rules_of_zenoh_are_the_rights_of_the_keystore(made: Path, mode: str
 
 def test_diff_and_view_show_where_the_worlds_differ(keystore: Path, tmp_path: Path) -> None:
     router = keystore / "enclaves/router/router.json5"
-    router.write_text(router.read_text().replace("0/chatter/*/*", "0/other/*/*"))
+    router.write_text(router.read_text().replace("0/chatter/$*::", "0/other/$*::"))
     shown = sros("diff_policy", keystore, router)
     assert shown.status == 1
     assert "- /talker ALLOW publish topic /chatter\n" in shown.out
@@ -290,7 +292,7 @@ def test_a_keystore_without_these_files(tmp_path: Path) -> None:
 
 def test_the_answer_for_dds_has_that_of_zenoh_next_to_it(made: Path) -> None:
     shown = explain(made / "client", "/talker", "publish", "/chatter").ok()
-    assert "\n  zenoh     yes: put 0/chatter/type/hash from /talker: rule " in shown.out
+    assert "\n  zenoh     yes: put 0/chatter/any::type/hash from /talker: rule " in shown.out
     denied = explain(made / "client", "/talker", "publish", "/nope")
     assert "\n  zenoh     no, dropped: " in denied.out
     compared = explain(made / "client", "/talker", "publish", "/chatter", "--all-vendors").ok()

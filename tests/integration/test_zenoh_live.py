@@ -32,7 +32,7 @@ POLICY = policy_text(
         "/listener": subscribe("/chatter", "/secret", "/map"),
         "/server": '<services reply="ALLOW"><service>/add</service></services>',
         "/client": '<services request="ALLOW"><service>/add</service></services>',
-        "/other": publish("/elsewhere") + subscribe("/elsewhere"),
+        "/other": publish("/elsewhere") + subscribe("/elsewhere", "/chatter/*"),
     }
 )
 
@@ -68,7 +68,7 @@ def play(what: str, folder: Path, mode: str = "peer") -> Any:
 @pytest.mark.parametrize("mode", ["peer", "client"])
 def test_who_may_communicates_and_nobody_else(keystores: Path, mode: str) -> None:
     assert play("secured", keystores, mode) == {
-        "heard": ["chatter", "keeper"],
+        "heard": ["_buf/0a1b", "_buf_cpu", "chatter", "keeper"],
         "overheard": [],
         "executed": ["client"],
         "answered": ["server"],
@@ -82,8 +82,8 @@ def test_who_may_communicates_and_nobody_else(keystores: Path, mode: str) -> Non
 
 def test_without_the_rules_each_of_these_attacks_succeeds(keystores: Path) -> None:
     observed = play("open", keystores)
-    assert set(observed["heard"]) >= {"other", "wildcard", "wildcards", "talker"}
-    assert set(observed["overheard"]) >= {"chatter", "keeper", "server"}
+    assert set(observed["heard"]) >= {"other", "wildcard", "wildcards", "talker", "forged image"}
+    assert set(observed["overheard"]) >= {"chatter", "keeper", "server", "_buf_cpu", "_buf/0a1b"}
     assert "other" in observed["executed"]
     assert "thief" in observed["answered"]
     assert "spoofed" in observed["nodes"]

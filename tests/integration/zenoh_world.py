@@ -27,12 +27,14 @@ from sros_tool.zenoh.configuration import Configuration, Mode
 from tests.support.children import LONG
 
 TYPE = "std_msgs::msg::dds_::String_/RIHS01_" + "0" * 64
+BUFFERS = ("_buf_cpu", "_buf/0a1b")
+"""Where images of /chatter would be sent, below its key (`sros_tool.zenoh.releases`)."""
 GRAPH = "@ros2_lv/0/**"
 WITHIN = 60.0
 """Seconds within which what is allowed has to happen; usually it takes parts of one."""
 PAUSE = 0.5
 
-ITS_OWN = {"other", "wildcard", "wildcards", "thief"}
+ITS_OWN = {"other", "wildcard", "wildcards", "thief", "forged image"}
 """What a session says to itself: no rule stands in between."""
 FALSE_TOKENS = (
     ("/talker", "spoofed"),
@@ -217,6 +219,10 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             listener.declare_subscriber(key("/secret"), lambda each: heard.add(text(each))),
             other.declare_subscriber(key("/chatter"), lambda each: overheard.add(text(each))),
             other.declare_subscriber("0/**", lambda each: overheard.add(text(each))),
+            # What /other may hear below /chatter is no buffer of /chatter.
+            other.declare_subscriber(
+                "0/chatter/*/**/$*::$*/*/**", lambda each: overheard.add(text(each))
+            ),
             serve(server, "/add", "server", executed),
             serve(other, "/add", "thief", stolen),
             token(talker, "/talker", "talker"),
@@ -224,6 +230,12 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             *(token(other, *each) for each in FALSE_TOKENS),
             token(other, "/other", "other"),
         ]
+        for each in BUFFERS:
+            buffer = f"{key('/chatter')}/{each}"
+            for session, what in ((listener, heard), (other, overheard)):
+                kept.append(
+                    session.declare_subscriber(buffer, lambda each, to=what: to.add(text(each)))
+                )
         graph = Graph(listener)
         until(lambda: "talker" in graph.nodes())
         erasing = token(other, "/other", "talker", zid=str(talker.info.zid()))
@@ -244,6 +256,7 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
 
         def attack() -> None:
             other.put(key("/chatter"), "other")
+            other.put(f"{key('/chatter')}/_buf_cpu", "forged image")
             other.put(f"0/*/{TYPE}", "wildcard")
             other.put("0/**", "wildcards")
             talker.put(key("/secret"), "talker")
@@ -255,9 +268,12 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             attack()
             time.sleep(0.1)
         if not rules:  # what succeeds may take its time on a busy machine
-            attacks = {"other", "wildcard", "wildcards", "talker"}
+            attacks = {"other", "wildcard", "wildcards", "talker", "forged image"}
             until(lambda: heard >= attacks and "server" in overheard, attack)
         until(lambda: "chatter" in heard, lambda: talker.put(key("/chatter"), "chatter"))
+        for each in BUFFERS:
+            buffer = f"{key('/chatter')}/{each}"
+            until(lambda e=each: e in heard, lambda b=buffer, e=each: talker.put(b, e))  # type: ignore[misc]
         until(lambda: "keeper" in heard, lambda: keeper.put(key("/secret"), "keeper"))
         answered: set[str] = set()
         until(

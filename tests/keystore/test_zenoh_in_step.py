@@ -134,7 +134,7 @@ def test_more_domains_reach_the_rules(folder: Path) -> None:
     sros("update_keystore", "client", "--domain", "0,7", "--allow-looser", cwd=folder).ok()
     in_step(folder / "client")
     text = (folder / "client/enclaves/router/router.json5").read_text()
-    assert '"7/x/*/*"' in text and '"0/x/*/*"' in text
+    assert '"7/x/$*::$*/*/**"' in text and '"0/x/$*::$*/*/**"' in text
 
 
 def test_rights_that_zenoh_cannot_enforce_are_refused_with_their_line(folder: Path) -> None:

@@ -537,7 +537,7 @@ def _messages(topic: str, domain: int, writes: bool) -> list[tuple[Flow, Message
     flow = Flow.INGRESS if writes else Flow.EGRESS
     begin = topic[:2]
     name = topic[2 : len(topic) - len({"rt": "", **SERVICE_ENDS}[begin])]
-    key = f"{domain}{name}/type/hash"
+    key = f"{domain}{name}/any::type/hash"
     if begin == "rt":
         return [(flow, Message.PUT, key)]
     if begin == "rq":
