@@ -112,6 +112,8 @@ def loadable_environment(
     wanted = domain_from(environment if domain_text is None else {DOMAIN: domain_text})
     used = chosen_rmw(rmw, environment)
     with_zenoh = _uses_zenoh(rmw, used)
+    if with_zenoh and not target:
+        _check_release(environment)
     check_enclave_name(name)
     keystore = Keystore(root)
     keystore.check()
@@ -311,6 +313,21 @@ def _uses_zenoh(named: str | None, rmw: str) -> bool:
     return False
 
 
+def _check_release(environment: Mapping[str, str]) -> None:
+    """Raise `UsageError` if the rmw_zenoh of this machine is too old for an enclave's files."""
+    from sros_tool.runtime.environment import RMW_ZENOH
+    from sros_tool.runtime.rmw import package_version
+    from sros_tool.zenoh.releases import release_of, too_old_because, version_text
+
+    version = package_version(RMW_ZENOH, environment)
+    if version and (why := too_old_because(version)):
+        raise UsageError(
+            f"{RMW_ZENOH} {version_text(version)} cannot run in an enclave",
+            why,
+            f"Install {RMW_ZENOH} {version_text(release_of(version).least)} or later.",
+        )
+
+
 def _opened_zenoh(
     keystore: Keystore, name: str, state: OpenedEnclave, now: datetime
 ) -> OpenedZenoh:
@@ -413,11 +430,14 @@ def _zenoh_environment(
         SESSION_FILE,
     )
     from sros_tool.runtime.environment import (
+        RMW_ZENOH,
         ROUTER_URI,
         SESSION_URI,
         replaced_notes,
         zenoh_environment,
     )
+    from sros_tool.runtime.rmw import package_version
+    from sros_tool.zenoh.releases import release_of
 
     place = folder.absolute()
     uris = {SESSION_URI: SESSION_FILE, ROUTER_URI: ROUTER_FILE}
@@ -429,10 +449,13 @@ def _zenoh_environment(
     )
     needed: tuple[Note, ...] = ()
     if SESSION_FILE in zenoh.configurations:
+        version = package_version(RMW_ZENOH, environment)
+        by_graph = version and release_of(version).below_topics
+        images = ", and send it no images" if by_graph else ""
         text = (
             f"start every node with `--ros-args --enclave {name}`: on Zenoh, others drop the "
             "graph token of a node that names another enclave or none, and do not find its "
-            "topics and services."
+            f"topics and services{images}."
         )
         needed = (Note("zenoh.enclave-argument", text),)
     notes = (

@@ -37,7 +37,7 @@ from sros_tool.runtime.environment import (
     SESSION_URI,
     override_pairs,
 )
-from sros_tool.runtime.rmw import RMW
+from sros_tool.runtime.rmw import RMW, package_version
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.document import (
@@ -45,6 +45,7 @@ from sros_tool.zenoh.document import (
     UnreadConfigurationError,
     parse_configuration,
 )
+from sros_tool.zenoh.releases import too_old_because, version_text
 
 _RCL = "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy."
 _NAME_IT = (
@@ -338,6 +339,15 @@ UNREAD = FindingKind(
     _SOURCE,
     f"Write it as JSON5 objects into a file. {OWN_CONFIGURATION}",
 )
+TOO_OLD = FindingKind(
+    "runtime.zenoh-too-old",
+    ERROR,
+    "an rmw_zenoh that is too old for the files that sros writes",
+    "No session opens in an enclave: an earlier rmw_zenoh does not read ZENOH_CONFIG_OVERRIDE, and "
+    "its Zenoh does not accept all settings.",
+    "Changelogs of rmw_zenoh_cpp; wheels of Zenoh measured.",
+    "Install a later version of the same distribution.",
+)
 OVERRIDDEN = FindingKind(
     "runtime.zenoh-overridden",
     WARNING,
@@ -388,6 +398,9 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
     """Yield the findings in the variables of rmw_zenoh, and in the configurations they make."""
     if not is_zenoh(environment):
         return
+    version = package_version(RMW_ZENOH, environment)
+    if version and (why := too_old_because(version)):
+        yield TOO_OLD.found(RMW_ZENOH, f"{RMW_ZENOH} {version_text(version)} is installed. {why}")
     if environment.get(ENABLE) == "true" and not environment.get(SESSION_URI):
         yield NO_SESSION_FILE.found(SESSION_URI, f"{SESSION_URI} is not set")
     overrides = tuple(override_pairs(environment.get(OVERRIDE, "")))

@@ -7,12 +7,15 @@ here, and its log texts in `sros_tool.runtime.vendor_log`.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.errors import SrosError
 
 RMW = "RMW_IMPLEMENTATION"
 """The variable that names the RMW of a process."""
@@ -83,6 +86,25 @@ def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
 def _prefixes(environment: Mapping[str, str]) -> list[str]:
     paths = environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     return [prefix for prefix in (*paths, sys.prefix) if prefix]
+
+
+def package_version(rmw: str, environment: Mapping[str, str]) -> tuple[int, int, int] | None:
+    """Return the version of an installed RMW by its package.xml; None if that cannot be told."""
+    from sros_tool.xml import parse, read_bytes
+
+    for prefix in _prefixes(environment):
+        if not Path(prefix, _RMW_INDEX, rmw).exists():
+            continue
+        path = Path(prefix, "share", rmw, "package.xml")
+        with suppress(SrosError):
+            text = parse(read_bytes(path, "package"), str(path)).findtext("version") or ""
+            if numbers := _VERSION.fullmatch(text.strip()):
+                return int(numbers[1]), int(numbers[2]), int(numbers[3])
+        return None
+    return None
+
+
+_VERSION = re.compile(r"(\d{1,9})\.(\d{1,9})\.(\d{1,9})", re.ASCII)
 
 
 def chosen_rmw(named: str | None, environment: Mapping[str, str]) -> str:

@@ -47,7 +47,13 @@ from sros_tool.runtime.events import (
     signal_name,
 )
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
-from sros_tool.runtime.rmw import MIDDLEWARE, RMW, middleware_of, rmw_implementations
+from sros_tool.runtime.rmw import (
+    MIDDLEWARE,
+    RMW,
+    middleware_of,
+    package_version,
+    rmw_implementations,
+)
 from sros_tool.runtime.variables import choose_enclave, domain_of
 from sros_tool.runtime.vendor_log import (
     endpoint_refusal,
@@ -56,6 +62,7 @@ from sros_tool.runtime.vendor_log import (
     plain_text,
 )
 from sros_tool.values import Words
+from sros_tool.zenoh.releases import release_of, too_old_because, version_text
 
 _LOG = logging.getLogger(__name__)
 
@@ -65,6 +72,7 @@ ROS_ADVICE = (
     "The ROS 2 packages of Ubuntu (ros-jazzy-ros-base) have DDS Security built in; the wheels on"
     " PyPI do not."
 )
+_ZENOH_ADVICE = "It enforces the files that `sros zenoh KEYSTORE` writes, and none of DDS Security."
 _EXIT_SECONDS = 5.0
 
 
@@ -160,7 +168,22 @@ def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
         variables |= below.explains
     stack = Stack(f"rclpy with {rmw or 'its default RMW'}", "rmw", "", rmw=rmw)
     stack = _probed(stack, "rclpy", probe, variables)
+    if below and below.name == "Zenoh":
+        return _with_release(stack)
     return stack._replace(advice="" if stack.enforces else ROS_ADVICE)
+
+
+def _with_release(stack: Stack) -> Stack:
+    """Return an RMW on Zenoh with the release that is installed, and what enforces security."""
+    version = package_version(stack.rmw, os.environ)
+    if version is None:
+        return stack._replace(advice=_ZENOH_ADVICE)
+    text = f"({stack.rmw} {version_text(version)}, as in ROS 2 {release_of(version).distribution})"
+    return stack._replace(
+        dds="Zenoh",
+        version=f"{stack.version} {text}".lstrip(),
+        advice=too_old_because(version) or _ZENOH_ADVICE,
+    )
 
 
 def _without_rclpy() -> Stack:

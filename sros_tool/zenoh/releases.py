@@ -8,16 +8,23 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+_LEAST_ZENOH = "1.3"
+"""The first Zenoh that accepts all settings of the files."""
 
-class _Release(NamedTuple):
-    """A series of versions of rmw_zenoh_cpp.
+Version = tuple[int, int, int]
 
+
+class RmwZenohRelease(NamedTuple):
+    """The versions of rmw_zenoh_cpp of one distribution, from ``begin`` to that of the next one.
+
+    ``least`` is the first one that has `_LEAST_ZENOH` and reads ZENOH_CONFIG_OVERRIDE.
     ``below_topics`` are the key expressions, below the key of a topic, on which its messages are
-    sent too, or instead.
+    sent too, or instead: to the subscriptions whose graph tokens the publisher sees.
     """
 
     distribution: str
-    series: tuple[int, int]
+    begin: Version
+    least: Version
     below_topics: tuple[str, ...] = ()
 
 
@@ -26,9 +33,31 @@ _BUFFERS = ("_buf_cpu", "_buf/*")
 C++: one key for all subscriptions in main memory, and one for each of those on accelerators."""
 
 RELEASES = (
-    _Release("Humble", (0, 1)),
-    _Release("Jazzy", (0, 2)),
-    _Release("Kilted", (0, 6)),
-    _Release("Lyrical", (0, 10), _BUFFERS),
+    RmwZenohRelease("Humble", (0, 1, 0), (0, 1, 2)),
+    RmwZenohRelease("Jazzy", (0, 2, 0), (0, 2, 3)),
+    RmwZenohRelease("Kilted", (0, 3, 0), (0, 6, 0)),
+    RmwZenohRelease("Lyrical", (0, 7, 0), (0, 7, 0), _BUFFERS),
 )
-"""All that are supported, the earliest first."""
+"""All that are supported, the earliest first; those of Rolling are counted to the next one."""
+
+
+def release_of(version: Version) -> RmwZenohRelease:
+    """Return the release that a version belongs to: the latest one that had begun."""
+    begun = (each for each in reversed(RELEASES) if each.begin <= version)
+    return next(begun, RELEASES[0])
+
+
+def too_old_because(version: Version) -> str:
+    """Return why a version cannot run with the files that sros writes, or "" if it can."""
+    release = release_of(version)
+    if version >= release.least:
+        return ""
+    return (
+        f"Files that sros writes need Zenoh {_LEAST_ZENOH} and ZENOH_CONFIG_OVERRIDE, which it has "
+        f"since {version_text(release.least)} (ROS 2 {release.distribution})."
+    )
+
+
+def version_text(version: Version) -> str:
+    """Return a version as people write it."""
+    return ".".join(map(str, version))

@@ -26,6 +26,7 @@ from sros_tool.runtime.processes import (
 from sros_tool.validity import parse_iso
 from tests.checks import zenoh_cases
 from tests.checks.bench import DAY, Bench
+from tests.support import zenoh_configurations
 
 Change = Callable[[RuntimeState, Bench], RuntimeState]
 
@@ -195,6 +196,11 @@ def session_written_since(state: RuntimeState, bench: Bench) -> RuntimeState:
     return _written_since(on_zenoh()(state, bench), bench)
 
 
+def old_rmw_zenoh(state: RuntimeState, bench: Bench) -> RuntimeState:
+    installed = zenoh_configurations.with_rmw_zenoh(bench.root.parent / "ros", "0.2.2")
+    return on_zenoh(None, **installed)(state, bench)
+
+
 CASES: dict[str, Change] = {
     "runtime.enable-misspelt": having(**{ENABLE: "True"}),
     "runtime.not-enabled": having(**{ENABLE: None}),
@@ -237,6 +243,7 @@ CASES: dict[str, Change] = {
     "runtime.zenoh-process-unread": on_zenoh("mode: client\n"),
     "runtime.zenoh-open": on_zenoh(**{SESSION: None}),
     "runtime.zenoh-file-not-found": on_zenoh(**{SESSION: "/nowhere/session.json5"}),
+    "runtime.zenoh-too-old": old_rmw_zenoh,
     "runtime.zenoh-unread": on_zenoh("[]"),
     "runtime.zenoh-overridden": on_zenoh(
         **{OVERRIDE: 'connect/endpoints=["tls/a:1"];access_control/enabled=false'}

@@ -16,6 +16,7 @@ from sros_tool.pki import smime
 from sros_tool.runtime.environment import NO_CONFIGURATION, REFUSING, render_refusal
 from tests.support.children import importing, run
 from tests.support.harness import policy_text, publish, sros
+from tests.support.zenoh_configurations import with_rmw_zenoh
 
 PROGRAM = [sys.executable, "-m", "sros_tool"]
 ZENOH = ("--rmw", "rmw_zenoh_cpp")
@@ -64,6 +65,34 @@ def test_a_client_whose_router_does_not_run_is_told_that_its_node_waits(keystore
     assert "zenoh.no-router" not in sros("env", keystore, "/router", *ZENOH).ok().err
     sros("zenoh", keystore, "--endpoint", "robot.example:7447").ok()  # another machine: not asked
     assert "zenoh.no-router" not in sros("env", keystore, "/a", *ZENOH).ok().err
+
+
+@pytest.mark.parametrize(
+    ("version", "least", "said"),
+    [
+        ("0.1.1", "0.1.2", ""),
+        ("0.1.2", "", "topics and services."),
+        ("0.2.2", "0.2.3", ""),
+        ("0.2.10", "", "topics and services."),
+        ("0.5.0", "0.6.0", ""),
+        ("0.6.7", "", "topics and services."),
+        ("0.10.5", "", "topics and services, and send it no images."),
+        ("0.11.0", "", "topics and services, and send it no images."),
+        ("of today", "", "topics and services."),
+    ],
+)
+def test_the_installed_rmw_zenoh_has_to_be_recent_enough(
+    version: str, least: str, said: str, keystore: Path
+) -> None:
+    env = with_rmw_zenoh(keystore.parent / "ros", version)
+    answer = sros("env", keystore, "/a", *ZENOH, env=env)
+    if least:
+        assert answer.status == 2 and "RMW_IMPLEMENTATION" not in answer.out
+        assert f"Install rmw_zenoh_cpp {least} or later." in answer.err
+    else:
+        assert said in answer.ok().err
+    # Where the process will run, another version may be installed.
+    sros("env", keystore, "/a", *ZENOH, "--target", "/etc/keystore", env=env).ok()
 
 
 def test_the_environment_chooses_too_and_the_option_wins(keystore: Path) -> None:

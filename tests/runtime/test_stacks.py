@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from pathlib import Path
 
 import pytest
 
 from sros_tool.errors import UnavailableError
-from sros_tool.runtime import netns
+from sros_tool.runtime import netns, stacks
 from sros_tool.runtime.cyclone import FOLDER_VARIABLE, load_cyclone, version_of
 from sros_tool.runtime.rmw import rmw_implementations
 from tests.support.children import python
+from tests.support.zenoh_configurations import with_rmw_zenoh
 
 
 def index(prefix: Path, *names: str) -> Path:
@@ -84,6 +86,22 @@ def test_an_isolation_that_is_not_to_be_had_says_why(monkeypatch: pytest.MonkeyP
     isolation = netns.try_isolation()
     assert not isolation.isolated
     assert isolation.reason.endswith("Operation not permitted")
+
+
+@pytest.mark.parametrize(
+    ("version", "advice"),
+    [("0.10.5", "It enforces the files"), ("0.2.2", "which it has since 0.2.3")],
+)
+def test_the_release_of_rmw_zenoh_is_said(
+    version: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(stacks, "_run_probe", lambda *_: stacks.ProbeRun((), "", 1))
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "none"))
+    monkeypatch.setenv("AMENT_PREFIX_PATH", with_rmw_zenoh(tmp_path, version)["AMENT_PREFIX_PATH"])
+    [stack] = stacks.rclpy_stacks(stacks.ProbeEnclave({}, "/a", "/b"))
+    assert stack.dds == "Zenoh" and f"(rmw_zenoh_cpp {version}, as in ROS 2 " in stack.version
+    assert advice in stack.advice
 
 
 def test_importing_loads_no_library() -> None:

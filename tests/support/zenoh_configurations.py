@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 
@@ -115,3 +116,19 @@ def denying() -> str:
             },
         }
     )
+
+
+def with_rmw_zenoh(prefix: Path, version: str) -> dict[str, str]:
+    """The variable of an ament prefix that has a version of rmw_zenoh_cpp."""
+    for path, text in (
+        ("ament_index/resource_index/rmw_typesupport/rmw_zenoh_cpp", ""),
+        (
+            "rmw_zenoh_cpp/package.xml",
+            '<?xml version="1.0"?>\n<?xml-model href="package_format3.xsd"?>\n'
+            f'<package format="3">\n  <version>{version}</version>\n</package>\n',
+        ),
+    ):
+        file = prefix / "share" / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    return {"AMENT_PREFIX_PATH": str(prefix)}
