@@ -39,6 +39,7 @@ from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Source
+from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import Right, Rules, nodes_from_text, parts
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh.graph import nodes_in_rules
@@ -715,24 +716,43 @@ def _recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
     """Return the ROS rights that signed permissions give an enclave in a ROS domain.
 
     A topic ``*`` without a ROS name, as ros2/sros2 grants it, stands for all topics and services if
-    it may be published and subscribed; other topics without a ROS name are not on Zenoh.
+    it may be published and subscribed.  Of other topics without a ROS name, those whose wildcard
+    begins right behind the prefix of ROS topics are said exactly; those with no ROS topic are not
+    on Zenoh.
 
     Raises:
-        PolicyError: it is uncertain which ROS names a denial is about.
+        PolicyError: it is uncertain which ROS names a right or a denial is about.
     """
     source = Source(f"the permissions of {enclave}", 0)
     rules = tuple(each for each in grant.rules if domain in each.domains.closed())
     rights = grant_rights(enclave, replace(grant, rules=rules))
     raw = {each for each in rights if not each.name.startswith("/")}
-    if unclear := sorted(each.describe() for each in raw if each.qualifier is not ALLOW):
-        raise PolicyError(
-            f"{source}: DENY {unclear[0]} cannot be said to Zenoh",
-            "It is a name of DDS, and not certainly one of ROS.",
-            "State the rights of the enclave in a policy, with `sros create_permission`.",
-        )
-    if {each.right for each in raw if each.name == "*"} == {"publish", "subscribe"}:
+    rights -= raw
+    if {each.right for each in raw if each.name == "*" and each.qualifier is ALLOW} == {
+        "publish",
+        "subscribe",
+    }:
         rights |= {
             Right(enclave, ALLOW, right, "/*") for right in (*RIGHTS["topics"], *RIGHTS["services"])
         }
-    parted = (part for each in rights - raw for part in parts(each))
+        raw -= {each for each in raw if each.name == "*"}
+    for each in sorted(raw):
+        if each.name.startswith(f"{_TOPICS}*"):
+            rights |= {each._replace(name=each.name.removeprefix(_TOPICS))}
+        elif each.qualifier is not ALLOW or _meets_ros_names(each.name):
+            raise PolicyError(
+                f"{source}: {each.describe()} cannot be said to Zenoh",
+                "It is a name of DDS, and not certainly one of ROS.",
+                "State the rights of the enclave in a policy, with `sros create_permission`.",
+            )
+    parted = (part for each in rights for part in parts(each))
     return tuple([StatedRight(each, source) for each in sorted(set(parted))])
+
+
+_TOPICS = "rt"
+"""The prefix of ROS topics on DDS."""
+
+
+def _meets_ros_names(topic: str) -> bool:
+    """Return whether a wildcard of DDS also matches topics of ROS names."""
+    return is_expression(topic) and any(overlap(topic, f"{each}/*") for each in ("rt", "rq", "rr"))

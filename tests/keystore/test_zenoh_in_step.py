@@ -9,9 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import Criteria, Grant, Rule
+from sros_tool.errors import PolicyError
 from sros_tool.files import templates_dir
 from sros_tool.keystore.lifecycle.update import set_zenoh
 from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.zenoh_files import _recorded_rights
 from sros_tool.pki import smime
 from sros_tool.zenoh.configuration import ZenohNetwork
 from tests.support.harness import policy_text, publish, snapshot, sros
@@ -229,3 +233,32 @@ def test_a_table_that_was_taken_out_by_hand_is_no_silent_end(folder: Path) -> No
     assert ended.status == 2 and "sros zenoh client --off" in ended.err
     sros("update_keystore", "client", "--discard-edits", cwd=folder).ok()
     in_step(folder / "client")
+
+
+@pytest.mark.parametrize(
+    ("topics", "names"),
+    [
+        (["rt/a", "rt*/chatter"], ["*/chatter", "/a"]),
+        (["rt*"], ["*"]),
+        (["ros_discovery_info", "other/*"], []),
+        (["r*/chatter"], None),
+        (["*chatter"], None),
+        (["?t/a"], None),
+        (["*"], None),  # without the right to subscribe it, no service of ROS works
+    ],
+)
+def test_a_wildcard_of_dds_is_said_exactly_or_refused(
+    topics: list[str], names: list[str] | None
+) -> None:
+    """What another program signed may have a wildcard in the prefix of a topic."""
+    domain = DomainSet.of((0, 0))
+    rules = (Rule(allow=True, domains=domain, publish=(Criteria(tuple(topics)),)),)
+    grant = Grant("/n", "CN=/n", "", "", rules)
+    if names is None:
+        with pytest.raises(PolicyError, match="cannot be said to Zenoh"):
+            _recorded_rights("/n", grant, 0)
+    else:
+        stated = _recorded_rights("/n", grant, 0)
+        assert [(each.right.right, each.right.name) for each in stated] == [
+            ("publish", name) for name in names
+        ]
