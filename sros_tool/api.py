@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 AnyPath = str | PathLike[str]
 Item = TypeVar("Item")
 Secrets = Callable[[str], str]
-"""Function that returns the passphrase or PIN that its argument names in words."""
+"""A callback that gets a prompt, such as "the PIN of the token X", and returns the secret."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,9 +26,9 @@ from sros_tool.errors import DocumentError
 
 _LAST = 0x10FFFF
 _NO_LETTERS = ((0, 0), (0xD800, 0xDFFF))
-"""NUL and halves of characters, which have no encoding."""
+"""Characters that no name can have: NUL, and surrogates, which UTF-8 cannot encode."""
 _PREFERRED = ascii_lowercase + ascii_uppercase + digits + "_/" + punctuation + " "
-"""The letters for examples, best first."""
+"""The characters to build readable examples from, best first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Letters:
 
     @classmethod
     def between(cls, ends: Iterable[tuple[str, str]]) -> Letters:
-        """Return the characters of ranges, each with its last one; one that goes back is empty."""
+        """Return the characters of inclusive ranges; one that ends before it starts is empty."""
         return cls._joined((ord(low), ord(high)) for low, high in ends)
 
     @classmethod
@@ -59,7 +59,7 @@ class Letters:
 
     @classmethod
     def union(cls, sets: Iterable[Letters]) -> Letters:
-        """Return the characters of any of some sets."""
+        """Return the characters that are in at least one of the sets."""
         return cls._joined(part for some in sets for part in some.ranges)
 
     def __or__(self, other: Letters) -> Letters:
@@ -94,16 +94,16 @@ _USABLE = ~Letters(_NO_LETTERS)
 # ── automata ───────────────────────────────────────────────────────────────────────────────
 
 _Moves = Mapping[int, int]
-"""By distance (0 stays): the positions, as bits, that a letter moves by so many."""
+"""Distance → bit mask of the positions that a letter advances by this distance (0: stays)."""
 
 
 _MOST_KNOWN = 20_000
-"""Most answers that an automaton keeps: the same names are asked about again and again."""
+"""Size of an automaton's cache of answers: callers ask about the same names repeatedly."""
 
 
 @dataclass(frozen=True)
 class Automaton:
-    """A finite automaton: positions from 0, edges between them with letters, and where it ends.
+    """A finite automaton: numbered positions, edges labelled with letters, accepting positions.
 
     There may be several edges from a position with the same letter.  Equal expressions should have
     equal automata: then nothing is searched where both are compared.
@@ -114,7 +114,7 @@ class Automaton:
 
     @classmethod
     def sequence(cls, pieces: Iterable[Letters | None]) -> Automaton:
-        """Return an automaton for letters in a row, where None stands for any text."""
+        """Return an automaton for a sequence of letters, in which None matches any text."""
         at = 0
         loops: set[int] = set()
         edges: list[tuple[int, Letters, int]] = []
@@ -140,7 +140,7 @@ class Automaton:
         return Automaton((*dict.fromkeys(first), *edges), frozenset(ends))
 
     def surrounded(self, begin: str, end: str) -> Automaton:
-        """Return an automaton for the accepted names with ``begin`` before and ``end`` behind."""
+        """Return an automaton for ``begin`` + name + ``end``, for every accepted name."""
         size, more = self.size, len(begin)
         edges = [(i, Letters.of(letter), i + 1) for i, letter in enumerate(begin)]
         edges += [(at + more, letters, to + more) for at, letters, to in self.edges]
@@ -198,12 +198,12 @@ class Automaton:
 
     @cached_property
     def end_bits(self) -> int:
-        """The positions where it accepts, as bits."""
+        """The accepting positions, as a bit mask."""
         return sum(1 << end for end in self.ends)
 
     @cached_property
     def endless_bits(self) -> int:
-        """The positions, as bits, from which it accepts whatever follows."""
+        """The positions from which every text is accepted, as a bit mask."""
         loops = {at for at, letters, to in self.edges if at == to and letters == ANY_LETTER}
         return sum(1 << each for each in self.ends & loops)
 
@@ -251,14 +251,14 @@ class Automaton:
         return self.prefix, self.suffix, repr(self.edges)
 
     def may_meet(self, other: Automaton) -> bool:
-        """Return False only if no name is accepted by both: beginnings or ends differ."""
+        """Return False if both automata surely share no name, by their prefixes and suffixes."""
         return _agree(self.prefix, other.prefix) and _agree(self.suffix[::-1], other.suffix[::-1])
 
 
 def _only_way(
     edges: Mapping[int, Sequence[tuple[Letters, int]]], at: int, stops: frozenset[int]
 ) -> str:
-    """Return the letters of the edges from ``at`` on, as long as there is only one way."""
+    """Return the text that must follow position ``at``: its edges have no alternative."""
     found = ""
     while at not in stops:
         ways = edges.get(at, ())
@@ -291,7 +291,7 @@ def _moved(reached: int, moves: _Moves) -> int:
 # ── sets ───────────────────────────────────────────────────────────────────────────────────
 
 _Truth = bool | None
-"""Whether a name is in a set; None as long as it depends on how the name goes on."""
+"""Whether a name is in a set; None while that depends on the rest of the name."""
 _Ask = Callable[["_Some"], _Truth]
 
 
@@ -304,7 +304,7 @@ class _Some:
 
     @cached_property
     def everything(self) -> frozenset[Automaton]:
-        """Those of the automata that accept every name."""
+        """The automata that accept every name."""
         return frozenset(automaton for automaton in self.automata if automaton.endless_bits & 1)
 
     def has(self, name: str) -> bool:
@@ -367,7 +367,7 @@ class _Not:
 
 @dataclass(frozen=True)
 class _Every:
-    """The names that are in each of ``of``."""
+    """The intersection of the sets ``of``."""
 
     of: tuple[_Node, ...]
 
@@ -386,7 +386,7 @@ class _Every:
 
 @dataclass(frozen=True)
 class _First:
-    """The first set of ``of`` that has a name decides whether it belongs here, else ``last``."""
+    """The names decided by the first set of ``of`` that contains them, else by ``last``."""
 
     of: tuple[tuple[_Node, bool], ...]
     last: bool
@@ -435,7 +435,7 @@ _Node = _Some | _Not | _Every | _First | _AtLeast
 
 
 class SearchLimit:
-    """A limit for the steps of one question, so that nobody waits without end."""
+    """A limit on the number of search steps of one question."""
 
     def __init__(self, most: int = 600_000) -> None:
         """Allow ``most`` steps: some ten seconds."""
@@ -481,7 +481,7 @@ class NameSet:
 
     @classmethod
     def first(cls, rules: Iterable[tuple[NameSet, bool]], otherwise: bool = False) -> NameSet:
-        """Return the names for which the first rule that has them says True, else ``otherwise``."""
+        """Return the names that the first matching rule accepts; ``otherwise`` decides the rest."""
         joined = tuple(
             (cls.union(names for names, _ in same)._node, kept)
             for kept, same in groupby(rules, key=lambda each: each[1])
@@ -511,11 +511,11 @@ class NameSet:
         return cls._of(_AtLeast(tuple(names._node for names in sets), count))
 
     def between(self, begin: str, end: str) -> NameSet:
-        """Return the texts that this set has with ``begin`` before and ``end`` behind them."""
+        """Return the texts ``x`` for which ``begin`` + ``x`` + ``end`` is in this set."""
         return NameSet._of(_between(self._node, begin, end))
 
     def around(self) -> Surroundings | None:
-        """Return exact names and automata that together have every name of this set, and others.
+        """Return exact names and automata that cover this set, and possibly more names.
 
         Returns None if that would be all names.
         """
@@ -539,7 +539,7 @@ class NameSet:
         return NameSet._of(_Not(self._node))
 
     def __eq__(self, other: object) -> bool:
-        """Return whether the sets were made alike; sets of the same names may differ."""
+        """Return whether both were built in the same way; sets of the same names may be unequal."""
         return isinstance(other, NameSet) and self._node == other._node
 
     def __hash__(self) -> int:
@@ -549,7 +549,7 @@ class NameSet:
         return bool(self._node.truth(lambda some: some.has(name)))
 
     def stated(self) -> Iterator[str]:
-        """Yield the names of this set that were given as they are, the shortest first."""
+        """Yield the exact names of this set (not those of wildcards), the shortest first."""
         exact = {name for each in _leaves(self._node) for name in each.exact}
         return (name for name in sorted(exact, key=_length) if name in self)
 
@@ -608,14 +608,14 @@ def _between(node: _Node, begin: str, end: str) -> _Node:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """Exact names, and automata, which have at least the names of a set."""
+    """A superset of a set of names: exact names, and automata."""
 
     exact: frozenset[str]
     automata: frozenset[Automaton]
 
 
 def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Surroundings | None:
-    """Return surroundings of a set; of several, those for which ``best`` is least."""
+    """Return a superset of a set; of several candidates the one with the least ``best``."""
     match node:
         case _Some():
             return Surroundings(node.exact, node.automata)
@@ -641,7 +641,7 @@ def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Sur
 
 
 def _roughness(around: Surroundings) -> tuple[int, int]:
-    """Return the sort key of surroundings: those that tell most of beginning and end come first."""
+    """Return the sort key of a superset: long prefixes and suffixes come first."""
     told = min((len(a.prefix) + len(a.suffix) for a in around.automata), default=_LAST)
     return -told, -len(around.exact)
 
@@ -708,14 +708,14 @@ def _reduced(
 
 
 _OF_A_STEP = 16
-"""So many automata are looked at in the time of one step of a search."""
+"""Number of automata that can be compared in the time of one search step."""
 _FEW = 64
 _MOST_AUTOMATA = 8192
-"""With more of them, a search could take gigabytes."""
+"""Largest number of automata in one search: more could take gigabytes of memory."""
 
 
 def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
-    """Yield searches that together find every name of a set that is not exact in it.
+    """Yield searches that together find every name of a set but its exact names.
 
     Each considers the names of one automaton, and only the other automata that may have names in
     common with it.  If no few automata have all names of the set, the last one considers the names
@@ -742,7 +742,7 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
 
 
 def _width(around: Surroundings) -> tuple[int, int]:
-    """Return the sort key of surroundings: few automata, none of which may meet all others."""
+    """Return the sort key of a superset: first those with few automata that share no name."""
     if len(around.automata) > _FEW:
         return len(around.automata), 0
     rough, _ = _roughness(around)
@@ -750,7 +750,7 @@ def _width(around: Surroundings) -> tuple[int, int]:
 
 
 def _needed(node: _Node) -> frozenset[Automaton]:
-    """Return automata without which no name is in a set without exact names."""
+    """Return automata that every name of the set matches; the set has no exact names."""
     match node:
         case _Some():
             return node.automata if len(node.automata) == 1 else frozenset()
@@ -768,7 +768,7 @@ def _needed(node: _Node) -> frozenset[Automaton]:
 
 
 def _excepted(node: _Node) -> frozenset[Automaton]:
-    """Return automata without which every name is in a set without exact names."""
+    """Return automata that every name outside of the set matches; the set has no exact names."""
     match node:
         case _Not():
             return _needed(node.of)
@@ -840,7 +840,7 @@ class _Search:
         return None
 
     def _left(self, reached: int) -> int | None:
-        """Return the letters to go at least, or None if no name can begin so."""
+        """Return the fewest letters that complete a name, or None if no name begins like this."""
         left = 0
         for need in self._needed:
             some = self._machine.left(need, reached)
@@ -870,7 +870,7 @@ def _machine(automata: tuple[Automaton, ...]) -> _Machine:
 
 
 class _Class(NamedTuple):
-    """Letters that every automaton treats alike, the best one for examples, and its moves."""
+    """Letters that every automaton treats alike, with the best letter for examples."""
 
     letters: Letters
     best: str
@@ -878,7 +878,7 @@ class _Class(NamedTuple):
 
 
 class _Machine:
-    """Several automata with their positions one after the other, as the bits of one integer."""
+    """Several automata run in parallel; all their positions are the bits of one integer."""
 
     def __init__(self, automata: tuple[Automaton, ...]) -> None:
         sizes = [automaton.size for automaton in automata]
@@ -900,11 +900,11 @@ class _Machine:
         )
 
     def ended(self, reached: int) -> _Ask:
-        """Return what to ask about a name that ends at positions."""
+        """Return a function: does one of some automata accept a name that ends at ``reached``?"""
         return lambda some: any(reached & self._ends[automaton] for automaton in some.automata)
 
     def going_on(self, reached: int) -> _Ask:
-        """Return what to ask about a name that goes on from positions."""
+        """Return a function: can one of some automata accept a continuation from ``reached``?"""
 
         def ask(some: _Some) -> _Truth:
             if any(reached & self._endless[automaton] for automaton in some.automata):
@@ -918,7 +918,7 @@ class _Machine:
         return ask
 
     def left(self, automaton: Automaton, reached: int) -> int | None:
-        """Return how many letters an automaton needs at least to accept; None if it cannot."""
+        """Return the fewest letters after which an automaton accepts; None if it never does."""
         for distance, places in self._levels[automaton]:
             if reached & places:
                 return distance
@@ -926,7 +926,7 @@ class _Machine:
 
 
 def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
-    """Return the classes of letters that edges treat alike, best letters first."""
+    """Group letters that all edges treat alike into classes, best letters first."""
     by_letters: dict[Letters, list[tuple[int, int]]] = {}
     for at, letters, to in edges:
         by_letters.setdefault(letters, []).append((at, to))
@@ -964,7 +964,7 @@ def _rank(letter: str) -> tuple[int, str]:
 
 
 class _Taken:
-    """Names that are no answer, as a tree of their letters; outside of it, the place is -1."""
+    """Excluded names, as a tree of their letters; place -1 means outside of the tree."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self._tree: list[dict[str, int]] = [{}]
@@ -979,7 +979,7 @@ class _Taken:
         self._ways: dict[int, list[tuple[str, _Moves, int]]] = {}
 
     def ways(self, place: int, classes: Sequence[_Class]) -> list[tuple[str, _Moves, int]]:
-        """Return the letters to go on with from a place, their moves, and the places there."""
+        """Return the possible next letters at a place, with their moves and next places."""
         if place not in self._ways:
             children = self._tree[place] if place >= 0 else {}
             found = []

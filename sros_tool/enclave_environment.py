@@ -1,4 +1,4 @@
-"""An enclave as a process gets it, only if it can run in it: as environment, or as a container."""
+"""The environment, container definition or systemd units of an enclave, checked to be loadable."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def loadable_environment(
 
 
 def _check_key_closed(key: Path, root: Path, name: str) -> None:
-    """Raise `KeystoreError` if users other than the owner can read a private key."""
+    """Raise `KeystoreError` if users other than the owner can read the enclave's private key."""
     mode = stat.S_IMODE(key.stat().st_mode)
     if mode & 0o077:
         raise KeystoreError(
@@ -181,7 +181,7 @@ def _check_key_closed(key: Path, root: Path, name: str) -> None:
 
 
 def _check_folders_closed(root: Path, folder: Path, name: str) -> None:
-    """Raise `KeystoreError` if others can put files of their own into the enclave's folders."""
+    """Raise `KeystoreError` if other users can write to the enclave's folders."""
     trusted = frozenset({0, os.geteuid(), root.stat().st_uid})
     for each in (folder, *folder.parents):
         if why := other_writers(each.stat(), trusted):
@@ -225,7 +225,7 @@ def _check_joining(
 
 
 def _check_dates_here(name: str, keystore: Keystore, vendor: Vendor, context: JoinContext) -> None:
-    """Raise `KeystoreError` if DDS takes permissions that are valid for expired in this time zone.
+    """Raise `KeystoreError` if the local time zone makes DDS see valid permissions as expired.
 
     Fast DDS reads their dates, which are in UTC, as local time.
     """
@@ -260,7 +260,7 @@ def _token_there(name: str, place: TokenUri) -> Note:
 
 
 def _check_token_used(place: TokenUri, name: str, rmw: str) -> None:
-    """Raise `KeystoreError` if a process would use an RMW that reads keys from files alone."""
+    """Raise `KeystoreError` if the key is on a token and the RMW reads keys only from files."""
     from sros_tool.runtime.rmw import vendor_of
 
     vendor = vendor_of(rmw)
@@ -273,7 +273,7 @@ def _check_token_used(place: TokenUri, name: str, rmw: str) -> None:
 
 
 def _check_pin(place: TokenUri, name: str) -> None:
-    """Raise `KeystoreError` if others can read the PIN of a token, or this user cannot."""
+    """Raise `KeystoreError` if the token's PIN file is readable by others, or not by this user."""
     from sros_tool.pki.token import pin_file_problem
 
     if problem := pin_file_problem(place):
@@ -362,10 +362,10 @@ def _opened_zenoh(
 
 
 def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
-    """Raise `KeystoreError` if the file of an enclave has not the rights of all others.
+    """Raise `KeystoreError` if the enclave's Zenoh file lacks current rights of other enclaves.
 
-    A router, and a session that connects to others, enforces those rights: with a file of before,
-    validly signed, it would enforce those of before.  An export does not have them.
+    A router, and a session in mode peer, enforces the rights of other enclaves: an outdated file,
+    though validly signed, would enforce outdated rights.  An export cannot be checked for this.
     """
     from sros_tool.keystore.layout import PERMISSIONS, SETTINGS
     from sros_tool.keystore.zenoh_files import zenoh_drift
@@ -395,7 +395,7 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
 def _zenoh_domain(
     root: Path, zenoh: OpenedZenoh, wanted: int | None, domains: DomainSet
 ) -> int | None:
-    """Return the domain that a process should use, one of those that its configuration is for.
+    """Return the ROS domain for a process, one of the domains of its Zenoh configuration.
 
     Raises:
         KeystoreError: the configuration is not for the ``wanted`` domain.
@@ -492,7 +492,7 @@ _LISTENING = "0A"
 
 
 def _listens_here(port: int) -> bool:
-    """Return whether a TCP port of this machine has a listener, also if that cannot be seen.
+    """Return whether a TCP port of this machine has a listener; True if that is unknown.
 
     No connection is made: each one that is given up would pause the listener of a router.
     """
@@ -520,7 +520,7 @@ INSTALLED = "/etc/sros/keystore"
 
 
 def target_path(text: str) -> Path:
-    """Return the path of a keystore on another machine.
+    """Parse the absolute path of a keystore on another machine.
 
     Raises:
         UsageError: it is not absolute, or not in its shortest form.
@@ -546,7 +546,7 @@ def container_text(
     image: str,
     now: datetime,
 ) -> str:
-    """Return an enclave as a service of Compose, or as objects of Kubernetes.
+    """Return a Compose service or Kubernetes objects that run a process in an enclave.
 
     Args:
         root: the keystore.
@@ -585,7 +585,7 @@ def container_text(
 
 
 def _check_mounted(root: Path, enclave: str, target: Path) -> None:
-    """Raise `KeystoreError` if the folder of an enclave cannot be mounted alone."""
+    """Raise `KeystoreError` if mounting the enclave's folder would also mount other enclaves."""
     from sros_tool.keystore.layout import enclaves_below
     from sros_tool.keystore.reader import open_keystore
 
@@ -614,7 +614,7 @@ def node_units(
     command: Sequence[str] = (),
     sros: str = "",
 ) -> tuple[dict[str, str], list[Note]]:
-    """Return the units of systemd of nodes in enclaves, by their paths, and notes about them.
+    """Return systemd units that run nodes in enclaves: file contents by path, and notes.
 
     Args:
         root: the keystore.
@@ -647,7 +647,7 @@ def node_units(
 
 
 def enclave_of_node(file: Path, command: Sequence[str]) -> str:
-    """Return the enclave in which a policy has the node that a command starts.
+    """Return the enclave that a policy assigns to the node which a command starts.
 
     Raises:
         UsageError: the command names no node, or the policy has it in none or several enclaves.

@@ -34,7 +34,7 @@ class SrosError(Exception):
 
     @property
     def clause(self) -> str:
-        """Its cause as a clause: ``why``, or else ``what``."""
+        """The cause as a clause without a full stop: ``why``, or ``what`` if ``why`` is empty."""
         why = self.why.rstrip(".")
         begin = why[:1] if why[1:2].isupper() else why[:1].lower()
         return f"{begin}{why[1:]}" or self.what
@@ -69,7 +69,7 @@ class UnavailableError(SrosError):
 
 
 class Note(NamedTuple):
-    """A remark on the result."""
+    """A warning or hint about a successful result."""
 
     id: str
     """A stable name, such as ``portable.document-size``."""

@@ -35,7 +35,7 @@ _IN_EXPORT = {
     "has the CA keys, first replace the file there: `rm {path} && sros create_enclave {root} "
     "{enclave}`.",
 }
-"""What to do on a robot, of which not all is to be done in the keystore that has the CA keys."""
+"""Remedies on a robot, whose export has no CA keys, where they differ from the keystore's."""
 _GOVERNANCE = (
     "Every enclave depends on it: restore {root}/enclaves/governance.p7s from a backup, or read "
     "{root}/enclaves/governance.xml and sign it again: `openssl smime -sign -text -in "

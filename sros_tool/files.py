@@ -1,4 +1,4 @@
-"""Replacing single files atomically in folders of others; TOML with limits; the shipped folders."""
+"""Atomic and exclusive file writes, safe in folders that others can write; bounded TOML reading."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def staged_file(
 
 
 def _locked_file(folder: Folder, prefix: str, mode: int) -> tuple[str, int]:
-    """Make and lock a file; return its name and a descriptor that the caller closes."""
+    """Create and lock a temporary file; return its name and a descriptor that the caller closes."""
     while True:
         name = f"{prefix}{secrets.token_hex(4)}"
         handle = folder.create(name, mode)
@@ -194,7 +194,7 @@ def replace_file(path: Path, data: bytes) -> None:
 
 
 def _write_to(path: Path, state: os.stat_result, data: bytes) -> None:
-    """Write to the device or pipe with this state; something else may be at ``path`` by now."""
+    """Write to a device or pipe, unless ``path`` no longer is the file that ``state`` describes."""
     handle = os.open(path, os.O_WRONLY | os.O_NOCTTY | os.O_CLOEXEC)
     try:
         if not os.path.samestat(os.fstat(handle), state):
@@ -205,7 +205,7 @@ def _write_to(path: Path, state: os.stat_result, data: bytes) -> None:
 
 
 def _follow_own_links(path: Path) -> tuple[Path, bool]:
-    """Return where links of this user or of root lead, and whether no link of others was met."""
+    """Resolve links of this user or root; return the target, and whether no other link was met."""
     for _ in range(_MOST_LINKS):
         state = _state(path, follow=False)
         if not state or not stat.S_ISLNK(state.st_mode):
@@ -296,5 +296,5 @@ def templates_dir() -> Path:
 
 
 def unpacked_dds_dir() -> Path:
-    """Return the folder of a checkout for the Cyclone DDS that ``./dev`` unpacks without apt."""
+    """Return the folder of a source checkout into which ``./dev`` unpacks Cyclone DDS."""
     return _PACKAGE.parent / ".dds"

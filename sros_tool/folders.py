@@ -75,14 +75,14 @@ class Folder:
         return self._owner
 
     def forget(self) -> None:
-        """Close the folders below it that were kept open, since their paths have changed."""
+        """Close cached descriptors of subfolders, whose paths have changed."""
         for path in [handle for handle in self._handles if handle]:
             os.close(self._handles.pop(path))
 
     # ── looking ────────────────────────────────────────────────────────────────────────────
 
     def state(self, path: str) -> os.stat_result | None:
-        """Return the state of what is at ``path``, of a link itself; None if nothing is there."""
+        """Return the lstat(2) of ``path`` (a link is not followed); None if nothing is there."""
         try:
             parent, name = self._at(path)
             return os.stat(name, dir_fd=parent, follow_symlinks=False)
@@ -90,7 +90,7 @@ class Folder:
             return None
 
     def mode(self, path: str) -> int:
-        """Return the type and permission bits of what is at ``path``; 0 if nothing is there."""
+        """Return the st_mode of ``path`` (file type and permission bits); 0 if nothing is there."""
         state = self.state(path)
         return state.st_mode if state else 0
 
@@ -130,7 +130,7 @@ class Folder:
             return file.read(state.st_size)
 
     def open(self, path: str) -> BinaryIO:
-        """Return what is at ``path``, open for reading; it need not be a regular file."""
+        """Open ``path`` for reading, whatever its file type; return the file object."""
         parent, name = self._at(path)
         with self._naming(path):
             return open(os.open(name, _OLD_FILE, dir_fd=parent), "rb")
@@ -207,7 +207,7 @@ class Folder:
                     os.close(handle)
 
     def close_to_others(self, path: str) -> None:
-        """Take the rights of the group and of others away from a file or folder.
+        """Remove all permissions of group and others from a file or folder (chmod go=).
 
         It stays as it is if it belongs to somebody else than this folder, or has a second name,
         which may be one elsewhere.
@@ -298,11 +298,11 @@ class Folder:
     # ── the disk ───────────────────────────────────────────────────────────────────────────
 
     def flush(self, path: str = "") -> None:
-        """Flush the names in the folder at ``path`` to the disk, not the contents of its files."""
+        """Flush the directory entries of ``path`` to disk, not the contents of its files."""
         os.fsync(self.handle(path))
 
     def flush_file_system(self, path: str = "") -> None:
-        """Flush the file system of the folder at ``path``: one flush for each file costs more."""
+        """Flush the file system of ``path`` (syncfs(2)), cheaper than fsync(2) of many files."""
         flush_file_system(self.handle(path))
 
     # ── the way to a path ──────────────────────────────────────────────────────────────────
@@ -331,7 +331,7 @@ class Folder:
         return self._find(path)
 
     def _pair(self, one: str, other: str) -> tuple[int, str, int, str]:
-        """Return what `_at` returns for two paths; looking for the second keeps the first open."""
+        """Return `_at` of two paths; opening the second does not evict the first from the cache."""
         return (*self._at(one), *self._find(other))
 
     def _find(self, path: str) -> tuple[int, str]:
@@ -342,7 +342,7 @@ class Folder:
 
     @contextlib.contextmanager
     def _naming(self, path: str) -> Iterator[None]:
-        """Give an error of the system the whole path."""
+        """Add the full path to an OSError that the body raises."""
         try:
             yield
         except OSError as error:
@@ -431,7 +431,7 @@ def _c_library() -> ctypes.CDLL:
 
 
 def _last_error() -> int:
-    """Return the error of the last call of the C library in this thread."""
+    """Return the OSError for the errno of this thread's last C library call."""
     import ctypes
 
     return ctypes.get_errno()

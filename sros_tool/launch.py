@@ -28,7 +28,7 @@ _PREFIX, _FILTER = "launch-prefix", "launch-prefix-filter"
 
 @expose_action("secured_nodes")
 class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where it is missing
-    """Start each process that follows with ``sros run --policy``, so in its enclave or not at all.
+    """Launch action that starts every later process with ``sros run --policy``, in its enclave.
 
     It sets the prefix of commands, in front of one that is already there, such as of a debugger.
     Launch itself, and a process with a prefix of its own, get variables with which no node starts,
@@ -44,7 +44,7 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
         enclave: SomeSubstitutionsType = "",
         **more: Any,
     ) -> None:
-        """Take the folder of the keystore, and the file of the policy that names its enclaves."""
+        """Configure the action with a keystore's folder, and the policy that names the enclaves."""
         super().__init__(**more)
         self._given = tuple(map(normalize_to_list_of_substitutions, (keystore, policy, enclave)))
 

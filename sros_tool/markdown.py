@@ -1,4 +1,4 @@
-"""Text as Markdown of code hosts: bounded, and with names of others that stay text.
+"""Markdown for code hosts, of limited length, in which untrusted names stay plain text.
 
 A name in a policy or the path of a file can be anything that whoever opened the pull request wants
 to be seen: a link, an image, a mention of a user, the end of a comment.  As a code span or in a
@@ -24,19 +24,19 @@ def code(text: str) -> str:
 
 
 def plain(text: str) -> str:
-    """Return words of sros with what could be markup escaped."""
+    """Return ``text`` with Markdown markup escaped."""
     return _PUNCTUATION.sub(r"\\\1", _shown(text))
 
 
 def fenced(text: str, language: str = "text") -> str:
-    """Return ``text`` as a fenced block, whose fence is longer than any in it."""
+    """Return ``text`` as a fenced block; the fence is longer than any backtick run in ``text``."""
     fence = "`" * max(3, _ticks(text))
     lines = "\n".join(map(_shown, text.rstrip("\n").split("\n")))
     return f"{fence}{language}\n{lines}\n{fence}"
 
 
 def bounded(items: Iterable[str], most: int, rest: str) -> str:
-    """Return a list of items with at most ``most`` characters.
+    """Return ``items`` as a Markdown list of at most ``most`` characters.
 
     Items that do not fit are counted in a last one; ``rest`` says where they are, as a clause.
     """
@@ -54,16 +54,16 @@ def bounded(items: Iterable[str], most: int, rest: str) -> str:
 
 
 def _ticks(text: str) -> int:
-    """Return how many backticks delimit a text that may have backticks."""
+    """Return the number of backticks that safely delimit ``text``, which may contain backticks."""
     return max((len(run) for run in _RUNS.findall(text)), default=0) + 1
 
 
 _BLANK = "\u115f\u1160\u2800\u3164\uffa0\U0001d159"
-"""Characters that are printable, and look like nothing."""
+"""Printable characters that are invisible."""
 
 
 def _shown(text: str) -> str:
-    """Return ``text`` without line ends, and what is not printable or not seen by itself."""
+    """Return ``text`` on one line, with invisible and unprintable characters escaped."""
     return "".join(
         character if _is_seen(character) else f"\\x{ord(character):02x}" for character in text
     )

@@ -213,7 +213,7 @@ def expand(name: str, ns: str, node: str) -> str:
 
 
 def has_parts(text: str, parts: Sequence[str]) -> bool:
-    """Return whether a text begins with the first part, ends with the last, and has all in order.
+    """Return whether ``text`` matches ``parts`` joined by ``*``: the first at its start, and so on.
 
     Those are at least two, and do not overlap: what is between the ``*`` of an expression.
     """
@@ -230,7 +230,7 @@ def has_parts(text: str, parts: Sequence[str]) -> bool:
 
 
 def action_part(name: str) -> tuple[str, str]:
-    """Return the action that a service or topic belongs to, and its part, such as ``send_goal``.
+    """Split the name of an action's service or topic into the action and a part (``send_goal``).
 
     Both are "" if ``name`` does not belong to an action.
     """
@@ -251,7 +251,7 @@ ACTION_PARTS: dict[str, tuple[tuple[str, str], ...]] = {
 """The parts of a right to an action: pairs of a right and a suffix of the action's name."""
 
 GOAL = f"{ACTION_SEPARATOR}send_goal"
-"""The suffix of the service by which an action is recognised."""
+"""Suffix of the service that identifies an action: ``NAME/_action/send_goal``."""
 
 SERVICE_ENDS = {"rq": "Request", "rr": "Reply"}
 """Prefix and suffix of the DDS topics of a service: requests and replies."""
@@ -318,11 +318,14 @@ _RIGHTS_TO_USE = {
     "rq": ("request", "reply"),
     "rr": ("reply", "request"),
 }
-"""By the prefix of a DDS topic: the right to write it, and the right to read it."""
+"""DDS topic prefix → the ROS rights to write and to read topics with this prefix."""
 
 
 def right_to_use(topic: str, *, writes: bool) -> tuple[str, str]:
-    """Return the right to write or to read a DDS topic, and its ROS name; or "" and the topic."""
+    """Return the ROS right to write or read a DDS topic, and its ROS name.
+
+    Returns "" and the topic if it belongs to no ROS name.
+    """
     service, begin = service_of(topic)
     name = service or (topic[2:] if topic.startswith("rt/") else "")
     if not name:

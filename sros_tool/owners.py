@@ -1,4 +1,4 @@
-"""Which users, besides those who are trusted, can change a file or put another in its place.
+"""Checks whether untrusted users can change or replace a file, by owners and permission bits.
 
 Only owners and permission bits are looked at, not access control lists (acl(5)).
 """
@@ -37,7 +37,7 @@ def other_writers(state: os.stat_result, trusted: frozenset[int]) -> str:
 
 
 def replaceable_on_the_way(path: Path, trusted: frozenset[int]) -> Iterator[tuple[Path, str]]:
-    """Yield each folder and link on the way to ``path`` by which others can replace it, and why.
+    """Yield the folders and links above ``path`` through which others can replace it, and why.
 
     A folder in which only the owner of a file can rename it (sticky, as ``/tmp``) counts only if
     others own what is in it on the way.
@@ -49,7 +49,7 @@ def replaceable_on_the_way(path: Path, trusted: frozenset[int]) -> Iterator[tupl
 
 
 def file_of_root(path: Path) -> Path | None:
-    """Return the real path of a regular file that only root can change or replace, else None."""
+    """Return the real path of a regular file if only root can change or replace it, else None."""
     try:
         real = path.resolve(strict=True)
         state = real.lstat()
@@ -61,7 +61,7 @@ def file_of_root(path: Path) -> Path | None:
 
 
 def _way(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
-    """Yield the folders and links that the system passes on the way to ``path``, with their states.
+    """Yield the folders and links that resolving ``path`` passes, with their lstat(2).
 
     ``path`` itself is not among them, unless it is a link.
     """

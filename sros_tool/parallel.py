@@ -25,13 +25,13 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 Progress = Callable[[str], None]
-"""Callback that gets the name of each enclave when the work on that enclave is done."""
+"""Callback that is called with an enclave's name when work on the enclave is done."""
 
 _MOST_PROCESSES = 8
 
 
 class Tally:
-    """How much of a long list is done, also by forked workers, which share its memory.
+    """A progress counter in memory that forked workers share.
 
     ``total`` is the number of items that `map_slices` works on now, or 0.
     """
@@ -44,12 +44,12 @@ class Tally:
         self._place = 0
 
     def begin(self, total: int) -> None:
-        """Begin with a list of ``total`` items; 0 for none."""
+        """Set the number of items to ``total`` and the number of finished items to 0."""
         self._counts[:] = memoryview(bytes(8 * _MOST_PROCESSES)).cast("Q")
         self.total, self._began = total, time.monotonic()
 
     def of_worker(self, place: int) -> None:
-        """Count what this process does from now on at a place of its own."""
+        """Count this worker's finished items in slot ``place``, which no other worker uses."""
         self._place = place
 
     def add(self) -> None:
@@ -61,7 +61,7 @@ class Tally:
         return sum(self._counts)
 
     def left(self) -> float | None:
-        """Return the seconds that the rest will take at this pace; None if nothing is done."""
+        """Return the estimated remaining seconds; None before the first item is done."""
         done = self.done()
         return (time.monotonic() - self._began) * (self.total - done) / done if done else None
 
@@ -71,7 +71,7 @@ _tallies: list[Tally] = []
 
 @contextlib.contextmanager
 def tallied() -> Iterator[Tally]:
-    """Count the items of `map_slices` that `tick` reports, until the body ends."""
+    """Yield a `Tally` of the items that `tick` reports while the ``with`` body runs."""
     _tallies.append(Tally())
     try:
         yield _tallies[-1]
@@ -87,7 +87,7 @@ def tick() -> None:
 
 _SMALLEST_SLICE = 100
 _COLLECT_AFTER = 50_000
-"""So many objects more than before start a collection of garbage; Python's default is 700."""
+"""New objects that trigger a garbage collection; Python's default is 700."""
 _PR_SET_PDEATHSIG = 1
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -121,7 +121,7 @@ def map_slices(
 
 @contextlib.contextmanager
 def _rare_collections() -> Iterator[None]:
-    """Look for circular garbage less often: parsed files make many objects and no circles."""
+    """Run garbage collection less often in the body, which makes many objects and no cycles."""
     before = gc.get_threshold()
     gc.set_threshold(_COLLECT_AFTER, *before[1:])
     try:

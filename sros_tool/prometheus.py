@@ -1,4 +1,4 @@
-"""Metrics as the text that Prometheus reads, such as from a file of node_exporter's textfile.
+"""Metrics in the Prometheus text format, for node_exporter's textfile collector.
 
 Source: Prometheus, "Exposition formats", text format 0.0.4.
 """
@@ -17,28 +17,28 @@ _NAME = re.compile(r"[a-z][a-z0-9_]*\Z", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A value with its labels, which may have any text."""
+    """A value with its labels; a label's value may be any text."""
 
     value: int | float
     """The value; moments are in seconds since 1970."""
     labels: Mapping[str, str] = field(default_factory=dict)
-    """Its labels and their values, such as ``keystore``."""
+    """Label values by label name, such as ``keystore``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A gauge: what it says, and its samples.
+    """A Prometheus gauge with its help text and its samples.
 
     Raises:
         ValueError: a name is not of lower-case letters, digits and ``_``.
     """
 
     name: str
-    """Its name."""
+    """The name of the metric."""
     help: str
-    """What it says."""
+    """The help text of the metric."""
     samples: tuple[Sample, ...]
-    """Its values."""
+    """The values of the metric, one for each set of labels."""
 
     def __post_init__(self) -> None:
         for name in (self.name, *(label for sample in self.samples for label in sample.labels)):
@@ -51,7 +51,7 @@ class KeystoreMetrics(NamedTuple):
 
     keystore: NamedKeystore
     metrics: Sequence[Metric]
-    """The metrics, all of them gauges."""
+    """The metrics; all are gauges."""
     dry_run: DryRun
     changes: Sequence[FileChange]
     """The file that was written or, with ``--dry-run``, would be; empty without ``-o``."""

@@ -69,7 +69,7 @@ _WRITER_RIGHTS = {
     "rq": ("services", "request", SERVICE_ENDS["rq"]),
     "rr": ("services", "reply", SERVICE_ENDS["rr"]),
 }
-"""By the prefix of a DDS topic: the kind of ROS name, the right to write it, and its suffix."""
+"""DDS topic prefix → kind of ROS name, right to write the topic, and suffix of the DDS name."""
 
 
 @shows("source", "right", "name", "target")
@@ -87,9 +87,9 @@ class Hop(NamedTuple):
     """The enclave that receives."""
     kind: str
     right: str
-    """Its right."""
+    """The right of the source: publish, request, reply, call or execute."""
     name: str
-    """The name."""
+    """The ROS name that carries the information."""
     said: str
     heard: str
 
@@ -222,7 +222,7 @@ class Network:
 
     @property
     def enclaves(self) -> tuple[str, ...]:
-        """The enclaves that may write or read anything, sorted."""
+        """The enclaves that may write or read at least one topic, sorted."""
         return tuple(sorted({name for side in self._sides.values() for name in side.of}))
 
     def hops(self, enclave: str) -> Iterator[Hop]:

@@ -1,4 +1,4 @@
-"""The only place that prints, and the characters that no text may have that others chose.
+"""Printing to the terminal, with control characters from untrusted text made visible.
 
 Names of files, certificates and tokens, lines of logs and policies may come from an attacker.
 Their control characters could clear the screen, hide a denial, reverse a name, or forge a line.
@@ -30,13 +30,13 @@ _COLOURS = {
 
 
 class Coloured(NamedTuple):
-    """A word of sros in its colour, on a terminal and without $NO_COLOR (https://no-color.org)."""
+    """A word printed in colour on a terminal, unless $NO_COLOR is set (https://no-color.org)."""
 
     word: str
 
 
 def visible(text: str) -> str:
-    """Replace what can steer a terminal, and is in no XML document, with visible escapes.
+    """Return ``text`` with control characters as visible escapes, so that none steers a terminal.
 
     Newline and tab stay.
     """
@@ -50,9 +50,9 @@ def visible_line(text: str) -> str:
 
 
 def log_step(level: str, module: str, text: str, *args: object) -> None:
-    """Log a step, for ``-v`` or the program that uses sros.
+    """Log a step if `logging` is loaded: by ``-v``, or by a program that uses sros.
 
-    Who wants to see steps has loaded `logging` before, which takes a while.
+    Importing `logging` only to drop the message would slow down every start.
     """
     if logging := sys.modules.get("logging"):
         logging.getLogger(module).log(getattr(logging, level), text, *args)
@@ -81,12 +81,12 @@ def echo(*parts: str | Coloured, err: bool = False) -> None:
 
 
 def echo_lines(*parts: str | Coloured, err: bool = False) -> None:
-    """Print lines of which sros made the ends, on standard error with ``err``."""
+    """Print several lines that sros split itself, on standard error with ``err``."""
     _print(parts, visible, err=err)
 
 
 def echo_document(document: str | bytes) -> None:
-    """Print a document for another program: exactly, except on a terminal."""
+    """Print a document for another program: unchanged, or on a terminal with visible escapes."""
     import click
 
     if sys.stdout is not None and sys.stdout.isatty():
@@ -96,14 +96,14 @@ def echo_document(document: str | bytes) -> None:
 
 
 def echo_bytes(data: bytes) -> None:
-    """Write an archive to standard output, after all text printed before."""
+    """Write binary data to standard output, after flushing text printed before."""
     sys.stdout.flush()
     sys.stdout.buffer.write(data)
     sys.stdout.buffer.flush()
 
 
 def redraw(text: str) -> None:
-    """Replace the present line of the terminal on standard error; erase it with "".
+    """Replace the current line of the terminal on standard error; "" erases it.
 
     It goes to the terminal itself: a signal may come while the stream's buffer is in use.
     """

@@ -332,12 +332,12 @@ def grant_rights(enclave: str, grant: Grant) -> frozenset[Right]:
 
 
 def _all_topics(criteria: Iterable[Criteria]) -> dict[str, bool]:
-    """Map each topic to False; `ros_rights` sets True for the topics of a service or action."""
+    """Map every topic to False; `ros_rights` marks topics of services and actions with True."""
     return dict.fromkeys((topic for criterion in criteria for topic in criterion.topics), False)
 
 
 def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tuple[str, str, str]]:
-    """Yield kind, right and name of the actions, then the services, that have a request topic here.
+    """Yield kind, right and name of the actions, then the services, of the request topics.
 
     The caller checks that the other topics of the action or service are in the rule, too.
     """

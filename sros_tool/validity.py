@@ -32,9 +32,9 @@ class Window:
     """A validity from ``not_before`` to ``not_after``, both included and both in UTC."""
 
     not_before: datetime
-    """Begin of its validity, in UTC."""
+    """The begin of the validity, in UTC."""
     not_after: datetime
-    """End of its validity, in UTC."""
+    """The end of the validity, in UTC."""
 
     def __post_init__(self) -> None:
         if self.not_after <= self.not_before:
@@ -54,9 +54,9 @@ class Window:
         return Window(max(self.not_before, outer.not_before), min(self.not_after, outer.not_after))
 
     def lasts(self, new: Window, now: datetime) -> bool:
-        """Return whether something with this validity can stay instead of one with a ``new`` one.
+        """Return whether a document with this validity can be kept instead of a ``new`` one.
 
-        So it is until two thirds of the new one would be over, and never after the new one.
+        It can while more than a third of ``new`` is left, and if it does not expire after ``new``.
         """
         return (
             self.not_before <= max(now, new.not_before)

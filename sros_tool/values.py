@@ -1,4 +1,4 @@
-"""Values as JSON, the parts of it that many verbs print, reading JSON, and writing YAML."""
+"""Conversion of values to JSON and YAML, reading JSON, and values that several verbs print."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from sros_tool.validity import iso
 
 _Value = TypeVar("_Value")
 _SHOWN: dict[type, ShownKeys | None] = {}
-"""The keys of the JSON object that a class becomes; None for a class that becomes none."""
+"""Class → the keys of its JSON object; None for a class that is not written as an object."""
 
 
 _JSON_VERSION = 1
-"""The version of what ``--json`` prints: a key that changes its meaning or goes raises it."""
+"""The version of the ``--json`` output, raised when a key is removed or changes its meaning."""
 
 
 def versioned(value: object) -> dict[str, Any]:
@@ -29,7 +29,7 @@ def versioned(value: object) -> dict[str, Any]:
 
 
 def parse_json(data: bytes) -> Any:
-    """Return the value of a JSON document; raise `ValueError` if it is none."""
+    """Parse a JSON document; raise `ValueError` if it is malformed."""
     try:
         return json.loads(data)
     except RecursionError as error:
@@ -38,7 +38,7 @@ def parse_json(data: bytes) -> Any:
 
 _PLAIN_YAML = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*\Z")
 _YAML_WORDS = frozenset(("y", "n", "yes", "no", "on", "off", "true", "false", "null"))
-"""Words that a version of YAML takes for something other than a text, whatever their case."""
+"""Words, in lower case, that YAML 1.1 or 1.2 does not read as a string, such as ``yes``."""
 
 
 def yaml_text(value: object) -> str:
@@ -123,7 +123,7 @@ def as_plain(value: object) -> Any:
 
 
 class ShownKeys(NamedTuple):
-    """The keys of the JSON object that a class becomes: see `shows`."""
+    """The keys of a class's JSON object; see `shows`."""
 
     names: tuple[str, ...]
     optional: tuple[str, ...] = ()
@@ -141,9 +141,9 @@ def shows(
 
     Args:
         names: the attributes that become keys; without any, the public fields of the class.
-        optional: those that are left out where they are None.
-        null_if_empty: those that are null where they are empty.
-        spread: those whose own keys stand in place of theirs; None has no keys.
+        optional: attributes left out of the object if they are None.
+        null_if_empty: attributes written as null if they are empty.
+        spread: attributes whose own keys are put into this object; None adds no key.
     """
 
     def decorate(kind: type[_Value]) -> type[_Value]:
@@ -162,11 +162,11 @@ def shown(kind: type) -> ShownKeys | None:
 
 
 class Words(tuple[str, ...]):
-    """The words that a text is one of, as an annotation of its type for the JSON Schema."""
+    """The allowed values of a string type, as an annotation for the JSON Schema."""
 
 
 def key_of(name: str) -> str:
-    """Return the key of an attribute, which may be a word of Python with an underscore after it."""
+    """Return the JSON key of an attribute: its name without a trailing underscore (``from_``)."""
     return name.rstrip("_")
 
 
@@ -215,14 +215,14 @@ Notes = Annotated[Sequence[Note], "Notes, which text output prints on standard e
 
 
 class PlannedFiles(NamedTuple):
-    """What would be written."""
+    """The files that a dry run would write."""
 
     changes: FileChanges
     notes: Notes
     dry_run: Literal[True] = True
-    """Nothing was written."""
+    """Always true: nothing was written."""
 
 
 def file_change(path: Path, *, existed: bool) -> tuple[FileChange]:
-    """Return the change of a single file."""
+    """Return the change for writing ``path``: "replace" if it ``existed``, else "create"."""
     return (FileChange("replace" if existed else "create", str(path)),)

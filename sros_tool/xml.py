@@ -18,7 +18,7 @@ from sros_tool.terminal import log_step
 MAX_BYTES = 16 * 1024 * 1024
 """Largest document that is read, in bytes."""
 _MAX_MARKUP = 400_000
-"""Most tags and attributes that are read: even a short one takes libxml2 over 100 bytes."""
+"""Limit on tags and attributes: even a short one takes libxml2 over 100 bytes of memory."""
 
 
 @cache
@@ -50,7 +50,7 @@ def read_bytes(path: Path, what: str, *, owner: int | None = None, most: int = M
 def read_file(
     path: Path, what: str, *, owner: int | None = None, most: int = MAX_BYTES
 ) -> tuple[os.stat_result, bytes]:
-    """Return the state of a regular file, and its content as `read_bytes` does."""
+    """Return the fstat(2) of a regular file, and its content as `read_bytes` does."""
     try:
         # Looked at first, because opening a pipe would wait for its writer.
         there, data = path.stat(), b""
@@ -80,7 +80,7 @@ def read_file(
 
 
 def _read_open(path: Path, most: int) -> tuple[os.stat_result, bytes]:
-    """Return the state of a file and at most one byte more of it than ``most``.
+    """Return the fstat(2) of a file, and its first ``most`` + 1 bytes.
 
     Without its content if it is not a regular file, as one that has just been exchanged.
     """
@@ -99,7 +99,7 @@ def _read_open(path: Path, most: int) -> tuple[os.stat_result, bytes]:
 
 
 def open_at_once(path: Path) -> BinaryIO:
-    """Return a file open for reading; opening a pipe does not wait for its writer."""
+    """Open a file for reading without waiting: opening a pipe does not block for its writer."""
     return open(_handle_at_once(path), "rb")
 
 
@@ -196,7 +196,7 @@ _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 
 def escape(text: str) -> str:
-    """Return a text as the content of an element.
+    """Escape a text for use as the content of an XML element.
 
     Raises:
         DocumentError: it has a character that no XML document can have.
@@ -211,7 +211,7 @@ def escape(text: str) -> str:
 
 
 def quoted(text: str) -> str:
-    """Return a text as the value of an attribute, with its quotation marks."""
+    """Escape a text as the value of an XML attribute, including the quotation marks."""
     text = escape(text).replace("\n", "&#10;").replace("\r", "&#13;").replace("\t", "&#9;")
     if '"' in text and "'" not in text:
         return f"'{text}'"

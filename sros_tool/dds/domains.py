@@ -109,7 +109,7 @@ class DomainSet:
     def one_of_each_kind(
         cls, listed: Collection[DomainSet], others: Iterable[DomainSet]
     ) -> tuple[int, ...]:
-        """Return domains of which each is in other sets than the ones before it, sorted.
+        """Return one domain for every combination of sets that a domain can be in, sorted.
 
         Only those in a ``listed`` set are returned, unless an end is open: vendors differ in which
         domains these are.

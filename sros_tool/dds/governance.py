@@ -60,7 +60,7 @@ class Attribute:
 
     @property
     def is_flag(self) -> bool:
-        """Whether it is true or false, and not a protection kind."""
+        """Whether the attribute is a boolean; otherwise it is a protection kind."""
         return isinstance(self.open, bool)
 
     def is_open(self, rule: DomainRule | TopicRule) -> bool:
@@ -85,11 +85,11 @@ class TopicRule:
     """The protection of the topics that match an expression."""
 
     topic_expression: str
-    """The DDS topics that it is for."""
+    """The expression for the DDS topics that the rule protects."""
     enable_discovery_protection: bool = field(metadata=_flag("discovery"))
     """Whether discovery of the topic is protected."""
     enable_liveliness_protection: bool = field(metadata=_flag("liveliness"))
-    """Whether its liveliness is protected."""
+    """Whether liveliness of the topic's endpoints is protected."""
     enable_read_access_control: bool = field(metadata=_flag("read_access_control"))
     """Whether permissions decide who may read."""
     enable_write_access_control: bool = field(metadata=_flag("write_access_control"))
@@ -148,7 +148,7 @@ def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
 
 
 def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
-    """Map the names of a rule's attributes to protecting values, or else to open ones."""
+    """Map a rule's attributes to protecting values; without ``protect``, to open values."""
     return {
         attribute.name: attribute.portable if protect else attribute.open
         for attribute in attributes(rule)

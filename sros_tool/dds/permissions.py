@@ -22,7 +22,7 @@ from sros_tool.xml import escape, parse, quoted, require_child, tag_of
 _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
 MAX_SIGNED_BYTES = 60 * 1024
-"""Size in bytes from which signed permissions may keep Fast DDS 2.9 from finishing a handshake.
+"""Size limit, in bytes, of signed permissions: Fast DDS 2.9 may not finish a larger handshake.
 
 A message of the handshake must fit into one UDP datagram of 64 KB, with the certificate, the
 signature and the participant's data.  Measured on Fast DDS 2.9.1 with one network interface:
@@ -278,7 +278,7 @@ def _read_criteria(element: etree._Element) -> Criteria:
 
 
 def domain_lines(domains: DomainSet) -> list[str]:
-    """Return the ``<domains>`` element, a line each: ids alone, ranges with both ends."""
+    """Return the lines of a ``<domains>`` element: single ids, and ranges with both ends."""
     lines = ["<domains>"]
     for part in domains.ranges:
         if part.first == part.last:
@@ -347,11 +347,11 @@ _CONSEQUENCES = {
 
 
 Meets = Callable[[str], bool]
-"""Whether an expression and some of certain others match a common name."""
+"""A function: does an expression share a name with one of some other expressions?"""
 
 
 def _meets_text(names: Sequence[str]) -> Meets:
-    """Return whether one expression matches the text of the other; other overlaps are missed."""
+    """Return a `Meets` that only tests whether one expression matches the text of the other."""
     return lambda name: any(fnmatchcase(each, name) or fnmatchcase(name, each) for each in names)
 
 
@@ -360,7 +360,7 @@ def outside(
     signed_bytes: int,
     meets_some_of: Callable[[Sequence[str]], Meets] = _meets_text,
 ) -> Iterator[tuple[str, str]]:
-    """Yield the id and a clause of a note for each part of a document outside of the profile.
+    """Yield (id, clause) of a note for every part of a document outside of the portable profile.
 
     ``meets_some_of`` returns the function that says whether an expression and one of its arguments
     match a common name.

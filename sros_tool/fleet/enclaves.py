@@ -1,4 +1,4 @@
-"""Whose enclave is whose: the enclaves of a robot, and the robot of an enclave.
+"""The enclaves of a robot and the robot of an enclave, by the fleet's path patterns.
 
 A fleet has the paths of its enclaves with placeholders, so that neither answer needs a list of all
 enclaves.
@@ -35,7 +35,7 @@ _VALUES = {"robot": _PART, "namespace": f"(?:/{_PART})*"}
 
 
 def pattern_problem(path: str) -> str:
-    """Return why ``path`` is not that of one enclave for each robot, as a sentence, or ""."""
+    """Return why ``path`` is not a pattern of one enclave per robot, as a sentence, or ""."""
     try:
         parts = parts_of(path)
         check_path(parts)
@@ -68,7 +68,7 @@ def enclaves_of(fleet: Fleet, robot: Robot) -> tuple[str, ...]:
 
 
 def size_problem(fleet: Fleet) -> str:
-    """Return why the robots cannot have all enclaves that the fleet names, or ""; a sentence."""
+    """Return why the fleet would have too many enclaves, as a sentence; "" if it would not."""
     if len(fleet.enclaves) > MAX_PATTERNS:
         return f"It has {len(fleet.enclaves)} paths with a placeholder, more than {MAX_PATTERNS}."
     members = {name: len(robots) for name, robots in fleet.groups.items()}
@@ -78,7 +78,7 @@ def size_problem(fleet: Fleet) -> str:
 
 
 def robot_of(fleet: Fleet, enclave: str) -> Robot | None:
-    """Return the robot that an enclave belongs to, or None: it is that of no robot."""
+    """Return the robot that an enclave belongs to; None for an enclave of no robot."""
     for pattern in _fitting(fleet, enclave):
         for robot in _candidates(fleet, pattern, enclave):
             inside = group_of(pattern.parts) in ("", *robot.groups)
@@ -88,7 +88,7 @@ def robot_of(fleet: Fleet, enclave: str) -> Robot | None:
 
 
 def left_robot_of(fleet: Fleet, enclave: str) -> str:
-    """Return the name of the robot whose enclave this was, by its path: it left, or its group.
+    """Return the name of the former owner of an enclave: a robot that left the fleet or its group.
 
     Return "" for an enclave of a robot, and for one whose path names none.  A path with a namespace
     alone tells only of robots that are still in the fleet.
@@ -107,7 +107,7 @@ def left_robot_of(fleet: Fleet, enclave: str) -> str:
 
 
 class Unrecorded(NamedTuple):
-    """Enclaves that belong to no robot by the paths of the fleet, and to this robot by their own.
+    """Enclaves with a robot's name in their path that match no path pattern of the fleet.
 
     ``below`` are in a folder that is the robot's alone, such as ``/r3``; ``naming`` have its name
     as a part of their path elsewhere, such as ``/desk/r3``.
@@ -120,7 +120,7 @@ class Unrecorded(NamedTuple):
 def unrecorded_enclaves(
     fleet: Fleet, names: Iterable[str], robots: Collection[str]
 ) -> dict[str, Unrecorded]:
-    """Map each of ``robots`` to those of the enclaves ``names`` that it has only by their paths."""
+    """Map each robot to those of the enclaves ``names`` that are `Unrecorded` for it."""
     folders = _folders(fleet)
     below: dict[str, list[str]] = {robot: [] for robot in robots}
     naming: dict[str, list[str]] = {robot: [] for robot in robots}
@@ -173,7 +173,7 @@ def _begin(path: Parts) -> Parts:
 
 
 def _fitting(fleet: Fleet, enclave: str) -> Iterator[_Pattern]:
-    """Yield the patterns that end as the path of an enclave does."""
+    """Yield the patterns whose end matches the end of an enclave's path."""
     patterns = _patterns(fleet.enclaves)
     end = len(enclave)
     while end >= 0:
@@ -188,7 +188,7 @@ class _Pattern(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _patterns(paths: tuple[str, ...]) -> Mapping[str, list[_Pattern]]:
-    """Return the patterns by the whole parts of a name behind their last placeholder."""
+    """Group the patterns by the path parts after their last placeholder."""
     patterns: dict[str, list[_Pattern]] = {}
     for path in paths:
         parts = parts_of(path)
@@ -230,7 +230,7 @@ _SHOWN = 20  # robots that a line names; --json has all
 
 
 def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Yield the text of lines, in the order of the first of each kind.
+    """Yield lines about enclaves, with lines that differ only in the robot merged into one.
 
     Those that are the same but for the name and namespace of the robot become one line, with
     placeholders in place of them, and the robots behind it.
@@ -273,13 +273,13 @@ def _with_placeholders(text: str, enclave: str, robot: Robot) -> str:
 
 @lru_cache(maxsize=4096)
 def _whole(value: str) -> re.Pattern[str]:
-    """Return the expression for a value that is no part of a longer name."""
+    """Return a regular expression for ``value`` as a whole name, not as part of a longer name."""
     before = "(?<![A-Za-z0-9_/])" if value.startswith("/") else "(?<![A-Za-z0-9_{])"
     return re.compile(f"{before}{re.escape(value)}(?![A-Za-z0-9_}}])")
 
 
 def _named(fleet: Fleet, names: Sequence[str]) -> str:
-    """Return robots in words."""
+    """Return a list of robots in words, such as "r1, r2 and 3 more robots"."""
     count = f"{len(names)} robots"
     if len(names) == len(fleet.robots):
         return f"all {count}"

@@ -29,14 +29,14 @@ _MOST_NAMES = 200_000  # of one enclave: a signed document cannot have more
 
 
 class FleetPolicy(Mapping[str, Enclave]):
-    """The enclaves of a policy for a fleet, by their paths; each is expanded when it is asked for.
+    """The enclaves of a policy for a fleet, by path; an enclave is expanded when it is read.
 
     ``fleet`` has the robots.  ``patterns`` are the paths with a placeholder, as `Fleet` has them.
     ``protects`` says whether it states the protection of a name.
     """
 
     def __init__(self, policy: Policy, fleet: Fleet) -> None:
-        """Find the paths of all enclaves.
+        """Compute the paths of all enclaves.
 
         Args:
             policy: a policy that was read with its placeholders.
@@ -84,7 +84,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         return len(self._of)
 
     def stated(self, path: str) -> tuple[Enclave, Robot | None]:
-        """Return the enclave of the policy that a path is of, not filled in, and its robot."""
+        """Return the unexpanded policy enclave that a path comes from, and the path's robot."""
         return self._of[path]
 
     def policy(self) -> Policy:
@@ -94,7 +94,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         return replace(self._policy, enclaves=tuple(self.values()))
 
     def for_one_robot(self) -> Policy:
-        """Return the policy with each enclave once, as it is for the first of its robots."""
+        """Return the policy with every enclave expanded for a single robot, the first one."""
         first: dict[int, str] = {}
         for path, (enclave, _) in self._of.items():
             first.setdefault(id(enclave), path)
@@ -156,7 +156,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         return "".join(map(str, fill(parts_of(text), robot.name, robot.namespace)))
 
     def _group(self, group: Group, robot: Robot | None, most: int) -> Group:
-        """Return the group with its names filled in; it may be left without any.
+        """Return the group with its names filled in for a robot; it can end up empty.
 
         Once it has more than ``most`` names, the rest is left out.
         """
@@ -173,7 +173,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         return replace(group, names=tuple(names), lines=tuple(lines))
 
     def _several(self, name: str, written: str, source: Source) -> tuple[str, ...]:
-        """Return the names that a name stands for: one, or one for each robot, each once."""
+        """Return the distinct names that a name expands to: a single one, or one per robot."""
         if not has_placeholder(name):
             if name != written and (problem := _name_problem(name)):
                 raise _not_valid(name, problem, source)
@@ -196,7 +196,7 @@ class FleetPolicy(Mapping[str, Enclave]):
 
 
 def read_policy_for(path: Path, fleet: Fleet | None, read: PolicyFiles | None = None) -> Policy:
-    """Return the policy in a file, with its placeholders filled in for a fleet, if there is one.
+    """Return the policy in a file; with a fleet, its placeholders are filled in.
 
     ``read`` returns the content of files that are not in the file system.
 
@@ -232,12 +232,12 @@ _NAMESPACE = "{namespace"
 
 
 def absolute(policy: Policy) -> Policy:
-    """Return a policy in which names that begin with ``{namespace}`` begin with a "/"."""
+    """Return the policy with "/" before every leading ``{namespace}``: names become absolute."""
     return _renamed(policy, lambda name: f"/{name}" if name.startswith(_NAMESPACE) else name)
 
 
 def as_written(text: str) -> str:
-    """Return names of `absolute`, or a text with them, as a policy has them."""
+    """Undo `absolute` in a name or a text: return names as a policy file writes them."""
     return text.replace(f"/{_NAMESPACE}", _NAMESPACE)
 
 
@@ -255,7 +255,7 @@ def _renamed(policy: Policy, change: Callable[[str], str]) -> Policy:
 
 
 def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozenset[Right]:
-    """Return observed rights as a policy states them, in the names of `absolute`.
+    """Return observed rights with placeholders for names of robots, in the form of `absolute`.
 
     A right that the policy does not state keeps its name; one of no enclave of the policy also its
     enclave.
@@ -282,7 +282,7 @@ def unobserved_robots(policy: FleetPolicy, observed: Iterable[Right]) -> dict[st
 
 
 def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Iterable[Right]) -> None:
-    """Check that no robot gets more, and that none loses what was observed of it.
+    """Check that a narrowed policy adds no right and removes no observed right, for any robot.
 
     Raises:
         PolicyError: a wildcard of the policy means something else for another robot.
@@ -315,7 +315,7 @@ def _by_enclave(observed: Iterable[Right]) -> dict[str, list[Right]]:
 
 
 def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterator[Right]:
-    """Yield what is observed of an enclave as the policy states it; only parts of actions."""
+    """Yield an enclave's observed rights as the policy states them, actions as their parts."""
     enclave, robot = policy.stated(path)
     policy[path]  # which has a bounded number of names
     stated = [e for e in policy_rights(absolute(Policy((enclave,)))) if e.qualifier is ALLOW]
@@ -347,7 +347,7 @@ def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterat
 
 
 def _names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]:
-    """Return the names of a robot that a name of `absolute` stands for."""
+    """Return the names that a name of `absolute` expands to for a robot."""
     if not has_placeholder(name):
         return (name,)
     parts = parts_of(as_written(name))
@@ -363,7 +363,7 @@ def _names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]
 
 
 def _likely(name: str, robot: Robot | None) -> Iterator[str]:
-    """Yield a name of a robot with placeholders where its namespace and its name are."""
+    """Yield a robot's name with its namespace and robot name replaced by placeholders."""
     if robot:
 
         def named(text: str) -> str:

@@ -38,9 +38,9 @@ _VALUES: Mapping[str, Callable[[str], str]] = {
     "address": address_problem,
     "user": user_problem,
 }
-"""The values of a robot that are texts, each with the function that says what is wrong with it."""
+"""Text settings of a robot, with the function that returns what is wrong with a value."""
 _OF_ROBOT = "{robot}"
-"""Stands for the name of a robot in the values of a group."""
+"""The placeholder for a robot's name in the settings of a group."""
 
 
 def read_fleet(path: Path) -> Fleet:
@@ -72,7 +72,7 @@ def read_fleet(path: Path) -> Fleet:
 
 
 def read_connections(path: Path) -> dict[str, str]:
-    """Return what an inventory says of how Ansible connects (`_connections`); nothing for TOML.
+    """Return the connection settings in an inventory of Ansible (`_connections`); {} for TOML.
 
     Raises:
         SrosError: as `read_fleet`.
@@ -87,7 +87,7 @@ def read_connections(path: Path) -> dict[str, str]:
 
 _OF_INVENTORIES = (".yml", ".yaml", ".json")
 _INI_HOST = re.compile(rb"^[A-Za-z0-9_.-]+[ \t]*(?:$|[ \t][A-Za-z_]+=)", re.MULTILINE)
-"""A host on a line of its own, or with variables behind it."""
+"""Matches a host line of an INI inventory: a host name, perhaps with variables after it."""
 
 
 def parse_fleet(data: bytes, what: str) -> Fleet:
@@ -100,7 +100,7 @@ def parse_fleet(data: bytes, what: str) -> Fleet:
 
 
 class _Reader:
-    """Reader of one file; ``words`` are the ones that it has in place of the keys."""
+    """Reader of a fleet file; ``words`` maps its keys to the words of messages (`_SHOWN`)."""
 
     def __init__(self, what: str, words: Mapping[str, str] = MappingProxyType({})) -> None:
         self._what = what
@@ -164,7 +164,7 @@ class _Reader:
     def _values(
         self, values: Mapping[str, Any], places: Mapping[str, str], name: str = ""
     ) -> dict[str, Any]:
-        """Return values that are checked; those of a group get the ``name`` of the robot."""
+        """Check settings and return them; fill the robot's ``name`` into settings of a group."""
         checked: dict[str, Any] = {}
         for key, value in values.items():
             if key == "domain":
@@ -184,7 +184,7 @@ class _Reader:
         return self._words.get(key, key)
 
     def _tables(self, table: Mapping[str, Any], key: str) -> Mapping[str, Mapping[str, Any]]:
-        """Return the tables below ``key``, each by a name that is valid."""
+        """Return the tables below ``key``, by their names, which are checked."""
         tables = table.get(key, {})
         if not isinstance(tables, dict):
             raise self._error(f"{key} is not a table", "", f"Write [{key}.NAME].")
@@ -270,10 +270,10 @@ _VARIABLES = {
     "address": "ansible_host",
     "user": "ansible_user",
 }
-"""The values of a robot, and the variables of a host that have them."""
+"""Robot setting → the Ansible host variable that has it."""
 _ROBOT = "sros_robot"
 _SHOWN = {"robots": "hosts", **_VARIABLES}
-"""The words of a fleet file, and those of an inventory."""
+"""Word in a fleet file → word in an inventory, for messages."""
 
 _OF_ALL = ("all", "ungrouped", "_meta")
 _MOST_DEPTH = 64
@@ -282,7 +282,7 @@ _WRITE_OUT = "Write it out with `ansible-inventory -i FILE --list > hosts.json`,
 
 
 def _fleet_table(data: bytes, what: str, *, is_json: bool) -> dict[str, Any]:
-    """Return the tables of a fleet file that state the same as an inventory.
+    """Convert an inventory into the tables of an equivalent fleet file.
 
     Args:
         data: the inventory.
@@ -297,7 +297,7 @@ def _fleet_table(data: bytes, what: str, *, is_json: bool) -> dict[str, Any]:
 
 
 def _connections(data: bytes, what: str, *, is_json: bool) -> dict[str, str]:
-    """Map what in an inventory says how Ansible delivers keys, and whose, to its values.
+    """Map the inventory's settings of how Ansible connects and delivers keys to their values.
 
     Left out is what a fleet has (`_fleet_table`).  The variables of groups count together with who
     is in them; beside a template, every value counts.  Parameters and errors are those of
@@ -318,7 +318,7 @@ def _connections(data: bytes, what: str, *, is_json: bool) -> dict[str, str]:
 
 
 def _values_below(top: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield everything in an inventory that is no mapping, or an empty one, with its keys."""
+    """Yield every leaf of an inventory (no mapping, or an empty one) with the keys to it."""
     left: list[tuple[tuple[str, ...], Any]] = [((), top)]
     while left:
         path, value = left.pop()
@@ -382,11 +382,11 @@ class _Inventory:
     def __init__(self, groups: Mapping[str, Any], what: str) -> None:
         self._what = what
         self._own: dict[str, dict[str, Any]] = {}
-        """The variables of each host itself."""
+        """Host → variables set at the host itself."""
         self._inherited: dict[str, dict[str, tuple[int, Any]]] = {}
-        """Those of its groups, with the depth of the group: the deepest one counts."""
+        """Host → variables set by its groups, with the group's depth: the deepest group wins."""
         self._unclear: dict[str, set[str]] = {}
-        """Those that groups of the same depth set to different values."""
+        """Host → variables that groups of the same depth set to different values."""
         self._groups: dict[str, set[str]] = {}
         self._steps = 0
         meta = self._mapping(groups.get("_meta"), "_meta")
@@ -402,7 +402,7 @@ class _Inventory:
         }
 
     def _names(self, groups: Mapping[str, Any]) -> Iterator[str]:
-        """Yield the groups that are read from the top: those in no other one, if all are there."""
+        """Yield the top-level groups: those that are in no other group."""
         inside: set[str] = set()
         for group in groups.values():
             children = group.get("children") if isinstance(group, dict) else None
@@ -414,7 +414,7 @@ class _Inventory:
                 yield name
 
     def _read(self, name: str, group: Any, above: tuple[str, ...], variables: _Variables) -> None:
-        """Read a group that is in the groups ``above``, whose ``variables`` it has, too."""
+        """Read a group; it inherits ``variables`` from the groups ``above`` that contain it."""
         self._step()
         if name in above or len(above) > _MOST_DEPTH:
             raise self._error(f"the group {name} is in itself, or in too many others")
@@ -465,7 +465,7 @@ class _Inventory:
                 self._groups[group].add(host)
 
     def _known(self, value: Any, at: object) -> dict[str, Any]:
-        """Return those of some variables that a fleet needs."""
+        """Return the variables that a fleet uses; drop all others."""
         values = self._mapping(value, at)
         return {key: values[key] for key in (*_VARIABLES.values(), _ROBOT) if key in values}
 
@@ -534,7 +534,7 @@ def inventory(fleet: Fleet) -> dict[str, Any]:
 
 
 def script_inventory(fleet: Fleet) -> dict[str, Any]:
-    """Return the inventory as a program prints it that Ansible runs with ``--list``."""
+    """Return the inventory in the form of a dynamic inventory script (``--list``)."""
     ungrouped = [robot.name for robot in fleet.robots.values() if not robot.groups]
     return {
         "_meta": {"hostvars": {robot.name: _variables(robot) for robot in fleet.robots.values()}},
@@ -556,5 +556,5 @@ def _variables(robot: Robot) -> dict[str, Any]:
 
 
 def _is_json(data: bytes) -> bool:
-    """Return whether a document begins as an object of JSON."""
+    """Return whether a document begins like a JSON object."""
     return data.lstrip()[:1] == b"{"

@@ -1,4 +1,4 @@
-"""A fleet: its robots with what differs between them, and the grammar of these values.
+"""A fleet and the settings of its robots, with the grammar of each setting.
 
 Every value has such a grammar that it can stand in a policy, a command or a path and stay one
 name: no markup, no wildcard, no white space, and "/" only in a namespace.
@@ -24,7 +24,7 @@ _MAX_HOST = 253
 """Longest host name (RFC 1035)."""
 
 _OF_ANSIBLE = frozenset({"all", "ungrouped", "_meta", "localhost"})
-"""Names with a meaning of their own in an inventory; "localhost" is the machine at home."""
+"""Names that Ansible reserves in an inventory; "localhost" is the machine that runs Ansible."""
 
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?\.?", re.ASCII)
@@ -66,7 +66,7 @@ class Fleet:
     def of(
         cls, robots: Iterable[Robot], groups: Iterable[str] = (), enclaves: Sequence[str] = ()
     ) -> Fleet:
-        """Return the fleet of these robots; ``groups`` may be without robots."""
+        """Return a fleet of ``robots``; ``groups`` may name groups without robots."""
         named = {robot.name: robot for robot in sorted(robots, key=lambda robot: robot.name)}
         members: dict[str, list[str]] = {name: [] for name in groups}
         spaces: dict[str, list[str]] = {}
@@ -82,7 +82,7 @@ class Fleet:
         )
 
     def robot(self, name: str) -> Robot:
-        """Return the robot with this name; raise `DocumentError` that names near ones."""
+        """Return the robot named ``name``; raise `DocumentError` with similar names if none is."""
         if name in self.robots:
             return self.robots[name]
         raise DocumentError(f"the fleet has no robot {name!r}", remedy=_near(name, self.robots))
@@ -107,7 +107,7 @@ class Fleet:
 
 
 def _near(name: str, known: Iterable[str]) -> str:
-    """Return the remedy for an unknown name: those that are most alike, or the first ones."""
+    """Return the remedy for an unknown name: similar known names, or else the first ones."""
     names = list(known)
     similar = get_close_matches(name[:_MAX_NAME], names, n=3, cutoff=0.5) or names[:3]
     return (

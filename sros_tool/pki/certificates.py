@@ -52,7 +52,7 @@ _ENCODINGS = {
     0x1C: "utf-32-be",
     0x1E: "utf-16-be",
 }
-"""The encodings that OpenSSL takes texts to have, by their ASN.1 type (a_strex.c, tag2nbyte)."""
+"""ASN.1 string type → encoding by which OpenSSL decodes it (a_strex.c, tag2nbyte)."""
 _ESCAPED = re.compile(r'[,+"\\<>;]|^[# ](?!\Z)| \Z')
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
@@ -65,7 +65,7 @@ _SIGNING_KEYS: dict[x509.ObjectIdentifier, type] = {
         if name.startswith(("RSA", "ECDSA", "_RSA")) and not name.startswith("ECDSA_WITH_SHA3_")
     },
 }
-"""The kind of key that makes a signature, by its OID; OpenSSL 3.0 has no ECDSA with SHA-3."""
+"""OID of a signature algorithm → kind of key; OpenSSL 3.0 has no ECDSA with SHA-3."""
 _NOT_A_CA = x509.BasicConstraints(ca=False, path_length=None)
 _A_CA = x509.BasicConstraints(ca=True, path_length=1)
 
@@ -91,7 +91,7 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
 
 
 def has_unique_part(subject: x509.Name) -> bool:
-    """Return whether an enclave's subject has a part besides its common name."""
+    """Return whether an enclave's subject has a part besides its common name (a unique OU)."""
     return len(subject.rdns) > 1 or any(len(rdn) > 1 for rdn in subject.rdns)
 
 
@@ -190,7 +190,7 @@ def pem(certificate: x509.Certificate) -> bytes:
 
 
 class Settings(Enum):
-    """What a program reads behind a certificate: what it is trusted for (OpenSSL, X509_AUX)."""
+    """How a program treats the trust settings of a ``TRUSTED CERTIFICATE`` (OpenSSL, X509_AUX)."""
 
     IGNORED = "nothing"
     READ = "settings, which have no effect"
@@ -264,7 +264,7 @@ def _blocks(data: bytes, what: str) -> Iterator[pem_file.Block]:
 
 @lru_cache(maxsize=8)  # several readers ask for the certificate of an enclave, or for all of them
 def _known_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
-    """Return the blocks of a PEM file up to the first damage, and what is damaged, or ""."""
+    """Return the blocks before the first damaged one, and what is damaged ("" if nothing is)."""
     found: list[pem_file.Block] = []
     try:
         found.extend(pem_file.blocks(data))
@@ -288,7 +288,7 @@ def _certificate_in(
 
 
 def _permits(rest: bytes, settings: Settings) -> bool:
-    """Return whether the settings behind a certificate do not forbid a use of it (obj_trust).
+    """Return whether the trust settings after a certificate allow its use (OpenSSL, obj_trust).
 
     Raises:
         PkiError, ValueError: they are no settings (X509_AUX).
@@ -428,7 +428,7 @@ def is_for_pss(certificate: x509.Certificate) -> bool:
 
 
 def _in_der(certificate: x509.Certificate, part: bytes) -> bytes:
-    """Return a part of a certificate in DER; what `cryptography` reads has nothing else."""
+    """Return a part of a certificate in DER."""
     return der.normalized(part) if tolerant.is_tolerated(certificate) else part
 
 
@@ -523,7 +523,7 @@ def authority_text(certificate: x509.Certificate) -> str:
 
 
 def other_issuer(certificate: x509.Certificate, authority: x509.Certificate) -> str:
-    """Return how to name the issuer of a certificate that ``authority`` did not issue."""
+    """Return a certificate's issuer in words: "another CA named X" if ``authority`` is named X."""
     name = subject_text(certificate.issuer)
     return f"another CA named {name}" if certificate.issuer == authority.subject else name
 
@@ -546,7 +546,7 @@ def subject_text(name: x509.Name) -> str:
 
 @lru_cache(maxsize=1024)  # the subjects of a keystore are asked for repeatedly
 def _name_text(name: bytes) -> str:
-    """Return a name (DER), with the attributes of an RDN in their order, as OpenSSL prints it."""
+    """Return a name (DER) as OpenSSL prints it, with the attributes of an RDN in their order."""
     return ",".join(
         "+".join(map(_attribute_text, reversed(der.children(rdn.content))))
         for rdn in reversed(der.children(der.first(name).content))
@@ -554,7 +554,7 @@ def _name_text(name: bytes) -> str:
 
 
 def _attribute_text(attribute: der.Value) -> str:
-    """Return an attribute; its value is in hexadecimal if the attribute is unknown, or no text."""
+    """Return ``type=value``; the value is hexadecimal if the type is unknown or not a string."""
     oid, value = der.children(attribute.content)
     dotted = der.decode_oid(oid.content)
     known = short_names().get(dotted)
@@ -629,12 +629,12 @@ _JUDGED = {
         _NETSCAPE_TYPE,
     )
 }
-"""The extensions whose values OpenSSL judges, apart from names."""
+"""The extensions, other than names, whose values OpenSSL evaluates."""
 _UNUSUAL = re.compile(rb"[^A-Za-z0-9/_]")
 
 
 class CertificateForm(NamedTuple):
-    """The form of a certificate file, and of the certificate's own parts those that are asked for.
+    """The form of a certificate file, without what is different in every certificate.
 
     ``common`` is equal for files that differ in the own parts of their certificates alone.
     ``validity`` is the period in DER.
@@ -646,7 +646,7 @@ class CertificateForm(NamedTuple):
 
 
 def read_form(data: bytes) -> CertificateForm | None:
-    """Return the form of the first certificate in a PEM file; None if it is an unusual one."""
+    """Return the form of the first certificate in a PEM file; None if it has unusual parts."""
     with suppress(PkiError, ValueError, IndexError, StopIteration):
         blocks = list(pem_file.blocks(data))
         first = next(block for block in blocks if block.label in pem_file.CERTIFICATES)
@@ -657,14 +657,14 @@ def read_form(data: bytes) -> CertificateForm | None:
 
 
 def holds_at(form: CertificateForm, now: datetime) -> bool | None:
-    """Return whether a certificate is valid at the time ``now``; None if that cannot be read."""
+    """Return whether a certificate is valid at ``now``; None if its dates cannot be read."""
     times = _times(form.validity)
     return times and times[0] <= now.astimezone(UTC).strftime("%Y%m%d%H%M%SZ") <= times[1]
 
 
 @lru_cache(maxsize=256)  # certificates that were issued together share it
 def _times(validity: bytes) -> tuple[str, str] | None:
-    """Return when a period begins and ends, as a GeneralizedTime (RFC 5280, 4.1.2.5)."""
+    """Return the begin and the end of a validity (DER), as GeneralizedTime (RFC 5280, 4.1.2.5)."""
     with suppress(PkiError, ValueError):
         begin, end = map(_time, der.children(validity))
         return begin, end

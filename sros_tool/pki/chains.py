@@ -57,14 +57,14 @@ _NETWORKS = {
     ObjectIdentifier("1.3.6.1.5.5.7.1.7"): "sbgp-ipAddrBlock",
     ObjectIdentifier("1.3.6.1.5.5.7.1.8"): "sbgp-autonomousSysNum",
 }
-"""Extensions of addresses and numbers of networks (RFC 3779)."""
+"""The extensions for IP addresses and autonomous system numbers (RFC 3779)."""
 _INHERITED = tuple(
     map(
         bytes.fromhex,
         ("30083006040200010500", "30083006040200020500", "3004a0020500", "3004a1020500"),
     )
 )
-"""Values of them by which a certificate has the networks of its CA."""
+"""Values of the network extensions that mean: inherited from the CA."""
 _SSL_CLIENT, _SMIME, _SMIME_CA, _ANY_NETSCAPE_CA = 0x80, 0x20, 0x02, 0x07
 _ANY_POLICY = ObjectIdentifier("2.5.29.32.0")
 _OF_POLICIES = {
@@ -75,11 +75,11 @@ _OF_POLICIES = {
 }
 _DEEPEST = 100
 _WITH_EXTENSIONS = 3
-"""The version of X.509 certificates that brought extensions (RFC 5280, 4.1.2.1)."""
+"""X.509v3, the version of certificates with extensions (RFC 5280, 4.1.2.1)."""
 
 
 class Checks(Flag):
-    """What is checked of a chain besides its signatures, validities and critical extensions."""
+    """Optional checks of a chain, besides signatures, validities and critical extensions."""
 
     NONE = 0
     ROOT_SIGNATURE = auto()
@@ -109,7 +109,7 @@ def chain_fault(
 
 
 class _Chain:
-    """A chain of certificates, which is asked with several checks; see `build_chain`."""
+    """A certificate chain from `build_chain`, which can be verified with different checks."""
 
     def __init__(self, certificates: list[x509.Certificate], missing: str, at: datetime) -> None:
         self.missing = missing
@@ -213,7 +213,7 @@ def _issuer(
     at: datetime,
     chain: Sequence[x509.Certificate] = (),
 ) -> x509.Certificate | None:
-    """Return the first possible issuer that is valid now; else the one that expires last."""
+    """Return the first possible issuer that is valid at ``at``, else the last to expire."""
     found = [each for each in among if likely_issued(certificate, each) and each not in chain]
     valid = (issuer for issuer in found if validity_of(issuer).contains(at))
     return next(
@@ -227,7 +227,7 @@ def _may_sign_certificates(certificate: x509.Certificate) -> bool:
 
 
 def denies_issuing(certificate: x509.Certificate) -> bool:
-    """Return whether a certificate says that it may not issue others.
+    """Return whether a certificate states that it must not issue other certificates.
 
     One without basicConstraints and keyUsage says nothing: vendors differ about it.
     """
@@ -238,7 +238,7 @@ def denies_issuing(certificate: x509.Certificate) -> bool:
 
 @lru_cache(maxsize=64)
 def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
-    """Return the extensions for which OpenSSL, or sros, refuses a certificate in any chain."""
+    """Return faults of extensions for which OpenSSL, or sros, refuses every chain."""
     name = subject_text(certificate.subject)
     faults = [*_unread_faults(certificate)]
     if extension(certificate, x509.KeyUsage) == _NO_USAGE:
@@ -260,7 +260,7 @@ def _unread_faults(certificate: x509.Certificate) -> list[str]:
 
 
 def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
-    """Yield why OpenSSL, or sros, refuses a chain for networks (v3_addr.c, v3_asid.c).
+    """Yield why the network extensions make OpenSSL, or sros, refuse a chain (v3_addr.c).
 
     Those of its CA restrict nothing, but where the first certificate has some, a trusted CA cannot
     have those of another one.
@@ -278,12 +278,12 @@ def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 
 
 class _Authority(Flag):
-    """Whether OpenSSL takes a certificate for that of a CA (X509_check_ca)."""
+    """OpenSSL's answer to whether a certificate is a CA certificate (X509_check_ca)."""
 
     NO = 0
     YES = auto()
     OLD = auto()
-    """It has no basicConstraints; taken for a root, unless strictly checked."""
+    """A certificate without basicConstraints: accepted as a root CA, but not by strict checks."""
     NETSCAPE = auto()
 
 
@@ -338,7 +338,7 @@ def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
 
 
 def _not_a_ca(certificate: x509.Certificate) -> str:
-    """Return why a certificate is not that of a CA, as a clause."""
+    """Return why a certificate is not a CA certificate, as a clause."""
     if extension(certificate, x509.BasicConstraints) is None:
         return "it has no basicConstraints"
     may_sign = _may_sign_certificates(certificate)
@@ -445,7 +445,7 @@ def _signature_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
 
 
 _ALWAYS_ASKED = {ExtensionOID.CERTIFICATE_POLICIES, ExtensionOID.POLICY_CONSTRAINTS}
-"""What OpenSSL decodes of policies; the rest only where a certificate names policies."""
+"""The policy extensions that OpenSSL always decodes, even if no certificate names a policy."""
 
 
 def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
@@ -487,7 +487,7 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 
 _IA5_MAIL = der.encode(der.OID, der.encode_oid(NameOID.EMAIL_ADDRESS.dotted_string)) + b"\x16"
 _HOST = re.compile(r"(?!.*(?:\.-|-\.))\w(?:[\w-]*\w)?(?:\.[\w-]*\w)+", re.ASCII)
-"""A common name that OpenSSL takes for a host: it has a dot."""
+"""Matches a common name that OpenSSL takes for a host name: it contains a dot."""
 
 
 def _name_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:

@@ -194,7 +194,7 @@ def _read_in_full(crl: x509.CertificateRevocationList) -> x509.CertificateRevoca
 
 
 def embedded_lists(data: bytes) -> list[bytes]:
-    """Return the revocation lists among the certificates of a PEM file, a PEM file each.
+    """Split the revocation lists out of a CA file; return a PEM document for each list.
 
     OpenSSL reads all of them, and nothing that does not begin a line (pem_lib.c).
     """
@@ -202,7 +202,7 @@ def embedded_lists(data: bytes) -> list[bytes]:
 
 
 def names_issuers(crl: x509.CertificateRevocationList) -> bool:
-    """Return whether an entry says of which CA it and the entries after it are."""
+    """Return whether an entry names the CA of its certificate (certificateIssuer: indirect CRL)."""
     return any(
         extension.oid == CRLEntryExtensionOID.CERTIFICATE_ISSUER
         for entry in crl
@@ -265,7 +265,7 @@ def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) 
 
 
 def may_sign_lists(authority: x509.Certificate) -> bool:
-    """Return whether OpenSSL accepts revocation lists of a CA: by keyUsage, if it has that."""
+    """Return whether a CA's keyUsage permits signing CRLs; true without that extension."""
     usage = extension(authority, x509.KeyUsage)
     return usage is None or usage.crl_sign
 
@@ -297,7 +297,7 @@ _REASONS = frozenset(x509.ReasonFlags) - {
 
 
 class Obstacle(Enum):
-    """Why a certificate is refused with the revocation lists that there are."""
+    """Reasons why a certificate is refused because of revocation lists."""
 
     MISSING = "no list of its CA"
     USAGE = "the CA may not sign lists"
@@ -310,7 +310,7 @@ class Obstacle(Enum):
 
 
 class ListRefusal(NamedTuple):
-    """Why a certificate is refused, the list that is the reason if there is one, and a clause."""
+    """A refusal because of revocation lists: reason, the list (None if missing), and a clause."""
 
     obstacle: Obstacle
     list: x509.CertificateRevocationList | None
@@ -318,7 +318,7 @@ class ListRefusal(NamedTuple):
 
 
 class _Score(NamedTuple):
-    """How well a list fits, in the order that OpenSSL weighs it (get_crl_score)."""
+    """How well a list fits a certificate, in OpenSSL's order of weight (get_crl_score)."""
 
     only_known: bool
     in_scope: bool
@@ -365,7 +365,7 @@ def list_refusal(
 
 
 def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate) -> bool:
-    """Return whether the list has an entry for the certificate, and not one that takes it back."""
+    """Return whether the list revokes the certificate; a removeFromCRL entry does not."""
     if not _entries(_Content(crl)).name_issuers:
         return lists_as_revoked(crl, certificate.serial_number)
     issuers: list[x509.Name] | None = None
@@ -387,7 +387,7 @@ def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate)
 def _best(
     chain: Sequence[x509.Certificate], lists: Lists, at: datetime
 ) -> tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None:
-    """Return the list that OpenSSL chooses: what fits best, then the newest (get_crl_sk)."""
+    """Return the list that OpenSSL uses: the best fit, of equal fits the newest (get_crl_sk)."""
     best: tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None = None
     for crl in lists:
         issuer = _issuer(chain, crl)
@@ -410,7 +410,7 @@ def _best(
 def _issuer(
     chain: Sequence[x509.Certificate], crl: x509.CertificateRevocationList
 ) -> x509.Certificate | None:
-    """Return the CA of the chain whose list it is, or None (crl_akid_check).
+    """Return the CA in the chain that issued the list, or None (crl_akid_check).
 
     Only lists with the name of the certificate's issuer are looked at.
     """
@@ -441,7 +441,7 @@ def _identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certifi
 
 
 class _Content:
-    """A list with a hash: all enclaves of a keystore have the same lists."""
+    """A hashable revocation list, for caches: all enclaves of a keystore share their lists."""
 
     def __init__(self, crl: x509.CertificateRevocationList) -> None:
         self.crl = crl
@@ -521,7 +521,7 @@ def _general_name(name: x509.GeneralName) -> object:
 
 
 def _all_reasons(certificate: x509.Certificate, crl: x509.CertificateRevocationList) -> bool:
-    """Return whether the places of lists in the certificate leave out no reason."""
+    """Return whether the certificate's distribution points cover every revocation reason."""
     for place in extension(certificate, x509.CRLDistributionPoints) or ():
         if _is_of(place, crl):
             return place.reasons is None or place.reasons >= _REASONS

@@ -1,4 +1,4 @@
-"""The little of DER (X.690) that `cryptography` leaves to its users.
+"""A small reader and writer of DER (X.690), for what `cryptography` does not parse.
 
 `cryptography` creates CMS signatures but cannot yet verify them: the reader extracts the parts that
 its verification primitives need.  The writer is for keys that are encrypted by scrypt.
@@ -63,7 +63,7 @@ def first(data: bytes) -> Value:
 
 
 def split(data: bytes) -> tuple[bytes, bytes]:
-    """Return the first value in ``data``, which is in BER, as it is written, and what follows it.
+    """Return the first value in BER ``data``, not re-encoded, and the bytes after it.
 
     Raises:
         PkiError: the value is truncated, or has a form that this reader does not support.
@@ -73,7 +73,7 @@ def split(data: bytes) -> tuple[bytes, bytes]:
 
 
 def split_all(data: bytes) -> list[bytes]:
-    """Return the values in ``data``, which are in BER, as they are written; raise as `split`."""
+    """Return all values in BER ``data``, not re-encoded; raise as `split`."""
     values = []
     while data:
         value, data = split(data)
@@ -82,7 +82,7 @@ def split_all(data: bytes) -> list[bytes]:
 
 
 def normalized(data: bytes) -> bytes:
-    """Return the first value in ``data``, which is in BER (X.690, 8), with the lengths of DER.
+    """Return the first value in BER ``data`` (X.690, 8), re-encoded with DER lengths.
 
     Also the values inside it, if it is constructed; OpenSSL reads both alike.
 
@@ -93,7 +93,7 @@ def normalized(data: bytes) -> bytes:
 
 
 def first_part(data: bytes) -> bytes:
-    """Return the first value inside a constructed value in BER, as it is written; raise as above.
+    """Return the first value inside a constructed BER value, not re-encoded; raise as `split`.
 
     That is what a signature covers.
     """
@@ -108,7 +108,7 @@ _END_OF_CONTENTS = b"\0\0"
 
 
 def _header(data: bytes, start: int) -> tuple[int, int, int | None]:
-    """Return the tag of the value at ``start``, where its content begins, and where it ends.
+    """Return the tag of the value at ``start``, and the offsets of the content's start and end.
 
     The end is None if a mark of two bytes ends it.
     """
@@ -130,7 +130,7 @@ def _header(data: bytes, start: int) -> tuple[int, int, int | None]:
 
 
 def _normalized(data: bytes, start: int, depth: int) -> tuple[bytes, int]:
-    """Return the value at ``start``, with the lengths of DER, and where it ends."""
+    """Return the value at ``start``, re-encoded with DER lengths, and the offset of its end."""
     if depth > _DEEPEST:
         raise PkiError("a DER value has a form that is not supported")
     tag, begin, end = _header(data, start)
@@ -157,7 +157,7 @@ def integer(value: Value) -> int:
 
 
 def encode(tag: int, *parts: bytes) -> bytes:
-    """Encode a value, whose content is all ``parts``."""
+    """Return a DER value with this tag; its content is the concatenation of ``parts``."""
     content = b"".join(parts)
     length = len(content).to_bytes((len(content).bit_length() + 7) // 8 or 1, "big")
     if len(content) >= 0x80:

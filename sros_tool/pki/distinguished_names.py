@@ -25,7 +25,7 @@ _ENCODINGS = {
     0x1C: "utf-32-be",
     0x1E: "utf-16-be",
 }
-"""The encodings of the string types that are compared as text; others by their bytes."""
+"""ASN.1 string type → encoding, for types compared as text; all others are compared by bytes."""
 _SPACES = re.compile(rb"[ \t\n\v\f\r]+")
 
 
@@ -36,18 +36,18 @@ def same_name(one: x509.Name, other: x509.Name) -> bool:
 
 @lru_cache(maxsize=64)  # all documents of a keystore have the same signer
 def canonical_issuer(certificate: x509.Certificate) -> tuple[bytes, ...]:
-    """Return the parts of the name of a certificate's issuer, as `canonical` does."""
+    """Return the `canonical` parts of a certificate's issuer name."""
     return canonical(certificate.issuer)
 
 
 def canonical(name: x509.Name) -> tuple[bytes, ...]:
-    """Return the parts (RDNs) of a name, such that names that are equal have equal parts."""
+    """Return the parts (RDNs) of a name in a form that is equal for equal names."""
     return canonical_der(name.public_bytes())
 
 
 @lru_cache(maxsize=256)  # a few CAs are compared with many certificates
 def canonical_der(name: bytes) -> tuple[bytes, ...]:
-    """Return the parts of a name in DER, as `canonical` does."""
+    """Return the `canonical` parts of a name given in DER."""
     parts = der.children(der.first(name).content)
     return tuple(
         b"".join(sorted(_attribute(attribute) for attribute in der.children(part.content)))
@@ -101,7 +101,7 @@ def reading(what: str, why: str, remedy: str = "") -> Iterator[None]:
 
 
 def is_of_reading(error: BaseException) -> bool:
-    """Return whether an error may be one of `cryptography` about what it reads."""
+    """Return whether `cryptography` may raise this error for a malformed document."""
     return isinstance(error, Exception) or type(error).__name__ == "PanicException"
 
 

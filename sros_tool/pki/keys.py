@@ -109,7 +109,7 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
 def load_any_key(
     pem: bytes, name: str, passphrase: Callable[[], str] | None = None
 ) -> PrivateKeyTypes:
-    """Return the key of a PEM file, also one of a kind that DDS Security does not have.
+    """Return the private key of a PEM file, also of a kind that DDS Security does not allow.
 
     Raises:
         PkiError: as `load_key`, but for the kind of the key.
@@ -144,7 +144,7 @@ _PSS = der.encode_oid("1.2.840.113549.1.1.10")
 
 
 def check_key(content: bytes, label: str = "") -> None:
-    """Raise an error of any class unless ``content`` is a private key in DER, as a label says."""
+    """Check that DER ``content`` is a private key of the PEM ``label``; raise any error if not."""
     if len(content) > _MAX_BYTES:
         raise ValueError("too large")
     data, _ = der.split(content)
@@ -215,7 +215,7 @@ _ENCRYPTED = re.compile(rb"-----BEGIN ENCRYPTED PRIVATE KEY-----([^-]*)")
 
 
 def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
-    """Return an RSA key that was loaded without validation, which takes minutes for huge ones."""
+    """Validate an RSA key that was loaded unvalidated; refuse sizes that would take minutes."""
     if key.key_size > _MAX_RSA_BITS:
         raise PkiError(
             f"the private key {name} has {key.key_size} bits",
@@ -230,7 +230,7 @@ def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
 
 _INITIAL_VALUE = re.compile(rb"^DEK-Info: *([^,\s]*),([0-9A-Fa-f]*)", re.MULTILINE)
 _HEX_DIGITS = {b"DES-CBC": 16, b"DES-EDE3-CBC": 16}
-"""Length of the initial value of ciphers with blocks of 64 bits; RFC 1421, 4.6.1.3."""
+"""Hexadecimal digits of the initialization vector of 64-bit block ciphers; RFC 1421, 4.6.1.3."""
 
 
 def _check_derivation(pem: bytes, name: str) -> None:
@@ -261,7 +261,7 @@ def _check_derivation(pem: bytes, name: str) -> None:
 
 
 def _derivation(block: bytes) -> tuple[bool, list[int]]:
-    """Return whether a block of PEM is encrypted by scrypt, and the numbers of the derivation.
+    """Return whether a PEM block's key derivation is scrypt, and the derivation's cost parameters.
 
     For scrypt these are N, r and p, for others the rounds, perhaps with more after them.
 
@@ -278,7 +278,7 @@ _LEAST_SCRYPT_WORK = 2**17  # N * r * p of `openssl pkcs8 -scrypt`
 
 
 def few_rounds(pem: bytes) -> str:
-    """Return why passphrases of an encrypted key are tried fast, as a clause; "" if they are not.
+    """Return why an encrypted key's passphrase is fast to guess, as a clause; "" if it is not.
 
     Source: RFC 8018, 4.2; OpenSSL 3.0, openssl-pkcs8 (2048 rounds) and PEM_write_bio_PrivateKey
     (one round of MD5).

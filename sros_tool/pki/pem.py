@@ -1,4 +1,4 @@
-"""PEM files as OpenSSL 3 reads them, and with it every DDS vendor (pem_lib.c), and other kinds.
+"""PEM as OpenSSL 3, used by every DDS vendor, reads it (pem_lib.c); detection of file types.
 
 OpenSSL reads less than other programs (RFC 7468 leaves it to them): a block begins and ends at the
 start of a line, and a damaged block hides all blocks after it.
@@ -18,7 +18,7 @@ CERTIFICATES = ("CERTIFICATE", "X509 CERTIFICATE", "TRUSTED CERTIFICATE")
 """Labels of certificates; the last one may carry what the certificate is trusted for."""
 
 _PIECE = re.compile(rb"[^\n]{0,253}\n|[^\n]{1,254}")
-"""What OpenSSL reads at once: a line, or 254 characters of a longer one."""
+"""Matches what OpenSSL reads as one line: a line, or 254 characters of a longer line."""
 _BEGIN = re.compile(rb"-----BEGIN (.*)-----", re.DOTALL)
 _END = b"-----END "
 _NOT_AT_START = re.compile(rb"[^\n]-----BEGIN ")
@@ -27,7 +27,7 @@ _ALONE = re.compile(
     rb"-----BEGIN ([A-Z0-9 ]{1,60})-----\n((?:[A-Za-z0-9+/]{1,76}\n)*[A-Za-z0-9+/]{1,76}={0,2}\n)"
     rb"-----END \1-----\n"
 )
-"""A file of one block without headers, as almost all programs write it."""
+"""Matches a file with a single block without headers: the usual form, read fast."""
 _BLANKS = bytes(range(0x21))
 _BETWEEN = b" \t\r\n"
 _BOM = b"\xef\xbb\xbf"
@@ -68,7 +68,7 @@ def blocks(data: bytes) -> Iterator[Block]:
 
 
 def read_as_text(data: bytes) -> bytes:
-    """Return what OpenSSL reads of a PEM file through a file pointer (bss_file.c).
+    """Return a PEM file as OpenSSL sees it when it reads lines from a FILE pointer (bss_file.c).
 
     A zero byte ends its line, and a line that begins with a zero byte the whole file.
     """
@@ -95,7 +95,7 @@ def missing(data: bytes, label: str) -> str:
 
 
 def _block(label: bytes, pieces: Iterator[bytes]) -> Block:
-    """Read a block after its first line: headers and an empty line, or only its content."""
+    """Parse a block after its BEGIN line: optional headers and an empty line, then the content."""
     name = label.decode("utf-8", "replace")[:80]
     parts: list[list[bytes]] = [[]]
     split = short = False
@@ -153,7 +153,7 @@ _MARKS = (
     (b"ecdsa-sha2-", "a public key of OpenSSH"),
     (b"pkcs11:", "the URI of a key on a token"),
 )
-"""What files with these first bytes are."""
+"""First bytes of a file → the kind of file, as a noun with its article."""
 
 _LABEL = re.compile(rb"^-----BEGIN ([^\r\n]{1,60})-----[ \t\r]*$", re.MULTILINE)
 _OF_LABEL = {
@@ -186,11 +186,11 @@ _PKCS12 = "a PKCS#12 container (.p12, .pfx)"
 _HEADER = re.compile(rb"(?i)\s*(?:mime-version|content-type|content-transfer-encoding)[ \t]*:")
 _BASE64_WITHOUT_PEM = re.compile(rb"[A-Za-z0-9+/\s]{40,}={0,2}\s*")
 _MOST = 4096
-"""How much of a text is looked at, in bytes."""
+"""Number of bytes at the start of a text that are examined."""
 
 
 def kind_of(data: bytes) -> str:
-    """Return what a file is, as a noun with its article; "" if that is not known."""
+    """Return the kind of a file by its content, such as "a private key"; "" if unknown."""
     for mark, kind in _MARKS:
         if data.startswith(mark):
             return kind
@@ -217,7 +217,7 @@ def _kind_of_label(label: str) -> str:
 
 
 def _kind_of_message(text: bytes) -> str:
-    """Return what a text with MIME headers is."""
+    """Return the kind of a MIME message, by its headers."""
     if text[:1].isspace():
         return "a MIME message with an empty line before its headers, which ends them at once"
     head = text[:_MOST].lower()
@@ -228,7 +228,7 @@ def _kind_of_message(text: bytes) -> str:
 
 
 def _kind_of_der(data: bytes) -> str:
-    """Return what a value in DER is by its structure; "" for any other."""
+    """Return the kind of a DER file, by its structure; "" if unknown."""
     try:
         whole, _ = der.split(data)
         parts = der.children(der.first(der.normalized(whole)).content)
@@ -249,7 +249,7 @@ def _kind_of_der(data: bytes) -> str:
 
 
 def _kind_of_signed(parts: list[der.Value]) -> str:
-    """Return what is signed: a certificate, a request or a revocation list, by its parts."""
+    """Return whether a signed value is a certificate, request or revocation list, in words."""
     tags = [part.tag for part in parts]
     if der.UTC_TIME in tags or der.GENERALIZED_TIME in tags:
         return _LIST_IN_DER

@@ -52,7 +52,7 @@ _SIGNATURE = (b"application/pkcs7-signature", b"application/x-pkcs7-signature")
 
 _SHORT = 1024
 _PARTS = 4
-"""What the marks of a signed message separate: a preamble, two parts, and an epilogue."""
+"""Number of pieces between MIME boundaries: a preamble, two parts, and an epilogue."""
 _SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
 _DATA = der.encode_oid("1.2.840.113549.1.7.1")
 _MESSAGE_DIGEST = der.encode_oid("1.2.840.113549.1.9.4")
@@ -60,7 +60,7 @@ _NULL = 0x05
 _ANY_VALUES = (
     der.SEQUENCE, der.OCTET_STRING, der.OID, der.UTC_TIME, der.GENERALIZED_TIME, _NULL
 )  # fmt: skip
-"""The types of attributes and parameters that OpenSSL writes again as it read them."""
+"""Types of attributes and parameters that OpenSSL re-encodes without changing a byte."""
 _OID = re.compile(rb"(?:(?:[\x81-\xff][\x80-\xff]*)?[\x00-\x7f])+")
 
 
@@ -153,7 +153,7 @@ class Signature:
         return known
 
     def _verify(self, content: bytes, signer: x509.Certificate) -> bool:
-        """Return what `is_intact` does.
+        """Verify the signature without the cache of `is_intact`; return the same.
 
         The kind of the key says how: OpenSSL ignores the algorithm that the message names, and so
         accepts RSA-PSS of keys for nothing else only, and no Ed25519 (pk7_doit.c,
@@ -238,7 +238,7 @@ class SignedDocument:
 
 
 def _other_signer(signer: x509.Certificate | None, authority: x509.Certificate) -> str:
-    """Return by whom a document is signed in place of ``authority``; None is not embedded."""
+    """Return a clause that tells the wrong signer from ``authority``; None: it is not embedded."""
     name = authority.subject.rfc4514_string()
     if signer is None:
         return f"by a certificate that is not embedded, not by the permissions CA {name}"
@@ -267,7 +267,7 @@ _Read = TypeVar("_Read")
 
 
 def _remembered(read: Callable[[_Part], _Read]) -> Callable[[_Part], _Read]:
-    """Have what was read from short parts remembered: all documents of a keystore have the same."""
+    """Cache the parser's results for short parts, which are equal in all of a keystore's files."""
     remembered = lru_cache(maxsize=64)(read)
 
     def read_or_remember(part: _Part) -> _Read:
@@ -284,7 +284,7 @@ def parse(message: bytes) -> SignedDocument:
 
 
 def parse_new(message: bytes) -> SignedDocument:
-    """Parse a message as `parse` does, and remember nothing: it was just signed."""
+    """Parse a message that was just signed, as `parse` but without its cache."""
     content, signature = _split(message)
     try:
         return _parse_cms(signature, content)
@@ -381,7 +381,7 @@ def _public_key(certificate: x509.Certificate) -> object:
 
 
 def _parts(value: der.Value, *tags: int) -> list[der.Value]:
-    """Return the values in a constructed value; raise `ValueError` unless they have the tags."""
+    """Return the values in a constructed value; raise `ValueError` unless they have ``tags``."""
     parts = der.children(value.content)
     if tuple(part.tag for part in parts) != tags:
         raise ValueError("not the structure of a CMS signature")
@@ -389,7 +389,7 @@ def _parts(value: der.Value, *tags: int) -> list[der.Value]:
 
 
 def _optional(values: list[der.Value], place: int, tag: int) -> list[der.Value]:
-    """Remove the value at a place if it has the tag, and return it in a list."""
+    """Pop ``values[place]`` if it has the tag; return a list with it, else an empty list."""
     return [values.pop(place)] if len(values) > place and values[place].tag == tag else []
 
 
@@ -489,7 +489,7 @@ def _issuer_and_serial(identifier: der.Value) -> tuple[tuple[bytes, ...], int]:
 
 
 def _check_values(*values: der.Value) -> None:
-    """Raise `ValueError` for a value that OpenSSL may read in another way, or not at all."""
+    """Raise `ValueError` for a value that OpenSSL might read differently, or refuse."""
     for value in values:
         if (
             value.tag not in _ANY_VALUES
@@ -500,7 +500,7 @@ def _check_values(*values: der.Value) -> None:
 
 
 def _attributes(attributes: bytes) -> dict[bytes, der.Value]:
-    """Return the first values of attributes by type, after checking their form (RFC 5652, 11)."""
+    """Map attribute types to first values, after checking their form (RFC 5652, 11)."""
     by_kind: dict[bytes, der.Value] = {}
     for attribute in der.children(attributes):
         name, values = _parts(attribute, der.OID, der.SET)

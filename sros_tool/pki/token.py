@@ -26,11 +26,11 @@ from sros_tool.xml import read_bytes
 MODULE_VARIABLE = "PKCS11_MODULE_PATH"
 """The variable that names the PKCS#11 module, for sros and for the engine of libp11."""
 Secrets = Callable[[str], str]
-"""Function that returns the secret that its argument names, such as "the PIN of the token X"."""
+"""A callback that gets a prompt, such as "the PIN of the token X", and returns the secret."""
 
 
 def _module_of(parsed: TokenUri, *, named: bool) -> str:
-    """Return the path of the library to load into this process; ``named``: the user gave the URI.
+    """Return the path of the PKCS#11 library to load; ``named``: the user gave the URI.
 
     A library named by anybody else, as in the settings of a keystore that was received, is
     loaded only if it is root's: loading runs its code.
@@ -63,7 +63,7 @@ def _module_of(parsed: TokenUri, *, named: bool) -> str:
 
 
 def _proxy() -> str:
-    """Return the module of p11-kit, which loads all that are registered here; "" without it.
+    """Return the path of p11-kit's module, which loads all registered modules; "" if missing.
 
     libp11 loads it, too, where no other is named (Debian and Ubuntu, libengine-pkcs11-openssl).
     """
@@ -154,7 +154,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         return True
 
     def exchange(self, algorithm: ec.ECDH, peer_public_key: ec.EllipticCurvePublicKey) -> bytes:
-        """Raise `PkiError`: this key can only sign."""
+        """Refuse key agreement: raise `PkiError`, because this key can only sign."""
         raise PkiError("a key on a token cannot be used for key agreement")
 
     def private_numbers(self) -> ec.EllipticCurvePrivateNumbers:
@@ -225,7 +225,7 @@ def open_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
 
 
 def planned_key(place: TokenUri) -> TokenKey:
-    """Return what stands for a key to be made, in a dry run, which opens no token."""
+    """Return a stand-in for a key that a dry run would create; no token is opened."""
     return TokenKey(None, ec.generate_private_key(ec.SECP256R1()).public_key(), place)
 
 
@@ -234,7 +234,7 @@ def _usable_uri(uri: str, *, named: bool) -> TokenUri:
 
 
 def _usable(parsed: TokenUri, *, named: bool) -> TokenUri:
-    """Return the parts of a URI with the module to load, once tokens can be used at all."""
+    """Return the URI with its module filled in; raise if tokens cannot be used here."""
     parsed = replace(parsed, module=_module_of(parsed, named=named))
     if importlib.util.find_spec("pkcs11") is None:
         raise UnavailableError(
@@ -486,7 +486,7 @@ def _encoded(text: str) -> str:
 
 
 def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
-    """Return the attributes of one part of a URI, decoded; an error does not show their values."""
+    """Decode the attributes of a part of a URI; errors do not show values, which may be secret."""
     found: dict[str, str] = {}
     for part in filter(None, parts):
         name, _, value = part.partition("=")

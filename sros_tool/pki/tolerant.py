@@ -37,7 +37,7 @@ _UNIQUE_IDENTIFIERS = (0x81, _CONTEXT_2)
 
 @dataclass(frozen=True)
 class UnknownKey:
-    """A public key (SubjectPublicKeyInfo in DER) of an unknown algorithm, or with such parameters.
+    """A public key (SubjectPublicKeyInfo in DER) whose algorithm or parameters are unknown.
 
     Two are equal if they are written alike.
     """
@@ -134,7 +134,7 @@ class _Signed:
         return None
 
     def public_bytes(self, encoding: serialization.Encoding) -> bytes:
-        """Return it as it was read, in DER, or that as PEM."""
+        """Return the original bytes in DER, or their PEM encoding."""
         if encoding is serialization.Encoding.DER:
             return self._data
         text = base64.encodebytes(self._data).replace(b"\n", b"")
@@ -143,7 +143,7 @@ class _Signed:
         return b"\n".join([b"-----BEGIN %b-----" % label, *lines, b"-----END %b-----\n" % label])
 
     def fingerprint(self, algorithm: hashes.HashAlgorithm) -> bytes:
-        """Return the hash of it."""
+        """Return the hash of the original DER bytes."""
         digest = hashes.Hash(algorithm)
         digest.update(self._data)
         return digest.finalize()
@@ -152,7 +152,7 @@ class _Signed:
         return _certificate_with(algorithm=self._algorithm.whole)
 
     def _signed_bytes(self) -> bytes:
-        """Return the part that is signed, as it was read."""
+        """Return the original bytes of the signed part."""
         return der.first_part(self._data)
 
     def __eq__(self, other: object) -> bool:
@@ -265,12 +265,12 @@ def read_certificate(data: bytes) -> x509.Certificate:
 
 
 def read_list(data: bytes) -> x509.CertificateRevocationList:
-    """Return a revocation list that `cryptography` does not read; raise as `read_certificate`."""
+    """Parse a revocation list that `cryptography` refuses; raise as `read_certificate`."""
     return cast(x509.CertificateRevocationList, _TolerantList(data))
 
 
 def check_list(data: bytes) -> None:
-    """Read a revocation list that is not used.
+    """Check that OpenSSL can read a revocation list.
 
     Raises:
         PkiError, ValueError: OpenSSL does not read it.
@@ -283,12 +283,12 @@ def check_list(data: bytes) -> None:
 
 
 def is_tolerated(certificate: x509.Certificate) -> bool:
-    """Return whether a certificate is one that `cryptography` does not read."""
+    """Return whether a certificate was read by this module, because `cryptography` refuses it."""
     return isinstance(certificate, _TolerantCertificate)
 
 
 def unread_extension(certificate: x509.Certificate) -> str:
-    """Return the name of an extension for which OpenSSL takes a certificate for invalid, or ""."""
+    """Return the name of a damaged extension that makes OpenSSL refuse a certificate, or ""."""
     if not is_tolerated(certificate):
         return ""
     return next(
@@ -302,20 +302,20 @@ def unread_extension(certificate: x509.Certificate) -> str:
 
 
 def version_of(certificate: x509.Certificate) -> int:
-    """Return the version of a certificate as people count: the one with extensions is the third."""
+    """Return the version of a certificate: 3 for X.509v3, the version with extensions."""
     if isinstance(certificate, _TolerantCertificate):
         return certificate.number
     return int(certificate.version.value) + 1
 
 
 def unread_date(certificate: x509.Certificate) -> str:
-    """Return which date of a certificate OpenSSL does not compare, or ""."""
+    """Return the name of a date of a certificate that OpenSSL cannot compare, or ""."""
     tolerated = certificate if isinstance(certificate, _TolerantCertificate) else None
     return next(iter(tolerated.unread_dates), "") if tolerated else ""
 
 
 def _name(data: bytes) -> x509.Name:
-    """Return a distinguished name in DER, also with values that their types do not allow.
+    """Parse a distinguished name in DER, also with values that their types do not allow.
 
     Raises:
         PkiError, ValueError: OpenSSL does not read it either.
@@ -365,7 +365,7 @@ def _public_key(data: bytes) -> object:
 
 
 def _date(value: der.Value) -> datetime | None:
-    """Return a date in UTC, or None for one that OpenSSL does not compare with others."""
+    """Parse a date in UTC; None for a form of date that OpenSSL cannot compare."""
     digits, form = _DIGITS.get(value.tag), _TIMES.get(value.tag)
     if digits is None or form is None:
         raise ValueError("not a date")
@@ -402,11 +402,11 @@ _DECODED = frozenset(
         ExtensionOID.CRL_DISTRIBUTION_POINTS,
     }
 )
-"""What OpenSSL decodes of a certificate before it uses it (v3_purp.c): damaged, it is invalid."""
+"""Extensions that OpenSSL always decodes: if damaged, the certificate is invalid (v3_purp.c)."""
 
 
 class _LooseConstraints(x509.BasicConstraints):
-    """basicConstraints that may have a path length without being those of a CA."""
+    """basicConstraints in which a certificate that is not a CA may have a path length."""
 
     def __init__(self, ca: bool, path_length: int | None) -> None:
         super().__init__(ca, path_length if ca else None)
@@ -439,7 +439,7 @@ class _LooseKeyIdentifier(x509.AuthorityKeyIdentifier):
 
 
 class UnreadableName(x509.GeneralName):
-    """A GeneralName whose value is none of its kind, such as an IP address of one byte."""
+    """A GeneralName with an invalid value, such as an IP address of one byte."""
 
     value = None
 
@@ -462,7 +462,7 @@ _Loose = Callable[[bytes], x509.ExtensionType | None]
 def _read(
     parts: Iterable[der.Value], strict: _Strict, loose: Mapping[ObjectIdentifier, _Loose]
 ) -> x509.Extensions:
-    """Return extensions, given in DER; raise `PkiError` if a part is not one."""
+    """Parse extensions in DER; raise `PkiError` if one of ``parts`` is not an extension."""
     known = [_parts(part) for part in parts]
     count = [oid for oid, _, _ in known]
     extensions = []
@@ -496,7 +496,7 @@ def _value(
     strict: _Strict,
     loose: Mapping[ObjectIdentifier, _Loose],
 ) -> x509.ExtensionType | None:
-    """Return the value of an extension; None if it says nothing, so that it may be left out."""
+    """Return the value of an extension; None if its value is empty and it can be left out."""
     ways: list[Callable[[bytes], x509.ExtensionType | None]] = [
         lambda data: strict(_encoded(oid, data))[0].value
     ]
@@ -527,7 +527,7 @@ _ONE = der.encode_integer(1)
 def _certificate_with(
     *, algorithm: bytes = _ED25519, subject: bytes = _NOBODY, extension: bytes = b""
 ) -> x509.Certificate:
-    """Return a certificate that holds parts of another one, in DER, for `cryptography` to read.
+    """Build a certificate around DER parts of another one, so that `cryptography` parses them.
 
     Raises:
         ValueError: `cryptography` does not read a part.
@@ -609,7 +609,7 @@ _USAGES = (
 
 
 def key_usage(*usages: str) -> x509.KeyUsage:
-    """Return a keyUsage that allows these usages alone, by the names of `x509.KeyUsage`."""
+    """Return a keyUsage that allows only the named usages (names of `x509.KeyUsage`)."""
     return x509.KeyUsage(**{usage: usage in usages for usage in _USAGES})
 
 

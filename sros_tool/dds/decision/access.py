@@ -169,7 +169,7 @@ def _rules_for(
 
 
 def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
-    """Return the verdict where no rule matches."""
+    """Return the verdict that the grant's ``<default>`` gives where no rule matches."""
     if not traits.honours_default:
         return RuleVerdict(Outcome.DENIED, "no-rule")
     if traits.crashes_on_empty_texts and grant.default_empty:
@@ -178,7 +178,7 @@ def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
 
 
 class _GrantRules:
-    """The rules of a grant in order, for one verb, or for both to decide on a topic alone."""
+    """The rules of a grant in order, for publish or subscribe, or for both at once."""
 
     def __init__(
         self,
@@ -219,7 +219,7 @@ class _GrantRules:
 
     @cached_property
     def _index(self) -> ExpressionIndex:
-        """The index of the entries, which are asked about seldom, or often."""
+        """The index that finds the entries which match a topic."""
         texts = (_usable_expression(self._traits, each.expression) for each in self._entries)
         return ExpressionIndex(self._traits.style, texts)
 
@@ -270,7 +270,7 @@ class _GrantRules:
         return NameSet.first(self._deciding(self._entries), self._otherwise.allowed)
 
     def _deciding(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
-        """Yield the topics of entries, joined as long as their verdict is the same, with it."""
+        """Yield verdicts with their topics; neighbouring entries with one verdict are merged."""
         for allowed, some in groupby(
             entries, key=lambda each: each.allow and bool(each.expression)
         ):
@@ -326,7 +326,7 @@ def _partitions(
 
 
 class GovernedDomain:
-    """What a governance says of a domain to a vendor; prepared once for many subjects.
+    """The governance of a domain as a vendor applies it; prepared once for many subjects.
 
     ``rule`` is the first domain rule that lists the domain, or None.
     """
@@ -448,16 +448,16 @@ def _decide_join(
 
 
 class _Kind(Enum):
-    """What decides on the topics of a rule of the governance."""
+    """How access to the topics of a governance topic rule is decided."""
 
     NOTHING = auto()
-    """They are denied."""
+    """All access is denied."""
     EVERYTHING = auto()
-    """They are allowed."""
+    """All access is allowed."""
     RULES = auto()
-    """The rules of the grant in the direction that is asked about."""
+    """The grant's rules for the requested direction (publish or subscribe) decide."""
     BOTH_WAYS = auto()
-    """These, and the rules for the topic itself."""
+    """The grant's rules must allow both the requested direction and creating the topic."""
 
 
 @cache
@@ -569,7 +569,7 @@ class Access:
         return tuple((names, domain, rule) for names, rule in self._governed.names_by_rule())
 
     def _kind_of(self, verb: AccessVerb, rule: TopicRule) -> _Kind:
-        """Return what decides on the topics of a rule, as `_ruled` does."""
+        """Return how access to the topics of a topic rule is decided, consistent with `_ruled`."""
         if self._traits.crashes_on_empty_texts and not rule.topic_expression.strip():
             return _Kind.NOTHING
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
@@ -601,12 +601,12 @@ class Access:
 
     @cached_property
     def _own(self) -> dict[AccessVerb, _GrantRules]:
-        """The rules by which its own participant decides."""
+        """The grant's rules as the participant itself applies them."""
         return {verb: self._deciding(self._own_rules, verb) for verb in _ENDPOINTS}
 
     @cached_property
     def _peers(self) -> dict[AccessVerb, _GrantRules]:
-        """The rules by which its peers decide; the same value as `_own` if they are the same."""
+        """The grant's rules as peers apply them; the same object as `_own` if they are equal."""
         relays = ("relay",) if self._traits.relays_count_for_readers else ()
         if self._own_rules is self._rules and not relays:
             return self._own
@@ -617,7 +617,7 @@ class Access:
 
     @cached_property
     def _either(self) -> _GrantRules:
-        """The rules that decide on a topic, whatever the direction."""
+        """The grant's rules for creating a topic: a right in either direction is enough."""
         return self._deciding(self._rules, *_ENDPOINTS)
 
     def _deciding(self, rules: Sequence[NumberedRule], *verbs: str) -> _GrantRules:
@@ -682,7 +682,7 @@ class Access:
         return self._verdict(verdict, asked, rule)
 
     def _in_the_open(self, rule: TopicRule) -> bool:
-        """Return whether a participant that peers refuse exchanges a topic that it may open freely.
+        """Return whether a participant that peers refuse can still exchange an unprotected topic.
 
         Peers check only the direction of the refused participant: read access for its readers,
         write access for its writers.  With access control in the other direction, the refused
@@ -743,5 +743,5 @@ class Access:
 
 
 def _is_topic_name(name: str) -> bool:
-    """Return whether Cyclone DDS 0.10 accepts it: letters, digits, ``_``, ``/``; no digit first."""
+
     return bool(_TOPIC_NAME.match(name))

@@ -195,9 +195,9 @@ def _decoded(text: str) -> str:
 _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
 _IGNORED = ("relay", "value", "name", "tag", "data_tags")
 _NOTHING = "["
-"""An expression that matches nothing: a set that is never closed."""
+"""An expression that matches no name: a set that is never closed."""
 _LONGEST_NUMBER = 4000
-"""Digits of a number that Python converts; without leading zeros, 64 bits have 20."""
+"""Largest number of digits that is converted; a 64-bit number has at most 20."""
 _INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]*|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
 
 

@@ -27,7 +27,7 @@ _Document = TypeVar("_Document", Governance, Permissions)
 def _readers(
     reader: DocumentReader,
 ) -> tuple[Callable[[bytes], Governance], Callable[[bytes], Permissions]]:
-    """Return how a vendor reads governance and permissions; sros's own documents need no reader."""
+    """Return the functions by which a vendor parses governance and permissions."""
     match reader:
         case DocumentReader.FAST:
             from sros_tool.dds.decision import fastdds
@@ -89,7 +89,7 @@ def _is_written(written: bytes, document: bytes) -> bool:
 
 
 def is_plain_governance(governance: Governance) -> bool:
-    """Return whether no vendor reads a text, a value or a range of domains in its own way."""
+    """Return whether all vendors read the governance's texts, values and domain ranges alike."""
     texts = []
     for rule in governance.domain_access_rules:
         if not (_are_plain_domains(rule.domains) and rule.topic_access_rules):
@@ -108,7 +108,7 @@ def _has_valid_values(rule: DomainRule | TopicRule) -> bool:
 
 
 def is_plain_permissions(permissions: Permissions) -> bool:
-    """Return whether no vendor reads a text, or a range of domains, in its own way."""
+    """Return whether all vendors read the permissions' texts and domain ranges alike."""
     texts = []
     for grant in permissions.grants:
         if not (grant.name and grant.rules):

@@ -1,4 +1,4 @@
-"""The letters that a vendor's expressions match: as sets of names, for all names at once.
+"""A vendor's topic expressions as sets of names, to decide for all names at once.
 
 fnmatch of glibc, or Cyclone DDS's own loop, read the sets of letters in an expression.
 """
@@ -35,7 +35,7 @@ _CLASSES = {
 
 
 def pieces_of(style: Style, expression: str) -> list[Letters | None]:
-    """Return the letters of an expression in a row, with None where any text may be."""
+    """Return the sequence of letters that an expression matches, with None for ``*``."""
     take_set = _FnmatchSets(expression).take if style is Style.FNMATCH else _cyclone_set
     pieces: list[Letters | None] = []
     index = 0
@@ -56,7 +56,7 @@ def pieces_of(style: Style, expression: str) -> list[Letters | None]:
 
 @lru_cache(maxsize=65536)
 def _automaton(style: Style, expression: str) -> Automaton | None:
-    """Return an automaton for the same names; None if ``expression`` matches only itself."""
+    """Return an automaton for the names of an expression; None if it matches only itself."""
     if not is_expression(expression):
         return None
     return Automaton.sequence(pieces_of(style, expression))
@@ -71,7 +71,7 @@ def names_of(style: Style, expressions: Iterable[str]) -> NameSet:
 
 
 def pattern_of(letters: Letters) -> str:
-    """Return a regular expression for one of some letters."""
+    """Return a regular expression that matches one character out of ``letters``."""
     if letters == ANY_LETTER:
         return "."
     if single := letters.single():
@@ -81,7 +81,7 @@ def pattern_of(letters: Letters) -> str:
 
 
 class _FnmatchSets:
-    """Reads the sets of an expression as glibc does, in linear time."""
+    """A parser of ``[...]`` sets as glibc reads them, in linear time."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -113,9 +113,9 @@ class _FnmatchSets:
         return _set_of(members, negated), index + 1
 
     def _end_of(self, index: int, *, first: bool) -> tuple[bool, bool]:
-        """Return whether a set whose members go on at ``index`` is closed, and plain if not.
+        """Return whether a set is closed after ``index``, and if not, whether its ``[`` is literal.
 
-        What was found for an index is kept: many unclosed sets would take quadratic time.
+        The results are cached: many unclosed sets would take quadratic time.
         """
         text = self._text
         path: list[tuple[int, bool | None]] = []

@@ -140,7 +140,7 @@ def _decoded(text: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return the text with its line ends and references resolved, up to a NUL."""
+    """Return the text up to a NUL, with line ends normalized and character references resolved."""
     if "&" not in text:
         return _decoded(_LINE_END.sub("\n", text) if "\r" in text or "\n" in text else text)
     # TinyXML-2 writes into the text that it reads: for a lone "&" it writes nothing, so the old
@@ -222,7 +222,7 @@ def _first(root: XmlElement, name: str) -> XmlElement:
 
 
 def _all(parent: XmlElement, name: str) -> list[XmlElement]:
-    """Return the children of ``parent``; raise unless there are some, all called ``name``."""
+    """Return the children of ``parent``; raise if it has none, or one not called ``name``."""
     children = parent.elements
     if not children or any(child.name != name for child in children):
         raise UnreadableError(f"<{parent.name}> needs <{name}> elements and nothing else")
@@ -303,7 +303,7 @@ def _number(element: XmlElement) -> int:
 
 
 def _integer(found: re.Match[str]) -> int:
-    """Return the number that sscanf reads: one that 64 bits cannot hold is their largest."""
+    """Parse a number as sscanf does: a number beyond 64 bits becomes the largest one."""
     if found[1]:
         return min(int(found[1], 16), 2**64 - 1)
     digits = found[2].lstrip("+-").lstrip("0")

@@ -21,7 +21,7 @@ _MOST_PARTS = 20  # Cyclone DDS 0.10 refuses a grant's subject of more
 
 
 class ComparisonCrash(Exception):  # noqa: N818
-    """A comparison of subjects ends the vendor's process."""
+    """The vendor's process crashes when it compares these subjects."""
 
 
 def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
@@ -36,7 +36,7 @@ def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
 def also_fitting(
     traits: VendorTraits, certified: Mapping[str, str], granted: Mapping[str, Collection[str]]
 ) -> dict[str, tuple[str, ...]]:
-    """Map each enclave to the others whose permissions fit its certificate as well, if any do.
+    """Map enclaves to other enclaves whose permissions their certificate matches, too.
 
     ``certified`` are the subjects of certificates, ``granted`` those of the grants.
     """
@@ -78,7 +78,7 @@ def _exact(granted: str, certified: str) -> bool:
 
 
 def _whole_attributes(granted: str, certified: str) -> bool:
-    """Compare part by part, between commas, also escaped ones, and without outer blanks.
+    """Compare subjects split at commas (also escaped ones), ignoring blanks around the parts.
 
     Source: Fast DDS 2.9.1, Permissions.cpp (rfc2253_string_compare).  A part of less than three
     bytes keeps some of its blanks, and what stands behind an empty part does not count.
@@ -95,7 +95,7 @@ def _whole_attributes(granted: str, certified: str) -> bool:
 
 
 def _trimmed(text: bytes, start: int, end: int) -> bytes:
-    """Return the part from ``start`` to ``end`` without outer blanks, as far as they are removed.
+    """Strip blanks from ``text[start:end]`` as Fast DDS 2.9.1 does, which leaves some.
 
     Each side stops where the part would have one byte left, and not at the end of a shorter part.
     """
@@ -122,7 +122,7 @@ _BEFORE = {
     wanted: re.compile(rf'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\{wanted}])*', re.DOTALL)
     for wanted in "=,"
 }
-"""What stands before the first such character outside of escapes and quotes."""
+"""Matches the text before the first wanted character outside of escapes and quotes."""
 
 
 def _any_order(granted: str, certified: str) -> bool:
@@ -136,7 +136,7 @@ def _any_order(granted: str, certified: str) -> bool:
 
 
 def _types_and_values(name: str) -> list[tuple[str, str]]:
-    """Return the attributes before a malformed one, as Fast DDS 2.14 (DistinguishedName.cpp)."""
+    """Return a name's attributes up to the first malformed one (DistinguishedName.cpp, 2.14)."""
     pairs: list[tuple[str, str]] = []
     rest = name.lstrip(" ")
     while rest and len(pairs) < _MOST_ATTRIBUTES:
@@ -153,7 +153,7 @@ def _types_and_values(name: str) -> list[tuple[str, str]]:
 
 
 def _outside_quotes(text: str, wanted: str) -> int:
-    """Return the index of the first such character outside of escapes and quotes, else -1."""
+    """Return the index of the first ``wanted`` character outside of escapes and quotes, or -1."""
     before = _BEFORE[wanted].match(text)
     end = before.end() if before else 0
     return end if text[end : end + 1] == wanted else -1
@@ -164,7 +164,7 @@ _EQUALS = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
 
 
 def _attributes(name: str) -> list[tuple[str, str]]:
-    """Return kinds and plain values (no quotes, escapes, outer spaces) before a malformed one."""
+    """Return (type, unescaped value) of a name's attributes up to the first malformed one."""
     attributes = []
     index = 0
     while index < len(name):

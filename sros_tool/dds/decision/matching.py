@@ -9,10 +9,10 @@ from functools import lru_cache
 from sros_tool.dds.decision.vendors import Style
 
 _Matcher = Callable[[str], object]
-"""Truthy if a name matches."""
+"""A function of a name; its result is truthy if the name matches."""
 
 _SPECIAL = frozenset("*?[")
-"""An expression without any of these means itself, for every vendor."""
+"""Wildcard characters: every vendor takes an expression without them literally."""
 
 _BEFORE_SPECIAL = re.compile(r"[^*?\[]*")
 
@@ -32,7 +32,7 @@ def _matcher(style: Style, expression: str) -> _Matcher | None:
 
 
 def _patterns(style: Style, expression: str) -> Iterable[str]:
-    """Return regular expressions for the letters of an expression, with "" where any text may be.
+    """Return a regular expression for every letter of an expression, and "" for ``*``.
 
     Only the sets of letters are read in a vendor's own way.
     """
@@ -45,7 +45,7 @@ def _patterns(style: Style, expression: str) -> Iterable[str]:
 
 
 def _joined(segments: list[str]) -> str:
-    """Return the pattern for the segments between stars.
+    """Return the regular expression for segments that are separated by ``*``.
 
     Each segment matches a fixed number of characters, so the first fit is as good as a later one.
     The atomic group tries only that one; otherwise many stars would take exponential time.

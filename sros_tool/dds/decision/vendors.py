@@ -37,33 +37,33 @@ class Moments(Enum):
     """The reading of dates in a grant."""
 
     STANDARD = auto()
-    """With its offset; UTC if it has none."""
+    """A date has the offset that it names, or else is in UTC."""
     LOCAL = auto()
-    """In the standard time of the host's zone, the offset dropped (Fast DDS)."""
+    """A date is in the host's standard time; its offset is ignored (Fast DDS)."""
     CYCLONE = auto()
-    """With its offset; a date that is incomplete or not from 1970 to 2262 is long past."""
+    """As STANDARD, but an incomplete date, or a year outside of 1970 to 2262, has passed."""
 
 
 class OpenRange(Enum):
     """The meaning of a range of domains with one end."""
 
     OPEN = auto()
-    """Without an upper end from N on; without a lower end up to N."""
+    """``min N`` alone means N and above; ``max N`` alone means 0 to N."""
     SINGLE = auto()
-    """Without an upper end N alone; without a lower end up to N (Fast DDS)."""
+    """``min N`` alone means only N; ``max N`` alone means 0 to N (Fast DDS)."""
     CRASHES = auto()
-    """Without an upper end N alone; without a lower end a crash (Cyclone DDS)."""
+    """``min N`` alone means only N; ``max N`` alone is a crash (Cyclone DDS)."""
 
 
 class DenyPartitions(Enum):
     """The partitions of an endpoint that a deny rule must name to apply to it."""
 
     ANY_OR_ALL = auto()
-    """One of them; without partitions the rule applies to all."""
+    """At least one of the endpoint's; a rule without partitions applies to all partitions."""
     ANY_OR_DEFAULT = auto()
-    """One of them; without partitions the rule applies to the default one only (Cyclone DDS)."""
+    """At least one; a rule without partitions applies only to the default one (Cyclone DDS)."""
     IGNORED = auto()
-    """None: a deny rule applies whatever its partitions (Fast DDS)."""
+    """A deny rule applies in all partitions, whatever it names (Fast DDS)."""
 
 
 class Signers(Enum):
@@ -121,14 +121,14 @@ class VendorTraits:
     reader: DocumentReader = DocumentReader.STANDARD
     style: Style = Style.FNMATCH
     governance_both_ways: bool = False
-    """A topic's name is also taken as an expression for the governance's expressions."""
+    """A topic's name, taken as an expression, is also matched against governance expressions."""
     trims_texts: bool = False
     """Spaces around the text of an element do not count."""
     subjects: Subjects = Subjects.EXACT
     escapes_subjects: bool = False
     """A character beyond ASCII in a certificate's subject is compared as ``\\C3\\B6``."""
     longest_subject: int | None = None
-    """The subject of a certificate is cut to so many bytes before it is compared."""
+    """Length, in bytes, to which a certificate's subject is cut before it is compared."""
     crashes_on_empty_subject: bool = False
     """A certificate without any attribute in its subject crashes the process, and its peers'."""
     moments: Moments = Moments.STANDARD
@@ -136,23 +136,23 @@ class VendorTraits:
     """A later grant is used if the first grant of the subject is not valid now."""
     open_range: OpenRange = OpenRange.OPEN
     filters_own_domain: bool = True
-    """Rules for other domains do not count for the own participant (they never do for peers)."""
+    """The participant itself ignores its rules for other domains (peers always ignore them)."""
     relays_count_for_readers: bool = False
     """For a reader, peers also check ``<relay>``, after the ``<subscribe>`` of the same rule."""
     topic_decides: bool = False
-    """The first rule whose topic matches decides, and then its partitions must fit."""
+    """The first rule whose topic matches decides, even if its partitions then do not match."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY_OR_ALL
     honours_default: bool = True
     crashes_on_empty_texts: bool = False
     """An expression or a default without text crashes the process when a decision reaches it."""
     longest_topic_name: int | None = None
-    """A topic with a longer name, in bytes, is created and never matched."""
+    """Length of a name, in bytes, above which a topic is created but never matched."""
     creates_topics: bool = False
     """A topic is created before its endpoint, and needs a right in either direction."""
     always_needs_allow_rule: bool = False
     """Without any allow rule the participant does not start, even without join control."""
     needs_domain_rule: bool = True
-    """On a domain that the governance does not list, the participant does not even start."""
+    """A participant does not start on a domain that the governance does not list."""
     shares_open_topics: bool = False
     """A participant that peers refuse still exchanges unprotected topics with them (measured).
 
@@ -171,17 +171,17 @@ class VendorTraits:
     If its hash is one that the vendor does not take, the process crashes, because it was freed.
     """
     verifies_policies: bool = False
-    """Of a chain, the policies and the CA's own signature are verified, too (Fast DDS)."""
+    """Certificate policies and the root CA's own signature are verified, too (Fast DDS)."""
     reads_trusted_certificates: bool = True
     """A certificate may be in a PEM block ``TRUSTED CERTIFICATE``."""
     reads_files_as_text: bool = False
-    """In a file with certificates or a list, a zero byte ends its line, and perhaps the file."""
+    """In files with certificates or lists, a zero byte ends the line, or even the file."""
     hashes: Hashes = Hashes.ANY
     keys: Keys = Keys.ANY
     reads_tokens: bool = True
     """The key of an enclave can be on a PKCS#11 token, as ``key.p11`` names it."""
     largest_document: int | None = None
-    """With larger signed permissions, in bytes, a handshake may never finish."""
+    """Size of signed permissions, in bytes, above which a handshake may never finish."""
 
 
 _STANDARD = VendorTraits("DDS-Security 1.1")
