@@ -19,7 +19,7 @@ from pathlib import Path
 
 from benchmarks.checking import checking
 from benchmarks.deciding import deciding
-from benchmarks.explaining import explaining
+from benchmarks.explaining import explaining, explaining_zenoh
 from benchmarks.fleet import fleet
 from benchmarks.floor import make_enclaves, sizes_of
 from benchmarks.inputs import enclaves_policy, topics_policy
@@ -79,6 +79,7 @@ def main() -> int:
         rows += [Row(*figure) for figure in deciding()]
         checked = checking(folder, options.enclaves, RULES, options.rounds)
         checked += explaining(folder, options.enclaves, RULES, options.rounds)
+        checked += explaining_zenoh(folder, options.enclaves, RULES, options.rounds)
         checked += requiring(folder, options.enclaves, options.rounds)
         rows += [Row(name, taken, None, limit, kept) for name, taken, limit, kept in checked]
         rows += [

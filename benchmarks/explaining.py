@@ -1,8 +1,11 @@
-"""Benchmarks of ``sros explain`` on a keystore of many enclaves, and of proving permissions."""
+"""Benchmarks of ``sros explain`` on keystores of many enclaves, and of proving permissions."""
 
 from __future__ import annotations
 
+import resource
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -67,6 +70,42 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
         taken = statistics.median(_seconds(work) for _ in range(rounds))
         figures.append((name, taken, f"{limit:g} s", taken < limit))
     return figures
+
+
+def explaining_zenoh(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figure]:
+    """Measure the seconds of CPU of ``sros explain --vendor zenoh``, the start included."""
+    from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
+    from sros_tool.keystore.lifecycle.update import set_zenoh
+    from sros_tool.keystore.template import load_template
+    from sros_tool.policy.document import read_policy
+    from sros_tool.zenoh.configuration import Mode, ZenohNetwork
+
+    now = datetime.now(UTC)
+    question = ("publish", "/robot7/topic_0", "--vendor", "zenoh")
+    peers = enclaves // 5
+    tasks = (
+        (f"explain --who on Zenoh, {enclaves} clients: CPU", Mode.CLIENT, enclaves, ("--who",), 2),
+        (f"explain on Zenoh, {peers} peers: CPU", Mode.PEER, peers, ("/robot7/part",), 1),
+    )
+    figures = []
+    for name, mode, count, asked, limit in tasks:
+        root, file = folder / f"explained_{mode}", folder / f"explained_{mode}.xml"
+        file.write_text(enclaves_policy(count, rules))
+        create_keystore(root, template=load_template("production"), now=now)
+        generate_artifacts(root, policies=[read_policy(file)], now=now)
+        set_zenoh(root, ZenohNetwork(mode=mode), now=now)
+        program = str(Path(sys.executable).with_name("sros"))
+        command = (program, "explain", str(root), *asked, *question)
+        taken = statistics.median(_cpu_seconds(command) for _ in range(rounds))
+        figures.append((name, taken, f"{limit} s", taken < limit))
+    return figures
+
+
+def _cpu_seconds(command: tuple[str, ...]) -> float:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def _seconds(work: Callable[[], object]) -> float:

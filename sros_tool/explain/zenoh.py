@@ -42,8 +42,8 @@ from sros_tool.policy.rights import Right, parts
 from sros_tool.translate_zenoh.graph import example_token
 from sros_tool.translate_zenoh.rights import ANY_TYPE, untyped
 from sros_tool.values import shows
-from sros_tool.zenoh.access import Enforcement, Message
-from sros_tool.zenoh.configuration import Mode
+from sros_tool.zenoh.access import Enforcement, Flow, Message, MessageFilter
+from sros_tool.zenoh.configuration import Mode, RenderedReader
 from sros_tool.zenoh.delivery import (
     Check,
     Delivery,
@@ -249,6 +249,8 @@ class ZenohEvaluator:
         self.names = keystore.names
         self._at = at
         self._file = cache(self._read)
+        self._rendered = RenderedReader()
+        self._is_signed = cache(self._verified)
         self.router = self._router()
 
     def _router(self) -> ZenohFile:
@@ -283,7 +285,8 @@ class ZenohEvaluator:
     ) -> ZenohAnswer:
         """Return the answer for one enclave; ``reach`` says whether to look at all others.
 
-        A ``brief`` answer for a peer is by the router's file, which has the same rights.
+        A ``brief`` answer says neither which files are unsigned, nor asks peers: for these the
+        router's file has the same rights.
         """
         if enclave not in self.names:
             raise no_such_enclave(self.keystore, enclave, self.names)
@@ -295,7 +298,7 @@ class ZenohEvaluator:
             _Outcome.REFUSED,
             own.problem,
             until=own.until,
-            unsigned=self._unsigned(own),
+            unsigned=() if brief else self._unsigned(own),
         )
         if own.process is None:
             return answer
@@ -368,32 +371,37 @@ class ZenohEvaluator:
         if not (folder / file).exists():
             return _closed(enclave, file, f"it has no {file}: its processes open no session")
         try:
-            data = self.keystore.read(folder / file, "Zenoh configuration")
-            document = parse_configuration(data, str(folder / file), lines=False)
+            mode, access, endpoints = self._configuration(folder / file)
         except SrosError as error:
             return _closed(enclave, file, f"Zenoh does not accept its {file}: {error.why}".strip())
-        state = self.keystore.enclave(enclave, now=self._at)
-        faults = [each for each in state.problems_at_home if each.file in _OF_TLS]
-        if faults or state.certificate is None:
+        identity = self.keystore.identity(enclave, now=self._at)
+        certificate = identity.certificate
+        faults = [problem for problem in identity.problems if problem.file in _OF_TLS]
+        if faults or certificate is None:
             problem = str(faults[0]) if faults else f"{CERTIFICATE_FILE} cannot be read"
             return _closed(enclave, file, problem)
-        name = common_name_of(state.certificate.subject) or ""
+        name = common_name_of(certificate.subject) or ""
         if name != enclave:
             problem = f"Zenoh knows its processes by the common name {name!r} of {CERTIFICATE_FILE}"
             return _closed(enclave, file, problem)
-        return ZenohFile(
-            enclave,
-            file,
-            ZenohProcess(name, document.mode, document.access),
-            "",
-            validity_of(state.certificate).not_after,
-            document.listen if document.mode is Mode.ROUTER else document.connect,
-        )
+        until = validity_of(certificate).not_after
+        return ZenohFile(enclave, file, ZenohProcess(name, mode, access), "", until, endpoints)
 
-    def _is_signed(self, path: Path) -> bool:
+    def _configuration(self, path: Path) -> tuple[Mode, MessageFilter, tuple[ZenohEndpoint, ...]]:
+        """Return the mode of a process, what it enforces, and where it connects or listens."""
+        data = self.keystore.read(path, "Zenoh configuration")
+        if own := self._rendered.read(data):
+            texts = own.listen if own.mode is Mode.ROUTER else own.connect
+            return own.mode, own.access_control, tuple(map(ZenohEndpoint, texts))
+        document = parse_configuration(data, str(path), lines=False)
+        endpoints = document.listen if document.mode is Mode.ROUTER else document.connect
+        return document.mode, document.access, endpoints
+
+    def _verified(self, path: Path) -> bool:
         try:
             document = self.keystore.read(path, "Zenoh configuration")
-            return is_signed(path, document, self.keystore.ca_certificate(PERMISSIONS))
+            authority = self.keystore.ca_certificate(PERMISSIONS)
+            return is_signed(path, document, authority, self.keystore.files)
         except SrosError:
             return False
 
@@ -455,11 +463,8 @@ class ZenohEvaluator:
         """Return how a node is announced in the graph, and how it sees all others."""
         everything = f"@ros2_lv/{self.domain}/**"
         assert self.router.process
-        stated = (
-            key
-            for rule in self.router.process.access.rules_of(own.name)
-            if rule.allows and Message.LIVELINESS_TOKEN in rule.messages
-            for key in rule.key_expressions
+        stated = self.router.process.access.allowed_keys(
+            own.name, Flow.INGRESS, Message.LIVELINESS_TOKEN
         )
         node = example_token(self.domain, own.name, stated)
         return token((own, other), node, everything), token((other, own), everything, everything)
@@ -513,8 +518,9 @@ class ZenohEvaluator:
         if check.message not in (Message.PUT, Message.QUERY) or not check.decision.rules:
             return ""
         file = self._file(check.enforcer, self._file_of(check.enforcer))
-        rules = file.process.access.rules if file.process else ()
-        keys = next(rule.key_expressions for rule in rules if rule.id in check.decision.rules)
+        if not file.process:
+            return ""
+        keys = file.process.access.key_expressions_of(check.decision.rules[0])
         wide = next((key for key in keys if includes(key, check.key)), "")
         return wide if "*" in untyped(wide).removesuffix("/*/*") else ""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -486,6 +486,16 @@ class Keystore:
             lambda: open_enclave(folder, now=now, domain=domain, files=self.files),
         )
 
+    def identity(self, name: str, *, now: datetime) -> EnclaveIdentity:
+        """Return the certificate of an enclave, and what is wrong with its files of identity.
+
+        It reads neither governance nor permissions: Zenoh needs none of them.
+        """
+        folder = self.folder(name)
+        return self.once(
+            ("identity", name, now), lambda: _EnclaveFiles(folder, now, self.files).identity()
+        )
+
     def certificate_of(self, name: str) -> x509.Certificate:
         """Return the certificate of an enclave.
 
@@ -506,7 +516,7 @@ class Keystore:
         )
 
 
-_OF_ENCLAVES = ("enclave", "grant", "certificate")
+_OF_ENCLAVES = ("enclave", "identity", "grant", "certificate")
 
 
 @dataclass(frozen=True, slots=True)
@@ -653,13 +663,7 @@ class OpenedEnclave:
     @property
     def problems_at_home(self) -> tuple[Problem, ...]:
         """The problems, except the missing key of an enclave whose key is on the robot."""
-        if not self.key_on_robot:
-            return self.problems
-        return tuple(
-            each
-            for each in self.problems
-            if (each.file, each.fault) != (KEY_FILE, Fault.FILE_MISSING)
-        )
+        return _at_home(self.problems, self.key_on_robot)
 
     def domains(self) -> DomainSet | None:
         """Return the ROS domains that the governance names, or None without governance."""
@@ -695,6 +699,23 @@ class OpenedEnclave:
         return min(moments)
 
 
+@dataclass(frozen=True, slots=True)
+class EnclaveIdentity:
+    """The certificate of an enclave, and the problems of it, of its key and of its identity CA.
+
+    The key may be missing in a keystore if it was generated on the robot and stays there.
+    """
+
+    certificate: x509.Certificate | None
+    problems: tuple[Problem, ...]
+
+
+def _at_home(problems: tuple[Problem, ...], key_on_robot: bool) -> tuple[Problem, ...]:
+    """Return the problems, except a missing key that is on the robot."""
+    on_robot = (KEY_FILE, Fault.FILE_MISSING) if key_on_robot else None
+    return tuple(problem for problem in problems if (problem.file, problem.fault) != on_robot)
+
+
 def weaknesses(state: OpenedEnclave) -> Iterator[tuple[str, str]]:
     """Yield weak cryptography in an enclave's files: the name of the file, and a clause."""
     for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, CERTIFICATE_FILE):
@@ -727,6 +748,7 @@ _EXPIRY_OF_CERTIFICATE = (Fault.CERTIFICATE_EXPIRED, Fault.CERTIFICATE_NOT_YET_V
 _EXPIRY_OF_CA = (Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID)
 _EXPIRY_OF_PERMISSIONS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
 
+_IDENTITY_FILES = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
 _ENCRYPTED = re.compile(rb"ENCRYPTED")
 _SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
@@ -755,20 +777,18 @@ class _EnclaveFiles:
         self._files = files
         self._problems: list[Problem] = []
 
+    def identity(self) -> EnclaveIdentity:
+        """Return the identity alone."""
+        files, _ = self._read_all(_IDENTITY_FILES)
+        certificate, *_ = self._checked_identity(files)
+        return EnclaveIdentity(
+            certificate, _at_home(tuple(self._problems), key_on_robot(self._folder))
+        )
+
     def check(self, domain: int | None) -> OpenedEnclave:
-        token_file = self._read_token_file()
-        files = {
-            name: self._read(name)
-            for name in REQUIRED_FILES
-            if name != KEY_FILE or token_file is None or (self._folder / name).exists()
-        }
-        files.setdefault(KEY_FILE, None)
-        token = self._token(token_file, files[KEY_FILE]) if token_file is not None else None
-        identity_ca = self._certificate(IDENTITY_CA_FILE, files)
+        files, token = self._read_all(REQUIRED_FILES)
         permissions_ca = self._certificate(PERMISSIONS_CA_FILE, files)
-        certificate = self._certificate(CERTIFICATE_FILE, files)
-        public_key = self._check_identity(certificate, identity_ca, files)
-        files[CRL_FILE] = self._check_revocation(certificate, identity_ca, files[IDENTITY_CA_FILE])
+        certificate, identity_ca, public_key = self._checked_identity(files)
         governance = permissions = None
         document = self._signed(GOVERNANCE_FILE, files, permissions_ca)
         if document is not None:
@@ -800,6 +820,27 @@ class _EnclaveFiles:
             public_key,
             self._files,
         )
+
+    def _read_all(self, names: Sequence[str]) -> tuple[dict[str, bytes | None], TokenUri | None]:
+        """Return the content of files, and the key on a token if there is one."""
+        token_file = self._read_token_file()
+        files = {
+            name: self._read(name)
+            for name in names
+            if name != KEY_FILE or token_file is None or (self._folder / name).exists()
+        }
+        files.setdefault(KEY_FILE, None)
+        return files, None if token_file is None else self._token(token_file, files[KEY_FILE])
+
+    def _checked_identity(
+        self, files: dict[str, bytes | None]
+    ) -> tuple[x509.Certificate | None, x509.Certificate | None, object]:
+        """Check the identity, and return its certificate, its CA and its public key."""
+        identity_ca = self._certificate(IDENTITY_CA_FILE, files)
+        certificate = self._certificate(CERTIFICATE_FILE, files)
+        public_key = self._check_identity(certificate, identity_ca, files)
+        files[CRL_FILE] = self._check_revocation(certificate, identity_ca, files[IDENTITY_CA_FILE])
+        return certificate, identity_ca, public_key
 
     def _add(self, file: str, text: str, fault: Fault) -> None:
         self._problems.append(Problem(file, text, fault))

@@ -10,12 +10,12 @@ with the wheel 1.10.2.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from functools import cached_property, lru_cache
 from itertools import product
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from sros_tool.automata import NameSet
 from sros_tool.zenoh.key_expressions import KeyExpressions, includes, names_of
@@ -73,7 +73,7 @@ class RemoteRights:
     rules: tuple[AccessRule, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class AccessControl:
     """The access control of a process: each common name occurs once, everybody else is denied.
 
@@ -116,12 +116,59 @@ class AccessControl:
             each for rule in rules if rule.allows is allows for each in rule.key_expressions
         )
 
+    def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
+        """Return what `Enforcement.decide` does for the same access control, read from its file."""
+        own = None if remote.common_name is None else self._by_name.get(remote.common_name)
+        if own is None:
+            stated = any(each.rules for each in self.remotes)
+            return AccessDecision(False, (), (), _NO_SUBJECT if stated else _NO_RULE_AT_ALL)
+        applying = [
+            (rule.allows, rule_id(own.common_name, number))
+            for number, rule in enumerate(own.rules)
+            if rule.flow is flow
+            and message in rule.messages
+            and _include(rule.key_expressions, key)
+        ]
+        return _decided(applying, (own.common_name,))
+
+    def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
+        """Return the key expressions that rules allow, whatever others deny of them."""
+        rules = self._rules(common_name, flow, message)
+        return tuple(key for rule in rules if rule.allows for key in rule.key_expressions)
+
+    def key_expressions_of(self, rule: str) -> tuple[str, ...]:
+        """Return the key expressions of a rule of `decide`, by its id."""
+        name, _, number = rule.rpartition("#")
+        return self._by_name[name].rules[int(number)].key_expressions
+
+    @cached_property
+    def _by_name(self) -> Mapping[str, RemoteRights]:
+        return {remote.common_name: remote for remote in self.remotes}
+
     def _rules(self, common_name: str, flow: Flow, message: Message) -> Iterator[AccessRule]:
-        for remote in self.remotes:
-            if remote.common_name == common_name:
-                for rule in remote.rules:
-                    if rule.flow is flow and message in rule.messages:
-                        yield rule
+        if remote := self._by_name.get(common_name):
+            for rule in remote.rules:
+                if rule.flow is flow and message in rule.messages:
+                    yield rule
+
+
+def rule_id(common_name: str, number: int) -> str:
+    """Return the id that a rule of a remote process has in a file, by its place among them."""
+    return f"{common_name}#{number}"
+
+
+_NO_RULE = "no rule allows it, and the default is DENY"
+_NO_SUBJECT = "no subject matches, and the default is DENY"
+_NO_RULE_AT_ALL = "no rule is in force, and the default is DENY"
+
+
+def _decided(applying: Sequence[tuple[bool, str]], subjects: tuple[str, ...]) -> AccessDecision:
+    """Return the decision of the rules that apply, each with whether it allows: DENY wins."""
+    if denied := tuple(rule for allows, rule in applying if not allows):
+        return AccessDecision(False, denied, subjects, f"rule {denied[0]} denies it")
+    allowed = tuple(rule for _, rule in applying)
+    why = f"rule {allowed[0]} allows it" if allowed else _NO_RULE
+    return AccessDecision(bool(allowed), allowed, subjects, why)
 
 
 _FEW = 16
@@ -257,6 +304,19 @@ class AccessDecision:
     why: str
 
 
+class MessageFilter(Protocol):
+    """What decides on the messages that a process gets and sends."""
+
+    def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
+        """Return whether a message from or to a remote process passes."""
+
+    def key_expressions_of(self, rule: str) -> tuple[str, ...]:
+        """Return the key expressions of a rule, by its id."""
+
+    def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
+        """Return the key expressions that rules allow, whatever others deny of them."""
+
+
 _OF_HISTORY = (Message.PUT, Message.QUERY)
 
 _Combination = tuple[str | None, ...]
@@ -358,7 +418,22 @@ class Enforcement:
                 return AccessDecision(True, _once(allowed), subjects, why)
         if denying:
             return AccessDecision(False, _once(denying), subjects, f"rule {denying[0]} denies it")
-        return AccessDecision(False, (), subjects, "no rule allows it, and the default is DENY")
+        return AccessDecision(False, (), subjects, _NO_RULE)
+
+    def key_expressions_of(self, rule: str) -> tuple[str, ...]:
+        """Return the key expressions of a rule, by its id."""
+        return next(each.key_expressions for each in self.rules if each.id == rule)
+
+    def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
+        """Return the key expressions that rules of subjects with a name allow."""
+        return tuple(
+            key
+            for subject in self.subjects
+            if common_name in (subject.cert_common_names or ())
+            for rule in self.rules_of(subject.id)
+            if rule.allows and flow in rule.flows and message in rule.messages
+            for key in rule.key_expressions
+        )
 
     def passing(
         self, remote: Remote, flow: Flow, message: Message, of: Callable[[Iterable[str]], NameSet]

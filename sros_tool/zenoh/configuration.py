@@ -18,7 +18,14 @@ from json.encoder import encode_basestring_ascii
 from typing import Any, NamedTuple
 
 from sros_tool.errors import DocumentError
-from sros_tool.zenoh.access import AccessControl, AccessRule, Flow, Message, RemoteRights
+from sros_tool.zenoh.access import (
+    AccessControl,
+    AccessRule,
+    Flow,
+    Message,
+    RemoteRights,
+    rule_id,
+)
 
 
 class Mode(StrEnum):
@@ -188,7 +195,7 @@ _PERMISSIONS = {True: "allow", False: "deny"}
 def render_rights(remote: RemoteRights) -> RenderedRights:
     """Return the lines of a remote enclave, as each file of a network in peer mode has them."""
     name = remote.common_name
-    ids = [f"{name}#{number}" for number in range(len(remote.rules))]
+    ids = [rule_id(name, number) for number in range(len(remote.rules))]
     rules = (
         f'   {{"id": {_list([each])[1:-1]}, "permission": "{_PERMISSIONS[rule.allows]}", '
         f'"flows": ["{rule.flow}"], '
@@ -219,37 +226,96 @@ def parse_rendered(data: bytes, name: str) -> Configuration:
     Raises:
         DocumentError: it is not exactly as sros writes it, so it may have another meaning.
     """
-    try:
-        document = json.loads(data)
-        control = document["access_control"]
-        rules = {
-            each["id"]: AccessRule(
-                Flow(each["flows"][0]),
-                tuple(map(Message, each["messages"])),
-                tuple(each["key_exprs"]),
-                each["permission"] == _PERMISSIONS[True],
-            )
-            for each in control["rules"]
-        }
-        remotes = tuple(
-            RemoteRights(each["subjects"][0], tuple(rules[rule] for rule in each["rules"]))
-            for each in control["policies"]
-        )
-        found = Configuration(
-            Mode(document["mode"]),
-            tuple(document["listen"]["endpoints"]),
-            tuple(document["connect"]["endpoints"]),
-            AccessControl(remotes),
-        )
-        same = any(found.render(each) == data for each in SettingsEdition)
-    except (ValueError, KeyError, IndexError, TypeError, RecursionError):
-        same = False
-    if not same:
+    configuration = RenderedReader().read(data)
+    if configuration is None:
         raise DocumentError(
             f"{name} is not a Zenoh configuration as sros writes it",
             "Something else wrote it, or somebody changed it by hand.",
         )
-    return found
+    return configuration
+
+
+_CONTROL = ',\n "access_control": {\n'
+_SECTIONS = re.compile(
+    r'  "enabled": true,\n  "default_permission": "deny",\n'
+    r'  "rules": \[(.*)\n  \],\n  "subjects": \[(.*)\n  \],\n  "policies": \[(.*)\n  \]\n }\n}\n',
+    re.DOTALL,
+)
+
+
+class RenderedReader:
+    """Reader of many configurations as `Configuration.render` writes them.
+
+    What several of them say about a remote enclave in the same words is read once.
+    """
+
+    def __init__(self) -> None:
+        self._beginnings: dict[str, tuple[Mode, tuple[str, ...], tuple[str, ...]]] = {}
+        self._policies: dict[str, tuple[str, int]] = {}
+        self._remotes: dict[RenderedRights, RemoteRights] = {}
+
+    def read(self, data: bytes) -> Configuration | None:
+        """Return a configuration, or None if it is not exactly as sros writes it."""
+        try:
+            beginning, mark, control = data.decode().partition(_CONTROL)
+            sections = _SECTIONS.fullmatch(control)
+            if not mark or not sections:
+                return None
+            mode, listen, connect = self._beginning(beginning)
+            return Configuration(mode, listen, connect, AccessControl(self._of_all(sections)))
+        except (ValueError, KeyError, IndexError, TypeError, RecursionError):
+            return None
+
+    def _beginning(self, text: str) -> tuple[Mode, tuple[str, ...], tuple[str, ...]]:
+        """Return the mode, and where a process listens and connects; raise if others wrote it."""
+        if text not in self._beginnings:
+            document = json.loads(f"{text}\n}}")
+            mode = Mode(document["mode"])
+            listen, connect = (tuple(document[key]["endpoints"]) for key in ("listen", "connect"))
+            if all(_rest(mode, listen, connect, edition) != text for edition in SettingsEdition):
+                raise ValueError("another beginning")
+            self._beginnings[text] = mode, listen, connect
+        return self._beginnings[text]
+
+    def _of_all(self, sections: re.Match[str]) -> tuple[RemoteRights, ...]:
+        rules, subjects, policies = (_lines(section) for section in sections.groups())
+        remotes, begin = [], 0
+        for subject, policy in zip(subjects, policies, strict=True):
+            name, count = self._policy(policy)
+            of_remote = RenderedRights(",\n".join(rules[begin : begin + count]), subject, policy)
+            begin += count
+            remotes.append(self._remote(name, of_remote))
+        if begin != len(rules) or len({remote.common_name for remote in remotes}) != len(remotes):
+            raise ValueError("rules without a subject, or a subject twice")
+        return tuple(remotes)
+
+    def _policy(self, line: str) -> tuple[str, int]:
+        """Return the remote enclave of a policy, and its number of rules."""
+        if line not in self._policies:
+            policy = json.loads(line)
+            self._policies[line] = policy["subjects"][0], len(policy["rules"])
+        return self._policies[line]
+
+    def _remote(self, name: str, rendered: RenderedRights) -> RemoteRights:
+        if rendered not in self._remotes:
+            rules = tuple(
+                AccessRule(
+                    Flow(rule["flows"][0]),
+                    tuple(map(Message, rule["messages"])),
+                    tuple(rule["key_exprs"]),
+                    rule["permission"] == _PERMISSIONS[True],
+                )
+                for rule in json.loads(f"[{rendered.rules}]")
+            )
+            remote = RemoteRights(name, rules)
+            if render_rights(remote) != rendered:
+                raise ValueError("not as it is rendered")
+            self._remotes[rendered] = remote
+        return self._remotes[rendered]
+
+
+def _lines(section: str) -> list[str]:
+    return section.removeprefix("\n").split(",\n") if section else []
 
 
 _ENDPOINT = re.compile(r"(?:[A-Za-z0-9.-]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5})\Z", re.ASCII)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from sros_tool.values import shows
-from sros_tool.zenoh.access import AccessDecision, Enforcement, Flow, Message, Remote
+from sros_tool.zenoh.access import AccessDecision, Flow, Message, MessageFilter, Remote
 from sros_tool.zenoh.configuration import Mode
 
 
@@ -23,7 +23,7 @@ class ZenohProcess:
 
     name: str
     mode: Mode
-    access: Enforcement
+    access: MessageFilter
 
 
 @shows("enforcer", "remote", "flow", "message", "key", "allowed", "rules", "why")
