@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -53,8 +54,8 @@ def tree_of(source: str) -> ast.Module:
 
 
 @cache
-def nodes_of(tree: ast.Module) -> tuple[ast.AST, ...]:
-    """Return all nodes of a module, which several tests go through."""
+def nodes_of(tree: ast.AST) -> tuple[ast.AST, ...]:
+    """Return all nodes of a tree, which several tests go through."""
     return tuple(ast.walk(tree))
 
 
@@ -601,13 +602,13 @@ def used_names(name: str, modules: Modules, known: Modules) -> set[tuple[str, st
     whole = [module for module in aliases.values() if module in known]
     folder = f"{name.rpartition('.')[0]}."
     beside = [each for each in known if each.startswith(folder) and each != name]
-    for node in nodes:
-        if isinstance(node, ast.Attribute):
-            # Of any module that is here whole: it may be asked as the variable of a loop.
-            found |= {(module, node.attr) for module in whole}
-        elif isinstance(node, ast.Constant) and (word := str(node.value)).isidentifier():
-            # A table of verbs, or of what is imported late, names what stands next to it.
-            found |= {(each, word) for each in beside}
+    # Of any module that is here whole: it may be asked as the variable of a loop.
+    attributes = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+    found.update(product(whole, attributes))
+    # A table of verbs, or of what is imported late, names what stands next to it.
+    constants = (node.value for node in nodes if isinstance(node, ast.Constant))
+    words = {word for word in constants if isinstance(word, str) and word.isidentifier()}
+    found.update(product(beside, words))
     return {(module, each) for module, each in found if module != name}
 
 
@@ -616,7 +617,7 @@ def loaded_names(*trees: ast.AST) -> set[str]:
     return {
         node.id
         for tree in trees
-        for node in ast.walk(tree)
+        for node in nodes_of(tree)
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)
     }
 
@@ -624,7 +625,7 @@ def loaded_names(*trees: ast.AST) -> set[str]:
 def types_of_signatures(tree: ast.Module) -> set[str]:
     """Return the names that stand in the annotations of a module."""
     found = set()
-    for node in ast.walk(tree):
+    for node in nodes_of(tree):
         for field in ("annotation", "returns"):
             if annotation := getattr(node, field, None):
                 found |= loaded_names(annotation)

@@ -24,6 +24,7 @@ from sros_tool.pki.certificates import identity_of, load_certificate
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
 from tests.support.harness import policy_text, publish, sros
+from tests.support.long_form import some
 
 LOGS = Path(__file__).with_name("logs")
 CYCLONE_LINE = "1795242829.914522 [0]     recvUC: "
@@ -136,7 +137,7 @@ def test_the_true_cause_is_found_in_the_enclave(breakage: str, log: Path, keysto
     assert "Traceback" not in broken.err
 
 
-@pytest.mark.parametrize("breakage", BREAKAGES)
+@pytest.mark.parametrize("breakage", some([*BREAKAGES], 8))
 def test_the_remedy_runs_and_mends_it(breakage: str, keystore: Path) -> None:
     BREAKAGES[breakage](Enclave(keystore))
     asked = ("explain", keystore, ENCLAVE, "--log", log_of(FAST_14, breakage), "--domain", "0")
@@ -220,7 +221,9 @@ def test_a_clock_is_set_on_the_robot_and_not_at_home(keystore: Path) -> None:
 
 
 @pytest.mark.dds
-@pytest.mark.parametrize("breakage", [each for each in BREAKAGES if each not in SILENT_ON_CYCLONE])
+@pytest.mark.parametrize(
+    "breakage", some([name for name in BREAKAGES if name not in SILENT_ON_CYCLONE], 5)
+)
 def test_what_cyclone_says_now(breakage: str, keystore: Path, tmp_path: Path) -> None:
     """The very log of a process that could not start, as Cyclone DDS prints it here."""
     program = Path(__file__).with_name("join_cyclone.py")

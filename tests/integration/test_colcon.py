@@ -22,6 +22,9 @@ print({each.name: each for each in entry_points(group="ros2cli.command")}["secur
 """
 """What ros2cli 0.32 does: entries by name, so it takes the last one (``entry_points.py``)."""
 
+BUILT = sometimes("a workspace is built")
+"""Marks the tests of the workspace, which is built for all of them or for none."""
+
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -59,7 +62,7 @@ def sourced(workspace: Path, command: str, **env: str) -> str:
     return ended.stdout
 
 
-@sometimes("the program of a workspace")
+@BUILT
 def test_the_program_of_the_workspace_works(workspace: Path) -> None:
     assert sourced(workspace, "command -v sros").startswith(f"{workspace}/install/")
     program = "-P -c 'import sros_tool.cli as cli; print(cli.__file__); cli.main()'"
@@ -71,7 +74,7 @@ def test_the_program_of_the_workspace_works(workspace: Path) -> None:
     assert not list((workspace / "src").rglob("*.egg-info"))
 
 
-@sometimes("imports in a workspace")
+@BUILT
 def test_nothing_is_imported_from_the_working_folder(workspace: Path) -> None:
     """An empty part of PYTHONPATH is the working folder, which anybody may own."""
     for before in ({}, {"PYTHONPATH": "/somewhere"}):
@@ -80,6 +83,7 @@ def test_nothing_is_imported_from_the_working_folder(workspace: Path) -> None:
         assert len(paths) == 2 + len(before)
 
 
+@BUILT
 def test_its_ros2_security_is_that_of_sros_where_sros2_is_installed_too(workspace: Path) -> None:
     """A workspace comes first in PYTHONPATH, and ros2cli takes the last entry of a name."""
     sros2 = workspace / "ros/lib/sros2.dist-info"

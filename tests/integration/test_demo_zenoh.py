@@ -31,7 +31,7 @@ def some_words() -> list[str]:
     """Return names of rows that nobody but their scenario has, and of some attacks."""
     attacks = list(dict.fromkeys(row.attack for row in ATTACKS.rows))
     others = [row.name for row in ROWS if not row.attack]
-    return [*others, *some(attacks, 3)]
+    return [*others, *some(attacks, 2)]
 
 
 def is_played(row: Row) -> bool:

@@ -339,7 +339,7 @@ STRANGERS = {
 
 
 @needs_rclpy
-@pytest.mark.parametrize(("system", "path"), ENCLAVES)
+@pytest.mark.parametrize(("system", "path"), some(ENCLAVES, 4))
 def test_cyclone_creates_what_the_node_has_and_nothing_else(
     keystore: Path, system: str, path: str
 ) -> None:
@@ -361,7 +361,7 @@ def literal_endpoints(enclave: Enclave) -> set[Endpoint]:
 
 @pytest.mark.parametrize(
     ("system", "path"),
-    [(system, each.path) for system in SYSTEMS for each in policy_of(system).enclaves],
+    some([(system, each.path) for system in SYSTEMS for each in policy_of(system).enclaves], 6),
 )
 def test_every_right_of_the_policy_holds_on_cyclone(keystore: Path, system: str, path: str) -> None:
     enclave = enclave_of(system, path)

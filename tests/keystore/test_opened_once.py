@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import os
 import re
 import shutil
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from cryptography import x509
 
 from sros_tool.pki import certificates, crl, smime
 from tests.support import opens
-from tests.support.harness import sros
+from tests.support.harness import forked, sros
 from tests.support.opens import can_count, count_opens
 
 ENCLAVES = [f"/e{number}" for number in range(13)]
@@ -71,9 +70,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("words", QUESTIONS.values(), ids=QUESTIONS)
 def test_a_question_opens_each_file_once(words: tuple[str, ...], folder: Path) -> None:
     def ask() -> None:
-        program = [sys.executable, "-P", "-m", "sros_tool", *words]
-        ended = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
-        assert ended.returncode in (0, 1), ended.stderr
+        ended = forked(*words, first=lambda: os.chdir(folder))
+        assert ended.status in (0, 1), ended
 
     opened = count_opens(folder / "ks", ask)
     for file in ("public/permissions_ca.cert.pem", "enclaves/e1/permissions.p7s"):
@@ -93,9 +91,7 @@ def changed(folder: Path, tmp_path: Path) -> Path:
 @pytest.mark.parametrize("words", CHANGES.values(), ids=CHANGES)
 def test_a_change_opens_each_file_once(words: tuple[str, ...], changed: Path) -> None:
     def change() -> None:
-        program = [sys.executable, "-P", "-m", "sros_tool", *words]
-        ended = subprocess.run(program, cwd=changed, capture_output=True, text=True, check=False)
-        assert ended.returncode == 0, ended.stderr
+        forked(*words, first=lambda: os.chdir(changed)).ok()
 
     opened = count_opens(changed / "ks", change)
     assert opened["ledger.jsonl"] == 1
