@@ -226,8 +226,8 @@ def variable_findings(
     yield from _enclave(environment, root, domain, now=now, zone=zone)
 
 
-def asks_in_vain(environment: Mapping[str, str]) -> list[str]:
-    """Return the variables that configure security, where nothing says whether to enable it."""
+def set_without_enable(environment: Mapping[str, str]) -> list[str]:
+    """Return the security variables that are set although ROS_SECURITY_ENABLE is not set."""
     if ENABLE in environment:
         return []
     return [name for name in (STRATEGY, KEYSTORE, ENCLAVE) if environment.get(name)]
@@ -237,7 +237,7 @@ def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
     enable, strategy = environment.get(ENABLE), environment.get(STRATEGY)
     if enable not in (None, "", "true", "false"):
         yield ENABLE_MISSPELT.found(ENABLE, value_text(environment, ENABLE))
-    elif named := asks_in_vain(environment):
+    elif named := set_without_enable(environment):
         yield NOT_ENABLED.found(
             ENABLE,
             f"{' and '.join(named)} {'is' if len(named) == 1 else 'are'} set, and {ENABLE} is not",
@@ -262,7 +262,7 @@ def _enclave(
     zone: tzinfo,
 ) -> Iterator[Finding]:
     names, wanted = set(search_enclaves(root)[0]), environment.get(ENCLAVE, "")
-    governed = _governed(root)
+    governed = _governed_domains(root)
     if governed and domain is not None and domain not in governed:
         text = f"the governance of '{root}' is for domain {governed}, not for {domain}"
         yield DOMAIN_NOT_GOVERNED.found(DOMAIN, text)
@@ -292,8 +292,8 @@ def _enclave(
             yield each
 
 
-def _governed(root: Path) -> DomainSet | None:
-    """Return the domains of a keystore's governance, or None if it cannot be read."""
+def _governed_domains(root: Path) -> DomainSet | None:
+    """Return the ROS domains of a keystore's governance, or None if it cannot be read."""
     try:
         signed = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document"))
         return parse_governance(signed.document).domains().closed()
@@ -302,7 +302,7 @@ def _governed(root: Path) -> DomainSet | None:
 
 
 def value_text(environment: Mapping[str, str], name: str) -> str:
-    """Return a variable and its value as a clause."""
+    """Return a clause with the variable's value, such as ``ROS_DOMAIN_ID is '7'``."""
     value = environment.get(name)
     return f"{name} is not set" if value is None else f"{name} is {value!r}"
 
@@ -333,7 +333,7 @@ FILE_NOT_FOUND = FindingKind(
 UNREAD = FindingKind(
     "runtime.zenoh-unread",
     WARNING,
-    "a configuration of Zenoh that sros does not read",
+    "a configuration of Zenoh that sros cannot read",
     "Zenoh reads more than sros: YAML, lists in place of objects, pipes, more than 16 MiB. Whether "
     "the configuration enforces anything is not known.",
     _SOURCE,
@@ -387,7 +387,7 @@ def is_zenoh(environment: Mapping[str, str]) -> bool:
 
 
 def _named_files(environment: Mapping[str, str]) -> Iterator[tuple[str, Path]]:
-    """Yield the variables that name a configuration of Zenoh, and its path."""
+    """Yield each variable that names a Zenoh configuration file, and the path of the file."""
     for name in (SESSION_URI, ROUTER_URI):
         text = environment.get(name, "")
         if text and text != NO_CONFIGURATION:
@@ -395,7 +395,7 @@ def _named_files(environment: Mapping[str, str]) -> Iterator[tuple[str, Path]]:
 
 
 def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Finding]:
-    """Yield the findings in the variables of rmw_zenoh, and in the configurations they make."""
+    """Yield findings about the variables of rmw_zenoh and the configuration files they name."""
     if not is_zenoh(environment):
         return
     version = package_version(RMW_ZENOH, environment)
@@ -408,7 +408,7 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
         try:
             data = read_bytes(path, "Zenoh configuration")
         except SrosError as error:
-            kind = UNREAD if _may_be_read(path) else FILE_NOT_FOUND
+            kind = UNREAD if _is_readable(path) else FILE_NOT_FOUND
             yield kind.found(name, str(error))
             continue
         try:
@@ -425,8 +425,8 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
         yield from _certificates(effective, name)
 
 
-def _may_be_read(path: Path) -> bool:
-    """Return whether another program may read what sros does not read, such as a pipe."""
+def _is_readable(path: Path) -> bool:
+    """Return whether Zenoh could read a path that sros refuses to read, such as a pipe."""
     try:
         return not path.is_dir() and os.access(path, os.R_OK)
     except ValueError:  # a NUL
@@ -434,11 +434,10 @@ def _may_be_read(path: Path) -> bool:
 
 
 def enforces_nothing(environment: Mapping[str, str], variable: str) -> str:
-    """Return why a process has no access control, or "": it has, does not start, or is not known.
+    """Return why a process of rmw_zenoh has no access control, as a clause, or "".
 
-    What is not known, the findings on its environment say.
-
-    ``variable`` is the one that names its configuration.
+    The result is also "" if the configuration file cannot be read: another finding reports that.
+    ``variable`` is the environment variable that names the configuration file.
     """
     text = environment.get(variable, "")
     if not text:
@@ -450,9 +449,9 @@ def enforces_nothing(environment: Mapping[str, str], variable: str) -> str:
 
 
 def open_because(data: bytes, name: str, override: str) -> str:
-    """Return why a configuration has no access control, as a clause, or "" if it has.
+    """Return why a configuration has no access control, as a clause, or "" if it has some.
 
-    ``name`` is the name of the file; ``override`` is the value of ZENOH_CONFIG_OVERRIDE.
+    ``name`` is the name of the configuration file, ``override`` that of ZENOH_CONFIG_OVERRIDE.
 
     Raises:
         SrosError: sros cannot read the configuration.
@@ -466,7 +465,7 @@ def _overridden(
     effective: ConfigurationDocument,
     overrides: tuple[tuple[str, str], ...],
 ) -> Iterator[Finding]:
-    """Yield a finding if more changed than the router to connect to, and paths of TLS."""
+    """Yield a finding if the overrides change more than the router address and the TLS paths."""
     unchanged = replace(
         effective, connect=stated.connect, tls=replace(effective.tls, named=stated.tls.named)
     )

@@ -18,7 +18,7 @@ _SIGNS = {"error": "🔴", "warning": "🟠", "note": "🔵"}
 
 
 def findings_markdown(chosen: ChosenFindings) -> str:
-    """Return the findings under a heading that counts them in words."""
+    """Return the findings as Markdown, under a heading with their numbers."""
     rest = "which `sros check` shows"
     listed = bounded(map(_item, by_cause(chosen.shown)), _MOST, rest)
     title = f"### Findings: {plain(chosen.summary())}"
@@ -30,7 +30,7 @@ def _item(findings: Sequence[Finding]) -> str:
 
 
 def _cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
-    """Yield the lines of findings of one cause."""
+    """Yield the Markdown lines of findings that share a cause."""
     first = findings[0]
     assert first.cause, "findings that are shown together have a cause"
     word, place = first.severity.word, first.cause.place or first.place
@@ -129,7 +129,7 @@ def _location(file: str, line: int | None, base: Path) -> dict[str, Any]:
 
 
 def _plain(text: str) -> str:
-    """Return text without embedded links (SARIF 2.1.0, 3.11.6): names in it may be of others.
+    """Escape embedded links (SARIF 2.1.0, 3.11.6), as others may have chosen a name in the text.
 
     Only text with the form of a link is escaped, because many viewers show the escapes.
     """

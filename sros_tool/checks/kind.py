@@ -26,12 +26,12 @@ class Severity(StrEnum):
 
     @property
     def word(self) -> str:
-        """The plain word."""
+        """The severity as a plain string."""
         return self.value
 
     @property
     def weight(self) -> int:
-        """The position among the severities, of which a note has the lowest."""
+        """Rank of the severity for comparisons; a note has the lowest rank."""
         return _WEIGHTS[self]
 
     def __lt__(self, other: str) -> bool:
@@ -67,25 +67,25 @@ class FindingKind:
     """
 
     id: str
-    """Its id."""
+    """Stable id of the kind, such as ``enclave.certificate-expired``."""
     severity: Severity
-    """Its severity."""
+    """Severity of the findings of this kind."""
     title: str
-    """What is wrong."""
+    """What is wrong, as a clause."""
     why: str
-    """Why that matters."""
+    """Why it matters."""
     source: str
-    """Where the rule comes from."""
+    """Source of the rule, such as a section of a specification."""
     remedy: str
-    """What to do."""
+    """What to do about it."""
     group: str = ""
     vendors: tuple[Vendor, ...] = ()
-    """The DDS vendors that it concerns; null for all."""
+    """The DDS vendors that the kind concerns; null for all."""
     prominent: bool = False
 
     @property
     def family(self) -> str:
-        """The part before the dot."""
+        """The part of the id before the dot, such as ``enclave``."""
         return self.id.partition(".")[0]
 
     def found(
@@ -104,14 +104,14 @@ class FindingKind:
 
 @dataclass(frozen=True, slots=True)
 class RelatedPlace:
-    """Another place that a finding is about."""
+    """Another place in a file that a finding is about."""
 
     text: str
-    """What is there."""
+    """What is at this place."""
     file: str
-    """The file."""
+    """Path of the file."""
     line: int | None = None
-    """The line in that file, from 1, or null."""
+    """Line in the file, from 1, or null."""
 
     def __str__(self) -> str:
         """Return text such as ``robot.xml:12``."""
@@ -120,11 +120,11 @@ class RelatedPlace:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """The common cause of several findings of one severity, and the remedy that ends all of them.
+    """The common cause of several findings of one severity, and the remedy for all of them.
 
-    ``title`` is a clause, ``text`` and ``remedy`` are sentences.  ``number`` counts the findings:
-    where only some of them are selected, they are shown one by one.  ``place`` is shown in place of
-    that of the first one, unless it is empty.
+    ``title`` is a clause, ``text`` and ``remedy`` are sentences.  ``number`` counts the findings
+    with this cause: if only some of them are selected, they are shown one by one.  ``place``, if
+    not empty, is shown instead of the place of the first finding.
     """
 
     title: str
@@ -149,50 +149,50 @@ class Finding:
 
     kind: FindingKind
     subject: str
-    """The enclave, variable or file that it is about."""
+    """The enclave, variable or file that the finding is about."""
     text: str
-    """What was found."""
+    """What is wrong in detail, as a clause."""
     file: str = ""
-    """The file that has it, or null."""
+    """Path of the file with the problem, or null."""
     line: int | None = None
-    """The line in that file, from 1, or null."""
+    """Line in the file, from 1, or null."""
     own_remedy: str = ""
     accepted: str = ""
-    """The template or setting that accepts it, or null."""
+    """The template or setting that accepts the finding, or null."""
     related: tuple[RelatedPlace, ...] = ()
-    """Other places that it is about, in the order to read them."""
+    """Other places that the finding is about, in the order to read them."""
     cause: Cause | None = None
 
     @property
     def id(self) -> str:
-        """The kind of finding, such as ``enclave.certificate-expired``."""
+        """Id of the kind of finding, such as ``enclave.certificate-expired``."""
         return self.kind.id
 
     @property
     def source(self) -> str:
-        """Where the rule comes from."""
+        """Source of the rule, such as a section of a specification."""
         return self.kind.source
 
     @property
     def severity(self) -> Severity:
-        """Its severity."""
+        """Severity of the finding; an accepted finding is a note."""
         return NOTE if self.accepted else self.kind.severity
 
     @property
     def remedy(self) -> str:
-        """What to do."""
+        """What to do about it."""
         return self.own_remedy or self.kind.remedy
 
     @property
     def place(self) -> str:
-        """The file with its line, or else the subject."""
+        """File and line, such as ``robot.xml:12``, or the subject for a finding without a file."""
         if not self.file:
             return self.subject
         return f"{self.file}:{self.line}" if self.line else self.file
 
 
 def by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
-    """Yield findings in their order, those of one cause together if none of them is missing."""
+    """Yield groups of findings in order: a cause with all its findings, any other finding alone."""
     groups: dict[Cause, list[Finding]] = {}
     for each in findings:
         if each.cause:
@@ -208,7 +208,7 @@ def by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
 
 
 def some_names(names: Sequence[str]) -> str:
-    """Return the first names, and the number of the others."""
+    """Return text with the first names and the number of the other names."""
     return first_few(names, _NAMES_SHOWN)
 
 

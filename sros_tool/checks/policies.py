@@ -88,7 +88,7 @@ class _Statement:
 
     @property
     def name(self) -> str:
-        """The absolute name."""
+        """The absolute ROS name."""
         return self.right.name
 
     def found(self, kind: FindingKind, text: str, remedy: str = "") -> Finding:
@@ -114,7 +114,7 @@ class _CheckedPolicy:
 
     @cached_property
     def statements(self) -> tuple[_Statement, ...]:
-        """Every right and denial, in the order of the document."""
+        """All rights and denials, in the order of the policy file."""
         return tuple(
             _Statement(placed.right, placed.written, placed.source, placed.profile)
             for enclave in self.policy.enclaves
@@ -133,7 +133,7 @@ NEVER_MATCHES = FindingKind(
 DDS_NAME = FindingKind(
     "policy.dds-name",
     WARNING,
-    "a DDS name where a ROS name is meant",
+    "a DDS name in place of a ROS name",
     "ROS 2 puts rt/, rq/ or rr/ before a ROS name to get the name of its DDS topic. Names in a "
     "policy have no prefix.",
     "ROS 2 design, Topic and Service name mapping to DDS.",
@@ -211,7 +211,7 @@ MISSPELT = FindingKind(
 CONTRADICTING_PROTECTION = FindingKind(
     "policy.protection-contradicts",
     ERROR,
-    "a name that is said with different protection",
+    "a name with contradicting protect= values",
     "A keystore has one governance for all enclaves, so a name has one protection; a wildcard "
     "says it of all names that it matches. No keystore can be made from this.",
     "DDS-Security 1.1, 9.4.1.2 (topic rules); sros: protect= in a policy.",
@@ -285,12 +285,12 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _is_of_a_node(name: str) -> bool:
-    """Return whether every node offers a service of this name: not everything has a client."""
+    """Return whether every node offers this service, so that it needs no client in the policy."""
     return name.rpartition("/")[2] in NODE_SERVICES
 
 
 def _misspelt(each: _Statement, other: str, meant: Sequence[_Statement]) -> Finding:
-    """Return the finding that ``each`` perhaps means what one of ``meant`` offers."""
+    """Return the finding that a statement has no counterpart, with similar names as suggestions."""
     shown = " or ".join(f"{one.name} ({one.right.right})" for one in meant[:_NAMES_SHOWN])
     text = f"no enclave may {other} {each.name}; perhaps you mean {shown}, which nobody uses"
     places = tuple(
@@ -305,9 +305,9 @@ def _place(source: Source) -> tuple[str, int | None]:
 
 
 def _check_protection(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield findings about names whose protection is said differently."""
+    """Yield findings about names with contradicting protect= values."""
     for one, other in islice(contradictions(stated_protections(checked.policy.enclaves)), _MANY):
-        text = f"{other} is said with {other.word}, and {one} with {one.word} at {one.source}"
+        text = f"{other} has protect={other.word}, and {one} has protect={one.word} at {one.source}"
         place = other.source
         yield CONTRADICTING_PROTECTION.found(other.enclave, text, place.file, place.line)
 
@@ -319,7 +319,7 @@ def _never(name: str) -> str:
 
 
 def _belongs(each: _Statement) -> str:
-    """Return the kind that ROS 2 gives to this name, if it differs from the rule's kind."""
+    """Return the kind, "topics" or "services", of a ROS 2 name; "" if the rule has that kind."""
     kind, name = each.right.kind, each.name
     if kind != "services":
         is_service = (
@@ -430,7 +430,7 @@ _STARTING = {
 }
 """What a node does when it starts, for each kind of finding that denies it."""
 _LISTENER = "transform_listener_impl_"
-"""Name prefix of the nodes of tf2_ros listeners, which have no parameters and no events."""
+"""Name prefix of the nodes of tf2_ros listeners, which have no parameter services."""
 _OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 
 
@@ -463,7 +463,7 @@ def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
 
 @dataclass(frozen=True, slots=True)
 class _Lacking:
-    """A finding about a node that lacks a right that every node needs."""
+    """A finding about a node without a right that every node needs."""
 
     finding: Finding
     node: str
@@ -471,12 +471,12 @@ class _Lacking:
 
     @property
     def has_include(self) -> bool:
-        """Whether including the common part is the remedy."""
+        """Whether the remedy is to include ``common/node.xml``."""
         return not self.listener and self.finding.severity is ERROR
 
 
 def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
-    """Return the cause of findings in one file: the common part is not included."""
+    """Return the common cause of findings in one file: ``common/node.xml`` is not included."""
     file = Path(lacking[0].finding.file)
     nodes = list(dict.fromkeys(each.node for each in lacking))
     lines = list(dict.fromkeys(each.finding.line or 0 for each in lacking))
@@ -607,7 +607,7 @@ ROOT_ENCLAVE = FindingKind(
 
 
 def _check_root_enclave(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield a finding about an enclave / that has everybody's rights."""
+    """Yield a finding about an enclave / that has the rights of several nodes or enclaves."""
     root = checked.policy.enclave("/")
     if root is None:
         return
@@ -618,7 +618,7 @@ def _check_root_enclave(checked: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def within_root(rights: Collection[Right]) -> str:
-    """Return which enclaves have no right that the enclave / lacks, in words; "" if none.
+    """Return a clause that names the enclaves whose rights the enclave / has too; "" if none.
 
     Rights that every node needs do not count.
     """
@@ -644,7 +644,7 @@ def only_basic(rights: Collection[Right]) -> bool:
 
 @cache
 def _basic_rights() -> Rules:
-    """Return the rights that every node needs, as those of the enclave /."""
+    """Return the rights that every node needs, granted to the enclave /."""
     return Rules(policy_rights(read_policy(policies_dir() / "defaults" / "node_basics.xml")))
 
 
@@ -675,7 +675,7 @@ def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
-    """Return ``found`` at the first denial of its enclave."""
+    """Return the finding with the place of the first denial of its enclave."""
     denials = (s for s in checked.statements if s.right.enclave == found.subject and not s.allows)
     source = next(denials).source
     return replace(found, file=source.file, line=source.line)
@@ -684,13 +684,13 @@ def _at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
 def outside_findings(
     permissions: Permissions, signed_bytes: int, subject: str, file: str, line: int | None = None
 ) -> Iterator[Finding]:
-    """Yield findings about the parts of permissions that are outside of the portable profile."""
+    """Yield findings about parts of permissions that are outside the portable profile."""
     for identity, fact in outside(permissions, signed_bytes, lambda names: Names(names).meets):
         yield _OUTSIDE[identity].found(subject, fact, file, line)
 
 
 def _signed_bytes(enclave: Enclave) -> int:
-    """Return the size in bytes of the signed permissions; small ones are only estimated."""
+    """Return the size in bytes of an enclave's signed permissions; an estimate if small."""
     rights = policy_rights(Policy((enclave,)))
     estimate = sum(map(right_bytes, rights))
     return SizeEstimator().signed_bytes(enclave) if estimate > _MEASURED_FROM_BYTES else estimate
@@ -748,7 +748,7 @@ HALF_ACTION = FindingKind(
 
 
 def _check_rules(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield findings about contradicting, useless and repeated statements of an enclave."""
+    """Yield findings about contradicting, unused and repeated statements of an enclave."""
     for each in checked.statements:
         if each.allows:
             yield from _permission(each, checked.rules)
@@ -842,7 +842,7 @@ _MANY = 1000
 
 
 def findings_in(policy: Policy, distribution: str = "") -> Iterator[Finding]:
-    """Yield all findings in a policy that was read, except those about its includes."""
+    """Yield all findings in a parsed policy, except the findings about its includes."""
     checked = _CheckedPolicy(policy, distribution)
     for check in _CHECKS:
         yield from check(checked)
@@ -854,8 +854,8 @@ def policy_file_findings(
     """Yield all findings in a policy file; a file that cannot be read is a finding too.
 
     ``distribution`` is the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
-    ``fleet`` has the robots that its placeholders stand for.  ``policy`` is what was read from the
-    file, if it has been read already.
+    ``fleet`` has the robots that its placeholders stand for.  ``policy`` is the parsed file, if
+    it is parsed already.
     """
     try:
         policy = policy or read_policy_for(path, fleet)
@@ -898,7 +898,7 @@ def _duplicates(path: Path) -> Iterator[tuple[str, int]]:
 
 
 def _includes(path: Path) -> Iterator[Finding]:
-    """Yield findings about the includes of a file; each included file is read once."""
+    """Yield findings about the includes of a file; reads an included file only once."""
     graph = _IncludeGraph(Path(os.path.realpath(path)))
     for includes in graph.by_parent():
         reached = {each for file in {file for _, file in includes} for each in graph.reached(file)}
@@ -915,7 +915,7 @@ def _includes(path: Path) -> Iterator[Finding]:
 
 
 class _IncludeGraph:
-    """The includes of a policy file that can be read, and the files that they lead to."""
+    """The includes of a policy file, and the files that they include in turn."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
@@ -924,7 +924,7 @@ class _IncludeGraph:
         self._reached: dict[Path, frozenset[Path]] = {}
 
     def by_parent(self) -> Iterator[list[tuple[etree._Element, Path]]]:
-        """Yield the includes next to each other, each with its file, in the policy file."""
+        """Yield lists of sibling include elements of the policy file, with the included files."""
         for parent in self._includer.load(self._file).iter():
             includes = list(parent.iterchildren(*_INCLUDES))
             if len(includes) <= _MANY:
@@ -932,7 +932,7 @@ class _IncludeGraph:
                 yield [(each, file) for each, file in found if file]
 
     def reached(self, file: Path) -> frozenset[Path]:
-        """Return the other files that a file includes, directly or through others."""
+        """Return the files that a file includes, directly or through other files."""
         if file not in self._reached:
             found: set[Path] = set()
             waiting = [file]
@@ -969,7 +969,7 @@ _SHORTEST = 4  # letters of a part: /arm_l and /arm_r are two arms, and min and 
 
 
 class NearNames:
-    """Names to compare others with; each comparison takes the same time, however many there are."""
+    """An index of names that finds similar names in constant time."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self._by_key: dict[str, list[str]] = defaultdict(list)
@@ -978,18 +978,18 @@ class NearNames:
                 self._by_key[key].append(name)
 
     def near(self, name: str) -> list[str]:
-        """Return the names that are nearly equal to ``name``, sorted; not ``name`` itself.
+        """Return the sorted names that look like a typing error of ``name``, except itself.
 
-        One part between "/" and "_" has one letter more, less or another, or two letters changed
-        places; or the names differ only in capitals and separators.  Parts that differ in digits,
-        or are shorter than four letters, are names of different things.
+        Similar names differ in one part (between "/" and "_") by one letter that is added,
+        removed, replaced or swapped with its neighbour; or only in capitals and separators.
+        Parts that differ in digits, or are shorter than four letters, are not similar.
         """
         found = {each for key in set(_keys(name)) for each in self._by_key.get(key, ())}
         return sorted(each for each in found if each != name and _is_near(name, each))
 
 
 def _keys(name: str) -> Iterator[str]:
-    """Yield texts of which nearly equal names have one in common."""
+    """Yield index keys of a name; similar names have a key in common."""
     yield _plain(name)
     parts = _PARTS.split(name)
     for index, part in enumerate(parts):
@@ -1032,14 +1032,14 @@ _MOST_ENCLAVES = 1000  # of each policy: signing must not wait for the check of 
 def signed_findings(
     policies: Iterable[Policy | FleetPolicy], enclaves: Collection[str], distribution: str = ""
 ) -> list[tuple[Finding, ...]]:
-    """Return the errors and warnings in policies, the worst first, those of one cause together.
+    """Return the errors and warnings in policies, worst first, grouped by cause.
 
-    A policy for a fleet is checked as it is for one robot of each group, and of a larger policy
-    the first 1,000 enclaves.
+    A policy for a fleet is checked for one robot of each group.  At most 1,000 enclaves are
+    checked.
 
     Args:
         policies: the policies.
-        enclaves: the enclaves that they are signed for; all others are left out.
+        enclaves: the enclaves whose permissions are to be signed; others are not checked.
         distribution: the ROS 2 distribution of the nodes; "" is the latest.
     """
     found: list[Finding] = []
@@ -1053,7 +1053,7 @@ def signed_findings(
 
 
 def as_note(findings: tuple[Finding, ...]) -> Note:
-    """Return one finding, or findings of one cause, as a note."""
+    """Return a finding, or several findings with one cause, as a note."""
     first = findings[0]
     if first.cause and len(findings) > 1:
         cause, place = first.cause, first.cause.place or first.place

@@ -1,4 +1,4 @@
-"""Checks of the running processes (open, among strangers) and of the files that they run with."""
+"""Checks of running ROS 2 processes: their security, their neighbours and their enclave files."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from sros_tool.checks.environment import (
     OWN_CONFIGURATION,
     PROCESS_OPEN,
-    asks_in_vain,
     enforces_nothing,
     is_zenoh,
     open_because,
+    set_without_enable,
     value_text,
 )
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
@@ -128,13 +128,13 @@ PROCESS_NOT_SEEN = FindingKind(
 )
 
 _NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="ROOT")
-"""The remedy where a CA has expired, and nothing can be renewed with it."""
+"""Remedy for an expired CA, which can no longer renew anything."""
 _MOST_LEDGER = 64 * 1024 * 1024
 _LOADED_BY_ZENOH = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
 
 
 def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator[Finding]:
-    """Yield the findings about the files with which a process runs."""
+    """Yield findings about the enclave files with which a process runs."""
     enclave = process.enclave
     if enclave is None:
         return
@@ -195,11 +195,12 @@ def _unread_files(process: Process, enclave: ProcessEnclave) -> Iterator[Finding
 
 @dataclass(frozen=True, slots=True)
 class _Loaded:
-    """What a process loaded at its start, as far as it is known now.
+    """The certificates and permissions that a process loaded at its start, as far as known.
 
-    ``windows`` maps what it loaded to its validity, and ``grant`` is in its permissions.
-    ``revoked`` says when and why its certificate was revoked, as a clause, or is ""; ``unknown``
-    why that is not known.
+    ``windows`` maps a description, such as "its certificate", to a validity.  ``grant`` is the
+    grant in the loaded permissions.  ``revoked`` is a clause that says when and why the
+    certificate was revoked, or "".  ``unknown`` is a clause that says why the ledger could not
+    be read, or "".
     """
 
     windows: Mapping[str, Window]
@@ -209,7 +210,7 @@ class _Loaded:
 
 
 def _loaded(enclave: ProcessEnclave, newer: Sequence[str], started: datetime) -> _Loaded:
-    """Return what a process loaded: what unchanged files say, and what the ledger has of others."""
+    """Return what a process loaded, from unchanged files, or from the ledger for changed files."""
     windows: dict[str, Window] = {}
     changed = {each.split()[0] for each in newer}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)
@@ -255,7 +256,10 @@ def _recorded_window(what: str, entry: Entry) -> Mapping[str, Window]:
 
 
 def _revoked(enclave: ProcessEnclave, entries: Sequence[Entry], serial: int) -> str:
-    """Return when and why a certificate was revoked, by the ledger or the list, as a clause."""
+    """Return a clause that says when and why a certificate was revoked, or "".
+
+    The ledger and the enclave's revocation list are searched for the serial number.
+    """
     for each in entries:
         if each.what == "revocation" and each.serial and int(each.serial, 16) == serial:
             return f"revoked at {_plain_path(each.time)} ({plain(each.reason)})"
@@ -272,7 +276,7 @@ def _revoked(enclave: ProcessEnclave, entries: Sequence[Entry], serial: int) -> 
 
 
 def _entries(enclave: ProcessEnclave) -> tuple[Sequence[Entry], str]:
-    """Return what the ledger records of an enclave, and why it cannot be asked, as a clause."""
+    """Return an enclave's ledger entries, and a clause that says why they cannot be read, or ""."""
     if enclave.here is None:
         return (), "its keystore is not at this path here"
     ledger = enclave.here / LEDGER
@@ -290,7 +294,7 @@ def _entries(enclave: ProcessEnclave) -> tuple[Sequence[Entry], str]:
 
 
 def _certificates_in(enclave: ProcessEnclave, file: str) -> tuple[x509.Certificate, ...]:
-    """Return the certificates of a file, or none if it is not there or cannot be read."""
+    """Return the certificates in a file; none if the file is missing or unreadable."""
     data = enclave.file(file).data
     with suppress(SrosError):
         found = load_certificates(data, file) if data else ()
@@ -310,7 +314,7 @@ def _grant(enclave: ProcessEnclave, subject: str) -> Grant | None:
 def _local_time(
     process: Process, loaded: _Loaded, now: datetime, zone: tzinfo
 ) -> Iterator[Finding]:
-    """Yield a finding if Fast DDS reads the dates of permissions as passed, or still to come."""
+    """Yield a finding if permissions, read in local time as Fast DDS does, are not valid."""
     grant = loaded.grant
     window = loaded.windows.get("its permissions")
     if not grant or not window or not window.contains(now):
@@ -333,7 +337,10 @@ _POSIX_ZONE = re.compile(r"(?:[A-Za-z]{3,}|<[^>]+>)([+-]?)(\d{1,2})(?::(\d\d))?\
 
 
 def _zone(text: str, otherwise: tzinfo) -> tzinfo:
-    """Return the time zone that TZ names, or ``otherwise``; an unknown one is UTC, as for libc."""
+    """Return the time zone that ``text``, a value of TZ, names, or ``otherwise`` if it is empty.
+
+    An unknown time zone is UTC, as in libc.
+    """
     if not text:
         return otherwise
     name = text.removeprefix(":")
@@ -348,7 +355,7 @@ def _zone(text: str, otherwise: tzinfo) -> tzinfo:
 
 
 def _unsecured_because(process: Process) -> str:
-    """Return why a process that asks for security runs without it, as a clause, or ""."""
+    """Return why a process that requests security runs unsecured, as a clause, or ""."""
     environment, enclave = process.environment, process.enclave
     if environment.get(STRATEGY) == "Enforce" or (enclave and enclave.problem):
         return ""
@@ -365,7 +372,7 @@ def _unsecured_because(process: Process) -> str:
 
 
 def _plain_path(text: str) -> str:
-    """Return a text with a path in it so that it can be taken for nothing else in a message."""
+    """Return a path from another process without the characters that could fake a message."""
     return "".join(each if each.isprintable() else "?" for each in text[:_LONGEST_PATH])
 
 
@@ -486,7 +493,7 @@ _MOST_NODES = 20
 
 
 class Security(StrEnum):
-    """The security with which a process runs, as far as it can be seen."""
+    """Whether a process runs secured, as far as sros can see."""
 
     SECURED = "secured"
     OPEN = "open"
@@ -517,10 +524,11 @@ def process_findings(
     zone: tzinfo,
     one_by_one: bool = False,
 ) -> Iterator[Finding]:
-    """Yield the findings about running processes, from the place of an environment.
+    """Yield findings about running processes, compared with the environment of this shell.
 
-    ``now`` is the time on the clock of this machine, and ``zone`` its time zone.  If
-    ``one_by_one``, each open node is a finding where security is not enabled, and else one of all.
+    ``now`` is the time on the clock of this machine, and ``zone`` is its time zone.  If security
+    is not enabled here, all open nodes share one finding; with ``one_by_one`` each open node has
+    a finding of its own.
     """
     is_secured_here = environment.get(ENABLE) == "true"
     here = ("", environment.get(DOMAIN) or "0")
@@ -555,7 +563,7 @@ def process_findings(
 
 
 def _place(process: Process) -> tuple[str, str]:
-    """Return the network and the domain of a process: whoever has the same ones is next to it."""
+    """Return the network and the domain of a process; processes with equal ones are neighbours."""
     return process.network, process.environment.get(DOMAIN) or "0"
 
 
@@ -599,10 +607,10 @@ def _shown(environment: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def _zenoh_opening(process: Process) -> str:
-    """Return why a process of Zenoh enforces nothing, as a clause, or "".
+    """Return why a process of rmw_zenoh has no access control, as a clause, or "".
 
     Raises:
-        SrosError: sros cannot read its configuration.
+        SrosError: sros cannot read the configuration of the process.
     """
     variable = ROUTER_URI if process.is_router else SESSION_URI
     text = process.environment.get(variable, "")
@@ -647,7 +655,7 @@ def _zenoh(process: Process) -> Iterator[Finding]:
 
 
 def _is_open(environment: Mapping[str, str]) -> bool:
-    """Return whether security is off, and a session file of rmw_zenoh does not replace it."""
+    """Return whether DDS Security is off and rmw_zenoh has no session file either."""
     if environment.get(ENABLE) == "true":
         return False
     return not is_zenoh(environment) or bool(enforces_nothing(environment, SESSION_URI))
@@ -656,8 +664,8 @@ def _is_open(environment: Mapping[str, str]) -> bool:
 def _not_secured(
     environment: Mapping[str, str], nodes: Sequence[Process], *, one_by_one: bool
 ) -> Iterator[Finding]:
-    """Yield the open nodes that run; in one finding where the variables ask for no security."""
-    asks = environment.get(ENABLE) not in (None, "", "false") or asks_in_vain(environment)
+    """Yield findings about running open nodes; a single finding if no security is requested."""
+    asks = environment.get(ENABLE) not in (None, "", "false") or set_without_enable(environment)
     if asks or not _is_open(environment):
         for each in nodes:
             if not each.network:  # the others are named as such, with their security
@@ -690,7 +698,7 @@ def _mixed_vendors(
 ) -> Iterator[Finding]:
     """Yield a finding for each network and domain with secured processes of several RMWs.
 
-    ``environment`` is this one if it asks for security, and else None.
+    ``environment`` is the environment of this shell if it enables security, otherwise None.
     """
     places = dict(_by_place(secured))
     here = ("", environment.get(DOMAIN) or "0") if environment is not None else None
@@ -711,9 +719,10 @@ def _mixed_vendors(
 def _other_keystores(
     secured: Sequence[Process], environment: Mapping[str, str] | None
 ) -> Iterator[Finding]:
-    """Yield the processes of DDS that trust another identity CA than most next to them.
+    """Yield findings about DDS processes that trust another identity CA than their neighbours.
 
-    In the place of ``environment``, they trust another one than its enclave.
+    The CA of most neighbours counts; in the network and domain of ``environment``, the CA of its
+    enclave.
     """
     here = ("", environment.get(DOMAIN) or "0") if environment is not None else None
     own = _authorities_here(environment) if environment is not None else frozenset()
@@ -742,7 +751,7 @@ _Keys = frozenset[bytes]
 
 
 def _by_authorities(processes: Iterable[Process]) -> list[tuple[_Keys, list[Process]]]:
-    """Group processes that trust a common identity CA; those whose CA is not known are left out."""
+    """Group processes by a common identity CA; leave out processes whose CA is not known."""
     groups: list[tuple[_Keys, list[Process]]] = []
     for process in processes:
         keys = _keys(_certificates_in(process.enclave, IDENTITY_CA_FILE) if process.enclave else ())
@@ -756,7 +765,7 @@ def _by_authorities(processes: Iterable[Process]) -> list[tuple[_Keys, list[Proc
 
 
 def _authorities_here(environment: Mapping[str, str]) -> _Keys:
-    """Return the identity CAs of the enclave that an environment names, or else of the first."""
+    """Return the identity CAs of the enclave that an environment names, or of any enclave."""
     root = Path(environment.get(KEYSTORE, ""))
     name = environment.get(ENCLAVE) or next(iter(search_enclaves(root)[0]), "/")
     folder = enclave_path(root, name)
@@ -785,7 +794,7 @@ def _elsewhere(nodes: Sequence[Process], security: Mapping[int, Security]) -> It
 
 
 def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
-    """Yield what could not be looked at: nodes by their names, and the number of the others."""
+    """Yield findings about unreadable processes: each known node, and a count of the others."""
     for each in running.unseen:
         if each.speaks:
             text = f"it speaks ROS 2, and cannot be looked at: {each.why}"
@@ -809,7 +818,7 @@ def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
 def runtime_metrics(
     environment: Mapping[str, str], running: RunningProcesses, *, now: datetime, zone: tzinfo
 ) -> tuple[Metric, ...]:
-    """Return the metrics of the processes that run, from the place of an environment."""
+    """Return the metrics of the running processes, compared with the environment of this shell."""
     security = Counter(_security_of(each) for each in running.processes)
     findings = process_findings(environment, running, now=now, zone=zone)
     kinds = Counter((each.severity, each.id) for each in findings)

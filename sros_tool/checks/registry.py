@@ -41,7 +41,7 @@ def _declared(module: ModuleType) -> Iterator[FindingKind]:
 
 @cache
 def all_kinds() -> Mapping[str, FindingKind]:
-    """Return every kind by its id; this imports all checks."""
+    """Return all kinds of findings by id; imports all modules of checks."""
     modules = [import_module(f"sros_tool.checks.{name}") for name in _MODULES]
     return by_id(
         *dict.fromkeys(
@@ -83,7 +83,7 @@ class FindingFilter:
                 )
 
     def wants(self, kind: FindingKind) -> bool:
-        """Return whether this kind is selected, apart from its severity."""
+        """Return whether the filter selects this kind, whatever its severity."""
         included = not self.include or any(_matches(kind, each) for each in self.include)
         if self.vendor and kind.vendors and self.vendor not in kind.vendors:
             return False
@@ -96,7 +96,7 @@ class FindingFilter:
         return max(finding.severity, level) >= self.severity
 
     def choose(self, findings: Iterable[Finding]) -> ChosenFindings:
-        """Return the shown findings, the worst first, and the accepted ones that are not shown."""
+        """Return the findings to show, worst first, and the accepted findings that are hidden."""
         wanted = [each for each in findings if self.wants(each.kind)]
         if self.strict:
             wanted = [replace(each, accepted="") for each in wanted]
@@ -116,12 +116,12 @@ class ChosenFindings:
     hidden: int
 
     def numbers(self) -> dict[str, int]:
-        """Return the number of shown findings of each severity, the worst first."""
+        """Return the number of shown findings by severity, worst first."""
         severities = [finding.severity for finding in self.shown]
         return {str(level): severities.count(level) for level in (ERROR, WARNING, NOTE)}
 
     def summary(self) -> str:
-        """Return the number of findings, in words."""
+        """Return a line with the numbers of findings, such as ``2 errors, 1 note``."""
         counts = [counted(number, word) for word, number in self.numbers().items() if number]
         hidden = self.hidden
         unseen = f" (not shown: {counted(hidden, 'note')}, --severity note)" if hidden else ""
@@ -138,40 +138,40 @@ class ChosenFindings:
 
 
 class SharedCause(NamedTuple):
-    """What several findings have in common."""
+    """The common cause of several findings."""
 
     title: str
     """What is wrong."""
     text: str
-    """What was found, and why it matters."""
+    """What is wrong in detail, and why it matters."""
     remedy: str
-    """What to do about all of them."""
+    """How to resolve all these findings."""
     findings: Sequence[int]
-    """The positions of its findings in ``findings``, from 0."""
+    """Positions in ``findings`` of the findings with this cause, from 0."""
 
 
 class FindingCounts(NamedTuple):
     """The numbers of findings."""
 
     error: int
-    """Errors shown."""
+    """Number of errors that are shown."""
     warning: int
-    """Warnings shown."""
+    """Number of warnings that are shown."""
     note: int
-    """Notes shown."""
+    """Number of notes that are shown."""
     accepted: int
-    """Findings that the template accepts, which ``--strict`` makes count."""
+    """Number of findings that the keystore's template accepts; ``--strict`` counts them too."""
     hidden: int
-    """Findings below ``--severity``."""
+    """Number of findings below ``--severity``."""
 
 
 class ShownFindings(NamedTuple):
-    """The findings."""
+    """The findings of ``sros check``, and their numbers."""
 
     findings: Sequence[Finding]
     """The findings that are shown."""
     causes: Sequence[SharedCause]
-    """What several findings have in common, which is shown in their place as text."""
+    """Common causes of findings; the text output shows a cause in place of its findings."""
     accepted: Sequence[Finding]
     """Findings that the keystore's template accepts."""
     counts: FindingCounts
@@ -179,7 +179,7 @@ class ShownFindings(NamedTuple):
 
 
 def shown_findings(chosen: ChosenFindings) -> ShownFindings:
-    """Return what ``--json`` prints of findings."""
+    """Return the findings in the form that ``--json`` prints."""
     place = {id(finding): index for index, finding in enumerate(chosen.shown)}
     causes = [
         SharedCause(cause.title, cause.text, cause.remedy, [place[id(one)] for one in group])
@@ -192,10 +192,10 @@ def shown_findings(chosen: ChosenFindings) -> ShownFindings:
 
 
 class AllKinds(NamedTuple):
-    """All kinds of findings."""
+    """All kinds of findings that sros knows."""
 
     kinds: Sequence[FindingKind]
-    """The kinds."""
+    """The kinds of findings, grouped by family."""
 
 
 def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:
@@ -204,7 +204,7 @@ def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:
 
 
 _DIFFERENCES = "portable.vendors-differ"
-"""The kind of finding that is about several vendors."""
+"""The kind of finding about differences between vendors, which concerns several vendors."""
 
 
 def _matches(kind: FindingKind, pattern: str) -> bool:

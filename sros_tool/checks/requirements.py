@@ -8,10 +8,10 @@ VIOLATED = FindingKind(
     "requirement.violated",
     ERROR,
     "a requirement that does not hold",
-    "The access control allows, or does not allow, what the requirements file says otherwise. Each "
-    "name that could ever be used counts, not only those in use.",
+    "The policy or keystore allows access that the requirements file forbids, or denies access "
+    "that it demands. All names that a process could use count, not only the names in use today.",
     "The requirements file.",
-    "Change the lines of the policy that are named, or the requirement.",
+    "Change the policy at the named lines, or change the requirement.",
 )
 VACUOUS = FindingKind(
     "requirement.vacuous",
@@ -24,17 +24,18 @@ VACUOUS = FindingKind(
 DROPPED = FindingKind(
     "requirement.dropped",
     WARNING,
-    "a requirement that is no longer demanded",
-    "The earlier file demanded more: what it forbade can now be allowed without a finding.",
+    "a requirement that was removed or weakened",
+    "The earlier requirements file was stricter: a policy can now allow what it forbade, without a "
+    "finding.",
     "The requirements file, and the one given as --requirements-before.",
-    "Demand it again, or agree that it goes.",
+    "Restore the requirement, or approve its removal in the review.",
 )
 ASSUMED = FindingKind(
     "requirement.assumed",
     NOTE,
-    "a protection that is assumed, and not demanded",
-    "A policy alone has no governance: it becomes that of the keystore, whose template can protect "
-    "less than the default one.",
+    "a protection that the policy does not state, so that it is assumed",
+    "The governance of the keystore protects topics, and a policy alone has none. A keystore's "
+    "template can protect less than the default template.",
     "The requirements file.",
     "Name the keystore's template with --template, say protect= in the policy, or check the "
     "keystore.",
@@ -44,7 +45,7 @@ NOT_ON_ZENOH = FindingKind(
     "requirement.not-on-zenoh",
     NOTE,
     "requirements were not decided for Zenoh",
-    "The policy cannot be carried out on Zenoh, so what it would allow there is not known.",
+    "The policy cannot be translated to Zenoh, so its access on Zenoh is not known.",
     "zenoh.io, Access Control.",
     "Ignore this if the robot uses DDS.",
 )

@@ -1,4 +1,4 @@
-"""Checks of the runtime (variables, RMW, clock, processes), and what changes among its findings."""
+"""Checks of the runtime (variables, RMW, clock, processes), and changes of their findings."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class RuntimeState:
     """The input of the runtime checks: environment, clock, RMWs and processes.
 
     ``now`` is the moment to check for; ``clock`` is the host's clock, or None if it is ``now``.
-    ``rmws`` are the installed RMWs; ``insecure_rmws`` maps tried RMWs that do not enforce security
-    to the observed result.  ``zone`` is the host's time zone.
+    ``rmws`` are the installed RMWs; ``insecure_rmws`` maps an RMW that was tested and does not
+    enforce security to the result of the test.  ``zone`` is the host's time zone.
     """
 
     environment: Mapping[str, str]
@@ -66,7 +66,7 @@ _TOLERANCE = timedelta(minutes=2)
 
 
 def runtime_findings(state: RuntimeState) -> list[Finding]:
-    """Return all findings in an environment and on its host."""
+    """Return all findings about an environment and the host on which it is set."""
     environment = state.environment
     return joined(
         [
@@ -108,7 +108,7 @@ def _clock(state: RuntimeState) -> Iterator[Finding]:
 
 
 class ChangeKind(StrEnum):
-    """What became of a finding."""
+    """How a finding changed since the check before."""
 
     NEW = "new"
     CHANGED = "changed"
@@ -117,32 +117,32 @@ class ChangeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FindingChange:
-    """A change among the findings about processes; each is an object on a line of its own."""
+    """A change of a finding about processes; ``--json`` prints one object on each line."""
 
     time: datetime
-    """When it was seen, in UTC."""
+    """Time of the check that saw the change, in UTC."""
     change: ChangeKind
-    """What became of the finding: it is new, says something else, or is over."""
+    """Whether the finding is new, has another text, or is over."""
     finding: Finding
-    """The finding."""
+    """The finding that changed; if it is over, as it was last reported."""
 
     def __str__(self) -> str:
-        """Return a line of text."""
+        """Return the change as one line of text."""
         of = self.finding
         head = f"{iso(self.time)} {self.change}: {of.subject}: {of.severity.word}: {of.kind.title}"
         return f"{head} [{of.id}]: {of.text}"
 
 
 class FindingNews:
-    """The findings of the last time, to be compared with those of the next one."""
+    """The findings of the last check, to compare with the findings of the next check."""
 
     def __init__(self) -> None:
         self._before: dict[tuple[str, str], Finding] = {}
 
     def changes(self, findings: Iterable[Finding], now: datetime) -> Iterator[FindingChange]:
-        """Yield what changed since the last time; at first all findings are new.
+        """Yield the changes since the last check; in the first check all findings are new.
 
-        How many processes could not be looked at changes all the time, and is reported once.
+        The number of unreadable processes changes all the time, so it is reported only once.
         """
         found: dict[tuple[str, str], Finding] = {}
         for each in findings:

@@ -32,8 +32,8 @@ class Circumstances:
 
     ``distribution`` is the ROS 2 distribution of the nodes of policies; "" is the latest.
     ``vendor`` is the DDS vendor of the nodes, or ``zenoh``; "" if they may use any.
-    ``fleet`` has the robots that placeholders in policies stand for.  ``opened`` are the keystores
-    that were opened.
+    ``fleet`` has the robots that placeholders in policies stand for.  ``opened`` has the
+    keystores that are already open, by path.
     """
 
     now: datetime
@@ -46,7 +46,7 @@ class Circumstances:
     opened: dict[Path, Keystore] = field(default_factory=dict, repr=False, compare=False)
 
     def keystore(self, root: Path) -> Keystore:
-        """Return the keystore at a path, which is opened once for all questions about it."""
+        """Return the keystore at a path; opened once and used for all checks of it."""
         return self.opened.setdefault(root, Keystore(root))
 
 
@@ -72,9 +72,10 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
 
 
 def policy_findings(path: Path, at: Circumstances) -> list[Finding]:
-    """Return the findings at a policy, or in a folder of policies.
+    """Return the findings about a policy file, or about the policies in a folder.
 
-    Raises `DocumentError` if there is no file to read, or one in the folder is perhaps a policy.
+    Raises:
+        DocumentError: there is no file at the path, or no policy in the folder.
     """
     from sros_tool.checks.policies import policy_file_findings
     from sros_tool.policy.document import policy_files

@@ -1,6 +1,6 @@
-"""The answer to a question: the outcome, what decided it, and the lines of the policy behind it.
+"""The answer of ``sros explain``: the outcome, the deciding rule, and the policy lines behind it.
 
-What ``--json`` shows of an answer are the classes here, with their docstrings.
+``--json`` prints the classes in this module; their docstrings are the descriptions in the schema.
 """
 
 from __future__ import annotations
@@ -33,44 +33,44 @@ from sros_tool.policy.rights import PlacedRight, Right, placed_rights
 from sros_tool.values import Words, shows
 
 ADDITION = "allow.xml"
-"""Name of the file with the rights to add, in the commands that are proposed."""
+"""Name of the file with the rights to add, in proposed commands."""
 
 
 class Provenance(StrEnum):
     """Whether signed permissions were made from a policy file."""
 
     SAME = "same"
-    """They were made from the file as it is now."""
+    """The permissions were made from the policy file as it is now."""
     EQUAL = "equal"
-    """The file has changed since then, or it is another one, and it states the same rights."""
+    """The permissions were made from another version or file, which states the same rights."""
     CHANGED = "changed"
-    """The file states other rights than they have."""
+    """The policy file states other rights than the permissions have."""
     UNKNOWN = "unknown"
-    """The ledger does not have the file that they were made from."""
+    """The ledger does not say from which policy file the permissions were made."""
     PLANNED = "planned"
     """The answer is about the policy; nothing is signed yet."""
 
 
 @shows("source", "qualifier", "right", "name", "protection", spread=("source",))
 class PolicyLine(NamedTuple):
-    """A line.
+    """A line of a policy that states a right or a denial.
 
     ``group`` and ``profile`` contain the name; ``right`` is the word of the policy language.
     """
 
     source: Source
     qualifier: Qualifier
-    """Whether it allows."""
+    """Whether the line allows or denies."""
     right: str
-    """The right."""
+    """The right, such as ``publish``."""
     name: str
-    """The name, as written."""
+    """The name, as written in the policy."""
     group: Group
     profile: Profile
 
     @property
     def protection(self) -> Annotated[str, Words(("sign", "encrypt"))] | None:
-        """The protection that it demands at least, or null."""
+        """The protection that the line demands at least, or null."""
         return self.group.protect.lower() if self.group.protect else None
 
     def __str__(self) -> str:
@@ -79,24 +79,24 @@ class PolicyLine(NamedTuple):
 
     @property
     def stated(self) -> str:
-        """What it states, like ``ALLOW publish chatter``."""
+        """The qualifier, right and name, like ``ALLOW publish chatter``."""
         return f"{self.qualifier.value} {self.right} {self.name}"
 
 
 @shows("source", "xml", spread=("source",))
 class GroupEdit(NamedTuple):
-    """A group."""
+    """A group of a policy, such as ``<topics>``, to replace or remove."""
 
     source: Source
     xml: str
-    """Its new text; empty to remove it."""
+    """New XML of the group; empty to remove the group."""
 
 
 @shows(null_if_empty=("document",))
 class PolicyChange(NamedTuple):
-    """A change of the policy.
+    """A change of the policy that would allow the denied access.
 
-    Without anything to add or to lift, no change is needed.
+    If ``add`` and ``lift`` are empty, the policy needs no change.
     """
 
     add: tuple[Right, ...]
@@ -113,35 +113,35 @@ class PolicyChange(NamedTuple):
 
 
 class DecidingRule(NamedTuple):
-    """The rule of the permissions that decided."""
+    """The rule of the permissions that decided the answer."""
 
     grant: int | None
-    """Index of its grant, from 0."""
+    """Index of the grant with the rule, from 0."""
     grant_name: str
-    """Name of its grant."""
+    """Name of the grant with the rule."""
     rule: int
-    """Index in the grant, from 0."""
+    """Index of the rule in the grant, from 0."""
     allow: bool
-    """Whether it allows."""
+    """Whether the rule allows."""
     expression: str | None
     """The expression that matched, or null."""
 
 
 class StatedInPolicy(NamedTuple):
-    """What a policy says."""
+    """The part of a policy file that the answer concerns."""
 
     file: str
-    """The policy."""
+    """Path of the policy file."""
     provenance: Provenance
-    """Whether the permissions were made from it."""
+    """Whether the permissions were made from the policy file."""
     lines: tuple[PolicyLine, ...]
-    """The lines that the rule comes from."""
+    """The policy lines that the deciding rule comes from."""
     would_allow: bool
-    """Whether the policy allows it once it is signed."""
+    """Whether the policy allows the access once it is signed."""
 
 
 class AppliedProtection(NamedTuple):
-    """Protection by the governance."""
+    """The protection that the governance demands for the topic."""
 
     rtps: ProtectionKind
     """Protection of RTPS messages."""
@@ -150,7 +150,7 @@ class AppliedProtection(NamedTuple):
     liveliness: ProtectionKind
     """Protection of liveliness messages."""
     topic_expression: str | None
-    """The topic rule that applies, or null; so for all that follow."""
+    """The topic rule that applies, or null; without a rule, the following fields are null too."""
     data: ProtectionKind | None
     """Protection of the payload."""
     metadata: ProtectionKind | None
@@ -163,7 +163,7 @@ class AppliedProtection(NamedTuple):
 
 @shows("part", "decision", spread=("part", "decision"))
 class DecidedPart(NamedTuple):
-    """An endpoint."""
+    """The decision on a DDS endpoint."""
 
     part: Part
     decision: Decision
@@ -177,14 +177,16 @@ class DecidedPart(NamedTuple):
 )
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The decision of a vendor.
+    """The decision of a DDS vendor on a question.
 
-    ``decision`` determines the outcome; ``part`` is the endpoint that it is about, None if it is
-    about joining.  ``grant`` and ``domain_rule`` are the parts of the documents that apply.
+    ``decision`` determines the outcome; ``part`` is the endpoint decided on, or None for
+    the decision on joining.  ``grant`` and ``domain_rule`` are the parts of the documents
+    that apply.
 
     `sros_tool.explain.explanation` fills in the other fields.  ``lines`` are the lines of the
     policy file that the deciding rule comes from, and ``provenance`` says whether the permissions
-    were made from that file.  ``sign`` says that the present policy file, once signed, allows it.
+    were made from that file.  ``sign`` says that the present policy file, once signed, allows the
+    access.
     """
 
     vendor: Vendor
@@ -195,38 +197,38 @@ class Answer:
     decision: Decision
     part: Part | None = None
     parts: tuple[DecidedPart, ...] = ()
-    """The DDS endpoints that it needs."""
+    """The DDS endpoints that the access needs."""
     problems: tuple[Problem, ...] = ()
     """Faults that keep the vendor from loading the enclave."""
     grant: Grant | None = None
     domain_rule: DomainRule | None = None
     until: datetime | None = None
-    """When the first of its files expires, in UTC, or null."""
+    """The earliest expiry of the enclave's files, in UTC, or null."""
     until_file: str = ""
-    """That file, or null."""
+    """The file that expires first, or null."""
     lines: tuple[PolicyLine, ...] = ()
     provenance: Provenance | None = None
     policy_sha256: str = ""
     """SHA-256 of the policy that the permissions were made from, or null."""
     change: PolicyChange | None = None
-    """The smallest change of the policy that would allow it, or null."""
+    """The smallest change of the policy that would allow the access, or null."""
     remedy: str = ""
-    """What to do if no policy can help, or null."""
+    """What to do if no change of the policy can help, or null."""
     sign: bool = False
 
     @property
     def vendor_title(self) -> str:
-        """Its name and version."""
+        """Name and version of the vendor."""
         return self.vendor.title
 
     @property
     def documented_only(self) -> bool:
-        """Whether the decision is by its documentation, not by tests."""
+        """Whether the vendor's behaviour is known from its documentation alone, not from tests."""
         return self.vendor.documented_only
 
     @property
     def as_documented(self) -> bool:
-        """Whether the answer relies on the vendor's documentation alone, not on tests."""
+        """Whether this answer relies on the vendor's documentation alone, not on tests."""
         return self.vendor.documented_only and not self.problems
 
     @property
@@ -236,17 +238,17 @@ class Answer:
 
     @property
     def reason(self) -> ReasonWord:
-        """Why, as a stable word such as `no-rule`."""
+        """Reason of the decision, as a stable word such as `no-rule`."""
         return self.decision.reason
 
     @property
     def text(self) -> str:
-        """Why, as a sentence."""
+        """Reason of the decision, as a sentence."""
         return self.decision.text
 
     @property
     def denied_by(self) -> str:
-        """Who denies it, or null."""
+        """Who denies the access, or null."""
         match self.outcome:
             case Outcome.ALLOWED:
                 return ""
@@ -264,7 +266,7 @@ class Answer:
 
     @property
     def rule(self) -> DecidingRule | None:
-        """The rule of the permissions that decided, or null."""
+        """The rule of the permissions that decided the answer, or null."""
         decision, grant = self.decision, self.grant
         if decision.rule is None or grant is None:
             return None
@@ -273,13 +275,13 @@ class Answer:
 
     @property
     def wildcard(self) -> str:
-        """The expression, if it is a wildcard, or null."""
+        """The expression that matched, if it is a wildcard, or null."""
         expression = self.decision.expression or ""
         return expression if is_expression(expression) else ""
 
     @property
     def policy(self) -> StatedInPolicy | None:
-        """What `--policy` says, or null without it."""
+        """The lines of the file of `--policy` that matter, or null without `--policy`."""
         if self.provenance is None:
             return None
         file = str(self.enclave.policy_file)
@@ -287,13 +289,13 @@ class Answer:
 
     @property
     def topic_rule(self) -> TopicRule | None:
-        """The rule of the governance for the topic, None if it is not known."""
+        """The governance's rule for the topic, or None if it is not known."""
         decisions = (self.decision, *(part.decision for part in self.parts))
         return next((decision.topic_rule for decision in decisions if decision.topic_rule), None)
 
     @property
     def protection(self) -> AppliedProtection | None:
-        """Protection by the governance, or null."""
+        """The protection that the governance demands for the topic, or null."""
         topic, domain = self.topic_rule, self.domain_rule
         if domain is None:
             return None
@@ -310,7 +312,7 @@ class Answer:
 
     @property
     def commands(self) -> list[str]:
-        """Commands that apply the change."""
+        """The commands that apply the change of the policy."""
         if not self.change and not self.sign:
             return []
         file = str(self.enclave.policy_file or "POLICY")
@@ -337,9 +339,9 @@ _CREATED = {
 
 
 def recorded_policy(keystore: Keystore, signed: bytes) -> str:
-    """Return the SHA-256 of the policy that signed permissions were made from, or "".
+    """Return the SHA-256 (hex) of the policy that signed permissions were made from, or "".
 
-    It comes from the ledger of the keystore; it is "" if there is no ledger or entry.
+    The ledger of the keystore has the digest; without a ledger or entry the result is "".
     """
     digest = hashlib.sha256(signed).hexdigest()
     ledger = keystore.ledger_with("sha256", digest)
@@ -348,9 +350,10 @@ def recorded_policy(keystore: Keystore, signed: bytes) -> str:
 
 
 def template_default(digest: str) -> str:
-    """Return which default of keystore templates has this digest (`recorded_policy`), or "".
+    """Return the default policy of keystore templates that has this digest, or "".
 
-    It is "everything" or "node_basics", a value of the template's ``permissions.default``.
+    ``digest`` is from `recorded_policy`.  The result is "everything" or "node_basics", as in the
+    template's ``permissions.default``.
     """
     from sros_tool.files import policies_dir
     from sros_tool.policy.document import read_policy
@@ -360,9 +363,9 @@ def template_default(digest: str) -> str:
 
 
 def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
-    """Return the names in an enclave's policy that the deciding rule of an answer comes from.
+    """Return the lines of an enclave's policy that the deciding rule of an answer comes from.
 
-    Several nodes of an enclave may have the same right, so there may be several.
+    Several nodes of an enclave may have the same right, so there may be several lines.
     """
     expression, part = answer.decision.expression, answer.part
     if part is None or not expression or answer.grant is None:
@@ -384,7 +387,7 @@ def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
 
 
 def lines_of_right(policy: Enclave, right: Right) -> tuple[PolicyLine, ...]:
-    """Return the names in an enclave's policy that state a right or denial."""
+    """Return the lines of an enclave's policy that state a right or denial."""
     stated = (placed for placed in placed_rights(policy) if placed.right[1:] == right[1:])
     return tuple(map(_line, stated))
 
@@ -417,7 +420,7 @@ class Evaluator:
 
     @property
     def access(self) -> Access | None:
-        """The access of the vendor's process; None if it does not run, or no peer accepts it."""
+        """Access of a process on this vendor; None if it cannot run, or if no peer accepts it."""
         return self._participant.access
 
     def answer(self, question: Question) -> Answer:
@@ -439,7 +442,7 @@ class Evaluator:
         own: Sequence[tuple[Part | None, Decision]],
         asked: tuple[DecidedPart, ...] = (),
     ) -> Answer:
-        """Return the answer that results from the decisions on the process and its endpoints."""
+        """Return the answer that follows from the decisions on the process and its endpoints."""
         decided = [*own, *asked]
         outcome = min((decision.outcome for _, decision in decided), key=_WORST_FIRST.index)
         # The first topic of the question explains an allowed outcome; any other outcome is
@@ -470,7 +473,7 @@ class Evaluator:
         return next((r for r in rules if self.context.domain in r.domains.closed()), None)
 
     def _first_expiry(self) -> tuple[str, datetime | None]:
-        """Return the file of the enclave that expires first, and when."""
+        """Return the file of the enclave that expires first, and its expiry."""
         expiries = list(self.enclave.expiries())
         access, permissions = self.access, self._participant.permissions
         if permissions and access:

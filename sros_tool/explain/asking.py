@@ -1,6 +1,6 @@
-"""What a question is about: the enclave of a keystore, a folder or a policy, when and where.
+"""Open the enclave of a question, from a keystore, a folder or a policy, and interpret its name.
 
-The command line and the Python API open here what they ask.
+The command line and the Python API both use this module.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 
 class AskingContext(NamedTuple):
-    """When, in which time zone and domain, and for which fleet a question is asked.
+    """The time, time zone, domain and fleet for which a question is asked.
 
-    Without a ``domain`` it is one that the enclave may join; ``fleet_file`` is for the placeholders
-    of a policy.
+    ``domain`` None stands for a domain that the enclave may join; ``fleet_file`` names the robots
+    for placeholders in a policy.
     """
 
     at: datetime
@@ -46,7 +46,7 @@ class AskingContext(NamedTuple):
     fleet_file: Path | None = None
 
     def context(self, domains: DomainSet | None) -> JoinContext:
-        """Return the domain, time and zone to decide for, if an enclave may join ``domains``."""
+        """Return the context of the decision for an enclave that may join ``domains``."""
         domain = self.domain
         if domain is None:
             domain = domains.preferred() if domains else 0
@@ -54,7 +54,7 @@ class AskingContext(NamedTuple):
 
 
 def fleet_of(file: Path | None, keystore: Keystore | None) -> Fleet | None:
-    """Return the fleet in a file, or else that of ``keystore``."""
+    """Return the fleet in a file, or else the fleet of the keystore."""
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.fleet import load_fleet
 
@@ -67,13 +67,13 @@ def fleet_of(file: Path | None, keystore: Keystore | None) -> Fleet | None:
 
 
 class AskedEnclave(NamedTuple):
-    """An enclave to ask about, and the policy that was named, with all of its enclaves."""
+    """An enclave to ask about, and the whole policy that was given, if any."""
 
     enclave: LoadedEnclave
     policy: Policy | None = None
 
     def other_rights(self, name: str) -> frozenset[Right]:
-        """Return the rights to a name in the policy and in the keystore, if they can be read."""
+        """Return all rights to a name in the policy and the keystore that can be read."""
         rights: frozenset[Right] = frozenset()
         if self.policy:
             from sros_tool.policy.rights import policy_rights
@@ -86,9 +86,9 @@ class AskedEnclave(NamedTuple):
 
 
 def rights_naming(keystore: Keystore, name: str) -> Iterator[Right]:
-    """Yield the rights of the enclaves of a keystore whose permissions have a ROS name.
+    """Yield the rights of all enclaves of a keystore whose permissions contain a ROS name.
 
-    Those that cannot be read are left out.  Most do not have the name, and are not parsed.
+    Unreadable permissions are left out; permissions without the name are not parsed.
     """
     for enclave in keystore.names:
         with suppress(SrosError, OSError):
@@ -98,7 +98,7 @@ def rights_naming(keystore: Keystore, name: str) -> Iterator[Right]:
 
 
 def _may_have(document: bytes, name: str) -> bool:
-    """Return whether a document may have a topic of a ROS name, perhaps written in another way."""
+    """Return whether a document can contain a topic of a ROS name, perhaps with escapes."""
     text = name.encode()
     return text in document and (
         b"rt" + text in document or b"rq" + text in document or b"rr" + text in document
@@ -106,7 +106,7 @@ def _may_have(document: bytes, name: str) -> bool:
 
 
 def _rights_in(enclave: str, data: bytes) -> Iterator[Right]:
-    """Yield the rights in a permissions document, by the first grant for each subject."""
+    """Yield the rights in a permissions document, from the first grant for each subject."""
     from sros_tool.pki import smime
     from sros_tool.translate import grant_rights
 
@@ -117,18 +117,18 @@ def _rights_in(enclave: str, data: bytes) -> Iterator[Right]:
 
 
 def is_enclave(folder: Path) -> bool:
-    """Return whether a folder is that of an enclave."""
+    """Return whether a folder is the folder of an enclave."""
     return any((folder / name).exists() for name in (CERTIFICATE_FILE, PERMISSIONS_FILE))
 
 
 def open_to_ask(
     root: Path | None, name: str, policy_file: Path | None, asking: AskingContext
 ) -> AskedEnclave:
-    """Return an enclave of a keystore, in a folder ``name``, or in a policy alone.
+    """Return an enclave to ask about, from a keystore, a folder ``name``, or a policy alone.
 
     Raises:
-        KeystoreError: the keystore does not have it.
-        PolicyError: the policy does not have it.
+        KeystoreError: the keystore does not have the enclave.
+        PolicyError: the policy does not have the enclave.
     """
     policy = own = None
     keystore = Keystore(root) if root else None
@@ -192,7 +192,7 @@ def signed_enclave(
 
 
 def _in_folder(folder: Path, at: datetime) -> LoadedEnclave:
-    """Load the enclave in a folder, by the common name of its certificate, or ""."""
+    """Load the enclave in a folder; its name is the common name of its certificate, or ""."""
     from sros_tool.pki.certificates import common_name_of
 
     state = open_enclave(folder, now=at)
@@ -205,7 +205,8 @@ def _planned_enclave(
 ) -> LoadedEnclave:
     """Return the enclave as the policy would create it, with the keystore's governance.
 
-    Without a keystore, the governance is that of the default template, raised as the enclave says.
+    Without a keystore, the governance is the default template's, with the protection that the
+    policy demands.
     """
     from sros_tool.keystore.participant import plan_enclave
     from sros_tool.keystore.protection import with_stated
@@ -228,10 +229,10 @@ def _planned_enclave(
 def _action_meant(
     evaluator: Evaluator, question: Question, others: Callable[[], Iterable[Right]]
 ) -> Question | None:
-    """Return the question about an action, if that is what the rights show the name to be.
+    """Return the question about an action, if the rights show that the name is an action, or None.
 
-    The rights of the enclave come first; ``others``, such as those of its policy and of its
-    keystore, are read only if the service is denied.
+    The rights of the enclave are read first; ``others``, such as the rights in its policy and
+    keystore, only if the service is denied.
     """
     if question.word not in ("call", "serve"):
         return None
@@ -245,9 +246,9 @@ def _action_meant(
 
 
 def taken_for_action(question: Question, action: Question) -> Note:
-    """Return the note that a question was taken for one about an action."""
+    """Return the note that a question about a service was answered for an action."""
     text = (
-        f"{action.name} is an action in the rights here, and no service: {question.word} is taken "
+        f"{action.name} is an action in these rights, not a service: {question.word} is taken "
         f"for '{action}'; --type service asks about a service."
     )
     return Note("explain.an-action", text)
@@ -256,7 +257,7 @@ def taken_for_action(question: Question, action: Question) -> Note:
 def meant(
     evaluator: Evaluator, asked: AskedEnclave, question: Question, kind: str | None
 ) -> tuple[Question, tuple[Note, ...]]:
-    """Return the question that is meant, and a note if it is another one."""
+    """Return the question to answer, and a note if it differs from the given question."""
     if not kind:
         action = _action_meant(evaluator, question, lambda: asked.other_rights(question.name))
         if action:
@@ -269,12 +270,12 @@ def meant(
 
 @shows("enclave", "question", "domain", "at", "time_zone")
 class Asked(NamedTuple):
-    """What was asked."""
+    """The question, with its enclave, domain and time."""
 
     enclave: str
-    """The enclave."""
+    """The enclave that is asked about."""
     question: Question
-    """The question."""
+    """The question, such as ``publish topic /chatter``."""
     context: JoinContext
 
     @property
@@ -284,7 +285,7 @@ class Asked(NamedTuple):
 
     @property
     def at(self) -> datetime:
-        """The moment, in UTC."""
+        """The time for which the question is asked, in UTC."""
         return self.context.at
 
     @property
@@ -295,12 +296,12 @@ class Asked(NamedTuple):
 
 @shows("allowed", "mode", "text")
 class ZenohInBrief(NamedTuple):
-    """What Zenoh does."""
+    """The decision of Zenoh."""
 
     allowed: bool
     """Whether data can flow."""
     mode: Annotated[str, Words(("client", "peer", "router"))] | None
-    """How the process takes part, or null."""
+    """Mode of the process, such as ``client`` or ``peer``, or null."""
     text: str
-    """Why, as a clause."""
+    """Reason of the decision, as a clause."""
     outcome: str

@@ -1,15 +1,15 @@
 """Find what a policy or a keystore would deny to the nodes of an observed ROS graph.
 
 DDS Security has no permissive mode: a rule denies, or there is no security.  So nothing is enforced
-here.  Every endpoint that the graph shows is put to the decision engine, in the enclave that its
-process would run in, and the answers are what a secured robot would log.
+here.  The decision engine decides every endpoint of the graph, in the enclave in which its process
+would run; the denials are the ones that a secured robot would log.
 
 The graph of a robot without security shows the enclave / for most processes.  The enclave is then
-the one that a profile of the policy, or the node's own services in the permissions of a keystore,
-names the node for.
+found by the node's name: in the profiles of the policy, or in the services of nodes that the
+permissions of a keystore name.
 
-What was not observed is not judged: the result names the nodes of the policy or keystore that did
-not appear, and everything in the graph that no enclave could be asked about.
+Nodes that were not observed are not judged: the result names the nodes of the policy or keystore
+that did not appear, and everything in the graph that belongs to no enclave.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ _USE = "use"
 
 @dataclass(frozen=True, slots=True)
 class EnclaveNodes:
-    """The names of the nodes that each enclave is for, perhaps with wildcards."""
+    """The nodes of each enclave; their names may have wildcards."""
 
     by_enclave: Mapping[str, tuple[str, ...]]
 
     def enclaves_for(self, node: str) -> frozenset[str]:
-        """Return the enclaves for the node with this full name; exact names count first."""
+        """Return the enclaves for the node with this full name; exact names win over wildcards."""
         exact = frozenset(name for name, nodes in self.by_enclave.items() if node in nodes)
         return exact or frozenset(
             name
@@ -83,7 +83,7 @@ class EnclaveNodes:
 
     @property
     def expected(self) -> frozenset[EnclaveNode]:
-        """The nodes that run when the whole robot does: all but the tools that observe it."""
+        """The nodes of the whole robot, without the tools that observe it."""
         return frozenset(
             EnclaveNode(enclave, node)
             for enclave, nodes in self.by_enclave.items()
@@ -94,13 +94,13 @@ class EnclaveNodes:
 
 @dataclass(frozen=True, slots=True, order=True)
 class EnclaveNode:
-    """A node that an enclave is for; ``node`` is "" if nothing tells the enclave's nodes."""
+    """A node of an enclave; ``node`` is "" if the nodes of the enclave are not known."""
 
     enclave: str
-    """The enclave that is for it."""
+    """The enclave of the node."""
     node: str
-    """Its full name, perhaps with wildcards; empty if nothing tells the nodes of the enclave, and
-    none of its nodes was seen."""
+    """Full name of the node, perhaps with wildcards; empty if the nodes of the enclave are not
+    known, and no node was seen in it."""
 
     def __str__(self) -> str:
         """Return text like ``node /talker of enclave /robot/talker``."""
@@ -108,13 +108,13 @@ class EnclaveNode:
 
 
 def _is_of(node: str, name: str) -> bool:
-    """Return whether the full name of a node is ``name``, which may have wildcards."""
+    """Return whether the full name of a node matches ``name``, which may have wildcards."""
     return node == name or (is_expression(name) and matches(name, node))
 
 
 @dataclass(frozen=True)
 class AuditedEnclaves:
-    """The enclaves of a policy or keystore (``what``), and how to ask a vendor about each."""
+    """The enclaves of a policy or keystore (``what``), with the evaluator of each enclave."""
 
     what: str
     nodes: EnclaveNodes
@@ -124,7 +124,7 @@ class AuditedEnclaves:
     _evaluators: dict[str, Evaluator] = field(default_factory=dict)
 
     def evaluator(self, enclave: str) -> Evaluator:
-        """Return the evaluator for an enclave, which is loaded once."""
+        """Return the evaluator for an enclave; loads the enclave only once."""
         if enclave not in self._evaluators:
             loaded = self.load(enclave)
             self._evaluators[enclave] = Evaluator(self.vendor, loaded, self.context)
@@ -140,7 +140,7 @@ def audited_enclaves(
     that its placeholders stand for.
 
     Raises:
-        UsageError: it is neither, or the fleet is for a keystore.
+        UsageError: ``path`` is neither a policy nor a keystore, or is a keystore with ``fleet``.
     """
     rights = load_rights(path, fleet)
     if fleet and rights.kind != "policy":
@@ -181,9 +181,10 @@ def policy_enclaves(
 def keystore_enclaves(
     source: RightsSource, names: Iterable[str], vendor: Vendor, context: JoinContext
 ) -> AuditedEnclaves:
-    """Return the enclaves ``names`` of a keystore, of which ``source`` has the rights.
+    """Return the enclaves ``names`` of a keystore, with the rights in ``source``.
 
-    Permissions name no nodes: an enclave is for the nodes whose own services it may offer.
+    Permissions name no nodes, so an enclave counts as the enclave of the nodes whose parameter
+    services it may offer.
     """
     replies: dict[str, list[tuple[str, str]]] = {name: [] for name in names}
     for right in source.rights:
@@ -203,26 +204,26 @@ def keystore_enclaves(
 @shows(spread=("right",))
 @dataclass(frozen=True, slots=True)
 class DeniedRight:
-    """A right that nodes of an enclave use, and that DDS would deny them.
+    """A right that nodes of an enclave use, and that DDS would deny.
 
-    ``nodes`` are their full names.  ``right.name`` is a DDS topic if it has no ROS name.
-    ``endpoints`` are the denied ones among those that the right needs.  ``by_rule`` says that a
-    rule denies it, so that a rule to allow it would not help; ``new_enclave`` that no enclave is
-    for the node, so that the enclave of ``right`` is a proposal.
+    ``nodes`` are the full names of the nodes.  ``right.name`` is a DDS topic if it has no ROS
+    name.  ``endpoints`` are the denied endpoints of the right.  ``by_rule`` says that a deny rule
+    denies the right, so that a new allow rule would not help; ``new_enclave`` says that the node
+    has no enclave yet, and that the enclave of ``right`` is a proposal.
     """
 
     right: Right
     """The right in the words of the policy language."""
     nodes: tuple[str, ...]
-    """The nodes that use it."""
+    """The nodes that use the right."""
     reason: str
-    """Why, as a sentence."""
+    """Reason of the denial, as a sentence."""
     by_rule: bool
-    """Whether a rule denies it, so that no right that is added allows it."""
+    """Whether a deny rule denies the right, so that adding a right does not help."""
     new_enclave: bool
-    """Whether the policy does not have the enclave."""
+    """Whether the policy does not have the enclave yet."""
     endpoints: tuple[Endpoint, ...]
-    """The DDS endpoints."""
+    """The denied DDS endpoints."""
 
     def __str__(self) -> str:
         """Return text like ``/robot publish topic /chatter (/talker): no rule allows it``."""
@@ -234,19 +235,19 @@ class RefusedEnclave(NamedTuple):
     """An enclave in which no process would start."""
 
     enclave: str
-    """The enclave."""
+    """Name of the enclave."""
     reason: str
-    """Why, as a sentence."""
+    """Reason of the refusal, as a sentence."""
 
 
 @shows(spread=("observation",))
 class AuditResult(NamedTuple):
-    """What a policy or keystore would deny to the running nodes."""
+    """The rights that a policy or keystore would deny to the running nodes."""
 
     source: Path
-    """The policy or keystore."""
+    """Path of the policy or keystore."""
     kind: Annotated[str, Words(("policy", "keystore"))]
-    """What it is."""
+    """Whether the source is a policy or a keystore."""
     vendor: Vendor
     """The DDS vendor, as ``--vendor`` takes it."""
     domain: int
@@ -261,7 +262,7 @@ class AuditResult(NamedTuple):
     unseen: Sequence[EnclaveNode]
     """The nodes of the policy or keystore that were not seen, and so not judged."""
     unjudged: Sequence[str]
-    """What was seen and not judged, each kind in words; ``notes`` has the names."""
+    """Things that were seen and not judged, with their number in words; ``notes`` has the names."""
     observation: Observation
     settled: bool
     """Whether the ROS graph stopped changing before the result."""
@@ -276,12 +277,12 @@ class AuditResult(NamedTuple):
 
 @dataclass(frozen=True)
 class Audit:
-    """What would be denied of an observation.
+    """The result of an audit of observed nodes.
 
-    ``refused`` maps enclaves in which no process would start, or be let in, to the reason.
-    ``observation`` has the nodes that were judged, each with the enclaves it was judged in.
-    ``unseen`` are those of the ``expected`` nodes of the policy or keystore that did not appear,
-    and ``unjudged`` says in words what appeared and was not judged.
+    ``refused`` maps enclaves in which no process could start, or find peers, to the reason.
+    ``observation`` has the judged nodes, each with the enclaves in which it was judged.
+    ``unseen`` are the ``expected`` nodes of the policy or keystore that did not appear, and
+    ``unjudged`` says in words which observed things were not judged.
     """
 
     denied: tuple[DeniedRight, ...]
@@ -294,27 +295,27 @@ class Audit:
 
     @property
     def allowed(self) -> bool:
-        """Whether nothing would be denied of what was judged; `complete` says if that is all."""
+        """Whether every judged node would be allowed everything; see `complete` for the others."""
         return not (self.denied or self.refused)
 
     @property
     def complete(self) -> bool:
-        """Whether every expected node was seen, and everything that was seen was judged."""
+        """Whether every expected node was seen, and every observed thing was judged."""
         return not (self.unseen or self.unjudged)
 
     @cached_property
     def missing(self) -> Learned:
-        """The rights to add so that everything is allowed that no rule of the policy denies."""
+        """The rights to add to the policy; rights that a deny rule denies are not included."""
         learned = learn(_used(self.denied, self.observation))
         return replace(learned, source=RightsFound.AUDIT)
 
 
 def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "") -> Audit:
-    """Return what the enclaves would be denied of everything that is observed.
+    """Return the rights that observed nodes use and that their enclaves would be denied.
 
-    If several enclaves are for the nodes of a process, all of them are judged, with a note.
-    ``observer`` is the enclave of the process that observes, if it has one: that process alone
-    is enough for an enclave that is for no node by name.
+    If several enclaves match the nodes of a process, all of them are judged, with a note.
+    ``observer`` is the enclave of the observing process, if it has one: an enclave without named
+    nodes counts as seen if this process runs in it.
     """
     unjudged = _unjudged(observation)
     notes = [note for note, _ in unjudged]
@@ -376,8 +377,8 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
 
 
 _DIVIDED = (
-    "no enclave is for all nodes of these processes, and a process has one enclave; the one in "
-    "which least is denied was judged"
+    "no enclave has all nodes of these processes, and a process has one enclave; the enclave with "
+    "the fewest denials was judged"
 )
 _UNCLEAR = (
     "several enclaves are for these nodes, and the graph does not show in which they run; all of "
@@ -392,9 +393,9 @@ _STRAYS = "not judged, because the writers or readers of these topics belong to 
 
 
 def _unjudged(observation: Observation) -> list[tuple[Note, str]]:
-    """Return a note on each kind of things that are not judged, with their number in words.
+    """Return notes on the observed things that are not judged, with their number in words.
 
-    The words are "" for tools that do nothing but observe.
+    The words are "" for tools that only observe.
     """
     tools = {node.fqn for node in observation.nodes if is_tool(node)}
     active = {node.fqn for node in observation.nodes if is_tool(node) and not _only_observes(node)}
@@ -423,7 +424,7 @@ _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 
 
 def _only_observes(node: ObservedNode) -> bool:
-    """Return whether a node uses nothing but what each node has: its own services, logging."""
+    """Return whether a node only has what every node has: its own services, and logging."""
     own = expand("~/", node.ns, node.name)
     folded = fold(node.endpoints)
     return not (folded.halves or folded.foreign) and all(
@@ -434,7 +435,7 @@ def _only_observes(node: ObservedNode) -> bool:
 def _enclaves_of(
     process: Sequence[ObservedNode], known: EnclaveNodes
 ) -> tuple[frozenset[str], bool]:
-    """Return the enclaves that a process may run in, and whether each is for all of its nodes.
+    """Return the enclaves that a process may run in, and whether they match all its nodes.
 
     The enclave that the graph shows counts, even if it is for other nodes.
     """
@@ -452,7 +453,7 @@ def _enclaves_of(
 
 @dataclass(frozen=True, slots=True)
 class _Judgement:
-    """What a process would be denied in one enclave; ``refused`` if it could not run there."""
+    """The rights that a process would be denied in an enclave; ``refused`` if it cannot run."""
 
     denied: tuple[DeniedRight, ...]
     refused: str = ""
@@ -511,7 +512,7 @@ def _without_enclave(node: ObservedNode, what: str) -> Iterator[DeniedRight]:
 
 
 def _by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
-    """Return each denied right once, sorted, with all nodes of the enclave that use it."""
+    """Return the denied rights without duplicates, sorted, with all nodes that use each right."""
     by_right: dict[Right, DeniedRight] = {}
     for each in denied:
         other = by_right.get(each.right, each)
@@ -521,7 +522,7 @@ def _by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
 
 
 def _used(denied: Iterable[DeniedRight], observation: Observation) -> Observation:
-    """Return the nodes with the endpoints of denied rights only; what a rule denies is left out."""
+    """Return the nodes with the endpoints of denied rights, unless a deny rule denies the right."""
     wanted: dict[tuple[str, str], set[Endpoint]] = {}
     for each in denied:
         if each.by_rule:

@@ -56,14 +56,14 @@ from sros_tool.runtime.vendor_log import (
 )
 
 _NEAR_LINES = 3
-"""The number of lines after a denial that still belong to it."""
+"""Number of log lines after a denial that can still belong to the denial."""
 
 
 @dataclass(frozen=True, slots=True)
 class Denial:
     """A denied DDS topic (raw name); ``direction`` is "publish", "subscribe", or "" if unknown.
 
-    ``by_rule`` says that a rule denies it, so that a rule to allow it would not help; ``remote``
+    ``by_rule`` says that a deny rule denies it, so that an allow rule would not help; ``remote``
     says that a peer's permissions deny it.  ``enclave`` is "" if the log does not name it.
     ``process`` is the label of the process that printed the denial, "" without a label, and
     ``line`` the number of its line, from 1.
@@ -81,7 +81,7 @@ class Denial:
 
 @dataclass(frozen=True, slots=True)
 class MissingRights:
-    """The rights that denials show to be missing, by enclave ("" if the log does not name it).
+    """The rights that nodes lack according to denials, by enclave ("" if the log names none).
 
     The user has to handle denials without a direction (``unclear``), by a deny rule (``by_rule``),
     by a peer's permissions (``remote``), and of topics without a ROS name (``foreign``).
@@ -95,7 +95,7 @@ class MissingRights:
 
 
 def read_denials(text: str) -> tuple[Denial, ...]:
-    """Return each denied topic of each process in a log without colours once.
+    """Return the denied topics in a log without colours, each topic once for each process.
 
     The labels that ros2 launch, journald or Docker Compose put before lines distinguish the
     processes in a log; the enclave named by one process is not used for another one.
@@ -125,7 +125,7 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
 
 
 def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
-    """Return whether a peer is denied, and the direction, from a denial and the next lines."""
+    """Return whether a peer is denied, and the direction, from a denial and the lines after it."""
     for line in lines:
         other = denied_topic(line)
         if other and other[1]["topic"] != topic:
@@ -193,7 +193,7 @@ def _right(denial: Denial) -> NodeRight:
 
 
 def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
-    """Return the rights without the topics that belong to an action among them."""
+    """Return the rights without topics and services of an action that is among the rights."""
     parts = {
         NodeRight(way, f"{right.name}{ACTION_SEPARATOR}{topic}")
         for right in rights
@@ -225,7 +225,7 @@ _SEVERAL = Note(
 )
 
 _NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
-"""Common parts, the widest first: a node that lacks one right of a part probably lacks all."""
+"""Common parts, widest first: a node that lacks one right of a part probably lacks all of them."""
 
 
 def learned_from_logs(
@@ -236,13 +236,13 @@ def learned_from_logs(
     place: tuple[str, str] | None,
     present: Policy | None,
 ) -> tuple[Learned, list[AskingLine], bool]:
-    """Return the rights that logs ask for, the lines that ask, and whether the logs deny anything.
+    """Return the rights that logs show as missing, the log lines, and whether there is any denial.
 
     Args:
         logs: the texts of the logs by their paths.
         file: the policy to which the rights are to be added, for the paths of common parts.
-        enclave: the enclave of processes whose log does not tell it, or "".
-        place: namespace and name of the node whose profile gets them, if it is named.
+        enclave: the enclave of processes whose log does not name their enclave, or "".
+        place: namespace and name of the node whose profile gets the rights, or None.
         present: the content of ``file``, if it exists.
     """
     denials = {log: read_denials(plain_text(text)) for log, text in logs.items()}
@@ -275,8 +275,8 @@ def as_learned(
 ) -> Learned:
     """Return the proposed rights as profiles.
 
-    With ``enclave``, only that enclave gets rights: those of denials that name it, and of denials
-    that name none.  ``node`` (namespace and name) names the profile.  Without it, the rights go to
+    With ``enclave``, only that enclave gets rights: from denials that name it or no enclave.
+    ``node`` (namespace and name) names the profile.  Without it, the rights go to
     the node whose standard services were denied, else to the only profile of the enclave in
     ``policy``, else to a profile for any node: DDS checks only the enclave.  A node that is not in
     the policy gets a note instead of rights.  With ``common``, a node that has none of the rights
@@ -318,7 +318,7 @@ def as_learned(
 
 
 def _by_enclave(missing: MissingRights, enclave: str) -> dict[str, frozenset[NodeRight]]:
-    """Return the rights by enclave; if ``enclave`` is not "", of that one alone."""
+    """Return the rights by enclave; only of ``enclave`` if it is not ""."""
     found: dict[str, frozenset[NodeRight]] = {}
     for named, rights in missing.rights.items():
         if enclave and named not in ("", enclave):
@@ -354,7 +354,7 @@ def _by_place(
 
 
 def _place(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:
-    """Return namespace and name of the profile for a node; they may have wildcards."""
+    """Return namespace and name of the profile for a node, perhaps with wildcards."""
     ns, _, name = fqn.rpartition("/")
     return next((each for each in present if covers(_fqn(each), fqn)), (ns or "/", name))
 
@@ -369,7 +369,7 @@ def _whole_parts(
     has: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
-    """Return the first part from which the node has no right and was denied one, if any."""
+    """Return the first common part of which a node has no right and was denied one, if any."""
     if is_expression(place[1]):
         return ()
     for part in _NODE_PARTS:

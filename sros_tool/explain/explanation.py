@@ -1,10 +1,9 @@
-"""Explain an answer: the lines of the policy behind it, and what to do about a denial.
+"""Add policy lines to an answer, and for a denial the smallest change or the remedy.
 
 The smallest change of the policy adds a right only if no right covers the question, and removes a
-denial only if it prevents the answer "allowed"; the decision engine checks it before it is shown.
+denial only if the denial prevents the access; the decision engine checks the change.
 
-Where the policy is not the cause, a command in a remedy works on a keystore with that fault, and
-repairs it.
+If the policy is not the cause, the command in the remedy repairs the fault in the keystore.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ from sros_tool.terminal import log_step
 
 
 def explain(evaluator: Evaluator, question: Question) -> Answer:
-    """Return the answer with its policy lines and, for a denial, a change or remedy."""
+    """Return the answer to a question with its policy lines and, for a denial, change or remedy."""
     answer, enclave = evaluator.answer(question), evaluator.enclave
     log_step(
         "INFO",
@@ -156,7 +155,7 @@ _BY_REASON: dict[str, str | Fault] = {
     "invalid-name": "Use a name of letters, digits, '_' and '/'.",
     "partition": "Leave partitions out of permissions; sros never writes them.",
 }
-"""Faults or texts, by the reasons of decisions that do not come from rights of the policy."""
+"""Faults or remedies by the reason of a denial that the policy did not cause."""
 
 _SHARED = {
     GOVERNANCE_FILE: GOVERNANCE_P7S,
@@ -174,8 +173,8 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
 
     Args:
         cause: a fault of the enclave's files, its id, or the reason of a decision.
-        root: the keystore, or "". An exported keystore, without the keys of the CAs, can only be
-            repaired in the keystore that has them.
+        root: the keystore, or "". An export, without CA keys, can only be repaired in the
+            original keystore.
         enclave: the name of the enclave.
         file: the enclave's file that has the fault, if known.
     """
@@ -242,7 +241,7 @@ def _is_latest(keystore: Path, enclave: str) -> bool:
 
 
 def _has_authorities(keystore: Path) -> bool:
-    """Return whether it is the original keystore, not an export or the folder of an enclave."""
+    """Return whether a folder is an original keystore, not an export or an enclave's folder."""
     return (keystore / PRIVATE).is_dir() or (keystore / LEDGER).is_file()
 
 
@@ -252,9 +251,9 @@ _NO_RULE = frozenset({"no-rule", "default"})
 
 
 def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None:
-    """Return the change that makes the evaluator's vendor allow a denied question.
+    """Return the smallest change of the policy that makes the vendor allow a denied question.
 
-    It starts from the policy of the enclave or, if that is not known, from the rights in its
+    The change is relative to the enclave's policy or, if it is not known, to the rights in its
     permissions.  Returns None if no policy could allow the question.
     """
     enclave, question = evaluator.enclave, answer.question
@@ -292,7 +291,7 @@ def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | Non
 
 
 def policy_of(name: str, rights: Iterable[Right]) -> Enclave:
-    """Return the policy of an enclave with a single nameless node that has these rights."""
+    """Return a policy of an enclave with these rights, in one profile without a node name."""
     groups = tuple(
         Group(right.kind, ((right.right, right.qualifier),), (right.name,))
         for right in sorted(rights)
@@ -335,10 +334,10 @@ _ANY_NODE = ("/", "*")
 
 
 def _addition(right: Right, places: Iterable[tuple[str, str]]) -> str:
-    """Return a policy with one right, in the profile of the node that it belongs to.
+    """Return the XML of a policy with one right, in the profile of the closest node.
 
-    It belongs to the node with the longest namespace around the right's name, of ``places``
-    (namespace and name of nodes).  Without any, no name of a node is invented.
+    The closest of the ``places`` (namespace and name of nodes) is the one with the longest
+    namespace that contains the right's name.  Without places, the profile is for any node.
     """
     known = list(places)
     fitting = [each for each in known if right.name.startswith(each[0].rstrip("/") + "/")]
@@ -353,7 +352,7 @@ def _addition(right: Right, places: Iterable[tuple[str, str]]) -> str:
 def _places(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, str]]:
     """Yield namespace and name of an enclave's nodes.
 
-    Without its policy, these are the nodes whose standard services its permissions allow.
+    Without a policy, these are the nodes whose standard services the permissions allow.
     """
     if policy:
         yield from ((profile.ns, profile.node) for profile in policy.all_profiles())
@@ -372,15 +371,15 @@ def _granted(name: str, answer: Answer) -> Iterator[Right]:
 
 
 _ALIKE = 0.9
-"""The lowest similarity (`difflib`) of a typo in a ROS name."""
+"""Lowest similarity (`difflib` ratio, 0 to 1) that counts as a typing error in a ROS name."""
 
 
 def likely_names(answer: Answer) -> tuple[str, ...]:
-    """Return at most three names of the same right that the denied name of a question may mean.
+    """Return at most three allowed names with which the denied name may have been confused.
 
-    For a standard service of a node, these are the services of the enclave's nodes; for any other
-    name, those with the same last part, as a forgotten remapping leaves it, and else those that are
-    spelled almost alike.
+    For a standard service of a node, these are the same services of the enclave's nodes.  For any
+    other name, they are names with the same last part (a forgotten remapping), or else names with
+    a similar spelling.
     """
     question, enclave = answer.question, answer.enclave
     names = {
@@ -401,11 +400,11 @@ def likely_names(answer: Answer) -> tuple[str, ...]:
 
 
 _SHOWN = 3
-"""The number of names that are proposed at most."""
+"""Highest number of names that are proposed."""
 
 
 def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
-    """Yield a replacement without these denials for each group that contains one."""
+    """Yield a replacement for each group of the policy that contains one of these denials."""
     groups: dict[Source, Group] = {}
     lifted: dict[Source, set[tuple[str, str]]] = {}
     for right in lift:

@@ -1,4 +1,4 @@
-"""Explain the security messages of a log by cause and remedy, and examine the enclave.
+"""Explain security messages in a log by cause and remedy, and examine the enclaves it names.
 
 The log may mix lines of several processes, with labels of ros2 launch, journald or Docker Compose,
 and may contain colours and tracebacks.
@@ -62,10 +62,10 @@ from sros_tool.translate_zenoh.rights import name_of_key
 from sros_tool.values import shows
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
-"""The forms of a topic in a line: without punctuation, or with punctuation of its name."""
+"""Patterns for words in a log line: without punctuation, or with the punctuation of topics."""
 _NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 _LONGEST = 8000
-"""The number of characters of a line that are read: a line may have many megabytes."""
+"""Number of characters that are read of a line, as a line may have many megabytes."""
 
 
 @shows(
@@ -75,74 +75,74 @@ _LONGEST = 8000
 )
 @dataclass(frozen=True, slots=True)
 class LogFinding:
-    """A message.
+    """A security message in a log, with its cause and remedy.
 
-    ``dds`` is the vendor whose message it is, None for messages of rcl and of Zenoh, which
-    ``zenoh`` tells apart.
+    ``dds`` is the vendor that printed the message, None for rcl and Zenoh; ``zenoh`` is true for
+    messages of Zenoh.
     """
 
     id: str
-    """A stable name."""
+    """Stable id of the message."""
     dds: Vendor | None
     line: int
-    """Its first line, from 1."""
+    """First line of the log with the message, from 1."""
     count: int
-    """How often it occurs."""
+    """How often the message occurs in the log."""
     text: str
-    """The line."""
+    """Text of the first line."""
     process: str
-    """The process that printed it, or null."""
+    """The process that printed the message, or null."""
     enclave: str
-    """The enclave, or null."""
+    """The enclave of the process, or null."""
     cause: str
-    """What it means."""
+    """Meaning of the message."""
     remedy: str
-    """What to do."""
+    """What to do about the cause."""
     found: tuple[str, ...] = ()
-    """Causes that were found in the enclave."""
+    """Causes that sros saw in the enclave itself."""
     checked: bool = False
     """Whether the enclave was examined."""
     zenoh: bool = False
 
     @property
     def vendor(self) -> str | None:
-        """The DDS vendor, zenoh, or null for ROS 2."""
+        """The DDS vendor that printed the message, zenoh, or null for ROS 2."""
         if self.zenoh:
             return "zenoh"
         return self.dds.value if self.dds else None
 
 
 class ExplainedLog(NamedTuple):
-    """The messages of a log."""
+    """The security messages of a log, explained."""
 
     log: str
-    """The log."""
+    """Path of the log."""
     findings: Sequence[LogFinding]
-    """The messages."""
+    """The security messages, each once."""
     notes: Sequence[Note]
     """Notes, which text output prints on standard error."""
 
 
 class SearchedKeystore:
-    """A keystore in which the enclaves of peers and of nodes are looked for, each thing once."""
+    """An index of a keystore that finds the enclaves of peers and nodes."""
 
     def __init__(self, root: Path) -> None:
         self._keystore = Keystore(root)
 
     def peer(self, guid: str) -> str:
-        """Return the enclave of the participant with a GUID, as a vendor writes it, or ""."""
+        """Return the enclave of the participant with a GUID in a vendor's spelling, or ""."""
         identity = guid.replace(".", "")
         if ":" in guid:
             identity = "".join(word.zfill(8) for word in guid.split(":"))
         return self._by_identity.get(identity[:IDENTITY_DIGITS], "")
 
     def enclaves_for(self, node: str) -> tuple[str, ...]:
-        """Return the enclaves whose permissions are for the node with this full name alone."""
+        """Return the enclaves whose permissions are only for the node with this full name."""
         return self._by_node.get(node, ())
 
     @cached_property
     def rotates(self) -> bool:
-        """Whether the CAs are being replaced, and the new ones have issued everything."""
+        """Whether a rotation of CAs is in the stage in which the new CAs have issued all files."""
         try:
             return read_rotation(self._keystore).stage is RotationStage.REISSUE
         except SrosError:
@@ -167,18 +167,19 @@ class SearchedKeystore:
 
 
 FindEnclave = Callable[[str], LoadedEnclave | None]
-"""A function from an enclave's name ("": the one that the user named) to the enclave, or None."""
+"""A function that loads an enclave by name ("" is the enclave that the user named), or None."""
 
 
 def explain_log_of(
     log: str, text: str, root: Path | None, name: str, asking: AskingContext
 ) -> ExplainedLog:
-    """Return the faults that a log reports, with what is found in the enclaves that it names.
+    """Explain the security messages of a log, and examine the enclaves that it names.
 
-    ``name`` is the enclave, or its folder, whose processes wrote the log, "" if the log names it.
+    ``name`` is the enclave (or its folder) whose processes wrote the log, or "" if the log names
+    the enclave.
 
     Raises:
-        UsageError: an enclave is named, and no keystore.
+        UsageError: ``name`` is an enclave, and there is no keystore.
     """
     keystore = Keystore(root) if root else None
     named: LoadedEnclave | None = None
@@ -230,10 +231,10 @@ def explain_log(
     root: str = "",
     keystore: SearchedKeystore | None = None,
 ) -> tuple[LogFinding, ...]:
-    """Return the faults that a log reports, each once, in the order of the log.
+    """Return the security messages of a log, each once, in the order of the log.
 
-    ``context`` gives domain and time for an enclave, ``root`` names its keystore in commands;
-    ``keystore`` is that keystore, to look for the enclaves of peers and of nodes in it.
+    ``context`` gives domain and time for an enclave; ``root`` is the keystore's path in commands;
+    ``keystore`` is the keystore that is searched for the enclaves of peers and nodes.
     """
     plain = plain_text(text)
     examiner = _Examiner(find, context, root, keystore)
@@ -269,7 +270,7 @@ class _Hit:
 
     @property
     def quoted(self) -> Mapping[str, str]:
-        """The fields, quoted for a shell command: the author of the log chose them."""
+        """The fields, quoted for a shell command because a log can contain any text."""
         return {name: quote(text) for name, text in self.fields.items()}
 
     @property
@@ -319,9 +320,10 @@ def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
 
 
 def _broken(process: str, line: str, rest: str, following: str) -> str:
-    """Return the line that was broken in two, for instance by a terminal, or "".
+    """Return a message that was broken into two lines, for instance by a terminal, or "".
 
-    It was if ``line`` is not understood, nor is the one that follows, and both together are.
+    A line is taken for broken if neither ``line`` nor ``following`` has a known meaning, but both
+    together have one.
     """
     if not UNKNOWN.pattern.search(rest):  # first, because it is fast
         return ""
@@ -334,7 +336,7 @@ def _broken(process: str, line: str, rest: str, following: str) -> str:
 
 
 def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
-    """Return the meaning of a line (``rest`` without its label), and the match, if any."""
+    """Return the meaning of a line, and its match, if any; ``rest`` is the line without label."""
     if found := zenoh_text(line):
         return found
     if ZENOH_LINE.search(rest):  # what is not in the table is no trouble of security
@@ -345,7 +347,7 @@ def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
 
 
 def _strongest(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:
-    """Yield the hits, except weaker ones if the same process has stronger ones.
+    """Yield the hits; leave out a weak hit if the same process has a strong hit.
 
     ``reported`` are the processes whose denied topics are reported separately.
     """
@@ -367,7 +369,7 @@ def _grouped(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
 def _lines_naming(
     lines: list[str], topics: set[str]
 ) -> Mapping[tuple[str, str], list[tuple[int, str]]]:
-    """Return, for each process and topic, the lines that name it: their numbers and texts."""
+    """Map (process, topic) to the numbers and texts of the lines that name the topic."""
     lines_of = defaultdict[tuple[str, str], list[tuple[int, str]]](list)
     for number, line in enumerate(lines, 1):
         process, text = labelled_line(line)
@@ -393,7 +395,7 @@ _DROPPED: Mapping[tuple[str, bool], str] = {
     ("Reply", False): "call",
     ("Declare Queryable", False): "call",
 }
-"""What a remote process may not do whose message is dropped, by its kind, and if it sent it."""
+"""Denied access of a remote process, by kind of dropped message and whether it was incoming."""
 _GRAPH: Mapping[tuple[str, bool], str] = {
     ("Liveliness Token", True): "announce this node, topic or service in the graph",
     ("Liveliness Token", False): "see this node, topic or service in the graph",
@@ -403,7 +405,7 @@ _GRAPH: Mapping[tuple[str, bool], str] = {
 
 
 def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
-    """Yield what access control of Zenoh dropped: one finding for each right that is missing."""
+    """Yield a finding for each right whose lack made Zenoh's access control drop messages."""
     numbered = ((n, *labelled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, str], list[DroppedMessage]] = {}
     for message in dropped_messages(numbered):
@@ -450,7 +452,7 @@ def _of_dropped(dropped: DroppedMessage, what: str, root: str) -> str:
 
 
 class _Examiner:
-    """An examiner that searches enclaves for the causes of messages."""
+    """A search for the causes of log messages in the enclaves that they name."""
 
     def __init__(
         self,
@@ -466,7 +468,7 @@ class _Examiner:
         self._evaluators: dict[tuple[Vendor, str], Evaluator] = {}
 
     def matters(self, hit: _Hit) -> bool:
-        """Return whether a message is one, and not the name of an enclave that exists."""
+        """Return whether a hit is a real message, and not about an enclave that exists."""
         return hit.meaning is not RUNS_OPEN or self._find("/") is None
 
     def message(self, hits: list[_Hit]) -> LogFinding:
@@ -514,7 +516,7 @@ class _Examiner:
         )
 
     def _with_names(self, text: str, enclave: LoadedEnclave | None, hit: _Hit) -> str:
-        """Return a remedy with the keystore and the enclave that the user named, and the fields."""
+        """Return a remedy, its placeholders replaced by keystore, enclave and the hit's fields."""
         own = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) or not enclave else enclave.name
         names = {"KEYSTORE": self._root, "ENCLAVE": own}
         for word, name in names.items():
@@ -525,7 +527,7 @@ class _Examiner:
         return text.format(**hit.quoted)
 
     def _peer(self, finding: LogFinding, hits: Sequence[_Hit]) -> LogFinding:
-        """Return a finding about peers with what their enclaves tell, where the log names them."""
+        """Return the finding with causes and remedies from the enclaves of the peers in the log."""
         shown = dict.fromkeys(hit.fields["peer"] for hit in hits if hit.fields.get("peer"))
         names = (
             [self._keystore.peer(each) for each in islice(shown, _MOST_PEERS)]
@@ -620,7 +622,7 @@ class _Examiner:
     def _other_name(
         self, denial: Denial, name: str, enclave: LoadedEnclave, remedy: str
     ) -> tuple[list[str], str]:
-        """Return causes and a remedy if the enclave may use names that may be meant."""
+        """Return causes and a remedy if the enclave has rights to similar names."""
         words = _words_to_ask(denial, name)
         if len(words) != 1 or denial.by_rule:
             return [], ""
@@ -634,7 +636,7 @@ class _Examiner:
         )
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:
-        """Return the commands that show what a policy lacks for a topic, here called ``name``."""
+        """Return the commands that show which rights a policy lacks for the topic of a denial."""
         root, enclave = self._root or "KEYSTORE", denial.enclave or "ENCLAVE"
         commands = [
             f"`sros explain {root} {quote(enclave)} {word} {quote(name)}`"
@@ -658,7 +660,7 @@ class _Examiner:
     def _causes(
         self, enclave: LoadedEnclave, answer: Answer, faults: tuple[Fault, ...]
     ) -> Iterator[tuple[str, str]]:
-        """Yield the faults of an enclave with remedies; only those in ``faults``, if it has any."""
+        """Yield the enclave's faults with remedies; only those in ``faults``, if it has some."""
         fitting = [problem for problem in answer.problems if problem.fault in faults]
         for each in fitting or answer.problems:
             yield str(each), remedy(each.fault, self._root, enclave.name, each.file)
@@ -693,7 +695,7 @@ class _Examiner:
 
 
 _MOST_PEERS = 5
-"""The number of peers that are looked at for a message: the log chooses how many it names."""
+"""Highest number of peers that are examined for one message."""
 _OF_ROTATION = ("peer-signature", "peer-permissions-ca")
 _NOT_RESTARTED = {
     Vendor.FAST: "Restart this process{of}: it was not restarted since stage 1, and so does not "
@@ -702,7 +704,7 @@ _NOT_RESTARTED = {
     "stage 2, and Cyclone DDS trusts one CA at a time.",
 }
 _OLDER_FILES = (
-    "Restart the processes of {peer}, and then this process: one of them loaded files of before."
+    "Restart the processes of {peer}, and then this process: one of them loaded older files."
 )
 _ABOUT_DOMAINS = ("domain", "domain-of-permissions")
 _EVERY_NODE = "the rights that every node needs: parameter services, /rosout, /parameter_events"
@@ -710,7 +712,7 @@ _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")
 
 
 def _nodes(answer: Answer) -> tuple[str, ...]:
-    """Return a text that names the nodes in the permissions of an enclave."""
+    """Return a clause that names the nodes in the permissions of an enclave, in a tuple."""
     nodes = _served(answer)
     if nodes:
         return (f"its permissions are for {_listed(nodes)}",)
@@ -755,7 +757,7 @@ _HALVES = {
 
 
 def _in_ros_terms(denial: Denial) -> tuple[str, str]:
-    """Return the denied action, as a word of `question.WORDS`, and its ROS name."""
+    """Return the denied operation, as a word of `question.WORDS`, and the ROS name."""
     prefix, topic = denial.topic[:2], denial.topic[2:]
     if prefix in SERVICE_ENDS and topic.endswith(SERVICE_ENDS[prefix]):
         name, part, _ = topic.removesuffix(SERVICE_ENDS[prefix]).partition(ACTION_SEPARATOR)
@@ -767,7 +769,7 @@ def _in_ros_terms(denial: Denial) -> tuple[str, str]:
 
 
 def _words_to_ask(denial: Denial, name: str) -> tuple[str, ...]:
-    """Return the words of questions that `explain` answers about a denied topic."""
+    """Return the operations that `sros explain` can be asked about a denied topic."""
     right, _ = _in_ros_terms(denial)
     either = ("call", "serve") if denial.topic[:2] in SERVICE_ENDS else (PUBLISH, SUBSCRIBE)
     words = either if right == "use" else (right,)

@@ -45,11 +45,11 @@ class Part(NamedTuple):
     """One DDS endpoint that a right needs; ``role`` names it in ROS terms, "" for a topic."""
 
     verb: AccessVerb
-    """What it does."""
+    """Whether the endpoint publishes or subscribes."""
     topic: str
-    """Its DDS topic."""
+    """DDS topic of the endpoint."""
     role: str = ""
-    """What it is for, or null."""
+    """Role of the endpoint in ROS terms, such as ``requests``, or null."""
 
     def __str__(self) -> str:
         """Return text like ``publish its requests (rq/addRequest)``."""
@@ -65,10 +65,10 @@ OWN_PARTS = (
 
 @shows("word", "type", "right", "name", null_if_empty=("type", "right", "name"))
 class Question(NamedTuple):
-    """The question.
+    """A question about an enclave, such as ``publish topic /chatter``.
 
-    It asks whether an enclave may do ``word`` with ``name``, an absolute ROS name, or may join if
-    that is "".  ``only`` replaces the endpoints that the right needs.
+    It asks whether the enclave may do ``word`` with ``name``, an absolute ROS name, or, if
+    ``name`` is "", whether it may join.  ``only`` replaces the endpoints that the right needs.
     """
 
     word: str
@@ -96,7 +96,7 @@ class Question(NamedTuple):
         return (*published, *read)
 
     def allowed(self, enclave: str) -> Right:
-        """Return the right that a policy must have to allow it."""
+        """Return the right of an enclave that allows the access."""
         return Right(enclave, ALLOW, self.right, self.name)
 
     def __str__(self) -> str:
@@ -141,10 +141,10 @@ _OF_ACTIONS = {"call": "call", "serve": "execute"}
 
 
 def about_action(question: Question, rights: Iterable[Right]) -> Question | None:
-    """Return the question about the action of this name, if the rights have no such service.
+    """Return the question about the action with this name, if the rights have no such service.
 
-    Clients say call and servers say serve of both, and an action's name looks like that of a
-    service.  Returns None if ``rights`` do not show that the name is an action, or if the question
+    "call" and "serve" are used for services and actions, whose names look alike.
+    Returns None if ``rights`` do not show that the name is an action, or if the question
     is about something else.
     """
     if question.type != "service" or question.word not in _OF_ACTIONS:
@@ -156,7 +156,7 @@ def about_action(question: Question, rights: Iterable[Right]) -> Question | None
 
 
 def _checked(name: str, word: str, kind: str) -> str:
-    """Return the name after checking that a node can use it."""
+    """Return the name; raise UsageError if no node can use it."""
     if not name:
         raise UsageError(f"{word} needs the name of {_a(kind)}", "", f"Write `{word} /NAME`.")
     problem = expression_problem(name)

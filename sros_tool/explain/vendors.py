@@ -1,4 +1,4 @@
-"""What vendors of DDS decide for one enclave, and which enclaves of a keystore may do something."""
+"""Decisions of DDS vendors for one enclave, and for all enclaves of a keystore."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from sros_tool.values import shows
 
 @shows("zenoh")
 class ZenohBeside(NamedTuple):
-    """What Zenoh decides next to DDS.
+    """The decision of Zenoh, shown next to the decision of DDS.
 
-    ``problem`` says why that is not known, if so.
+    ``problem`` says why the decision is not known, or is "".
     """
 
     zenoh: ZenohInBrief | None
-    """What Zenoh does with the files of the keystore, or null if that is not known; only if it has
-    any."""
+    """Decision of Zenoh with the files of the keystore, or null if it is not known; present only if
+    the keystore has Zenoh files."""
     problem: str = ""
 
 
 @shows("asked", "answer", "vendor_why", "beside", spread=("asked", "answer", "beside"))
 class VendorExplanation(NamedTuple):
-    """The decision of one vendor."""
+    """The decision of one DDS vendor."""
 
     asked: Asked
     answer: Answer
@@ -50,27 +50,27 @@ class VendorExplanation(NamedTuple):
 
     @property
     def allowed(self) -> bool:
-        """Whether the vendor allows it."""
+        """Whether the vendor allows the access."""
         return self.answer.allowed
 
 
 @shows("asked", "vendors", "differ", "beside", spread=("asked", "beside"))
 class VendorComparison(NamedTuple):
-    """The decisions of all vendors.
+    """The decisions of all DDS vendors.
 
-    ``allowed`` is that of the one that was chosen.
+    ``allowed`` is the decision of the chosen vendor.
     """
 
     asked: Asked
     vendors: Sequence[Answer]
-    """The decisions."""
+    """The decision of each vendor."""
     beside: ZenohBeside | None
     allowed: bool
     notes: tuple[Note, ...]
 
     @property
     def differ(self) -> bool:
-        """Whether they differ."""
+        """Whether the vendors decide differently."""
         return len({vendor.outcome for vendor in self.vendors}) > 1
 
 
@@ -83,10 +83,10 @@ def explain_on_dds(
     kind: str | None = None,
     every: bool = False,
 ) -> VendorExplanation | VendorComparison:
-    """Return what a vendor decides, or what all decide if ``every``.
+    """Return the decision of the chosen vendor, or with ``every`` the decisions of all vendors.
 
-    ``chosen`` is the vendor with the reason to choose it; ``kind`` is the type of the name if the
-    user said it.
+    ``chosen`` is the vendor and the reason to choose it; ``kind`` is the type of the name if the
+    user gave it.
     """
     vendor, why = chosen
     enclave = asked.enclave
@@ -115,7 +115,7 @@ def explain_on_dds(
 
 
 def differences(answers: Sequence[Answer]) -> str:
-    """Return a sentence that names the vendors whose outcome differs from the first one's."""
+    """Return a sentence that names the vendors whose outcome differs from the first vendor's."""
     first = answers[0]
     others = [answer for answer in answers if answer.outcome is not first.outcome]
     if not others:
@@ -165,7 +165,7 @@ def _no_topic(answer: Answer, asked: AskedEnclave) -> Iterator[Note]:
 
 
 def _other_name(answer: Answer) -> Iterator[Note]:
-    """Yield a note with the names that may be meant, if the enclave has rights to such names."""
+    """Yield a note with similar names to which the enclave has rights."""
     if answer.allowed or answer.problems or not answer.question.right:
         return
     if names := likely_names(answer):
@@ -177,7 +177,7 @@ def _other_name(answer: Answer) -> Iterator[Note]:
 
 
 def _beside(enclave: LoadedEnclave, question: Question, context: JoinContext) -> ZenohBeside | None:
-    """Return what Zenoh decides next to DDS, or why that is not known; None without its files."""
+    """Return Zenoh's decision, or why it is not known; None if the keystore has no Zenoh files."""
     keystore = enclave.keystore
     if keystore is None or enclave.state is None or not is_keystore(keystore.root):
         return None
@@ -194,9 +194,9 @@ def _beside(enclave: LoadedEnclave, question: Question, context: JoinContext) ->
 
 
 def _runs_on_zenoh(keystore: Keystore, name: str) -> bool:
-    """Return whether an enclave has a configuration of Zenoh, or others where settings name Zenoh.
+    """Return whether an enclave has a Zenoh configuration, or the keystore is set up for Zenoh.
 
-    Without such settings the other enclaves are not looked at: there may be very many.
+    If the settings have no [zenoh] part, other enclaves are not examined: there may be thousands.
     """
     if any((keystore.folder(name) / file).is_file() for file in ZENOH_SIGNED):
         return True
@@ -215,10 +215,10 @@ def _runs_on_zenoh(keystore: Keystore, name: str) -> bool:
     null_if_empty=("expression", "wildcard"),
 )
 class VendorOutcome(NamedTuple):
-    """An enclave."""
+    """The decision for one enclave."""
 
     enclave: str
-    """The enclave."""
+    """Name of the enclave."""
     outcome: OutcomeWord
     reason: ReasonWord
     text: str
@@ -227,42 +227,42 @@ class VendorOutcome(NamedTuple):
 
     @property
     def allowed(self) -> bool:
-        """Whether it may."""
+        """Whether the enclave may do it."""
         return self.outcome.ok
 
     @property
     def wildcard(self) -> str:
-        """The expression, if it is a wildcard, or null."""
+        """The deciding expression, if it is a wildcard, or null."""
         return self.expression if is_expression(self.expression) else ""
 
     @property
     def stopped(self) -> str:
-        """Why no process of it runs with the files as they are, or ""."""
+        """Why no process can run in the enclave with its present files, or ""."""
         runs = self.outcome not in (Outcome.REFUSED, Outcome.CRASHES)
         return "" if runs else self.text.partition(": ")[2]
 
 
 @shows("question", "vendor", "vendor_why", "documented_only", "enclaves")
 class WhoByVendor(NamedTuple):
-    """The enclaves that may do it."""
+    """The decision of a vendor for every enclave of a keystore."""
 
     question: str
-    """The question."""
+    """The question, such as ``publish topic /chatter``."""
     vendor: Vendor
     """The DDS vendor, as `--vendor` takes it."""
     vendor_why: str
     """Why this vendor was chosen."""
     enclaves: Sequence[VendorOutcome]
-    """All enclaves."""
+    """All enclaves, with the decision for each."""
 
     @property
     def documented_only(self) -> bool:
-        """Whether the decision is by its documentation, not by tests."""
+        """Whether the vendor's behaviour is known from its documentation alone, not from tests."""
         return self.vendor.documented_only
 
 
 class VendorOfKeystore(NamedTuple):
-    """A vendor that is asked about the enclaves of a keystore; all of them without ``names``."""
+    """A vendor that decides for the enclaves ``names`` of a keystore; without names, for all."""
 
     keystore: Keystore
     vendor: Vendor
@@ -272,7 +272,7 @@ class VendorOfKeystore(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Its name, and the reason to ask it."""
+        """Name of the vendor, and the reason to choose it."""
         documented = ", as documented" if self.vendor.documented_only else ""
         return f"{self.vendor.title} ({self.why}{documented})"
 
@@ -290,9 +290,9 @@ class VendorOfKeystore(NamedTuple):
         return of_each(self.keystore.names if self.names is None else self.names, outcome)
 
     def printed(self, question: Question, outcomes: Sequence[VendorOutcome]) -> WhoByVendor:
-        """Return what ``--json`` prints of its outcomes."""
+        """Return the outcomes in the form that ``--json`` prints."""
         return WhoByVendor(str(question), self.vendor, self.why, outcomes)
 
     def notes(self, _outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
-        """Yield notes on its outcomes: none."""
+        """Yield no notes: DDS needs none."""
         return iter(())

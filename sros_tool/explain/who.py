@@ -1,4 +1,4 @@
-"""Which enclaves of a keystore may do something, whoever decides, and whom one of them reaches."""
+"""Decide a question for all enclaves of a keystore, and follow whom an enclave can influence."""
 
 from __future__ import annotations
 
@@ -19,55 +19,55 @@ from sros_tool.values import shows
 
 
 class EnclaveOutcome(Protocol):
-    """What is decided for one enclave."""
+    """The decision for one enclave."""
 
     @property
     def enclave(self) -> str:
-        """The enclave."""
+        """Name of the enclave."""
 
     @property
     def allowed(self) -> bool:
-        """Whether it may."""
+        """Whether the enclave may do it."""
 
     @property
     def wildcard(self) -> str:
-        """The expression that allows it, if it is a wildcard, or ""."""
+        """The expression that allows the access, if it is a wildcard, or ""."""
 
     @property
     def stopped(self) -> str:
-        """Why no process of it runs with the files as they are, or ""."""
+        """Why no process can run in the enclave with its present files, or ""."""
 
 
 _Outcome = TypeVar("_Outcome", bound=EnclaveOutcome)
 
 
 class Decider(Protocol):
-    """A vendor of DDS, or Zenoh, that is asked about the enclaves of a keystore."""
+    """A DDS vendor, or Zenoh, that decides for the enclaves of a keystore."""
 
     @property
     def keystore(self) -> Keystore:
-        """The keystore."""
+        """The keystore whose enclaves are decided for."""
 
     @property
     def title(self) -> str:
-        """Its name, and the reason to ask it."""
+        """Name of the decider, and the reason to choose it."""
 
     def outcomes(self, question: Question) -> Sequence[EnclaveOutcome]:
-        """Return what it decides for each enclave, sorted by name."""
+        """Return the decision for each enclave, sorted by name."""
 
     def printed(self, question: Question, outcomes: Sequence[Any], /) -> NamedTuple:
-        """Return what ``--json`` prints of its outcomes."""
+        """Return the outcomes in the form that ``--json`` prints."""
 
     def notes(self, outcomes: Sequence[Any]) -> Iterator[Note]:
-        """Yield notes on its outcomes."""
+        """Yield notes on the outcomes."""
 
 
 class Everybody(NamedTuple):
-    """The question as it was meant, what is decided for each enclave, and notes."""
+    """The question that was answered, the decision for each enclave, and notes."""
 
     question: Question
     outcomes: Sequence[Any]
-    """Each one is an `EnclaveOutcome` of what decided."""
+    """One `EnclaveOutcome` for each enclave."""
     notes: tuple[Note, ...]
 
     @property
@@ -77,9 +77,9 @@ class Everybody(NamedTuple):
 
 
 def ask_everybody(decider: Decider, question: Question, kind: str | None) -> Everybody:
-    """Return what is decided for enclaves of a keystore about a service, or about an action.
+    """Return the decisions for all enclaves; a name of an action is taken for the action.
 
-    ``kind`` is the type of the name if the user said it.
+    ``kind`` is the type of the name if the user gave it.
     """
     outcomes = decider.outcomes(question)
     taken: tuple[Note, ...] = ()
@@ -104,7 +104,7 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
 
 
 def of_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_Outcome, ...]:
-    """Return what is decided for each of many enclaves, on all cores, sorted by name."""
+    """Return the decision for each of the named enclaves, sorted by name; runs on all cores."""
     from sros_tool.parallel import map_slices, tick  # a question about one enclave needs none
 
     def work(part: Sequence[str]) -> list[_Outcome]:
@@ -122,16 +122,16 @@ def of_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_O
 
 
 class ReachedStep(NamedTuple):
-    """A step."""
+    """A step of a path: one enclave sends, another receives."""
 
     from_: str
     """The enclave that sends."""
     to: str
     """The enclave that receives."""
     kind: str
-    """The kind of the name."""
+    """Kind of the name: topic, service or action."""
     right: str
-    """The right of the sender."""
+    """The right that the sender uses."""
     name: str
     """The ROS name."""
     said: str
@@ -141,23 +141,23 @@ class ReachedStep(NamedTuple):
 
 
 class ReachedEnclave(NamedTuple):
-    """An enclave."""
+    """An enclave that can be reached, and the path to it."""
 
     enclave: str
-    """The enclave."""
+    """Name of the enclave."""
     path: Sequence[ReachedStep]
-    """A shortest way."""
+    """A shortest path, step by step."""
 
 
 @shows("path", "left_out", "enclave", "influences", "learns_from")
 class FollowedReach(NamedTuple):
-    """The enclaves that one can influence and learn from."""
+    """The enclaves that one enclave can influence and learn from."""
 
     path: Path
-    """The keystore or policy."""
+    """Path of the keystore or policy."""
     left_out: Sequence[str]
-    """Topics that are not counted, and services (as */NAME) whose requests are not: they change
-    nothing."""
+    """Topics that do not count, and services (as */NAME) whose requests do not count, because they
+    change nothing."""
     reach: Reach
     fleet: Fleet | None
     notes: Sequence[Note]
@@ -169,12 +169,12 @@ class FollowedReach(NamedTuple):
 
     @property
     def influences(self) -> list[ReachedEnclave]:
-        """The enclaves that it can influence."""
+        """The enclaves that the enclave can influence."""
         return list(_printed(self.reach.influences))
 
     @property
     def learns_from(self) -> list[ReachedEnclave]:
-        """The enclaves that it can learn from."""
+        """The enclaves that the enclave can learn from."""
         return list(_printed(self.reach.learns_from))
 
 
@@ -184,12 +184,12 @@ def _printed(paths: Mapping[str, HopPath]) -> Iterator[ReachedEnclave]:
 
 
 def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) -> FollowedReach:
-    """Return whom an enclave can influence and learn from by the rights of a source.
+    """Return the enclaves that an enclave can influence and learn from, by the rights of a source.
 
-    ``infrastructure`` says whether topics of all nodes, and requests that only ask, count.
+    ``infrastructure`` says whether topics of all nodes, and requests that only read, count too.
 
     Raises:
-        KeystoreError: the keystore does not have the enclave, or it has no rights.
+        KeystoreError: the keystore does not have the enclave, or the enclave has no rights.
     """
     of_keystore = source.kind == "keystore"
     names = enclave_names(source.path) if of_keystore or source.kind == "zenoh" else ()

@@ -113,7 +113,7 @@ def test_what_is_no_longer_demanded(folder: Path, tmp_path: Path) -> None:
     asked = (*ONLY, "--requirements", new, "--requirements-before", "required.toml")
     ended = sros(*asked, cwd=folder)
     assert ended.status == 1
-    head = f"{new}: warning: a requirement that is no longer demanded [requirement.dropped]"
+    head = f"{new}: warning: a requirement that was removed or weakened [requirement.dropped]"
     assert ended.out.splitlines().count(head) == 3
     assert (
         "    only /mux may publish /cmd_vel: only this is left of it: "
@@ -250,7 +250,10 @@ def test_an_assumed_template_is_said(folder: Path, keystore: Path, tmp_path: Pat
     required.write_text('[[protected]]\ntopics = ["/scan"]\nlevel = "encrypt"\n')
     asked = (*ONLY, "--requirements", required)
     said = sros(*asked, cwd=folder).ok().out
-    assert "note: a protection that is assumed, and not demanded [requirement.assumed]" in said
+    assert (
+        "note: a protection that the policy does not state, so that it is assumed [requirement.assumed]"
+        in said
+    )
     assert (
         "topic /scan has to be encrypted: the policy does not say how /scan is protected, and that "
         "of the template development is assumed\n"

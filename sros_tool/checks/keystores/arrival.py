@@ -1,4 +1,4 @@
-"""The state of enclaves on a robot: whether and until when each can be used, and its findings."""
+"""Check the enclaves on a robot: whether a process can run in them, until when, and findings."""
 
 from __future__ import annotations
 
@@ -41,33 +41,33 @@ _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES)
 
 
 class ArrivalFinding(NamedTuple):
-    """A finding about a robot's folder."""
+    """A finding about the folder of enclaves on a robot."""
 
     enclave: str | None
-    """The enclave that it is about, or null."""
+    """The enclave that the finding is about, or null."""
     file: str
-    """Its file, relative to the enclave's folder or to DIR."""
+    """The file that the finding is about, relative to the enclave's folder or to DIR."""
     text: str
-    """What was found."""
+    """What is wrong, and what to do about it."""
 
 
 class VerifiedFolder(NamedTuple):
     """Whether the enclaves of a robot can be used."""
 
     path: Path
-    """DIR, as it was named."""
+    """The folder DIR, as named on the command line."""
     kind: Annotated[str, Words(("keystore", "enclave"))]
-    """What DIR is."""
+    """Whether DIR is a keystore or an enclave."""
     ok: bool
-    """Whether there is no finding: the exit status is 0."""
+    """Whether there is no finding, so that the exit status is 0."""
     enclaves: Sequence[ArrivedEnclave]
     """The enclaves."""
     findings: Sequence[ArrivalFinding]
     """What is wrong."""
     at: datetime
-    """The moment that was checked, in UTC."""
+    """The moment for which the enclaves were checked, in UTC."""
     domain: int | None
-    """The domain that was asked for, or null."""
+    """The ROS domain that the enclaves have to join, or null."""
 
 
 @shows(
@@ -76,10 +76,10 @@ class VerifiedFolder(NamedTuple):
 )
 @dataclass(frozen=True, slots=True)
 class ArrivedEnclave:
-    """An enclave on a robot: whether a process can run in it, in which domain, and until when.
+    """An enclave on a robot: whether a process can run in it, in which domains, and until when.
 
-    It can if it can on one of the measured vendors; what the others refuse is a finding.
-    ``place`` is that of a key on a token.
+    One vendor that accepts the enclave is enough; a refusal by another vendor is a finding.
+    ``place`` is the PKCS #11 URI of a key on a token.
     """
 
     name: str
@@ -89,20 +89,20 @@ class ArrivedEnclave:
     domains: str
     """The ROS domains that it can join, or null."""
     valid_until: datetime | None
-    """First expiry of its certificates and permissions, in UTC, or null."""
+    """The earliest expiry of the enclave's certificates and permissions, in UTC, or null."""
     key_on_robot: bool = False
-    """Whether only its key is missing here, because it was made on its robot."""
+    """Whether only the private key is missing here, because it was made on the robot."""
     place: TokenUri | None = None
 
     @property
     def token(self) -> str | None:
-        """The token that has its key, or null for a key in a file."""
+        """The token that has the enclave's key, or null for a key in a file."""
         return self.place.token if self.place else None
 
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """The enclaves in a robot's folder, or a single one, and the warnings and errors about them.
+    """The enclaves in a folder on a robot, or a single enclave, with the errors and warnings.
 
     ``root`` is the folder that contains the enclaves folder; ``kind`` is keystore or enclave.
     """
@@ -114,7 +114,7 @@ class Arrival:
     findings: tuple[Finding, ...]
 
     def verified(self, moment: datetime, domain: int | None) -> VerifiedFolder:
-        """Return what ``--json`` prints of the folder at a moment, for a ROS domain or all."""
+        """Return the result in the form that ``--json`` prints, for one ROS domain or all."""
         findings = [
             ArrivalFinding(
                 self.enclave_of(finding) or None,
@@ -152,9 +152,9 @@ def verify_arrival(
     only: Sequence[str] | None = None,
     secrets: Secrets | None = None,
 ) -> Arrival:
-    """Return the state of the enclaves in a robot's folder, or of one enclave, with findings.
+    """Check the enclaves in a folder on a robot, or one enclave.
 
-    The findings are the warnings and errors, and signing requests without an answer: without it the
+    The findings are errors, warnings and unanswered signing requests, without whose answer an
     enclave does not work.
 
     Args:
@@ -163,11 +163,11 @@ def verify_arrival(
         domain: the ROS domain that the enclaves have to join.
         zone: the time zone of the robot.
         only: the enclaves to check; None for all of them and the folder itself.
-        secrets: called for the PINs of tokens, which then have to prove that they have the keys;
-            without it, no token is opened.
+        secrets: called for the PINs of tokens, which are then opened to prove that they have the
+            keys; None opens no token.
 
     Raises:
-        DocumentError: ``path`` is neither of them.
+        DocumentError: ``path`` is neither a folder with enclaves nor an enclave.
     """
     if is_keystore(path):
         root, kind = path, "keystore"
@@ -239,7 +239,7 @@ def _token_findings(
 
 
 def _why_none(path: Path) -> str:
-    """Return why a path holds no enclaves."""
+    """Return why a path holds no enclaves, as a sentence."""
     if not path.exists():
         return "It does not exist."
     if not path.is_dir():

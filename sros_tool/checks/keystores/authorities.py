@@ -118,7 +118,7 @@ WEAK = FindingKind(
 def _authority_findings(
     role: str, chain: tuple[x509.Certificate, ...], at: datetime, subject: str, file: str
 ) -> Iterator[Finding]:
-    """Yield findings about a CA that some vendor refuses; ``chain`` is the content of its file."""
+    """Yield findings about a CA that a vendor refuses; ``chain`` is the content of its file."""
     certificate = chain[0]
     name = authority_text(certificate)
     if certificate.issuer != certificate.subject:
@@ -137,7 +137,7 @@ def _authority_findings(
 def key_findings(
     certificate: x509.Certificate, subject: str, file: str, *, what: str = "it has"
 ) -> Iterator[Finding]:
-    """Yield findings about a certificate's key or signature that some vendor refuses."""
+    """Yield findings about a certificate's key or signature that a vendor refuses."""
     key = certificate.public_key()
     fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
         isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
@@ -221,7 +221,7 @@ CA_KEY_FEW_ROUNDS = FindingKind(
     NOTE,
     "a CA key whose passphrase can be guessed fast",
     "Whoever copies the key can try millions of passphrases in a minute. OpenSSL makes 2048 rounds "
-    "of PBKDF2 unless it is told otherwise; 600,000 are recommended, or scrypt.",
+    "of PBKDF2 by default; 600,000 are recommended, or scrypt.",
     "OWASP Password Storage Cheat Sheet (2025); OpenSSL 3.0 (openssl-pkcs8).",
     "Run `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new && mv KEY.new KEY`.",
 )
@@ -359,7 +359,7 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 _SHOWN, _MOST_LEFT = 5, 20
-"""How many enclaves of a robot that left are named, and of how many robots."""
+"""Limits of a finding's text: enclaves named for each removed robot, and removed robots."""
 
 
 def _left_enclaves(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
@@ -378,7 +378,7 @@ def _left_enclaves(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]
 
 
 def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """Yield findings about the settings and the ledger: ros2/sros2 makes neither."""
+    """Yield findings about the settings and the ledger, which only sros writes."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
     if ledger and not settings:
         yield SETTINGS_MISSING.found("settings", f"there is no {SETTINGS}", str(keystore.root))
@@ -463,7 +463,7 @@ def _few_rounds(role: str, path: Path, pem: bytes) -> Iterator[Finding]:
 
 
 class _LockedError(Exception):
-    """The key has a passphrase, so it cannot be checked."""
+    """A CA key has a passphrase, so it cannot be checked."""
 
 
 def _locked() -> str:
@@ -493,7 +493,7 @@ def shared_ca_findings(
 
 
 def _separation(keystore: CheckedKeystore) -> str:
-    """Return what is left to do until identity CA and permissions CA have keys of their own."""
+    """Return a remedy: the commands that give identity CA and permissions CA separate keys."""
     from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 
     try:

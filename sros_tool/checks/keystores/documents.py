@@ -1,6 +1,6 @@
-"""Checks of an enclave's signed permissions and governance, and of the vendors' decisions on them.
+"""Checks of an enclave's signed permissions and governance, and of vendors' decisions.
 
-Vendors differ in how they read documents outside of the portable profile, and decide on them.
+Vendors read documents outside of the portable profile differently, and decide differently.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ _DIRECTIONS = ("publish", "subscribe")
 
 
 def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Yield findings about an enclave's permissions, if they can be verified and read."""
+    """Yield findings about an enclave's permissions, if their signature is valid and they parse."""
     permissions = enclave.state.permissions
     if permissions is None:
         return
@@ -275,7 +275,7 @@ def _form(grant: Grant, name: str, file: str) -> Iterator[Finding]:
 
 
 def _partitions_text(grant: Grant) -> str:
-    """Return what the partitions of the rules mean for ROS 2, as a clause."""
+    """Return a clause on the topics that rules allow only in partitions, which ROS 2 never uses."""
     for rule in grant.rules:
         for each in (*rule.publish, *rule.subscribe) if rule.allow else ():
             if each.topics and each.partitions and not any(map(_is_default, each.partitions)):
@@ -345,7 +345,7 @@ def _order(grant: Grant, name: str, file: str) -> Iterator[Finding]:
 def _hidden(
     stated: Mapping[tuple[str, bool], _Topics], rule: Rule, index: int, name: str, file: str
 ) -> Iterator[Finding]:
-    """Yield a finding if earlier rules deny topics that a rule allows."""
+    """Yield a finding if earlier deny rules hide topics that a rule allows."""
     hidden: dict[str, dict[str, list[str]]] = {}
     left = 0
     for direction in _DIRECTIONS:
@@ -365,7 +365,7 @@ def _hidden(
 
 
 class _Topics:
-    """The topics of the rules of a grant that allow, or of those that deny."""
+    """The topics in the allow rules of a grant, or in its deny rules."""
 
     def __init__(self, grant: Grant, direction: str, allow: bool, limit: ComparisonLimit) -> None:
         self._rules = grant.rules
@@ -377,16 +377,16 @@ class _Topics:
         self._names = Names(self._places, limit)
 
     def covering(self, topic: str, index: int) -> str:
-        """Return a topic that covers this one in an earlier rule than that of the index, or ""."""
+        """Return a topic expression in a rule before ``index`` that covers ``topic``, or ""."""
         found = (topic,) if topic in self._places else ()
         return self._earlier(chain(found, self._names.covering(topic)), index)
 
     def meeting(self, topic: str, index: int) -> str:
-        """Return a topic that overlaps with this one in an earlier rule, or ""."""
+        """Return a topic expression in a rule before ``index`` that overlaps ``topic``, or ""."""
         return self._earlier(self._names.meeting(topic), index)
 
     def _earlier(self, topics: Iterable[str], index: int) -> str:
-        """Return the first of the topics in a rule before this one that shares a domain with it."""
+        """Return the first topic in a rule before ``index`` that shares a domain with that rule."""
         for topic in topics:
             for place in self._places[topic]:
                 if place < index and _share_domains(self._rules[place], self._rules[index]):
@@ -576,7 +576,7 @@ _OPEN = {
     "enable_discovery_protection": DISCOVERY_OPEN,
     "enable_liveliness_protection": LIVELINESS_OPEN,
 }
-"""The kind of finding for each attribute whose open value is a weakness of its own."""
+"""The kind of finding for each governance attribute that is open."""
 _OF_ROS = ("rt/*", "rq/*Request", "rr/*Reply")
 """The DDS topics of all topics, services and actions of ROS."""
 _SIGNING = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
@@ -586,10 +586,10 @@ _NONE = (ProtectionKind.NONE,)
 def check_governance(
     enclave: CheckedEnclave, common: bytes, asked: Sequence[Vendor]
 ) -> Iterator[Finding]:
-    """Yield findings if an enclave loads another governance than the signed document ``common``.
+    """Yield findings if an enclave has another governance than the signed document ``common``.
 
-    That is the governance of the keystore, or of the first enclave of an export.  ``asked`` are the
-    vendors that its nodes may use.
+    ``common`` is the governance of the keystore, or of the first enclave of an export.  ``asked``
+    are the vendors that the enclave's nodes may use.
     """
     governance = enclave.state.governance
     if governance is None:
@@ -597,14 +597,14 @@ def check_governance(
     own = enclave.state.files[GOVERNANCE_FILE]
     if own != common and _content(own) != _content(common):
         file = enclave.file(GOVERNANCE_FILE)
-        of = "the keystore" if enclave.keystore.governance else "other enclaves"
-        yield DIFFERS.found(enclave.name, f"'{file}' differs from the governance of {of}", file)
+        source = "the keystore" if enclave.keystore.governance else "other enclaves"
+        yield DIFFERS.found(enclave.name, f"'{file}' differs from the governance of {source}", file)
         yield from governance_findings(enclave.keystore, governance, file, asked)
 
 
 @dataclass(frozen=True, slots=True)
 class _Chosen:
-    """Whether settings lead to a governance with the same finding."""
+    """A test whether a template's settings lead to a governance with the same finding."""
 
     kind: FindingKind
     text: str
@@ -627,9 +627,9 @@ def _rule_findings(rule: DomainRule, asked: Sequence[Vendor]) -> Iterator[tuple[
 def governance_findings(
     keystore: CheckedKeystore, governance: Governance, file: str, asked: Sequence[Vendor]
 ) -> Iterator[Finding]:
-    """Yield findings about what a governance document leaves unprotected.
+    """Yield findings about topics and discovery that a governance document leaves unprotected.
 
-    ``file`` is its path, ``asked`` are the vendors that nodes may use.
+    ``file`` is the document's path, ``asked`` are the vendors that nodes may use.
     """
     domains = governance.domains().closed()
 
@@ -648,7 +648,7 @@ def governance_findings(
 
 
 def _unauthenticated(rule: DomainRule, asked: Sequence[Vendor]) -> tuple[FindingKind, str]:
-    """Return what participants without an identity can do on the vendors, which may be none."""
+    """Return kind and text of the finding about participants without an identity."""
     kind = UNAUTHENTICATED_KEPT_OUT
     clauses: dict[str, list[str]] = {}
     for vendor in asked or MEASURED:
@@ -668,10 +668,10 @@ def _unauthenticated(rule: DomainRule, asked: Sequence[Vendor]) -> tuple[Finding
 
 
 def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
-    """Return which topics participants without an identity reach on a vendor that admits them.
+    """Return a clause on the topics that participants without an identity can use on a vendor.
 
-    Cyclone DDS 0.10.2 asks them for no rights, and hides from them each topic whose discovery is
-    to be protected, whatever the protection of discovery is.
+    Cyclone DDS 0.10.2 does not check the rights of these participants, but hides from them all
+    topics with enable_discovery_protection, whatever discovery_protection_kind is.
     """
     on_cyclone = vendor is Vendor.CYCLONE
     hides = on_cyclone or rule.discovery_protection_kind is not ProtectionKind.NONE

@@ -1,4 +1,4 @@
-"""Checks of a single enclave: problems that stop a process from running in it, and weaknesses."""
+"""Checks of a single enclave: faults that stop a process from running in it, and weaknesses."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ _LOADING_KINDS = by_id(
 def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
     """Yield a finding for every fault that keeps a process from loading the enclave.
 
-    In the keystore itself, it is no fault that a key is only on its robot.
+    A key that is only on the robot is no fault in the keystore itself.
     """
     state = enclave.state
     for problem in state.problems_at_home if enclave.keystore.is_home else state.problems:
@@ -81,7 +81,7 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
 def fault_remedy(enclave: CheckedEnclave, fault: Fault, name: str) -> str:
     """Return what to do about a fault in the file ``name`` of an enclave.
 
-    ``ROOT`` and ``NAME`` in it stand for the keystore and the enclave.
+    The text has the placeholders ``ROOT`` for the keystore and ``NAME`` for the enclave.
     """
     file = enclave.file(name)
     if enclave.keystore.can_issue:
@@ -100,7 +100,7 @@ _SHARED = {
     IDENTITY_CA_FILE: ca_certificate(IDENTITY),
     PERMISSIONS_CA_FILE: ca_certificate(PERMISSIONS),
 }
-"""The files of a keystore to which the links of its enclaves lead, which no verb makes again."""
+"""Keystore files that the enclaves link to and that no sros command can create again."""
 
 EXPIRES_SOON = FindingKind(
     "enclave.ends-soon",
@@ -174,7 +174,7 @@ EVERYTHING = FindingKind(
 ONLY_DENIALS = FindingKind(
     "keystore.only-denials",
     NOTE,
-    "an enclave that may do everything but what it is denied",
+    "an enclave that may do everything except what its deny rules name",
     "Its messages are authenticated and encrypted, but it can command every node whose topics and "
     "services nobody thought of.",
     EVERYTHING.source,
@@ -261,7 +261,7 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
 
 
 def _weak(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Yield findings about weak cryptography; the CAs of a keystore are checked once, for all."""
+    """Yield findings about weak cryptography of an enclave; the CAs are checked elsewhere."""
     for file, text in weaknesses(enclave.state):
         if not enclave.keystore.is_home or file not in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
             yield WEAK.found(enclave.name, text, enclave.file(file))
@@ -280,9 +280,9 @@ def _on_token(enclave: CheckedEnclave, place: TokenUri) -> Iterator[Finding]:
 
 
 def grant_of(enclave: CheckedEnclave) -> Grant | None:
-    """Return the grant that DDS reads for the enclave, if its validity is a time that is not empty.
+    """Return the grant that DDS reads for the enclave; None if its validity is empty or unreadable.
 
-    Dates may be of a form that only some vendors read.
+    Its dates may have a form that only some vendors read.
     """
     grant = enclave.state.grant
     with suppress(ValueError):
@@ -366,7 +366,7 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
 
 
 def _denied_before_everything(grant: Grant) -> list[str]:
-    """Return the topics that are denied before the rules of a grant allow all of them."""
+    """Return the topics that a grant denies before its rule that allows all topics."""
     denied: dict[str, None] = {}
     for index, rule in enumerate(grant.rules):
         if allows_everything(replace(grant, rules=grant.rules[: index + 1], default_allow=False)):
@@ -377,7 +377,7 @@ def _denied_before_everything(grant: Grant) -> list[str]:
 
 
 def _is_as_long(chosen: Span, length: timedelta) -> bool:
-    """Return whether the template's validity allows ``length``; a fixed expiry always does."""
+    """Return whether a chosen validity is at least ``length``; a fixed date of expiry always is."""
     return not isinstance(chosen, timedelta) or length <= chosen + BACKDATE
 
 
@@ -392,12 +392,12 @@ def _copies(enclave: CheckedEnclave) -> Iterator[Finding]:
 
 
 def plain(document: bytes) -> bytes:
-    """Return a document for comparison, with uniform line endings and no surrounding space."""
+    """Normalise a document for comparison: uniform line endings, no surrounding space."""
     return document.replace(b"\r\n", b"\n").strip()
 
 
 def _plain_file(enclave: CheckedEnclave, path: Path) -> bytes:
-    """Return a file's content for comparison, or b"" if it cannot be read."""
+    """Return a file's normalised content for comparison, or b"" if it cannot be read."""
     try:
         return plain(enclave.keystore.opened.read(path, "file"))
     except SrosError:

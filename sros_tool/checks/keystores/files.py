@@ -83,7 +83,7 @@ FOREIGN_OWNER = FindingKind(
     "keystore.foreign-owner",
     WARNING,
     "a keystore of another user",
-    "The owner can replace everything in it, and so decides whom your nodes trust. An archive that "
+    "The owner can replace all its files, and so decides whom your nodes trust. An archive that "
     "root unpacks may belong to whoever has that number on this machine.",
     "POSIX owners; CWE-283.",
     "Run the check as the user that runs the nodes, or make that user the owner: "
@@ -224,11 +224,11 @@ _KNOWN_ANYWHERE = re.compile(
 _ARCHIVES = re.compile(
     r"(?i)\.(?:tar|tgz|tbz2?|txz|gz|bz2|xz|zst|zip|7z|rar|p12|pfx|jks|keystore|bak|old|orig)\Z|~\Z"
 )
-"""The ends of names of archives, of containers of keys, and of copies that programs keep."""
+"""File name suffixes of archives, key containers and backup copies."""
 
 
 def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -> Iterator[Finding]:
-    """Yield findings about the modes, links and names of files, without reading the DDS files.
+    """Yield findings about the modes, links and names of files; does not read DDS documents.
 
     Args:
         keystore: the keystore.
@@ -267,9 +267,9 @@ def _hidden_enclaves(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 def _has_links(keystore: CheckedKeystore) -> bool:
-    """Return whether some enclave has a link to the identity CA, as where the keystore is kept.
+    """Return whether an enclave has a link to the identity CA, as in the original keystore.
 
-    All enclaves of an export have copies, whatever else somebody put into it to look like home.
+    The enclaves of an export have copies, even if somebody adds files to make it look original.
     """
     files = [enclave_path(keystore.root, name) / IDENTITY_CA_FILE for name in keystore.names]
     return not any(map(os.path.lexists, files)) or any(map(os.path.islink, files))
@@ -282,9 +282,9 @@ def _below(
     trusted: frozenset[int],
     kept: list[str],
 ) -> Iterator[Finding]:
-    """Yield findings about what is in the folder ``start``.
+    """Yield findings about the files and folders below ``start``.
 
-    Keys that belong where a keystore is kept are added to ``kept``.
+    Keys that belong only in the original keystore are added to ``kept``.
     """
     root = os.fspath(keystore.root)
     keys = {os.path.join(root, ENCLAVES, name[1:], KEY_FILE) for name in keystore.names}
@@ -330,9 +330,9 @@ def _below(
 
 
 def _mounted(key: str) -> str:
-    """Return where a key lies in the secret that Kubernetes mounts; else ``key``.
+    """Return the real path of a key in a mounted Kubernetes secret; else ``key``.
 
-    There, the files of a folder are links into ..data, itself a link to a folder beside it.
+    In such a secret, files are links into ..data, which is a link to a folder next to it.
     """
     path = Path(key)
     data = path.with_name("..data")
@@ -417,7 +417,7 @@ class _Links:
             yield LINK_OUTSIDE.found(link, f"it leads to '{real}'", link)
 
     def _end_of(self, link: str, end: str) -> str:
-        """Return the real path of a link that leads to ``end``, and remember that of a file.
+        """Return the real path of a link's target ``end``, and cache it for files.
 
         The folder of ``link`` contains no link, so ".." in the path can be removed first.
         """
@@ -448,7 +448,7 @@ def _content(keystore: CheckedKeystore, path: str) -> bytes:
 
 
 def _is_kept(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool:
-    """Return whether a file is a private key in a folder for those of CAs and revoked enclaves."""
+    """Return whether a file is a private key in a folder for keys of CAs or revoked enclaves."""
     if os.path.relpath(path, keystore.root).partition(os.sep)[0] not in (PRIVATE, REVOKED, RETIRED):
         return False
     try:
@@ -460,7 +460,7 @@ def _is_kept(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool
 def _other(
     keystore: CheckedKeystore, path: str, info: os.stat_result, home: bool
 ) -> Iterator[Finding]:
-    """Yield findings about a file that is not one of an enclave, such as a misplaced key."""
+    """Yield findings about a file that belongs to no enclave, such as a misplaced key."""
     root = os.fspath(keystore.root)
     inside = os.path.relpath(Path(path).parent, root)
     place = inside.partition(os.sep)[0]

@@ -126,7 +126,7 @@ REVOKED_BY_NEWER_LIST = FindingKind(
 OLDER_LIST = FindingKind(
     "enclave.crl-older",
     WARNING,
-    "an enclave with an older revocation list than another one",
+    "an enclave with an older revocation list than another enclave",
     "Its processes communicate with enclaves that the newer list revokes.",
     "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
     "Export the enclave again, with `sros distribute_key ROOT NAME TARGET --force`.",
@@ -147,12 +147,12 @@ _Key = TypeVar("_Key")
 
 _RIGHTS_SHOWN = 3
 _AUTHORITY_FILES = (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
-"""The files of an enclave that define whom it trusts."""
+"""The CA files of an enclave, which define the peers that it trusts."""
 
 
 @dataclass(frozen=True, slots=True)
 class EnclaveSummary:
-    """The digests and names of an enclave to compare; small, to be passed between processes."""
+    """Digests and names of an enclave, to compare enclaves that several processes checked."""
 
     name: str
     serial: int
@@ -164,11 +164,11 @@ class EnclaveSummary:
     unique: bool
     trusted: tuple[frozenset[str], ...]
     list_number: int
-    """The number of its revocation list, if a CA that it trusts signed it; -1 without one."""
+    """CRL number of the enclave's revocation list, or -1 without a list signed by a trusted CA."""
 
 
 def summary_of(enclave: CheckedEnclave) -> EnclaveSummary | None:
-    """Return the summary of an enclave; None without a certificate."""
+    """Return the summary of an enclave, or None if it has no certificate."""
     certificate = enclave.state.certificate
     if certificate is None:
         return None
@@ -215,7 +215,7 @@ def _number_if_signed(data: bytes, authority: bytes) -> int:
 
 @lru_cache(maxsize=8)
 def _trusted(data: bytes) -> frozenset[str]:
-    """Return the certificates in a CA's file; none if it is unreadable (reported elsewhere)."""
+    """Return fingerprints of the certificates in a CA file; empty if unreadable."""
     try:
         return fingerprints(data)
     except SrosError:
@@ -304,7 +304,7 @@ def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> It
 def _exported_governance(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
-    """Yield findings about exported enclaves whose governance differs from the first one's."""
+    """Yield findings about exported enclaves whose governance differs from the first enclave's."""
     copies = [each for each in summaries if each.governance]
     for each in copies[1:]:
         if each.governance != copies[0].governance:
@@ -314,7 +314,7 @@ def _exported_governance(
 
 
 def _lists(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
-    """Yield findings about enclaves of one CA whose revocation list is not the newest one."""
+    """Yield findings about enclaves whose revocation list is not the newest list of their CA."""
     for issuer in dict.fromkeys(each.issuer for each in summaries):
         enclaves = [each for each in summaries if each.issuer == issuer]
         newest = max(enclaves, key=lambda each: each.list_number)
@@ -379,7 +379,7 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
 
 
 def _is_plain_router(enclave: CheckedEnclave, grant: Grant | None) -> bool:
-    """Return whether an enclave is the Zenoh router that sros made, with no right of the robot."""
+    """Return whether an enclave is the Zenoh router that sros made, without rights of its own."""
     settings = enclave.keystore.settings
     if not (settings and settings.zenoh and settings.zenoh.router == enclave.name and grant):
         return False
@@ -389,7 +389,7 @@ def _is_plain_router(enclave: CheckedEnclave, grant: Grant | None) -> bool:
 
 
 def wanted_rights(keystore: CheckedKeystore) -> dict[str, frozenset[Right]]:
-    """Map each enclave of the policies to its rights."""
+    """Map each enclave of the given policies to its rights."""
     found: dict[str, frozenset[Right]] = {}
     for policy in keystore.policies:
         rights = defaultdict(set)

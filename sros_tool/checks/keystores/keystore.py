@@ -67,9 +67,9 @@ from sros_tool.wording import first_few
 
 _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
-"""Ids of the kinds that follow from a choice of the keystore, and so affect all enclaves."""
+"""Ids of findings that a setting of the keystore causes in all enclaves."""
 _OF_SEVERAL_FILES = frozenset({REFUSED.id, SOME_REFUSE.id})
-"""Ids of the kinds with one cause wherever their text is the same, such as a shared CA."""
+"""Ids of findings that have one cause if their texts are equal, such as a shared CA."""
 
 
 @of_one_state
@@ -94,12 +94,12 @@ def keystore_findings(
         domain: the ROS domain that its enclaves have to join.
         policies: policies with which its permissions are compared.
         only: the enclaves to check; None for all of them and the keystore itself.
-        on_robot: whether it is on a robot, where no CA key may be.
+        on_robot: whether the keystore is on a robot, where it must not have a CA key.
         distribution: the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
         vendor: the DDS vendor of its nodes, or ``zenoh``; "" if they may use any.
 
     Raises:
-        KeystoreError: it is no keystore.
+        KeystoreError: the path of ``opened`` is no keystore.
     """
     opened.check()
     root = opened.root
@@ -171,9 +171,9 @@ def _enclave_findings(
     governance: bytes,
     vendors: Sequence[Vendor],
 ) -> Iterator[Finding]:
-    """Yield all findings in one enclave, except for what the ``vendors`` of its nodes refuse.
+    """Yield all findings in one enclave, except the refusals by the ``vendors`` of its nodes.
 
-    ``governance`` is the signed document of which the findings are known.
+    ``governance`` is a signed document whose findings are reported already.
     """
     yield from check_enclave(enclave)
     yield from check_documents(enclave)
@@ -183,7 +183,7 @@ def _enclave_findings(
 
 
 def joined(findings: Sequence[Finding]) -> list[Finding]:
-    """Join the findings that several enclaves have because of a shared file or the same choice."""
+    """Join findings that several enclaves have because of a shared file or a keystore setting."""
     together: dict[tuple[object, ...], list[Finding]] = {}
     for each in findings:
         one = each.accepted or each.id in _OF_THE_KEYSTORE
@@ -194,9 +194,9 @@ def joined(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
-    """Return the first enclave with the signed governance of most enclaves, and this document.
+    """Return the keystore's signed governance, and the first enclave that has it.
 
-    That is the governance of the keystore, or in an export the one of the first enclave.
+    In an export, the governance of the first enclave is returned.
     """
     common = keystore.governance
     for name in names:
@@ -228,7 +228,7 @@ def _governance(
 
 
 def _at_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
-    """Return ``finding`` with the shared file instead of an enclave's link to it."""
+    """Return the finding with the path of the shared file instead of an enclave's link to it."""
     if "/enclaves/" not in finding.file or finding.id.startswith("keystore.link"):
         return finding
     real = Path(os.path.realpath(finding.file))
@@ -238,7 +238,7 @@ def _at_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
 
 
 def _with_names(finding: Finding, root: Path) -> Finding:
-    """Return ``finding`` with the keystore and the enclave in the commands of its remedy."""
+    """Return the finding with ROOT and NAME in its remedy replaced by keystore and enclave."""
     remedy = re.sub(r"\bROOT\b", lambda _: quote(str(root)), finding.remedy)
     if finding.subject.startswith("/") and "," not in finding.subject:
         remedy = re.sub(r"\bNAME\b", lambda _: quote(finding.subject), remedy)
@@ -256,14 +256,14 @@ def _one_of(group: list[Finding]) -> Finding:
 
 
 _OF_A_KEYSTORE = (KEY_READABLE, FOLDER_OPEN, TIME_FORMAT, LONG_PERMISSIONS, ONE_AUTHORITY)
-"""What ros2/sros2 writes into every keystore, and `update_keystore --template sros2` ends."""
+"""Ids of findings in any ros2/sros2 keystore; `update_keystore --template sros2` resolves them."""
 _OF_AN_ENCLAVE = (UNEXPLAINED, KEY_READABLE, TIME_FORMAT, NOT_UNIQUE, LONG_PERMISSIONS, EVERYTHING)
-"""What ros2/sros2 writes into every enclave, and `create_permission --revoke-old` ends."""
+"""Ids of findings in every ros2/sros2 enclave; `create_permission --revoke-old` resolves them."""
 _MOST_NAMED = 3
 
 
 def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list[Finding]:
-    """Return the findings; those in what ros2/sros2 made get one cause, if there are several."""
+    """Return the findings; several findings that ros2/sros2 causes get a common cause."""
     root = keystore.root
     if keystore.is_of_ros2:
         chosen = [each for each in findings if each.kind in _OF_A_KEYSTORE]
@@ -304,7 +304,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
 
 
 def _is_plain(findings: Sequence[Finding], name: str) -> bool:
-    """Return whether both files of an enclave are not in the ledger: it is new altogether."""
+    """Return whether neither certificate nor permissions of an enclave are in the ledger."""
     return sum(each.kind is UNEXPLAINED and each.subject == name for each in findings) > 1
 
 
@@ -316,7 +316,7 @@ def _with(
     text: str,
     remedy: str,
 ) -> list[Finding]:
-    """Return the findings, with a common cause for those of ``chosen`` that count by default."""
+    """Return the findings, where the errors and warnings among ``chosen`` get a common cause."""
     together = {id(each) for each in chosen if each.severity >= WARNING}
     if len(together) < 2:
         return list(findings)
@@ -325,7 +325,7 @@ def _with(
 
 
 def _kinds(findings: Sequence[Finding]) -> str:
-    """Return the titles of the kinds of findings, with their numbers."""
+    """Return text with the titles of the findings' kinds and how often each occurs."""
     counted = Counter(each.kind.title for each in findings if each.severity >= WARNING)
     return "; ".join(
         f"{title} ({number} times)" if number > 1 else title for title, number in counted.items()

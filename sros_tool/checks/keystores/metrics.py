@@ -1,4 +1,4 @@
-"""The state of a keystore as metrics: when what expires, and how many findings it has."""
+"""The state of a keystore as metrics: expiry of its files, and numbers of findings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _KINDS = "certificate, permissions, governance, crl, identity_ca or permissions_
 
 @dataclass(frozen=True, slots=True)
 class Expiry:
-    """The moment from which a file is not valid any more; ``enclave`` is "" for a shared file."""
+    """The moment when a file expires; ``enclave`` is "" for a file that all enclaves share."""
 
     kind: str
     enclave: str
@@ -43,12 +43,12 @@ def keystore_metrics(
 
     Args:
         keystore: the keystore.
-        findings: those of `keystore_findings`.
-        now: the moment of which they are.
+        findings: the result of `keystore_findings`.
+        now: the moment for which the findings were made.
         each_enclave: also give the expiry of each enclave's files, not only the earliest.
 
     Raises:
-        KeystoreError: it is no keystore, or enclaves of it may be missing.
+        KeystoreError: the path is no keystore, or some enclaves cannot be listed.
     """
     lifetimes, unreadable = survey(keystore)
     expiries = [*_shared(keystore), *_of_enclaves(keystore, lifetimes)]
@@ -112,7 +112,7 @@ def keystore_metrics(
 
 
 def _shared(keystore: Keystore) -> Iterator[Expiry]:
-    """Yield the expiry of what all enclaves share; what cannot be read is a finding."""
+    """Yield the expiry of the files that all enclaves share; skip unreadable files."""
     for role in ROLES:
         with suppress(SrosError):
             for certificate in keystore.authority(role)[:1]:
@@ -137,7 +137,7 @@ def _of_enclaves(keystore: Keystore, lifetimes: Iterable[Lifetime]) -> Iterator[
 
 
 def _exported(keystore: Keystore, name: str) -> Iterator[Expiry]:
-    """Yield the expiry of what an export has for each enclave, and a keystore once."""
+    """Yield the expiry of an exported enclave's copies of the shared files."""
     folder = keystore.folder(name)
     for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
         with suppress(SrosError):

@@ -58,16 +58,16 @@ class UnreadablePart:
 
 @dataclass(frozen=True)
 class CheckedKeystore:
-    """A view of a keystore, or of the part of one that was exported for a robot, for its checks.
+    """A view for checks of a keystore, or of an export of it for a robot.
 
-    A part that exists and cannot be read is as if it were not there, and one of ``unread``.
+    A file that exists and cannot be read counts as missing, and is listed in ``unread``.
 
     Args:
         opened: the keystore, or an export of it.
         now: the moment to check for.
         zone: the time zone of the host on which its enclaves run.
         policies: policies with which its permissions are compared.
-        on_robot: whether it is on a robot, where no CA key may be, even if it contains some.
+        on_robot: whether the keystore is on a robot, where it must not have a CA key.
         distribution: the ROS 2 distribution of its nodes; "" is the latest.
     """
 
@@ -91,19 +91,19 @@ class CheckedKeystore:
 
     @property
     def unread(self) -> tuple[UnreadablePart, ...]:
-        """The parts that cannot be read."""
+        """The files that exist but cannot be read."""
         _ = self.settings, self.ledger, self.crl, self.authorities
         _ = self.governance, self.fleet, self.fleet_edited
         return tuple(self._unread.values())
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Its enclaves; `check_files` reports folders that cannot be read."""
+        """Names of the enclaves; `check_files` reports folders that cannot be read."""
         return search_enclaves(self.root)[0]
 
     @cached_property
     def settings(self) -> Template | None:
-        """The settings; None if ros2/sros2 made it."""
+        """The settings of the keystore; None if ros2/sros2 made the keystore."""
         return self._part(SETTINGS, lambda: self.opened.settings, None)
 
     @cached_property
@@ -118,7 +118,7 @@ class CheckedKeystore:
 
     @cached_property
     def authorities(self) -> dict[str, tuple[x509.Certificate, ...]]:
-        """The certificates of the CA file of each role, the issuing one first."""
+        """The certificates in the CA files by role, the issuing certificate first."""
 
         def chain(role: str) -> tuple[x509.Certificate, ...]:
             return self._part(ca_certificate(role), lambda: self.opened.authority(role), ())
@@ -127,7 +127,7 @@ class CheckedKeystore:
 
     @cached_property
     def governance(self) -> bytes:
-        """The signed document that its enclaves share, or b""."""
+        """The signed governance that the enclaves share, or b""."""
         there = (self.root / GOVERNANCE_P7S).is_file()
 
         def read() -> bytes:
@@ -137,7 +137,7 @@ class CheckedKeystore:
 
     @cached_property
     def edits(self) -> HandEdits:
-        """What somebody edited by hand."""
+        """Edits by hand in the settings and in the fleet file."""
         signed: Governance | None = None
         with suppress(SrosError):  # what is wrong with it is a finding of each enclave
             signed = self.opened.governance
@@ -145,47 +145,47 @@ class CheckedKeystore:
 
     @cached_property
     def fleet(self) -> Fleet | None:
-        """Its robots, if somebody named them."""
+        """The robots of the keystore, or None if it has no fleet."""
         return self._part(FLEET, lambda: load_fleet(self.opened), None)
 
     @cached_property
     def fleet_edited(self) -> str:
-        """How the file of the fleet is not the one that sros wrote, as a clause, or ""."""
+        """A clause that says how the fleet file was changed by hand, or ""."""
         return self._part(FLEET, lambda: edited_fleet(self.opened, self.ledger), "")
 
     @property
     def looks_like_home(self) -> bool:
-        """Whether it has the folders of a keystore with CAs, wherever it is."""
+        """Whether the folder has the layout of a keystore with CAs, even on a robot."""
         return self.opened.is_home
 
     @property
     def is_home(self) -> bool:
-        """Whether it is a keystore with CAs, and not on a robot."""
+        """Whether this is the original keystore with its CAs, and not on a robot."""
         return self.looks_like_home and not self.on_robot
 
     @property
     def root(self) -> Path:
-        """Its folder."""
+        """Folder of the keystore."""
         return self.opened.root
 
     def enclave(self, name: str) -> OpenedEnclave:
-        """Return one of its enclaves at the moment of the check."""
+        """Return an enclave of the keystore at the moment of the check."""
         return self.opened.enclave(name, now=self.now)
 
     @property
     def can_issue(self) -> bool:
-        """Whether it is a keystore with CAs, in which verbs can issue and sign."""
+        """Whether the keystore has its CAs, so that sros commands can issue and sign in it."""
         return self.is_home and any((self.root / each).exists() for each in (PUBLIC, SETTINGS))
 
     def accepts(self, kind: FindingKind, chosen: Callable[[Template], bool]) -> str:
         """Return text naming the template or keystore that accepts a weakness; "" if none does.
 
-        ``chosen`` returns whether settings choose the weakness.  It is asked of the template as it
-        ships with sros: what the settings of this keystore changed, the template never accepted.
-        Without settings (ros2/sros2) nothing accepts it.
+        ``chosen`` returns whether settings choose the weakness.  It is called with the template
+        as sros ships it, so a changed setting of this keystore accepts nothing.  Without settings
+        (keystores of ros2/sros2) no weakness is accepted.
 
-        An export has no settings, so it is compared with all templates.  What none of them chooses
-        was chosen where the CA is; an error stays an error nevertheless.
+        An export has no settings, so it is compared with all templates.  A weakness that no
+        template chooses counts as accepted by the original keystore, but an error never does.
         """
         if self.settings:
             name = self.settings.name
@@ -199,13 +199,13 @@ class CheckedKeystore:
         return "" if kind.severity is ERROR else "keystore whose CA signed it"
 
     def shown(self, path: str | Path) -> str:
-        """Return a path below the root as findings show it."""
+        """Return the path of a file below the root in the form that findings show."""
         return os.path.join(self.root, path)
 
 
 @dataclass(frozen=True)
 class CheckedEnclave:
-    """An enclave, the content of its files, and its keystore."""
+    """A view for checks of an enclave: its name, its files, and its keystore."""
 
     keystore: CheckedKeystore
     name: str
@@ -213,16 +213,16 @@ class CheckedEnclave:
 
     @cached_property
     def folder(self) -> Path:
-        """Its folder."""
+        """Folder of the enclave."""
         return enclave_path(self.keystore.root, self.name)
 
     @property
     def accepts_expiry(self) -> str:
-        """Text naming the template that lets this enclave expire early; "" if none does."""
+        """Text naming the template that accepts this enclave's early expiry; "" if none does."""
         settings = self.keystore.settings
         short = settings is not None and settings.longest_validity(self.name) is not None
         return f"template {settings.name}" if settings and short else ""
 
     def file(self, name: str) -> str:
-        """Return the path of one of its files."""
+        """Return the path of a file of the enclave in the form that findings show."""
         return f"{self.folder}/{name}"

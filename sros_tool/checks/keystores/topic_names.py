@@ -1,4 +1,4 @@
-"""Checks of the topics that permissions name: names that no ROS topic, service or action has."""
+"""Checks for topics in permissions that no ROS topic, service or action can have."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ _ROS_NAME = re.compile(
     rf"(?:r[apst]{_TOKENS}|rq{_TOKENS}(?<=Request)|rr{_TOKENS}(?<=Reply)|{ROS_DISCOVERY_TOPIC})\Z"
 )
 _OF_DDS = re.compile(r"DCPS[A-Z]\w*\Z")
-"""The topics of the DDS itself, which need no right, and which some documents name."""
+"""Built-in topics of DDS, which need no right but appear in some permissions."""
 _TYPE = re.compile(r"[a-z][a-z0-9_]*/(?:msg|srv|action)/[A-Z][A-Za-z0-9]*\Z")
 _WILDCARD = re.compile(r"\[[^\]]*\]|[*?]")
 _FOREIGN = re.compile(r"[^A-Za-z0-9_/]")
@@ -71,7 +71,7 @@ _SHOWN = 3
 
 
 def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
-    """Yield findings about the names in the rules of a grant."""
+    """Yield findings about topic names in the rules of a grant."""
     if not is_for_ros(grant):
         names = [repr(each) for each in dict.fromkeys(_stated(grant, allow=True))]
         yield NOT_FOR_ROS.found(enclave.name, f"they name only {some_names(names)}", file)
@@ -88,9 +88,9 @@ def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Itera
 
 
 def check_capitals(enclaves: Mapping[str, frozenset[str]]) -> Iterator[Finding]:
-    """Yield a finding for names of enclaves on one robot that differ only in capitals.
+    """Yield a finding for topic names in a robot's enclaves that differ only in capitals.
 
-    ``enclaves`` are the `names_without_wildcards` of each enclave.
+    ``enclaves`` maps each enclave to its `names_without_wildcards`.
     """
     spelled: dict[str, dict[str, str]] = {}
     for enclave, names in sorted(enclaves.items()):
@@ -103,12 +103,12 @@ def check_capitals(enclaves: Mapping[str, frozenset[str]]) -> Iterator[Finding]:
 
 
 def names_without_wildcards(grant: Grant) -> frozenset[str]:
-    """Return the topics that the rules of a grant allow by their whole name."""
+    """Return the topics that the rules of a grant allow by name, without wildcards."""
     return frozenset(each for each in _stated(grant, allow=True) if not is_expression(each))
 
 
 def is_for_ros(grant: Grant) -> bool:
-    """Return whether the grant allows something by its name in ROS, or allows no name at all."""
+    """Return whether a grant allows a ROS name, or has no allow rule with a name at all."""
     named = tuple(_stated(grant, allow=True))
     return not named or any(
         overlap(wanted, each.strip())
@@ -119,9 +119,9 @@ def is_for_ros(grant: Grant) -> bool:
 
 @lru_cache(maxsize=8192)
 def ros_name_problem(text: str) -> str:
-    """Return why no ROS topic, service or action has a name that ``text`` matches, as a clause.
+    """Return a clause that says why the expression ``text`` matches no ROS name; "" if it can.
 
-    "" if there can be one.  Blanks around the text do not count.
+    Blanks around the text are ignored.
     """
     name = text.strip()
     if not name or _ROS_NAME.match(name) or _OF_DDS.match(name):
@@ -137,7 +137,7 @@ def ros_name_problem(text: str) -> str:
 
 
 def has_foreign_letters(name: str) -> bool:
-    """Return whether an expression has characters, outside of sets, that no ROS name has."""
+    """Return whether an expression has characters outside [sets] that no ROS name can have."""
     return bool(_FOREIGN.search(_WILDCARD.sub("", name.strip())))
 
 
@@ -161,7 +161,7 @@ def _foreign_problem(name: str) -> str:
 
 
 def _meant(name: str) -> str:
-    """Return what was probably meant, as a clause with a colon before it, or ""."""
+    """Return a hint with the probably intended name, such as ``: write rt/chatter``, or ""."""
     begin, slash, rest = name.partition("/")
     parts = [each for each in (rest if begin in _PREFIXES else name).split("/") if each]
     prefix = begin if slash and begin in _PREFIXES else "rt"
@@ -174,7 +174,7 @@ def _meant(name: str) -> str:
 
 
 def _stated(grant: Grant, *, allow: bool) -> Iterator[str]:
-    """Yield the topics to publish and to subscribe of the rules that allow, or that deny."""
+    """Yield the published and subscribed topics of the allow rules, or of the deny rules."""
     for rule in grant.rules:
         if rule.allow is allow:
             yield from _topics((*rule.publish, *rule.subscribe))

@@ -1,7 +1,7 @@
-"""Checks of what each DDS vendor makes of an enclave: whether a node starts, and its rights.
+"""Checks of each DDS vendor's decisions on an enclave: whether a node can start, and its rights.
 
-They ask what `sros explain` asks.  A refusal whose cause another finding names is not reported
-again by vendor.
+The decision engine is the one of `sros explain`.  A vendor's refusal is not reported if another
+finding already names its cause.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ _NAMED_BY: Mapping[str, frozenset[str]] = {
         "unauthenticated-with-rtps-protection": ("governance.unauthenticated",),
     }.items()
 }
-"""The ids of the findings that name the cause of a vendor's refusal, by its reason."""
+"""By reason of a vendor's refusal: ids of other findings that already name this cause."""
 
 _SAYS = {
     Outcome.CRASHES: ("crash on it", "crashes on it"),
@@ -125,16 +125,17 @@ _REFUSES = ("refuse it", "refuses it")
 
 
 def asked_vendors(vendor: str) -> tuple[Vendor, ...]:
-    """Return the measured vendors that ``vendor`` chooses: "" all, ``zenoh`` none."""
+    """Return the measured DDS vendors that ``--vendor`` selects: all for "", none for ``zenoh``."""
     return tuple(each for each in MEASURED if vendor in ("", each.value))
 
 
 @dataclass(frozen=True, slots=True)
 class EnclaveEvaluation:
-    """What vendors make of an enclave.
+    """The decisions of DDS vendors on an enclave.
 
-    ``enclave`` has the faults, and the documents, that it has for these vendors; ``by_domain`` has
-    their participants for each ROS domain.  ``portable`` says that sros wrote the permissions.
+    ``enclave`` is the loaded enclave with its faults for these vendors; ``by_domain`` maps a ROS
+    domain to the participant of each vendor.  ``portable`` says that the permissions have the
+    portable form that sros writes.
     """
 
     enclave: CheckedEnclave
@@ -145,12 +146,12 @@ class EnclaveEvaluation:
 def evaluate(
     enclave: CheckedEnclave, vendors: Sequence[Vendor], domain: int | None
 ) -> EnclaveEvaluation:
-    """Return what the vendors make of an enclave.
+    """Evaluate an enclave as the vendors do.
 
     Args:
         enclave: the enclave.
         vendors: the vendors that its nodes may use.
-        domain: the ROS domain to join; None for those of its documents.
+        domain: the ROS domain to join; None for the domains in the enclave's documents.
     """
     keystore = enclave.keystore
     there = loaded(enclave.name, enclave.folder, enclave.state, at=keystore.now)
@@ -172,9 +173,9 @@ def evaluate(
 
 
 def check_vendors(evaluation: EnclaveEvaluation, known: Collection[Finding]) -> Iterator[Finding]:
-    """Yield what vendors refuse, and decide differently.
+    """Yield findings about refusals by vendors, and about decisions in which vendors differ.
 
-    ``known`` are the findings about the enclave and its CAs.
+    ``known`` are the other findings about the enclave and its CAs.
     """
     enclave = evaluation.enclave
     for domain, made in evaluation.by_domain.items():
@@ -191,7 +192,7 @@ def check_vendors(evaluation: EnclaveEvaluation, known: Collection[Finding]) -> 
 
 
 def _domains(state: OpenedEnclave) -> tuple[int, ...]:
-    """Return domains of an enclave of which each is in other rules of its documents."""
+    """Return example domains of an enclave, one for each combination of document rules."""
     if state.governance is None:
         return (0,)
     rules = [each.domains for each in state.governance.domain_access_rules]
@@ -215,10 +216,10 @@ def _refusals(
     made: Mapping[Vendor, VendorParticipant],
     known: Collection[Finding],
 ) -> Iterator[Finding]:
-    """Yield an error if all vendors refuse it, or else what some of them refuse.
+    """Yield an error if all vendors refuse the enclave, or else the refusals by some vendors.
 
-    Nothing is yielded if an error in ``known`` names a cause for each of them; what only some
-    refuse is left out where a finding in ``known`` names it.
+    Yields nothing if errors in ``known`` name a cause for every vendor.  A refusal by only some
+    vendors is left out if a finding in ``known`` names its cause.
     """
     causes = {vendor: each.causes() for vendor, each in made.items()}
     by_cause: dict[RefusalCause, list[Vendor]] = {}
@@ -253,7 +254,7 @@ def _refusals(
 
 
 def _is_named(cause: RefusalCause, known: Iterable[Finding]) -> bool:
-    """Return whether a finding names the cause."""
+    """Return whether a known finding already names the cause of a refusal."""
     wanted = _NAMED_BY.get(cause.reason, frozenset())
     own = f"enclave.{cause.reason}"
     return any(
@@ -262,7 +263,7 @@ def _is_named(cause: RefusalCause, known: Iterable[Finding]) -> bool:
 
 
 def _file(finding: Finding) -> str:
-    """Return the name of the file that a finding is about."""
+    """Return the name, without folder, of the file that a finding is about."""
     return finding.file.rpartition("/")[2]
 
 
@@ -287,7 +288,7 @@ def _different_rights(
 ) -> Iterator[Finding]:
     """Yield a finding if vendors decide differently on a topic that the permissions name.
 
-    ``known`` are the ids of the findings that are known of the enclave.
+    ``known`` are the ids of the other findings about the enclave.
     """
     answers = {
         vendor: each.access for vendor, each in made.items() if each.access and not each.causes()
@@ -312,9 +313,9 @@ def _differences(answers: Mapping[Vendor, Access], topics: list[str]) -> Iterato
 
 
 def _topics_to_ask(enclave: CheckedEnclave, known: Collection[str]) -> list[str]:
-    """Return the named topics, an example for each wildcard, and a topic that no rule names.
+    """Return topics to compare: the named topics, examples of wildcards, and an unnamed topic.
 
-    Names that are ``known`` not to be those of ROS are left out.
+    If a finding in ``known`` reports names that are no ROS names, these names are left out.
     """
     grant = grant_of(enclave)
     named: dict[str, None] = {ROS_DISCOVERY_TOPIC: None}
@@ -329,7 +330,7 @@ def _topics_to_ask(enclave: CheckedEnclave, known: Collection[str]) -> list[str]
 
 
 def _example(expression: str) -> str:
-    """Return an example name for a wildcard; a set of characters becomes its first one."""
+    """Return an example name that matches a wildcard; a [set] becomes its first character."""
     if not is_expression(expression):
         return expression
     name, index = "", 0
@@ -353,7 +354,7 @@ NO_NODE = FindingKind(
     "permissions with which no ordinary node of ROS 2 can start",
     "A node of rclpy or rclcpp creates these endpoints when it starts, and exits if one of them is "
     "denied. The permissions say nothing of nodes that were created without them; "
-    "ros_discovery_info no process can do without.",
+    "Every process needs ros_discovery_info.",
     "ROS 2 Jazzy, rcl 9, rclcpp 28, rclpy 7 and rmw_dds_common; ~/get_type_description since Iron "
     "(REP-2016).",
     "Include common/node.xml in the profiles of its nodes (`sros check POLICY_FILE` says how), and "
@@ -372,10 +373,10 @@ _SOME_NODE = "/sros_nobody_has_this"
 
 @dataclass(frozen=True, slots=True)
 class _Denial:
-    """What a vendor denies of that which an ordinary node needs.
+    """The endpoints that an ordinary node needs and that a vendor denies.
 
-    ``text`` is a clause; ``by`` is the deny rule that decides, as findings name it, and
-    ``partition`` one in which it would be allowed.
+    ``text`` is a clause; ``by`` names the deciding deny rule as findings do, and ``partition`` is
+    a partition in which the access would be allowed.
     """
 
     text: str
@@ -390,20 +391,20 @@ class _Denial:
         return f"{self.text}{where if self.partition else ''}"
 
     def explains(self, finding: Finding) -> bool:
-        """Return whether a finding about the same permissions has the same cause."""
+        """Return whether a finding about the same permissions already names this cause."""
         if finding.kind is UNREACHABLE:
             return bool(self.by) and finding.text.endswith(self.by[self.by.index("denies") :])
         return finding.kind is PARTITIONS and bool(self.partition)
 
 
 def check_starting(evaluation: EnclaveEvaluation, known: Sequence[Finding]) -> list[Finding]:
-    """Return the findings, with another if no vendor lets an ordinary node start in the enclave.
+    """Return the findings, plus an error if no vendor lets an ordinary node start in the enclave.
 
-    Vendors that refuse the enclave are not asked.  Of the ``known`` findings about the enclave,
-    those with the same cause are left out.
+    Vendors that refuse the enclave do not count.  ``known`` findings with the same cause are left
+    out.
 
-    An enclave with a part of what every node needs, and nothing else, is for a tool such as the
-    observer of `sros generate_policy`, which has no log and no services.
+    An enclave with only a part of the rights that every node needs is for a tool such as the
+    observer of `sros generate_policy`, which has no log and no services; it gets no error.
     """
     enclave = evaluation.enclave
     grant = grant_of(enclave)
@@ -430,7 +431,7 @@ def check_starting(evaluation: EnclaveEvaluation, known: Sequence[Finding]) -> l
 
 
 def _states_all(grant: Grant) -> bool:
-    """Return whether the only rule of a grant names all that a node needs: no vendor denies it."""
+    """Return whether the only rule of a grant names every topic that a node needs."""
     if len(grant.rules) != 1 or not grant.rules[0].allow:
         return False
     published, subscribed = (
@@ -450,9 +451,9 @@ def _states_all(grant: Grant) -> bool:
 
 
 def _denial(participant: VendorParticipant, grant: Grant, *, described: bool) -> _Denial | None:
-    """Return what a vendor denies of that which an ordinary node needs, or None.
+    """Return the endpoints that an ordinary node needs and a vendor denies, or None.
 
-    ``described`` says that nodes describe their types.
+    ``described`` says that nodes offer ~/get_type_description (since ROS 2 Iron).
     """
     access = participant.access
     assert access is not None
@@ -482,7 +483,7 @@ def _denial(participant: VendorParticipant, grant: Grant, *, described: bool) ->
 
 
 def _partitions(grant: Grant) -> tuple[str, ...]:
-    """Return the partitions that allow rules name, once."""
+    """Return the partitions in allow rules, without duplicates."""
     return tuple(
         dict.fromkeys(
             name
@@ -496,9 +497,9 @@ def _partitions(grant: Grant) -> tuple[str, ...]:
 
 
 def _offers_types(access: Access, grant: Grant) -> bool:
-    """Return whether the node of some name may describe its types.
+    """Return whether a node of any name may offer ~/get_type_description.
 
-    Asked are a name that no rule has, and an example for each expression that fits.
+    Tries a name that no rule has, and an example for each matching expression.
     """
     wanted = dds_names("reply", f"/*/{_TYPES}").publish[0]
     nodes = [_SOME_NODE]
@@ -516,21 +517,21 @@ def _offers_types(access: Access, grant: Grant) -> bool:
 
 
 def _written(grant: Grant) -> Iterator[str]:
-    """Yield the topics that allow rules let the enclave publish."""
+    """Yield the topic expressions that allow rules let the enclave publish."""
     for rule in grant.rules:
         for criteria in rule.publish if rule.allow else ():
             yield from criteria.topics
 
 
 def _is_own(topic: str) -> bool:
-    """Return whether a topic is one of the robot, not one that every node has."""
+    """Return whether a topic belongs to the robot, and not to the topics that every node has."""
     name = topic.rpartition("/")[2].removesuffix("Reply")
     common = topic in (ROS_DISCOVERY_TOPIC, _PARAMETER_EVENTS, _ROSOUT)
     return not common and name not in NODE_SERVICES
 
 
 def with_causes(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings; those of several enclaves in which no node can start have one cause."""
+    """Return the findings, with a common cause if several enclaves let no node start."""
     same: dict[str, list[Finding]] = defaultdict(list)
     for each in findings:
         if each.kind is NO_NODE:
