@@ -33,7 +33,7 @@ DROPPED = FindingKind(
 ASSUMED = FindingKind(
     "requirement.assumed",
     NOTE,
-    "a protection that the policy does not state, so that it is assumed",
+    "a protection that the policy does not state",
     "The governance of the keystore protects topics, and a policy alone has none. A keystore's "
     "template can protect less than the default template.",
     "The requirements file.",

@@ -250,10 +250,7 @@ def test_an_assumed_template_is_said(folder: Path, keystore: Path, tmp_path: Pat
     required.write_text('[[protected]]\ntopics = ["/scan"]\nlevel = "encrypt"\n')
     asked = (*ONLY, "--requirements", required)
     said = sros(*asked, cwd=folder).ok().out
-    assert (
-        "note: a protection that the policy does not state, so that it is assumed [requirement.assumed]"
-        in said
-    )
+    assert "note: a protection that the policy does not state [requirement.assumed]" in said
     assert (
         "topic /scan has to be encrypted: the policy does not say how /scan is protected, and that "
         "of the template development is assumed\n"
