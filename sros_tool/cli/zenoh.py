@@ -61,7 +61,8 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
 @click.option(
     "--mode",
     type=click.Choice(["client", "peer"]),
-    help="client (usual): sessions connect to the router alone. peer: also to each other.",
+    help="client (usual): sessions connect to the router alone. peer: also to each other, on one "
+    "host.",
 )
 @click.option("--domain", metavar="IDS", help="ROS domains; usually those of the keystore.")
 @click.option("--off", is_flag=True, help="Remove the files, and keep none in step any more.")
@@ -106,7 +107,7 @@ def zenoh(
       created enclave /router
       wrote keystore/enclaves/router/router.json5
       wrote keystore/enclaves/talker/session.json5
-      $ sros zenoh keystore --mode peer --endpoint robot:7447 --listen [::]:7447
+      $ sros zenoh keystore --endpoint robot:7447 --listen [::]:7447
       $ sros zenoh keystore --check
       $ sros zenoh --from session.json5 -o policy.xml
 

@@ -17,7 +17,7 @@ from functools import lru_cache
 from json.encoder import encode_basestring_ascii
 from typing import Any, NamedTuple
 
-from sros_tool.errors import DocumentError
+from sros_tool.errors import DocumentError, UsageError
 from sros_tool.zenoh.access import (
     AccessControl,
     AccessRule,
@@ -326,3 +326,54 @@ def is_endpoint(text: str) -> bool:
     """Return whether ``text`` is ``HOST:PORT``, with a name or an address and a port from 1."""
     found = _ENDPOINT.match(text)
     return bool(found and 0 < int(found[1]) <= _MOST_PORT)
+
+
+def check_network(network: ZenohNetwork) -> None:
+    """Raise `UsageError` for a network in which nothing can communicate, whatever its processes do.
+
+    A host is known by its name alone: two names may be one host, but only those of the loopback
+    surely are this one.
+    """
+    connect, listen = ({_place(each) for each in of} for of in (network.endpoints, network.listen))
+    hosts = {host for host, _ in connect}
+    far = sorted(hosts - {_LOOPBACK})
+    if network.mode is Mode.PEER and far:
+        raise UsageError(
+            f"sessions in peer mode cannot reach a router at {far[0]} and each other",
+            "They listen on their own host alone, and the router passes no data on between peers: "
+            "those of different hosts would hear nothing.",
+            "Take client mode for several hosts: `--mode client`. For one host, leave the endpoint "
+            "at localhost.",
+        )
+    if len(hosts) > 1 and not listen:
+        raise UsageError(
+            f"the router cannot listen at {' and '.join(sorted(hosts))}",
+            "Without --listen it listens at each endpoint, and it does not start if one of them is "
+            "another host.",
+            f"Say where it listens, such as `--listen [::]:{min(connect)[1]}`.",
+        )
+    if not listen:
+        return
+    if not {port for _, port in connect} & {port for _, port in listen}:
+        ports = " and ".join(sorted({str(port) for _, port in listen}))
+        raise UsageError(
+            f"no session connects to port {ports}, at which the router listens",
+            f"The endpoints are {', '.join(network.endpoints)}.",
+            "Name the same port with --endpoint and --listen.",
+        )
+    if hosts == set(far) and {host for host, _ in listen} == {_LOOPBACK}:
+        raise UsageError(
+            f"the router listens on its own host alone, and sessions connect to {far[0]}",
+            "Another host cannot reach a router that listens at localhost.",
+            f"Let it listen for other hosts, such as `--listen [::]:{min(listen)[1]}`.",
+        )
+
+
+_LOOPBACK = "localhost"
+_LOOPBACKS = ("localhost", "[::1]", "ip6-localhost")
+
+
+def _place(endpoint: str) -> tuple[str, int]:
+    host, _, port = endpoint.rpartition(":")
+    is_here = host.lower() in _LOOPBACKS or host.startswith("127.")
+    return _LOOPBACK if is_here else host, int(port)

@@ -69,7 +69,7 @@ ALL = ["/a", "/b", "/router"]
         (("create_permission", "{}", "/a", "more.xml"), ["/a", "/router"], ALL),
         (("renew", "{}", "/a"), [], []),
         (("renew", "{}", "/a", "--new-key"), [], []),
-        (("update_keystore", "{}", "--set", "zenoh.endpoints=robot:7447"), ALL, ALL),
+        (("update_keystore", "{}", "--set", "zenoh.endpoints=localhost:7449"), ALL, ALL),
         (("update_keystore", "{}", "--set", "zenoh.listen=[::]:7447"), ["/router"], ["/router"]),
         (("zenoh", "{}"), [], []),
     ],
@@ -196,14 +196,14 @@ def test_who_has_no_valid_certificate_either_keeps_its_rules(folder: Path) -> No
 def test_a_template_may_choose_the_network(folder: Path) -> None:
     text = (templates_dir() / "production.toml").read_text()
     (folder / "robot.toml").write_text(
-        f'{text}\n[zenoh]\nrouter = "/way"\nendpoints = ["robot:7447"]\nmode = "peer"\n'
+        f'{text}\n[zenoh]\nrouter = "/way"\nendpoints = ["[::1]:7449"]\nmode = "peer"\n'
     )
     sros("create_keystore", "ks", "--template", "robot.toml", cwd=folder).ok()
     ended = sros("generate_artifacts", "-k", "ks", "-p", "first.xml", cwd=folder).ok()
     assert "created enclave /way" in ended.out
     in_step(folder / "ks")
     session = json.loads((folder / "ks/enclaves/a/session.json5").read_text())
-    assert (session["mode"], session["connect"]["endpoints"]) == ("peer", ["tls/robot:7447"])
+    assert (session["mode"], session["connect"]["endpoints"]) == ("peer", ["tls/[::1]:7449"])
 
 
 @pytest.mark.parametrize(
@@ -262,3 +262,29 @@ def test_a_wildcard_of_dds_is_said_exactly_or_refused(
         assert [(each.right.right, each.right.name) for each in stated] == [
             ("publish", name) for name in names
         ]
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("--endpoint robot:7447", ""),
+        ("--endpoint robot:7447 --mode peer", "peer mode cannot reach a router at robot"),
+        ("--mode peer --endpoint 127.0.0.1:7447 --endpoint [::1]:7447", ""),
+        ("--endpoint one:7447 --endpoint two:7447", "cannot listen at one and two"),
+        ("--endpoint one:7447 --endpoint two:7447 --listen [::]:7447", ""),
+        ("--endpoint localhost:7447 --endpoint robot:7447", "cannot listen at localhost and robot"),
+        ("--endpoint robot:7447 --listen [::]:7448", "no session connects to port 7448"),
+        ("--endpoint robot:7447 --listen localhost:7447", "on its own host alone"),
+        ("--endpoint robot:7447 --endpoint localhost:1 --listen localhost:1", ""),
+    ],
+)
+def test_a_network_that_cannot_work_is_refused_when_it_is_asked_for(
+    words: str, why: str, folder: Path
+) -> None:
+    before = snapshot(folder / "client")
+    ended = sros("zenoh", "client", *words.split(), cwd=folder)
+    if not why:
+        ended.ok()
+        return
+    assert (ended.status, why in ended.err) == (2, True), ended.err
+    assert snapshot(folder / "client") == before

@@ -43,6 +43,7 @@ from sros_tool.parallel import Progress
 from sros_tool.policy.model import Enclave, Policy, StatedProtection, stated_protections
 from sros_tool.translate import governance_for
 from sros_tool.validity import window
+from sros_tool.zenoh.configuration import check_network
 
 _NONE_IMPORTED: Mapping[str, bytes] = MappingProxyType({})
 
@@ -413,6 +414,8 @@ def _write_keystore(
     from sros_tool.keystore.lifecycle.governed import write_governance
 
     _check_free(change.root)  # another process may have created it meanwhile
+    if template.zenoh:
+        check_network(template.zenoh)
     for span in (template.certificate_validity, template.permissions_validity):
         window(change.now, span)  # raises if the CAs could not issue anything
     change.template, change.domains, change.fleet = template, domains, None

@@ -97,7 +97,7 @@ from sros_tool.translate import (
 from sros_tool.validity import iso
 from sros_tool.wording import counted
 from sros_tool.xml import read_bytes
-from sros_tool.zenoh.configuration import ZenohNetwork
+from sros_tool.zenoh.configuration import ZenohNetwork, check_network
 
 
 class UpdateStage(StrEnum):
@@ -430,6 +430,8 @@ class _Updater:
     ) -> Callable[[], KeystoreUpdate]:
         """Stage the changes of the stages ``done``; return what gives the result."""
         change, before, after = self._change, self._present.settings, self._goal.settings
+        if after.zenoh and after.zenoh != before.zenoh:
+            check_network(after.zenoh)
         names = tuple(
             name for name in change.names if not waits_for_answer(enclave_path(self._root, name))
         )
@@ -737,9 +739,11 @@ def set_zenoh(
     Raises:
         KeystoreError: files of the keystore were edited by hand, or it has no settings.
         PolicyError: an enclave has rights that Zenoh cannot enforce.
-        UsageError: the network is not for the domains of the keystore, or the router's enclave has
-            rights of its own.
+        UsageError: the network cannot work, is not for the domains of the keystore, or the router's
+            enclave has rights of its own.
     """
+    if network:
+        check_network(network)
     with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
         change.begin_issuing(None)
         _check_settings(change, edited=bool(change.notes))
