@@ -457,7 +457,7 @@ def _too_many() -> DocumentError:
         "it cannot be decided which names so many wildcards match",
         "The names that they have in common, and not in common, are too many to be told apart, "
         "such as with many '?' after a '*'.",
-        "Replace wildcards by the names that they stand for, or by fewer wildcards.",
+        "Write names instead of wildcards, or fewer wildcards.",
     )
 
 

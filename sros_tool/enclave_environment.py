@@ -187,7 +187,7 @@ def _check_folders_closed(root: Path, folder: Path, name: str) -> None:
         if why := other_writers(each.stat(), trusted):
             raise KeystoreError(
                 f"others can replace the files of enclave {name}",
-                f"'{each}': {why}. Whoever does decides whom the process trusts.",
+                f"'{each}': {why}. Whoever replaces them decides whom the process trusts.",
                 f"Run `chmod go-w {quote(str(each))}`, then `sros verify {quote(str(root))}`. To "
                 "run it nevertheless, add --accept-readable-key.",
             )
@@ -278,7 +278,7 @@ def _check_pin(place: TokenUri, name: str) -> None:
 
     if problem := pin_file_problem(place):
         raise KeystoreError(
-            f"the PIN for the key of enclave {name} is not safe or not there",
+            f"the PIN for the key of enclave {name} is missing or not protected",
             f"{problem[:1].upper()}{problem[1:]}.",
             "To run it nevertheless, add --accept-readable-key.",
         )
@@ -387,7 +387,7 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
         where = quote(str(keystore.root))
         raise KeystoreError(
             f"the Zenoh configuration of enclave {name} is not in step with the keystore",
-            "It states the rights of other enclaves otherwise than their permissions.",
+            "It contains rights of other enclaves that differ from their permissions.",
             f"Write it again: `sros zenoh {where}`, and restart the processes that it names.",
         )
 

@@ -102,7 +102,7 @@ def window(now: datetime, span: Span) -> Window:
         raise UsageError(
             f"the validity of what is signed at {iso(now)} is not within the years {_FIRST_YEAR} "
             "to 9999",
-            "A certificate cannot name other years.",
+            "Certificates cannot contain other years.",
             "Set the clock of this machine, or choose a shorter validity.",
         )
     if end <= moment:

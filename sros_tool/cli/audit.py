@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 @click.option(
     "--vendor",
     type=click.Choice([vendor.value for vendor in Vendor]),
-    help="The vendor whose decision counts. [default: the vendor of this machine's RMW]",
+    help="Decide as this DDS vendor does. [default: the vendor of this machine's RMW]",
 )
 @click.option(
     "--patch",
@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 @click.option(
     "--partial",
     is_flag=True,
-    help="Let the exit status tell only of the nodes that were seen and judged.",
+    help="Exit with 0 although some nodes were not seen or not judged, if nothing is denied.",
 )
 @fleet_option("The robots that the placeholders of POLICY stand for.")
 @force_option
@@ -193,11 +193,11 @@ _NOT_ALL = (
     "the exit status is 1 for what was not seen or not judged: --watch finds nodes that start "
     "later, and --partial accepts it"
 )
-_NO_PATCH = "no patch was written: no right that could be added would allow it"
+_NO_PATCH = "no patch was written: no added right would allow what is denied"
 
 
 def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
-    """Write the rights to add to ``patch``; return what was done, "" if there is nothing to add."""
+    """Write missing rights to ``patch``; return what was done in words, "" if none is missing."""
     from sros_tool.graph.learn import render
 
     if patch is None or not audited.missing.profiles:
@@ -220,7 +220,7 @@ def _denied(audited: Audit) -> list[str]:
 
 
 def _show(audited: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None:
-    """Print what is denied and unseen; the verdict names everything that it does not cover."""
+    """Print denied rights, unseen nodes and a verdict that says what the audit did not cover."""
     for line in (*_denied(audited), *(f"not seen: {node}" for node in audited.unseen)):
         echo(line)
     what = [counted(len(audited.denied), "right")] if audited.denied else []
@@ -240,4 +240,4 @@ def _show(audited: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> No
         verdict += f"; the ROS graph kept changing for {kept_changing:.0f} s"
     echo(verdict, err=True)
     if any(denied_right.by_rule for denied_right in audited.denied):
-        echo("a DENY denies some of it; no right that is added changes that", err=True)
+        echo("some of it is denied by a DENY, which no added right overrides", err=True)

@@ -1,4 +1,4 @@
-"""What verbs print that change a keystore: the change, what of the past still works, what is left.
+"""The output of verbs that change a keystore: changes, old files that still work, next steps.
 
 The change itself goes to standard output, or what ``--json`` prints; all else to standard error.
 """
@@ -27,7 +27,7 @@ _CLOSED_SHOWN = 3
 
 
 def json_form(result: Changed, form: str, **more: object) -> tuple[object, ...]:
-    """Return what ``--json`` prints of a change; ``form`` is a class in `lifecycle.shown`."""
+    """Convert a change to the ``--json`` class ``form``, one of `lifecycle.shown`."""
     from sros_tool.keystore.lifecycle import shown
 
     return shown.shown(result, getattr(shown, form), **more)
@@ -75,7 +75,7 @@ def print_follow_up(
     exported: bool = True,
     restart: bool = True,
 ) -> None:
-    """Print on standard error what follows from a change; arguments as of `print_changed`."""
+    """Print the next steps after a change on standard error; arguments as for `print_changed`."""
     if not result.dry_run:
         _print_closed(result.root, result.changes)
     if rights:  # on stderr, because stdout is that of ros2/sros2
@@ -93,7 +93,7 @@ def _tell(lines: Iterable[str]) -> None:
 
 
 def print_plan(root: Path, changes: Sequence[Change]) -> None:
-    """Print the changes that a dry run did not make."""
+    """Print the files that a dry run would change."""
     for change in changes:
         echo(f"would {change.action} {root / change.path}")
     if not changes:
@@ -101,7 +101,7 @@ def print_plan(root: Path, changes: Sequence[Change]) -> None:
 
 
 def _print_closed(root: Path, changes: Sequence[Change]) -> None:
-    """Say on stderr what a first write did: keys closed to others, what was taken over on trust."""
+    """Report on stderr keys that were closed to other users, and adoption of an sros2 keystore."""
     if any(change.action == "adopt" for change in changes):
         echo(
             f"took over '{root}', which ros2/sros2 made: it has settings and a ledger from now on. "
@@ -125,7 +125,7 @@ def _print_closed(root: Path, changes: Sequence[Change]) -> None:
 
 
 def rights_lines(replaced: Sequence[ReplacedRights], *, dry_run: bool) -> Iterable[str]:
-    """Yield what enclaves lose and gain."""
+    """Yield a line for every right that an enclave loses or gains."""
     together: dict[tuple[str, str], list[str]] = {}
     for rights in replaced:
         for verb, text in (("lose", rights.loses()), ("gain", rights.gains())):
@@ -137,7 +137,7 @@ def rights_lines(replaced: Sequence[ReplacedRights], *, dry_run: bool) -> Iterab
 
 
 def shown_names(names: Sequence[str]) -> str:
-    """Return the first names, and the number of the others."""
+    """Return the first names in words, and the number of the others: "/a, /b and 3 more"."""
     return first_few(names, _NAMES_SHOWN)
 
 

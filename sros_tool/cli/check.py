@@ -94,18 +94,18 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     type=_LEVELS,
     default="warning",
     show_default=True,
-    help="Lowest severity that is shown.",
+    help="Show only findings of this severity or higher.",
 )
 @click.option(
     "--fail-on",
     type=click.Choice(["note", "warning", "error", "never"]),
     default="warning",
     show_default=True,
-    help="Lowest severity that makes the exit status 1. Findings of this severity are shown, "
-    "whatever --severity says.",
+    help="Exit with 1 if there is a finding of this severity or higher. Such findings are "
+    "always shown, even below --severity.",
 )
 @click.option(
-    "--strict", is_flag=True, help="Report findings that the keystore's template accepts."
+    "--strict", is_flag=True, help="Also report findings that the keystore's template accepts."
 )
 @click.option(
     "--policy",
@@ -121,7 +121,7 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     type=PATH,
     multiple=True,
     metavar="FILE",
-    help="Decide whether the requirements in this TOML file hold, for all names.",
+    help="Check that the policy or keystore fulfils the requirements in this TOML file.",
 )
 @click.option(
     "--requirements-before",
@@ -129,24 +129,24 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     type=PATH,
     multiple=True,
     metavar="FILE",
-    help="Report the requirements of this earlier file that --requirements no longer has.",
+    help="An earlier version of the --requirements file: report requirements that were "
+    "dropped since.",
 )
 @click.option(
     "--template",
     metavar="TEMPLATE",
     shell_complete=complete_template,
-    help="Decide --requirements with the protection of this keystore template.",
+    help="With --requirements: assume the protection of this keystore template.",
 )
 @click.option(
     "--suggest",
     is_flag=True,
-    help="Print requirements that hold today, as TOML, to keep or to strike.",
+    help="Print, as TOML, requirements that the policy fulfils now: keep those that you want.",
 )
 @click.option(
     "--vendor",
     type=click.Choice([*(vendor.value for vendor in MEASURED), "zenoh"]),
-    help="Report only findings that concern this DDS vendor, or with zenoh only those that concern "
-    "Zenoh.",
+    help="Report only findings for this DDS vendor, or for Zenoh.",
 )
 @click.option(
     "--domain", metavar="ID", help="The ROS domain that the enclaves must be able to join."
@@ -169,12 +169,12 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     type=click.Choice(["text", "json", "sarif", "markdown"]),
     default="text",
     show_default=True,
-    help="Output for people, programs, code hosts, or a comment on a pull request.",
+    help="Output format: text, JSON, SARIF for code hosts, or Markdown for a pull request.",
 )
 @click.option(
     "--watch",
     is_flag=True,
-    help="With `runtime`: go on, and report each change among the processes once.",
+    help="With `runtime`: keep running, and report when processes change.",
 )
 @json_option
 @click.option("--sarif", "as_sarif", is_flag=True, help="The same as --format sarif.")
@@ -264,7 +264,7 @@ def check(
     if watch:
         if family != "runtime" or form not in ("text", "json") or moment:
             raise UsageError(
-                "--watch is for `sros check runtime`, as text or with --json, and for now",
+                "--watch is for `sros check runtime`, as text or --json, without --at",
                 "",
                 "Write `sros check runtime --watch`.",
             )
@@ -305,7 +305,7 @@ def _requirements(
     files: tuple[Path, ...],
     earlier: tuple[Path, ...],
 ) -> Callable[[Callable[[Path], System]], list[Finding]] | None:
-    """Return the decision of the requirements in some files, or None without any.
+    """Return a function that checks the requirements of files; None without files.
 
     It gets a function that reads the policy or keystore at a path.
     """
@@ -340,7 +340,7 @@ def _status(chosen: ChosenFindings, fail_on: str) -> int:
 
 
 def _is_named(parameter: str) -> bool:
-    """Return whether the command line has the option of this parameter."""
+    """Return whether the user gave this parameter's option on the command line."""
     source = click.get_current_context().get_parameter_source(parameter)
     return source is ParameterSource.COMMANDLINE
 
@@ -547,7 +547,7 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
 
 
 def renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:
-    """Return the enclaves that need to be renewed within a time as Markdown, or that none does."""
+    """Return the enclaves to renew soon as Markdown, or a sentence that there are none."""
     from sros_tool.markdown import bounded, code, plain
 
     if not lines:
@@ -564,7 +564,7 @@ def _print_markdown(chosen: ChosenFindings, _selection: FindingFilter) -> None:
 
 
 def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
-    """Return a fleet with the paths of its enclaves in policy files."""
+    """Return the fleet with the enclave paths that policy files define for it."""
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.policy.document import read_policy
 
@@ -576,7 +576,7 @@ def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
 
 
 def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Finding, str]]:
-    """Yield findings, and the robots for which the same one is left out.
+    """Merge findings that differ only in the robot; yield each with the other robots.
 
     It is the same if it is about the same line of the policy, in the enclave of another robot.
     """
@@ -660,7 +660,7 @@ class MachineReport(NamedTuple):
 
     diagnosis: Diagnosis
     ros2_security: SecurityProvider | None
-    """Whose command ``ros2 security`` is; null without ros2, or if no package has it."""
+    """The package that provides ``ros2 security``; null without ros2, or if no package does."""
     findings: Sequence[Finding]
     """Findings of ``sros check runtime``."""
 
@@ -680,8 +680,8 @@ _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "report",
     metavar="FILE",
     type=PATH,
-    help="Also write FILE, to attach to a bug report: versions, environment and findings, without "
-    "secrets and without names of hosts, users and paths.",
+    help="Also write a report for a bug report to FILE: versions, environment and "
+    "findings, without secrets and without names of hosts, users and paths.",
 )
 @force_option
 @json_option
@@ -771,7 +771,7 @@ def _report_sections(
 _SECONDS = 2.0
 """Time between two looks at the processes."""
 _AGAIN = timedelta(minutes=1)
-"""Time after which unchanged processes are judged again, because files expire."""
+"""Seconds after which unchanged processes are checked again, because files expire."""
 _ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -813,7 +813,9 @@ def _watch_processes(
 @keystore_argument()
 @output_option("Replace FILE at once, which ends in .prom, instead of printing.")
 @click.option(
-    "--earliest", is_flag=True, help="Leave out the files of single enclaves, for large keystores."
+    "--earliest",
+    is_flag=True,
+    help="Print only the earliest expiry, not that of every enclave; for large keystores.",
 )
 @click.option(
     "--policy",
@@ -821,13 +823,14 @@ def _watch_processes(
     type=PATH,
     multiple=True,
     metavar="FILE",
-    help="Also count where the keystore differs from this policy.  Can be repeated.",
+    help="Also print the number of differences between the keystore and this policy.  Can "
+    "be repeated.",
 )
 @fleet_option("The robots that the placeholders of the policies stand for.")
 @click.option(
     "--runtime",
     is_flag=True,
-    help="Also count the ROS processes that run here, by the state of their security.",
+    help="Also print the number of running ROS processes, by the state of their security.",
 )
 @dry_run_option
 @json_option

@@ -1,4 +1,4 @@
-"""What several verbs share: options, safe output, progress, times, secrets and logs."""
+"""Parts shared by several verbs: options, safe output, progress, times, secrets and logs."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def dry_run_option(function: Decorated) -> Decorated:
 
 
 class _MeasuredVendors(click.Choice):  # type: ignore[type-arg]  # generic from click 8.2 on
-    """The vendors whose DDS was measured; they are imported when the option is used."""
+    """An option type: the measured DDS vendors, imported only when the option is used."""
 
     def __init__(self) -> None:
         self.case_sensitive = True
@@ -125,8 +125,8 @@ def allow_refusal_option(function: Decorated) -> Decorated:
         multiple=True,
         type=_MeasuredVendors(),
         callback=_as_vendors,
-        help="Go on although this DDS then refuses enclaves that it accepts today.  Can be "
-        "repeated.",
+        help="Make the change even if this DDS vendor will then refuse enclaves that it "
+        "accepts now.  Can be repeated.",
     )(function)
 
 
@@ -155,8 +155,8 @@ def fleets_option(function: Decorated) -> Decorated:
         type=PATH,
         multiple=True,
         metavar="FILE",
-        help="The robots that the placeholders of policies stand for; the second one is for the "
-        "second policy.",
+        help="Fleet file whose robots replace the placeholders of the policies; give it twice "
+        "for different fleets of the first and the second policy.",
     )(function)
 
 
@@ -171,7 +171,7 @@ def fleets_of(files: Sequence[Path]) -> tuple[Fleet | None, Fleet | None]:
 
 
 def fleet_policies(files: Sequence[Path], fleet_file: Path) -> list[FleetPolicy]:
-    """Return the policies in files, for the fleet in the file that --fleet names."""
+    """Return the policies in files, expanded for the fleet in the --fleet file."""
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.policy.document import read_policy
@@ -181,7 +181,7 @@ def fleet_policies(files: Sequence[Path], fleet_file: Path) -> list[FleetPolicy]
 
 
 def policy_for(file: Path, fleet_file: Path | None) -> Policy:
-    """Return the policy in a file, for the fleet in the file that --fleet names, if it does."""
+    """Return the policy in a file, expanded for the fleet in the --fleet file if there is one."""
     from sros_tool.fleet.expansion import read_policy_for
     from sros_tool.fleet.fleet_file import read_fleet
 
@@ -189,7 +189,7 @@ def policy_for(file: Path, fleet_file: Path | None) -> Policy:
 
 
 def only_enclaves(when: str = "Only") -> Callable[[Decorated], Decorated]:
-    """Add ``--match PATTERN`` and ``--robot NAME`` to a verb that is for all enclaves otherwise."""
+    """Add ``--match PATTERN`` and ``--robot NAME`` to a verb whose default is all enclaves."""
 
     def add(function: Decorated) -> Decorated:
         function = robot_option(f"{when} the enclaves of this robot of the fleet.")(function)
@@ -212,7 +212,7 @@ def several_enclaves(function: Decorated) -> Decorated:
         "patterns",
         multiple=True,
         metavar="PATTERN",
-        help="All enclaves that match, such as '/arm/*'; * also matches '/'.  Can be repeated.",
+        help="Enclaves whose names match, such as '/arm/*'; * also matches '/'.  Can be repeated.",
     )(function)
     return click.option("--all", "every", is_flag=True, help="All enclaves of the keystore.")(
         function
@@ -337,7 +337,7 @@ def keystore_from_environment() -> Path:
     if not root:
         raise UsageError(
             "no keystore is named",
-            f"There is no keystore argument, and {KEYSTORE_VARIABLE} is not set.",
+            f"The command has no keystore argument, and {KEYSTORE_VARIABLE} is not set.",
             f"Name the keystore's folder, or set {KEYSTORE_VARIABLE}.",
         )
     return Path(root)
@@ -381,7 +381,7 @@ def words_argument(metavar: str, **more: Any) -> Callable[[Decorated], Decorated
 
 
 def _completions(names: Iterable[str], incomplete: str) -> list[str]:
-    """Return the names that begin so, and that a shell can show on its line."""
+    """Return the names that start with ``incomplete`` and that a shell can show on one line."""
     return [name for name in names if name.startswith(incomplete) and visible_line(name) == name]
 
 
@@ -427,7 +427,7 @@ def json_text(value: object) -> str:
 
 
 def print_json(value: object) -> None:
-    """Print what ``--json`` shows of a verb on stdout; the type of ``value`` says the keys."""
+    """Print ``value`` as a verb's ``--json`` output on stdout; its type defines the keys."""
     from sros_tool.values import versioned
 
     echo_lines(json_text(versioned(value)))
@@ -449,7 +449,7 @@ def check_output(output: Path, *, force: bool) -> None:
             ``force``.
     """
     if str(output) == "-":
-        raise UsageError("'-' is not the name of a file", "", "Name a file.")
+        raise UsageError("'-' is not a file name here", "", "Name a file.")
     if not output.absolute().parent.is_dir():
         raise UsageError(
             f"cannot write '{output}'", "Its folder does not exist.", "Create the folder first."
@@ -619,7 +619,7 @@ _KEY_PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS
 
 @contextmanager
 def secrets_taken() -> Iterator[None]:
-    """Keep the variables with secrets for this process alone: no process that it starts gets them.
+    """Remove secrets from this process's environment, so that child processes do not get them.
 
     Neither do commands that replace this process, as of ``sros run``.
     """
@@ -634,7 +634,7 @@ def secrets_taken() -> Iterator[None]:
 
 
 def taken_secrets() -> tuple[str, ...]:
-    """Return the values of the variables with secrets, for what has to leave them out."""
+    """Return the values of the secrets that were removed from the environment, for redaction."""
     return tuple(_taken.values())
 
 
@@ -642,8 +642,8 @@ key_option = click.option(
     "--key",
     metavar="URI",
     default="",
-    help="Where the key is on a token, or where to make it: pkcs11:token=NAME;object=LABEL. "
-    "Only Fast DDS can use it.",
+    help="URI of the private key on a PKCS#11 token, pkcs11:token=NAME;object=LABEL; the "
+    "key is created if missing. Only Fast DDS can use it.",
 )
 
 
@@ -750,14 +750,14 @@ def read_named(path: Path, what: str, *, most: int = 16 * 1024 * 1024) -> bytes:
     if not data:
         raise DocumentError(
             f"the {what} is empty",
-            "Nothing came from standard input.",
-            "Check the command that sends it.",
+            "Standard input had no data.",
+            "Check the command that writes to the pipe.",
         )
     return data
 
 
 _WRITER_WITHIN = 5.0
-"""How long a writer of a pipe is waited for, in seconds: both may have just been started."""
+"""Seconds to wait for a pipe's writer, which may have been started at the same time."""
 
 
 def _read_at_most(path: Path, count: int) -> bytes:
@@ -782,7 +782,7 @@ def _read_at_most(path: Path, count: int) -> bytes:
 
 
 def _first_of_pipe(handle: int, path: Path) -> bytes:
-    """Return at most one byte of a pipe, as soon as it has, or had, a writer.
+    """Wait for a writer of a pipe; return the first byte, or b"" if the writer wrote nothing.
 
     Raises:
         OSError: nobody opens it for writing.
@@ -884,7 +884,7 @@ def _wrapped(text: str, indent: str) -> list[str]:
 
 
 def print_signed(groups: Sequence[Sequence[Finding]], files: Iterable[str]) -> None:
-    """Print on stderr what is wrong with the policies, in ``files``, of signed permissions."""
+    """Print on stderr the findings about policies whose permissions were just signed."""
     from sros_tool.checks.kind import Severity
 
     for group in groups[:_MOST_SHOWN]:
@@ -908,11 +908,11 @@ _MOST_SHOWN = 3
 
 _FIRST, _EVERY = 1.0, 0.5  # seconds
 _ESTIMATED = 3.0
-"""Seconds from which on the time that is left is shown."""
+"""Seconds of work after which the remaining time is shown, too."""
 
 
 class _Line:
-    """A line on the terminal that a timer draws again and again.
+    """A progress line on the terminal that a timer redraws.
 
     The timer is a signal: unlike a thread, it does not get in the way of the processes that are
     forked for the work, and they do not inherit it.
@@ -957,7 +957,7 @@ class _Line:
 
 
 def _rounded(seconds: float) -> str:
-    """Return a time as text, in minutes from two on."""
+    """Return a duration as text, in minutes if it is two minutes or longer."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 

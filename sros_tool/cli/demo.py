@@ -48,7 +48,7 @@ def _complete_scenario(
     type=click.Choice(["auto", "rclpy", "cyclone", "zenoh"]),
     default="auto",
     show_default=True,
-    help="What the nodes run on; auto uses rclpy if its RMW enforces security, else Cyclone DDS.",
+    help="Middleware of the nodes; auto uses rclpy if its RMW enforces security, else Cyclone DDS.",
 )
 @click.option(
     "--scenario",
@@ -56,7 +56,7 @@ def _complete_scenario(
     multiple=True,
     metavar="NAME",
     shell_complete=_complete_scenario,
-    help="What to show: a name of --list, `all`, or your own TOML file; can be repeated.",
+    help="Scenario to run: a name from --list, `all`, or your own TOML file; can be repeated.",
 )
 @click.option("--list", "list_them", is_flag=True, help="List the scenarios.")
 @click.option(
@@ -75,7 +75,8 @@ def _complete_scenario(
     "--accept-open",
     multiple=True,
     metavar="ROW",
-    help="Accept that this attack succeeds in the keystore, or is not tried; can be repeated.",
+    help="Exit with 0 even if this attack succeeds or cannot be tried in your keystore; "
+    "can be repeated.",
 )
 @click.option("--topic", help="ROS topic of talkers and listeners.  [default: /chatter]")
 @click.option(
@@ -83,7 +84,7 @@ def _complete_scenario(
     type=int,
     default=80,
     show_default=True,
-    help="Domain id of the first row; each further row uses the next one.",
+    help="Domain id of the first row; every following row uses the next id.",
 )
 @click.option(
     "--template",
@@ -96,7 +97,7 @@ def _complete_scenario(
     type=click.Choice(["auto", "host"]),
     default="auto",
     show_default=True,
-    help="auto uses a separate network namespace if the system allows it.",
+    help="Network of the nodes; auto uses a separate network namespace if the system allows it.",
 )
 @click.option(
     "--keep",

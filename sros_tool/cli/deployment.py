@@ -194,13 +194,15 @@ def _refuse_terminal() -> None:
 
 @verb("verify")
 @keystore_argument("folder", "[DIR]")
-@click.option("--domain", metavar="ID", help="Also check whether enclaves may join this domain.")
+@click.option("--domain", metavar="ID", help="Also check that the enclaves may join this domain.")
 @click.option(
     "--at", metavar="MOMENT", help="Check as of a date (2027-06-01) or time from now (90d)."
 )
 @only_enclaves()
 @click.option(
-    "--tokens", is_flag=True, help="Also have each token prove that it has its key: needs the PIN."
+    "--tokens",
+    is_flag=True,
+    help="Also check that the PKCS#11 tokens have the enclaves' keys; needs the PINs.",
 )
 @json_option
 def verify(
@@ -343,21 +345,21 @@ def create_request(
 @click.option(
     "--no-answer",
     is_flag=True,
-    help="Sign, but write no answer: deliver with `distribute_key --keyless`.  REQUEST may then "
-    "hold several requests: all are signed, or none; one whose key already has a certificate "
-    "changes nothing.",
+    help="Do not write an answer file; deliver later with `distribute_key --keyless`.  "
+    "REQUEST may then hold several requests: all are signed, or none; a request whose"
+    " key already has a certificate changes nothing.",
 )
 @click.option(
     "--enclave",
     "only",
     multiple=True,
     metavar="NAME",
-    help="The enclave that REQUEST must be for. A revoked enclave gets a new certificate only if "
-    "it is named here. For several requests, once for each, in their order.",
+    help="Accept REQUEST only for this enclave; needed to certify a revoked enclave again."
+    " For several requests, give the option once for each request, in the same order.",
 )
 @allow_refusal_option
 @click.option(
-    "--refuse-revoked", is_flag=True, help="Refuse a revoked enclave also if --enclave names it."
+    "--refuse-revoked", is_flag=True, help="Refuse a revoked enclave even if --enclave names it."
 )
 @dry_run_option
 @json_option

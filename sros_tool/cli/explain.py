@@ -146,21 +146,25 @@ def _refuse_ignored(mode: str) -> None:
     shell_complete=_complete_words,
 )
 @click.option(
-    "--type", "kind", type=click.Choice(["topic", "service", "action"]), help="Type of NAME."
+    "--type",
+    "kind",
+    type=click.Choice(["topic", "service", "action"]),
+    help="Whether NAME is a topic, a service or an action.",
 )
 @click.option("--keystore", type=PATH, metavar="ROOT", help="A keystore, or an enclave's folder.")
 @click.option(
     "--policy",
     type=PATH,
     metavar="FILE",
-    help="Policy that the permissions were made from; without a keystore, explain this policy.",
+    help="Policy that the permissions were made from, to show its lines; without a "
+    "keystore, explain this policy.",
 )
 @fleet_option("The robots that placeholders of --policy stand for. [default: the keystore's]")
 @click.option(
     "--vendor",
     type=click.Choice([*(each.value for each in Vendor), _ZENOH]),
-    help="The vendor whose decision counts; zenoh: what Zenoh does with the files of `sros zenoh`."
-    " [default: the vendor of this machine's RMW]",
+    help="Decide as this DDS vendor does; zenoh: as Zenoh does with the files of `sros "
+    "zenoh`. [default: the vendor of this machine's RMW]",
 )
 @click.option("--all-vendors", is_flag=True, help="Compare the decisions of all vendors.")
 @click.option(
@@ -178,13 +182,15 @@ def _refuse_ignored(mode: str) -> None:
     help="Time zone of the robot, in which Fast DDS reads dates: Asia/Tokyo. "
     "[default: this machine's]",
 )
-@click.option("--who", is_flag=True, help="Show which enclaves of the keystore may do it.")
+@click.option(
+    "--who", is_flag=True, help="Show which enclaves of the keystore may do the operation on NAME."
+)
 @only_enclaves("With --who: only")
 @click.option(
     "--reach",
     metavar="ENCLAVE",
     shell_complete=_complete_enclave,
-    help="Show which enclaves this one can influence and learn from, over any number of hops.",
+    help="Show which enclaves ENCLAVE can influence and learn from, directly or through others.",
 )
 @click.option(
     "--infrastructure",
@@ -247,7 +253,7 @@ def explain(
     if sum((who, bool(reach), bool(logs))) > 1:
         raise UsageError("--who, --reach and --log exclude each other")
     if len(logs) > 1:
-        raise UsageError("--log takes one log", "", "Ask once for each log.")
+        raise UsageError("--log takes one log", "", "Run the command once for each log.")
     mode = "--who" if who else "--reach" if reach else "--log" if logs else ""
     _refuse_ignored(mode)
     if fleet_file and not policy:
@@ -295,7 +301,7 @@ def explain(
 def _split(
     words: tuple[str, ...], keystore: Path | None, *, verb: int
 ) -> tuple[Path | None, tuple[str, ...]]:
-    """Return the keystore, if it is the first word or named by the option, and the other words.
+    """Split off the keystore (first word, or the option); return it and the other words.
 
     ``verb`` is the index of the operation (such as publish) in ``words`` without a keystore.
     """
@@ -319,7 +325,7 @@ def _is_word(words: tuple[str, ...], place: int) -> bool:
 def _circumstances(
     moment: str | None, domain: str | None, zone: str | None, fleet_file: Path | None
 ) -> AskingContext:
-    """Return what --at, --domain, --time-zone and --fleet say, or their defaults."""
+    """Return the values of --at, --domain, --time-zone and --fleet, or their defaults."""
     from sros_tool.explain.asking import AskingContext
 
     return AskingContext(
@@ -364,7 +370,7 @@ def _open(root: Path | None, name: str, policy: Path | None, asking: AskingConte
 
 
 def _policy_alone(root: Path | None, asked: AskedEnclave, policy: Path | None) -> list[Note]:
-    """Return a note if a policy was asked although a keystore is set in the environment."""
+    """Return a note if the policy was explained although $ROS_SECURITY_KEYSTORE is set."""
     from sros_tool.runtime.variables import KEYSTORE
 
     default = os.environ.get(KEYSTORE)
@@ -608,7 +614,7 @@ def _names(names: Sequence[str]) -> str:
 
 
 def _message_lines(checks: Sequence[Check]) -> Iterator[str]:
-    """Yield for each message on a link who passes it by which rule, or drops it."""
+    """Yield, for every message on a link, the enclaves and rules that pass or drop the message."""
     decided: dict[tuple[str, str], list[str]] = {}
     for check in checks:
         way = "leaving" if check.flow == "egress" else "entering"
@@ -621,7 +627,7 @@ def _message_lines(checks: Sequence[Check]) -> Iterator[str]:
 
 
 def _link_text(link: CheckedLink) -> str:
-    """Return what happens on one of several links: whether all messages pass."""
+    """Return the result for one of several links in words: whether all messages pass."""
     dropped = next((check for check in link.checks if not check.allowed), None)
     if dropped is None:
         return "passes"
@@ -729,7 +735,7 @@ def _show_reach(
     if root is None and len(rest) == 1:
         root, rest = Path(rest[0]), ()
     if rest:
-        raise UsageError("--reach takes one enclave, and no question")
+        raise UsageError("--reach takes an enclave, and no operation or name")
     if zenoh and policy:
         raise UsageError("--reach on Zenoh takes no --policy", "It reads the files of Zenoh.")
     if zenoh:
@@ -753,7 +759,7 @@ def _show_reach(
 
 
 def _followed_lines(followed: FollowedReach) -> Iterator[str]:
-    """Yield the enclaves that one influences and learns from, each with a shortest path.
+    """Yield the enclaves that an enclave influences and learns from, with a shortest path to each.
 
     The enclaves of a fleet are folded by robot.
     """

@@ -1,4 +1,4 @@
-"""The verbs of a fleet: its robots, and what each has, by what it confirmed."""
+"""The verbs `sros fleet ...`: list robots, store their reports, compare them with the keystore."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 class _Fleet(Verb, click.Group):
-    """A group of verbs."""
+    """A click group whose subcommands are verbs."""
 
     command_class = Verb
 
@@ -62,12 +62,12 @@ def fleet() -> None:
 
 @fleet.command("inventory")
 @keystore_argument()
-@click.option("--yaml", "as_yaml", is_flag=True, help="Print YAML in place of JSON.")
+@click.option("--yaml", "as_yaml", is_flag=True, help="Print YAML instead of JSON.")
 @click.option(
     "--list",
     "as_list",
     is_flag=True,
-    help="Print what Ansible takes from a program that it runs as an inventory.",
+    help="Print the format of Ansible's dynamic inventory scripts.",
 )
 def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
     """Print the robots of the keystore ROOT as an inventory of Ansible.
@@ -124,7 +124,7 @@ def _report(folder: Path, robot: str) -> None:
     metavar="NAME",
     required=True,
     shell_complete=complete_robot,
-    help="The robot that it comes from.",
+    help="The robot that the report comes from.",
 )
 @dry_run_option
 @json_option
@@ -186,10 +186,10 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
 @click.option(
     "--max-age",
     metavar="DURATION",
-    help="Count a robot as not confirmed if its last confirmation is older, such as 7d.",
+    help="Treat confirmations older than this, such as 7d, as missing.",
 )
 @click.option("--prometheus", is_flag=True, help="Print metrics for node_exporter's textfile.")
-@click.option("--html", is_flag=True, help="Print a page.")
+@click.option("--html", is_flag=True, help="Print the status as an HTML page.")
 @output_option("Replace FILE at once instead of printing.")
 @dry_run_option
 @json_option
@@ -274,13 +274,13 @@ _WORDS = {
     "revoked": "revoked files",
     "another": "another's files",
 }
-"""How a state is called that is not called by its own name."""
+"""State of a file or robot → its words in the output, if they differ from the state's name."""
 _MOST_LINES, _MOST_GROUPS = 50, 3
-"""How many files of a robot are listed, and how many groups or unrecorded enclaves."""
+"""Maximum number of listed files of a robot, and of listed groups or unrecorded enclaves."""
 
 
 def _lines(status: FleetStatus, moment: datetime, robots: Sequence[str]) -> Iterator[str]:
-    """Yield the numbers first, then the robots that need something, or those that were named."""
+    """Yield the counts, then a line for every robot that is not current, or that was named."""
     counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
     yield f"{counted(len(status.robots), 'robot')}: {counts}"
     if status.stage != "complete":
@@ -314,7 +314,7 @@ def _lines(status: FleetStatus, moment: datetime, robots: Sequence[str]) -> Iter
 
 
 def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
-    """Yield what a robot has that it should not have, the worst first."""
+    """Yield in words how a robot's files differ from what it should have, the worst first."""
     if robot.state == "never":
         yield counted(robot.enclaves, "enclave")
     if robot.revoked:

@@ -45,12 +45,13 @@ _INDENT = "  "
     "--ca",
     "authority",
     type=PATH,
-    help="Permissions CA certificate that verifies a signed document.",
+    help="Verify the signed document PATH with this permissions CA certificate.",
 )
 @click.option(
     "--history",
     is_flag=True,
-    help="Show everything that the keystore PATH ever issued, with its current state.",
+    help="List all certificates and documents that the keystore PATH ever issued, with "
+    "their current state.",
 )
 @json_option
 def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) -> int:
@@ -86,7 +87,7 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
     signature = getattr(described, "signature", None)
     if authority and signature is None:
         raise UsageError(
-            f"--ca verifies a signed document, and '{path}' is of the kind {described.kind}",
+            f"--ca applies only to signed documents, not to '{path}' ({described.kind})",
             "",
             "Leave --ca out, or name a governance.p7s, permissions.p7s or session.p7s.",
         )

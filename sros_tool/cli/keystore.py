@@ -88,7 +88,7 @@ def create_enclave(words: tuple[str, ...], key: str, dry_run: bool, as_json: boo
 _revoke_old_option = click.option(
     "--revoke-old",
     is_flag=True,
-    help="Also issue the certificates again, and revoke all earlier ones.",
+    help="Revoke the replaced permissions: reissue the certificates, and revoke all earlier ones.",
 )
 
 
@@ -180,7 +180,7 @@ class _SeveralEnclavesAndPolicies(SeveralValues):
     multiple=True,
     type=PATH,
     metavar="FILE...",
-    help="Policies: create their enclaves, with the permissions stated.",
+    help="Policies whose enclaves are created, with the permissions that the policies state.",
 )
 @fleet_option(
     "The robots that the placeholders of the policies stand for: a TOML file, or an inventory of "
@@ -190,7 +190,7 @@ class _SeveralEnclavesAndPolicies(SeveralValues):
     "--template",
     "template_name",
     metavar="NAME|FILE",
-    help="Template to create a missing keystore from: a name, or a TOML file.  "
+    help="Template for a keystore that does not exist yet: a name, or a TOML file.  "
     "[default: development]",
     shell_complete=complete_template,
 )
@@ -319,7 +319,7 @@ def _created_lines(result: Creation) -> Iterator[str]:
 
 
 def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
-    """Yield how to send many new enclaves, and which enclaves did not change."""
+    """Yield hints for standard error: how to export new enclaves, and unchanged enclaves."""
     from sros_tool.keystore.layout import FLEET
 
     if len(result.created) > _MANY_CREATED and not (as_json or result.dry_run):
@@ -403,7 +403,8 @@ if TYPE_CHECKING:
 @click.option(
     "--domain",
     metavar="IDS",
-    help="ROS domains of its enclaves, as 0 or 0,7 or 10-19. [default: $ROS_DOMAIN_ID, or 0]",
+    help="ROS domains of the keystore's enclaves, such as 0 or 0,7 or 10-19. [default: "
+    "$ROS_DOMAIN_ID, or 0]",
 )
 @click.option(
     "--ca-layout",
@@ -413,23 +414,37 @@ if TYPE_CHECKING:
 @click.option(
     "--ca-validity",
     metavar="SPAN",
-    help="How long the CAs are valid: a duration (5y), an end date (2031-01-01), or a start and "
-    "one of both (2026-12-01/5y).",
+    help="Validity of the CAs: a duration (5y), an expiry date (2031-01-01), or an "
+    "interval (2026-12-01/5y).",
 )
-@click.option("--validity", metavar="SPAN", help="How long certificates are valid.")
-@click.option("--permissions-validity", metavar="SPAN", help="How long permissions are valid.")
+@click.option(
+    "--validity", metavar="SPAN", help="Validity of certificates, written as for --ca-validity."
+)
+@click.option(
+    "--permissions-validity",
+    metavar="SPAN",
+    help="Validity of permissions, written as for --ca-validity.",
+)
 @click.option(
     "--identity-ca",
     type=PATH,
     help="Certificate of an existing identity CA, with its chain; needs --identity-key.",
 )
-@click.option("--permissions-ca", type=PATH, help="The same for the permissions CA.")
+@click.option(
+    "--permissions-ca",
+    type=PATH,
+    help="Certificate of an existing permissions CA, with --permissions-key.",
+)
 @click.option(
     "--identity-key",
     metavar="URI",
-    help="Where the identity CA's key is, or where to make it: file:PATH or pkcs11:...",
+    help="Private key of the identity CA, created if missing: file:PATH or pkcs11:...",
 )
-@click.option("--permissions-key", metavar="URI", help="The same for the permissions CA.")
+@click.option(
+    "--permissions-key",
+    metavar="URI",
+    help="Private key of the permissions CA, like --identity-key.",
+)
 @click.option(
     "--encrypt-ca-keys", is_flag=True, help="Protect new CA keys in files with a passphrase."
 )
@@ -571,7 +586,7 @@ def _print_open_rights(root: Path, template: Template) -> None:
 
 
 def _open_rights(root: Path, template: Template) -> list[Note]:
-    """Return what a template leaves open."""
+    """Return warnings about what a template permits that should be restricted."""
     from sros_tool.keystore.template import EVERYTHING
 
     change = f"`sros update_keystore {quote(str(root))} --template production`"
@@ -599,7 +614,7 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
     "--template",
     "template_name",
     metavar="NAME|FILE",
-    help="Take over all settings of a template: a name, or a TOML file.",
+    help="Apply all settings of a template: a name, or a TOML file.",
     shell_complete=complete_template,
 )
 @click.option(
@@ -614,7 +629,7 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
     "rules",
     multiple=True,
     metavar="RULE",
-    help="Protect a topic, service or action in its own way: 'topic /camera/* data=NONE "
+    help="Set the protection of a topic, service or action: 'topic /camera/* data=NONE "
     "metadata=SIGN'.",
 )
 @click.option(
@@ -622,9 +637,13 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
     "dropped",
     multiple=True,
     metavar="RULE",
-    help="Remove such a rule: 'topic /camera/*'.",
+    help="Remove a rule that --rule made: 'topic /camera/*'.",
 )
-@click.option("--domain", metavar="IDS", help="The ROS domains of its enclaves: 0 or 0,7 or 10-19.")
+@click.option(
+    "--domain",
+    metavar="IDS",
+    help="New ROS domains of the keystore's enclaves, such as 0 or 0,7 or 10-19.",
+)
 @click.option("--take-edits", is_flag=True, help="Apply the edits in sros.toml or governance.xml.")
 @click.option(
     "--discard-edits", is_flag=True, help="Undo the edits in sros.toml and governance.xml."
@@ -632,11 +651,15 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
 @click.option(
     "--trust-records",
     is_flag=True,
-    help="Trust the rights in a ledger of version 0.1, which has no chain that protects them.",
+    help="Accept the rights in a ledger of version 0.1, which has no hash chain against tampering.",
 )
-@click.option("--next", "next_stage", is_flag=True, help="Do only the next stage.")
 @click.option(
-    "--allow-looser", is_flag=True, help="Allow changes that make something possible that was not."
+    "--next", "next_stage", is_flag=True, help="Make the change in stages: do only the next stage."
+)
+@click.option(
+    "--allow-looser",
+    is_flag=True,
+    help="Allow changes that permit more or protect less than before.",
 )
 @_revoke_old_option
 @allow_refusal_option
@@ -706,7 +729,7 @@ def update_keystore(
         again = f"sros update_keystore {quote(str(root))} --template production --next"
         raise UsageError(
             "no change is named",
-            "A keystore does not keep the goal of a change of which only the first stage is done."
+            "The keystore does not record the settings that the next stage will make."
             if next_stage
             else "",
             f"Name the goal again, with the same options as for that stage, for example `{again}`."
@@ -864,7 +887,7 @@ def _issued_lines(update: KeystoreUpdate) -> Iterator[str]:
 
 
 def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:
-    """Yield until when what an update replaced works, and how to end that."""
+    """Yield until when replaced certificates and permissions still work, and how to end it."""
     from sros_tool.validity import iso
 
     if update.works_until:

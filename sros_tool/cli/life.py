@@ -44,10 +44,10 @@ if TYPE_CHECKING:
 @click.option(
     "--all-expiring",
     metavar="DURATION|PERCENT",
-    help="Also renew the enclaves that expire within DURATION (30d), or have used PERCENT of their "
-    "validity (66%), but not those that were made short-lived: name these.",
+    help="Also renew the enclaves that expire within DURATION (30d), or have used PERCENT "
+    "of their validity (66%). Short-lived enclaves are renewed only if named.",
 )
-@click.option("--new-key", is_flag=True, help="Create new keys as well.")
+@click.option("--new-key", is_flag=True, help="Also create new private keys.")
 @key_option
 @click.option(
     "--revoke-old",
@@ -117,7 +117,7 @@ def renew(
 
 
 def _replaced_lines(result: Changed) -> Iterator[str]:
-    """Yield until when replaced certificates work, and who still has them."""
+    """Yield until when replaced certificates still work, and where copies of them are."""
     from sros_tool.validity import iso
 
     if not result.outcomes and not result.dry_run:
@@ -159,7 +159,8 @@ def _complete_reason(
 @click.option(
     "--until-retired",
     is_flag=True,
-    help="During a CA rotation: revoke without the key of the old identity CA.",
+    help="During a CA rotation: revoke although the old identity CA's key is gone. Its "
+    "certificates are refused only after the stage retire.",
 )
 @allow_refusal_option
 @dry_run_option
@@ -325,32 +326,42 @@ _DONE = {
 @click.option("--identity", is_flag=True, help="Replace only the identity CA.")
 @click.option("--permissions", is_flag=True, help="Replace only the permissions CA.")
 @click.option("--status", is_flag=True, help="Show the stage of the keystore (the default).")
-@click.option("--next", "go_on", is_flag=True, help="Do the next stage.")
+@click.option("--next", "go_on", is_flag=True, help="Perform the next stage of the rotation.")
 @click.option(
     "--to",
     type=click.Choice(["distribute", "reissue", "retire"]),
-    help="Do this stage if it is the next one; do nothing if it is already done.",
+    help="Perform this stage if it is the next one; if it is already done, change nothing.",
 )
-@click.option("--finish", is_flag=True, help="Do all stages that remain, at once.")
+@click.option("--finish", is_flag=True, help="Perform all remaining stages at once.")
 @click.option(
     "--same-key",
     is_flag=True,
     help="Extend the validity of the identity CA, with the same key and without stages.",
 )
 @click.option("--ca-validity", metavar="SPAN", help="How long the new CA is valid, such as 10y.")
-@click.option("--identity-key", metavar="URI", help="Where to make the new key: file: or pkcs11:.")
-@click.option("--permissions-key", metavar="URI", help="The same for the permissions CA.")
+@click.option(
+    "--identity-key",
+    metavar="URI",
+    help="Place of the new identity CA key: file:PATH or pkcs11:...",
+)
+@click.option(
+    "--permissions-key",
+    metavar="URI",
+    help="Place of the new permissions CA key: file:PATH or pkcs11:...",
+)
 @click.option(
     "--encrypt-ca-keys", is_flag=True, help="Protect new keys in files with a passphrase."
 )
 @click.option(
-    "--delete-old-key", is_flag=True, help="Delete the old key: keep no copy in 'retired'."
+    "--delete-old-key",
+    is_flag=True,
+    help="Delete the old CA's private key instead of keeping it in the folder 'retired'.",
 )
 @click.option(
     "--allow-unconfirmed",
     is_flag=True,
-    help="Go on although some robots of the fleet have not confirmed the stage; those robots are "
-    "cut off.",
+    help="Perform the stage even if some robots of the fleet have not confirmed the "
+    "previous stage; they lose communication.",
 )
 @allow_refusal_option
 @json_option

@@ -84,7 +84,7 @@ def observing_options(enclave_help: str) -> Callable[[Decorated], Decorated]:
             click.option(
                 "--watch",
                 metavar="[DURATION]",
-                help="Collect all observations for DURATION, such as 10m, or until Ctrl-C.",
+                help="Keep observing for DURATION, such as 10m, or until Ctrl-C.",
             ),
         ):
             function = option(function)
@@ -305,8 +305,7 @@ class _Words(Watching):
 @click.option(
     "--enclave-per-node",
     is_flag=True,
-    help="Put each process whose enclave the ROS graph does not show into an enclave that is named "
-    "after its node.",
+    help="Give every process without a known enclave an enclave named after its node.",
 )
 @click.option("--flat", is_flag=True, help="Write one file, without includes of common parts.")
 @click.option(
@@ -315,10 +314,14 @@ class _Words(Watching):
     multiple=True,
     type=PATH,
     metavar="LOG...",
-    help="Do not observe; add rights that Fast DDS or Cyclone DDS denied in these logs (- is "
-    "stdin).",
+    help="Do not observe: add the rights that Fast DDS or Cyclone DDS denied in these logs"
+    " (- is stdin).",
 )
-@click.option("--node", metavar="/NS/NAME", help="The node whose profile --from-log adds to.")
+@click.option(
+    "--node",
+    metavar="/NS/NAME",
+    help="With --from-log: the node to whose profile the rights are added.",
+)
 @click.option(
     "--accept",
     is_flag=True,
@@ -386,7 +389,7 @@ def generate_policy(
         if enclave_per_node:
             raise UsageError(
                 "--enclave-per-node is not for --from-log",
-                "A denial in a log is of the enclave that its process ran in.",
+                "A denial in a log belongs to the enclave in which the process ran.",
                 "Leave it out.",
             )
         if accept and file is None:

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 @click.argument("policy", metavar="POLICY", type=PATH)
 @click.argument("others", metavar="OTHER...", type=PATH, nargs=-1, required=True)
 @output_option("Write the result to FILE.")
-@click.option("--in-place", is_flag=True, help="Write the result to POLICY itself.")
+@click.option("--in-place", is_flag=True, help="Overwrite POLICY with the result.")
 @force_option
 @dry_run_option
 @json_option
@@ -160,7 +160,7 @@ def _check_includes(policy: Path, output: Path, document: bytes) -> None:
 @click.option(
     "--no-new-access",
     is_flag=True,
-    help="Find only what B adds to A, decided for all names; what it removes is no difference.",
+    help="Report only access that B gives and A does not, decided for all possible names.",
 )
 @click.option(
     "--format",
@@ -168,7 +168,7 @@ def _check_includes(policy: Path, output: Path, document: bytes) -> None:
     type=click.Choice(["text", "json", "markdown"]),
     default="text",
     show_default=True,
-    help="Output for people, programs, or a comment on a pull request, with a picture.",
+    help="Output format: text, JSON, or Markdown with a picture for a pull request.",
 )
 @json_option
 def diff_policy(
@@ -288,7 +288,7 @@ def _protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> li
 def _difference_lines(
     difference: RightsDifference, first: Fleet | None, second: Fleet | None
 ) -> list[str]:
-    """Return the lines that are shown of a difference: those of a fleet folded by robot."""
+    """Return the lines for a difference; lines that differ only in the robot are merged."""
     from sros_tool.fleet.enclaves import folded
 
     lines: list[tuple[str, str, str]] = []
@@ -324,7 +324,7 @@ class _SeveralObserved(SeveralValues):
     multiple=True,
     type=PATH,
     metavar="OBSERVED...",
-    help="Observed rights: policies by generate_policy, or permissions.",
+    help="Rights that were observed in use: policies from generate_policy, or permissions.",
 )
 @fleet_option("The robots that the placeholders of POLICY stand for.")
 @output_option("Write the narrowed policy to FILE.")
@@ -438,7 +438,7 @@ def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
 
 
 def _as_written(value: Any) -> Any:
-    """Return a JSON value with names as a policy for a fleet has them."""
+    """Return a JSON value with its names written with placeholders, as in a fleet's policy."""
     from sros_tool.fleet.expansion import as_written
 
     if isinstance(value, dict):
@@ -459,15 +459,15 @@ def _as_written(value: Any) -> Any:
     metavar="[DIR]",
     is_flag=False,
     flag_value="policies",
-    help="Copy them to the folder DIR (policies), as a start for your own; to a DIR named common, "
-    "only the common parts.",
+    help="Copy the policies to the folder DIR, as a start for your own; if DIR is named "
+    "common, only the common parts.",
 )
 @click.option(
     "--convert",
     "earlier",
     type=PATH,
     metavar="OLD",
-    help="Convert the policy OLD of version 0.1.0 to the present format.",
+    help="Convert the policy OLD from format 0.1.0 to the current format.",
 )
 @click.option(
     "--with-node-rights",
@@ -628,7 +628,7 @@ def _convert(
 
 
 _MOST_NEW_LINES = 20
-"""Lines of reach that text shows, and enclaves of a line; JSON has all."""
+"""Maximum number of reach lines, and of enclaves in a line, in text output; JSON has all."""
 _MOST_CHARACTERS = 12_000
 """Characters of each list in Markdown."""
 
@@ -636,7 +636,7 @@ _MOST_CHARACTERS = 12_000
 def _show_new_access(
     base: Path, head: Path, fleets: tuple[Fleet | None, Fleet | None], form: str
 ) -> int:
-    """Print what HEAD adds to BASE in a format; return 1 if it adds anything, else 0.
+    """Print the access that HEAD adds to BASE; return 1 if there is any, else 0.
 
     Raises:
         SrosError: it cannot be decided.
@@ -727,7 +727,7 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
 
 
 def access_summary(growth: Growth) -> str:
-    """Return what a change adds, in one sentence."""
+    """Return the added access and reach of a change in one sentence."""
     worlds = ", ".join(growth.worlds)
     basis = "".join(
         f"; {title}: {', '.join(clauses)}"
@@ -760,7 +760,7 @@ def _count(number: int, what: str) -> str:
 
 
 def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> str:
-    """Return what a change adds, and removes, as Markdown."""
+    """Return the added and removed access of a change as Markdown."""
     from sros_tool.markdown import bounded, code, plain
 
     rest = "which `sros diff_policy --no-new-access` shows"

@@ -130,7 +130,7 @@ _VERBOSE = click.Option(
     count=True,
     expose_value=False,
     callback=_report_steps,
-    help="Report each step on standard error; -vv in detail.",
+    help="Log what sros does on standard error; -vv logs more details.",
 )
 
 
@@ -278,7 +278,7 @@ def report_error(error: BaseException, arguments: Sequence[str], name: str = "sr
 
 
 def _named_command(arguments: Sequence[str], name: str) -> str:
-    """Return the command that words name; click does not say it for an option without a value."""
+    """Return the verb in ``arguments``, for errors in which click does not name it."""
     command: click.Command | None = program
     for word in arguments:
         if isinstance(command, click.Group) and not word.startswith("-"):

@@ -46,7 +46,7 @@ _TITLES = {
     "policy": "Policy",
     "rights": "Rights",
 }
-"""Kinds of steps, what matters most first: what does not fit into a comment is at its end."""
+"""Titles of the kinds of steps, the most important first: a comment is cut at its end."""
 
 
 class _Lines(click.ParamType[tuple[str, ...]]):
@@ -99,7 +99,7 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     "--fleet",
     default="",
     metavar="PATH",
-    help="The file with the robots that the placeholders of policies stand for.",
+    help="Fleet file whose robots replace the placeholders of the policies.",
 )
 @_paths_option("keystore", "PATH", "A keystore, or its public part.")
 @_paths_option("leave-out", "PATH", "A folder whose policies are not of the robot, such as tests.")
@@ -108,14 +108,15 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     type=click.Choice(["fail", "allow"]),
     default="fail",
     show_default=True,
-    help="Whether more access than in the base, and what a dropped requirement forbids, fails.",
+    help="Whether new access, or access that a dropped requirement forbids, makes the review fail.",
 )
 @click.option(
     "--renew-within",
     default="30d",
     show_default=True,
     metavar="DURATION|PERCENT",
-    help="Fail if an enclave of a keystore expires within this time, or share of its validity.",
+    help="Fail if an enclave of a keystore expires within DURATION, or has used "
+    "PERCENT of its validity.",
 )
 @click.option(
     "--repository",
@@ -123,7 +124,7 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     type=PATH,
     default=".",
     metavar="FOLDER",
-    help="The repository, if it is not that of the working directory.",
+    help="Folder of the git repository. [default: the working directory]",
 )
 @click.option(
     "--fetch",
@@ -135,13 +136,13 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     "--summary",
     type=PATH,
     metavar="FILE",
-    help="Write the result as Markdown, for a comment. FILE is outside of the repository.",
+    help="Write the result as Markdown, for a comment. FILE must be outside of the repository.",
 )
 @click.option(
     "--sarif",
     type=PATH,
     metavar="FILE",
-    help="Write the findings as SARIF. FILE is outside of the repository.",
+    help="Write the findings as SARIF. FILE must be outside of the repository.",
 )
 @json_option
 def review(
@@ -255,7 +256,7 @@ def review(
 
 
 class _Outputs:
-    """The files that the review is written to, which nothing of the repository can be."""
+    """The output files of a review, which must be outside of the repository."""
 
     def __init__(self, repository: Repository, summary: Path | None, sarif: Path | None) -> None:
         """Check the files.  Raises `UsageError`."""
@@ -272,11 +273,11 @@ class _Outputs:
         self._write(_markdown(result, request), [result.shown_finding(e) for e in result.findings])
 
     def write_unfinished(self) -> None:
-        """Write what counts if the review is ended from outside, such as by a limit of time."""
+        """Write "could not be decided" first, which stays if the review is killed (time limit)."""
         self._write("## Review: could not be decided\n\nIt was ended before its result.\n", [])
 
     def write_error(self, error: SrosError) -> None:
-        """Write why there is no result."""
+        """Write the error that prevented a result."""
         from sros_tool.markdown import code
 
         self._write(f"## Review: could not be decided\n\n{code(str(error))}\n", [])
@@ -294,18 +295,22 @@ class _Outputs:
 
 
 def _check_outside(file: Path, top: Path) -> None:
-    """Raise `UsageError` for a file that a change could have put a link or another file at."""
+    """Raise `UsageError` if the reviewed change could control the output file, by a link."""
     parent = Path(os.path.realpath(file.absolute().parent))
     if parent.is_relative_to(os.path.realpath(top)):
         raise UsageError(
             f"'{file}' is in the repository",
-            "A change that is reviewed could have a link there, which leads elsewhere.",
+            "The reviewed change could put a link there that leads to another file.",
             "Name a file outside of it, in a folder that only you can write to.",
         )
     if not parent.is_dir():
         raise UsageError(f"cannot write '{file}'", "Its folder does not exist.", "Create it first.")
     if file.is_symlink() or (file.exists() and not stat.S_ISREG(file.stat().st_mode)):
-        raise UsageError(f"'{file}' is no file", "It would not be followed.", "Name a new file.")
+        raise UsageError(
+            f"'{file}' is not a regular file",
+            "sros does not write through links or to devices.",
+            "Name a new file.",
+        )
 
 
 def _save(file: Path, data: bytes) -> None:
@@ -316,7 +321,7 @@ def _save(file: Path, data: bytes) -> None:
 
 
 def _sentence(result: Review, step: ReviewStep) -> str:
-    """Return what a step found, in one clause."""
+    """Return the result of a step as a clause."""
     from sros_tool.checks.registry import ChosenFindings
     from sros_tool.cli.policy import access_summary
     from sros_tool.proof.review import (
@@ -400,13 +405,13 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
 
 
 def _by_weight(result: Review) -> list[ReviewStep]:
-    """Return the steps, those that fail first, and of them what matters most."""
+    """Sort the steps: failed ones first, then by importance."""
     kinds = list(_TITLES)
     return sorted(result.steps, key=lambda step: (not step.status, kinds.index(step.kind)))
 
 
 def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
-    """Return what a step found as Markdown, or "" if the sentence says it all."""
+    """Return the details of a step as Markdown, or "" if `_sentence` is complete."""
     from sros_tool.checks.formats import findings_markdown
     from sros_tool.checks.registry import ChosenFindings
     from sros_tool.cli.check import renewal_markdown

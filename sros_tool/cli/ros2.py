@@ -15,7 +15,7 @@ from sros_tool.cli.program import program
 
 _PROGRAM = "ros2 security"
 _NO_PREFIX = "\0"
-"""What no word of a command line contains, so that none is an option of ros2."""
+"""An option prefix that no argument has, so that ros2 parses no argument as its own option."""
 
 
 class SecurityCommand:

@@ -80,13 +80,13 @@ _RMW = click.option(
 _ACCEPT_KEY = click.option(
     "--accept-readable-key",
     is_flag=True,
-    help="Accept a private key, or the PIN of its token, that other users can read, and folders in "
-    "which they can write, as on a file system without modes.",
+    help="Start even if other users can read the private key or its token's PIN, or write "
+    "to the enclave's folders, as on a file system without permission bits.",
 )
 
 
 class _FailingClosed(Verb):
-    """A verb whose output is evaluated: if it fails in any way, no node starts with its output.
+    """A verb whose output a shell evaluates; on failure the output keeps nodes from starting.
 
     That includes wrong options: a shell evaluates whatever is printed, and ignores the exit status.
     """
@@ -131,7 +131,7 @@ _FORMS = ("sh", "fish", "json", "systemd", "docker", *CONTAINER_FORMS)
 
 
 def _form_of(arguments: Sequence[str]) -> str:
-    """Return the form that arguments ask for which could not be parsed."""
+    """Return the --format in arguments that click could not parse."""
     named = (
         word.removeprefix("--format=")
         for word, before in zip(arguments, ["", *arguments], strict=False)
@@ -149,8 +149,9 @@ def _form_of(arguments: Sequence[str]) -> str:
     type=click.Choice(_FORMS),
     default=_FORMS[0],
     show_default=True,
-    help="For a shell (sh, fish), a program (json), a unit (systemd), an env-file (docker), or a "
-    "container: compose, kubernetes, and kubernetes-secret, which holds the private key.",
+    help="Output format: shell (sh, fish), json, systemd, docker (an env file), or container "
+    "definitions: compose, kubernetes, and kubernetes-secret, which contains the "
+    "private key.",
 )
 @click.option(
     "--target",
@@ -163,7 +164,7 @@ def _form_of(arguments: Sequence[str]) -> str:
     "--name",
     "container",
     metavar="NAME",
-    help="The name of the service in Compose, or the Deployment. [default: from the enclave]",
+    help="Name of the Compose service or Kubernetes Deployment. [default: from the enclave]",
 )
 @click.option("--image", metavar="IMAGE", help="The image of the container.")
 @_DOMAIN
@@ -290,13 +291,13 @@ class _WithCommand(Verb):
     "--policy",
     metavar="FILE",
     type=PATH,
-    help="Instead of NAME: use the enclave in which the policy FILE has the node that COMMAND "
-    "starts.",
+    help="Instead of NAME: use the enclave that the policy FILE assigns to the node which "
+    "COMMAND starts.",
 )
 @_DOMAIN
 @_RMW
 @_ACCEPT_KEY
-@click.option("--no-ros-args", is_flag=True, help="Add no arguments to COMMAND.")
+@click.option("--no-ros-args", is_flag=True, help="Do not add --ros-args to COMMAND.")
 @click.pass_context
 def run(
     ctx: click.Context,
@@ -331,7 +332,7 @@ def run(
         raise UsageError(
             f"--policy and the enclave {rest[0]} exclude each other",
             "The policy says in which enclave the node is.",
-            "Leave one of both out.",
+            "Leave one of them out.",
         )
     command = [*rest[0 if policy else 1 :], *ctx.meta[_COMMAND]]
     if not command:
@@ -419,10 +420,10 @@ class _WithCommandAfterDashes(_WithCommand):
     "jobs",
     multiple=True,
     type=click.Choice([job.value for job in Job]),
-    help="renew: renew what expires within 30 days. check: check the keystore each day. "
-    "metrics: write its metrics every 15 minutes. fleet: the same with those of `sros fleet "
-    "status`. guard: watch all ROS processes of the machine, as root and without a timer.  "
-    "Can be repeated.",
+    help="renew: renew enclaves that expire within 30 days. check: check the keystore "
+    "daily. metrics: write the keystore's metrics every 15 minutes. fleet: metrics, "
+    "and those of `sros fleet status`. guard: watch all ROS processes of the machine "
+    "(runs as root, without a timer).  Can be repeated.",
 )
 @click.option(
     "--target",
@@ -440,14 +441,15 @@ class _WithCommandAfterDashes(_WithCommand):
     "--sros",
     "program",
     metavar="FILE",
-    help="The program sros where the units run, which then also verifies each enclave before its "
-    "node starts. [default: none for nodes, this program for jobs]",
+    help="Path of sros on the machine of the units; it verifies an enclave before its node"
+    " starts. [default: none for nodes, this program for jobs]",
 )
 @click.option(
     "--passphrase-file",
     "passphrase",
     metavar="FILE",
-    help="With --job renew: the file with the passphrase of the CA keys, where the job runs.",
+    help="With --job renew: file with the passphrase of the CA keys, on the machine that "
+    "runs the job.",
 )
 @_DOMAIN
 @_RMW
@@ -508,13 +510,13 @@ def units(
         raise UsageError(
             "--user is not for --job guard",
             "Only root can look at the processes of all users.",
-            "Write the guard by a command of its own, without --user.",
+            "Write the units for guard with a separate command, without --user.",
         )
     if jobs and (rest[1:] or several) and there is None:
         raise UsageError(
             f"the nodes run where the keystore is in {INSTALLED}, and the jobs are for '{root}'",
             "One folder of units is for one machine.",
-            "Write them to two folders by two commands, or name the keystore there by --target.",
+            "Run two commands with two folders, or name the keystore with --target.",
         )
     target = None if there is None else target_path(there)
     files: dict[str, str] = {}
@@ -577,8 +579,8 @@ def _owner(root: Path) -> str:
 
 
 def _this_program() -> str:
-    """Return the absolute path of the program sros that runs.  Raises `UsageError`."""
+    """Return the absolute path of the running sros program.  Raises `UsageError`."""
     path = shutil.which(sys.argv[0]) or shutil.which("sros")
     if path is None or not os.access(path, os.X_OK):
-        raise UsageError("this program has no path of its own", "", "Add --sros FILE.")
+        raise UsageError("the path of the running sros program is unknown", "", "Add --sros FILE.")
     return str(Path(path).absolute())

@@ -87,7 +87,7 @@ def _complete_focus(
 @click.option(
     "--template",
     metavar="TEMPLATE",
-    help="Show policies with the protection of this keystore template.",
+    help="Draw policies with the protection of this keystore template.",
     shell_complete=complete_template,
 )
 @click.option(
@@ -103,22 +103,28 @@ def _complete_focus(
     "words",
     multiple=True,
     metavar="NAME...",
-    help="Draw only what can influence this topic, service, action or enclave, and what it can "
-    "influence.",
+    help="Draw only the enclaves and names that can influence this topic, service, action "
+    "or enclave, or be influenced.",
     shell_complete=_complete_focus,
 )
 @click.option(
     "--hops",
     type=click.IntRange(1, 99),
-    help="With --focus, draw enclaves so many hops away; further ones are counted. [default: 2]",
+    help="With --focus: number of hops to draw; enclaves further away are only counted. "
+    "[default: 2]",
 )
 @click.option(
     "--requirements",
     type=PATH,
     metavar="FILE",
-    help="Draw in red what breaks the requirements in this TOML file.",
+    help="Draw accesses that break the requirements in this TOML file in red.",
 )
-@click.option("--all", "everything", is_flag=True, help="Also draw rights that every node needs.")
+@click.option(
+    "--all",
+    "everything",
+    is_flag=True,
+    help="Also draw the rights that every node needs, such as /rosout.",
+)
 @click.option("--graphviz", is_flag=True, help="Lay out the SVG with Graphviz.")
 @force_option
 @dry_run_option
@@ -167,7 +173,7 @@ def view(
 
     check_one_format()
     if hops and not words:
-        raise UsageError("--hops is for --focus only", "", "Name what to look at with --focus.")
+        raise UsageError("--hops is for --focus only", "", "Add --focus NAME.")
     moment = now()
     written = _format("json" if as_json else form, output, graphviz)
     if output:

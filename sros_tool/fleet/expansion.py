@@ -301,8 +301,9 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
         if wrong:
             raise PolicyError(
                 "the policy cannot be narrowed for all robots at once",
-                f"A wildcard does not mean the same for each, so it is unclear who may {wrong[0]}.",
-                "Write the names that the robots use in its place.",
+                "A wildcard does not mean the same for every robot, so it is unclear who may "
+                f"{wrong[0]}.",
+                "Replace the wildcard by the names that the robots use.",
             )
 
 

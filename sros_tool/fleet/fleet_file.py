@@ -126,7 +126,7 @@ class _Reader:
         if both := sorted(fleet.robots.keys() & fleet.groups.keys()):
             raise self._error(
                 f"{_short(both[0])} is a robot and a group",
-                "Ansible would take one for the other.",
+                "Ansible would confuse them.",
                 "Give one of them another name.",
             )
         if problem := size_problem(fleet):
@@ -339,7 +339,7 @@ def _loaded(data: bytes, what: str, *, is_json: bool) -> Mapping[str, Any]:
     if not isinstance(value, dict):
         raise DocumentError(
             f"{what} is not an inventory in YAML or JSON",
-            "Its top is not a mapping of groups; an inventory in INI is not read.",
+            "Its top level is not a mapping of groups; sros does not read INI inventories.",
             _WRITE_OUT,
         )
     return value
@@ -351,7 +351,7 @@ def _load_yaml(data: bytes, what: str) -> Any:
     except ImportError as error:
         raise UnavailableError(
             f"{what} is in YAML, and PyYAML is not installed",
-            "It comes with ansible-core.",
+            "PyYAML is part of ansible-core.",
             "Run `pip install 'sros_tool[fleet]'`, or name the JSON of `ansible-inventory --list`.",
         ) from error
     loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

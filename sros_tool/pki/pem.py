@@ -204,7 +204,7 @@ def kind_of(data: bytes) -> str:
     if text.lstrip()[:1] == b"<":
         return XML
     if not text.strip():
-        return "a file of blanks alone"
+        return "a file with only blanks"
     if _BASE64_WITHOUT_PEM.fullmatch(text[:_MOST]):
         return "base64 without its lines '-----BEGIN' and '-----END'"
     return ""

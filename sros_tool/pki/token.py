@@ -494,7 +494,7 @@ def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
             shown = f" {name!r}" if name.replace("-", "").isalpha() else ""
             raise UsageError(
                 f"the attribute{shown} of a PKCS#11 URI is not accepted",
-                "RFC 7512 does not have it, not in this part of the URI, or not twice.",
+                "RFC 7512 does not allow it, or not in this part of the URI, or it is there twice.",
                 "Write pkcs11:token=NAME;object=LABEL?module-path=FILE&pin-source=FILE.",
             )
         found[name] = unquote(value)
@@ -518,7 +518,7 @@ def pin_file_problem(place: TokenUri) -> str:
         return str(error).rstrip(".")
     if mode & 0o077:
         return (
-            f"others can use the file with the PIN, '{path}' (mode {mode:04o}): run `chmod 600 "
+            f"others can access the file with the PIN, '{path}' (mode {mode:04o}): run `chmod 600 "
             f"{shell_quote(str(path))}`"
         )
     return ""

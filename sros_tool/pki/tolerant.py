@@ -192,7 +192,7 @@ class _TolerantCertificate(_Signed):
             rest.pop(0)
         found = _sequence(der.first(rest.pop(0).content)) if rest else []
         if rest:
-            raise ValueError("its signed part has more than a certificate has")
+            raise ValueError("its signed part has extra fields that a certificate does not have")
         self.extensions = _read(found, _in_certificate, _LOOSE_OF_CERTIFICATES)
 
     @property
@@ -229,13 +229,15 @@ class _TolerantList(_Signed):
         while rest and rest[0].tag in _TIMES:
             dates.append(_date(rest.pop(0)))
         if len(dates) > 2 or None in dates:
-            raise ValueError("its dates are none that OpenSSL compares")
+            raise ValueError("its dates have a form that OpenSSL cannot compare")
         self.last_update_utc = dates[0]
         self.next_update_utc = dates[1] if len(dates) == 2 else None
         entries = _sequence(rest.pop(0)) if rest and rest[0].tag == der.SEQUENCE else []
         found = _sequence(der.first(rest.pop(0).content)) if rest else []
         if rest:
-            raise ValueError("its signed part has more than a list has")
+            raise ValueError(
+                "its signed part has extra fields that a revocation list does not have"
+            )
         self.extensions = _read(found, _in_list, _LOOSE_OF_LISTS)
         self._entries = list(_entries(entries))
 
@@ -483,9 +485,9 @@ def _parts(extension: der.Value) -> tuple[ObjectIdentifier, bool, bytes]:
         (der.SEQUENCE, der.OID, der.OCTET_STRING, []),
         (der.SEQUENCE, der.OID, der.OCTET_STRING, [der.BOOLEAN]),
     ):
-        raise PkiError("an extension has another structure")
+        raise PkiError("an extension is not an Extension structure")
     if any(len(value.content) != 1 for value in flag):
-        raise PkiError("an extension has a flag that is none")
+        raise PkiError("an extension's critical flag is not a BOOLEAN")
     oid = ObjectIdentifier(der.decode_oid(identifier.content))
     return oid, any(value.content != b"\0" for value in flag), content.content
 

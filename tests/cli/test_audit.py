@@ -165,7 +165,7 @@ def test_a_patch_is_merged_and_then_nothing_is_denied(program: Program, tmp_path
     assert "no patch is needed; the earlier 'add.xml' stays\n" in ended.err
     ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "-")
     assert (ended.status, (tmp_path / "-").exists()) == (2, False)
-    assert "'-' is not the name of a file" in ended.err
+    assert "'-' is not a file name here" in ended.err
 
 
 def test_a_dry_run_writes_no_patch(program: Program, tmp_path: Path) -> None:
