@@ -417,13 +417,11 @@ if TYPE_CHECKING:
     help="Validity of the CAs: a duration (5y), an expiry date (2031-01-01), or an "
     "interval (2026-12-01/5y).",
 )
-@click.option(
-    "--validity", metavar="SPAN", help="Validity of certificates, written as for --ca-validity."
-)
+@click.option("--validity", metavar="SPAN", help="Validity of certificates, such as 90d or 1y.")
 @click.option(
     "--permissions-validity",
     metavar="SPAN",
-    help="Validity of permissions, written as for --ca-validity.",
+    help="Validity of permissions, such as 90d or 1y.",
 )
 @click.option(
     "--identity-ca",

@@ -87,8 +87,8 @@ DIAMONDS = {f"g{i}": {"children": [f"g{i + 1}", f"h{i + 1}"]} for i in range(30)
 @pytest.mark.parametrize(
     ("name", "text", "problem"),
     [
-        ("h.yml", "- a\n- b\n", "top is not a mapping"),
-        ("h.json", "[1]", "top is not a mapping"),
+        ("h.yml", "- a\n- b\n", "top level is not a mapping"),
+        ("h.json", "[1]", "top level is not a mapping"),
         ("h.json", "{", "not valid JSON"),
         ("h.json", "[" * 100_000, "nested too deeply"),
         ("h.yml", "[" * 500, "nested too deeply"),
