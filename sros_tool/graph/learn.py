@@ -7,8 +7,8 @@ with every start.  A common part is included only if the node has every right in
 include never grants more than was observed.  Learned names need no escaping: plain ROS names
 contain no markup.
 
-The graph shows the enclave / for a process that was started without ``--ros-args --enclave``, as
-those of a robot that is not secured yet usually are: `enclave_per_node` chooses one for each.
+The graph shows the enclave / for a process that was started without ``--ros-args --enclave``, which
+is usual on a robot that is not secured yet: `enclave_per_node` gives such processes enclaves.
 """
 
 from __future__ import annotations
@@ -62,7 +62,11 @@ class NodeRight(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LearnedProfile:
-    """The rights of a node: ``rights`` (all, absolute) as includes and, for the rest, groups."""
+    """The rights of a node, and how its profile states them.
+
+    ``rights`` are all its rights, with absolute names.  ``includes`` are the common parts that the
+    profile includes, ``groups`` state the rights that those parts do not contain.
+    """
 
     enclave: str
     ns: str
@@ -73,7 +77,11 @@ class LearnedProfile:
 
 
 class RightsFound(StrEnum):
-    """Where learned rights come from: observed, denied by the lines of a log, or missing."""
+    """Where learned rights come from.
+
+    ``graph``: the ROS graph was observed; ``log``: the lines of a log deny them; ``audit``: they
+    were observed, and the policy or keystore denies them.
+    """
 
     GRAPH = "graph"
     LOG = "log"
@@ -92,7 +100,7 @@ class Learned:
     source: RightsFound = RightsFound.GRAPH
 
     def noting(self, notes: Iterable[Note]) -> Learned:
-        """Return the same with these notes before its own."""
+        """Return a copy with ``notes`` in front of the present notes."""
         return replace(self, notes=(*notes, *self.notes))
 
     @property
@@ -101,7 +109,7 @@ class Learned:
         return tuple(sorted({part for profile in self.profiles for part in profile.includes}))
 
     def flat(self) -> Learned:
-        """Return the same rights without includes."""
+        """Return a copy that states all rights in groups, without includes."""
         profiles = (
             replace(
                 profile, includes=(), groups=groups_of(profile.rights, profile.ns, profile.node)
@@ -129,7 +137,7 @@ _Place = tuple[str, str, str]
 
 
 def learn(observation: Observation, common: CommonParts | None = None) -> Learned:
-    """Return the smallest policy for an observation; ``common`` are the parts it may include.
+    """Return the rights that the observed nodes use; profiles may include the parts in ``common``.
 
     If the enclave of a node is ambiguous, every possible enclave gets its rights, with a note.
     """
@@ -163,7 +171,10 @@ def learn(observation: Observation, common: CommonParts | None = None) -> Learne
 
 
 def _rights_of(node: ObservedNode, notes: _Notes) -> list[tuple[_Place, frozenset[NodeRight]]]:
-    """Return the rights of a node, once for each enclave that it may run in."""
+    """Return pairs of place (enclave, namespace, name) and rights: one for each possible enclave.
+
+    Names that a policy cannot express are left out, with a note.
+    """
     if not node.enclaves:
         notes.add("unknown-enclave", node.fqn)
         return []
@@ -224,7 +235,7 @@ def _is_place(ns: str, name: str) -> bool:
 
 
 class Folded(NamedTuple):
-    """The rights behind a set of endpoints.
+    """The ROS rights that a node needs for a set of DDS endpoints.
 
     ``halves`` are service endpoints without the matching request or reply endpoint; ``foreign``
     are topics that have no ROS name.  A policy can express neither.
@@ -239,7 +250,10 @@ _ANY_DOMAIN = DomainSet.of((0, 0))
 
 
 def fold(endpoints: Iterable[Endpoint]) -> Folded:
-    """Return the rights behind endpoints; complete sets of topics become services or actions."""
+    """Return the ROS rights that a node needs for these DDS endpoints.
+
+    The topics of a service or an action become one right if all of them are there.
+    """
     endpoints = tuple(endpoints)
     rule = Rule(True, _ANY_DOMAIN, _criteria(endpoints, PUBLISH), _criteria(endpoints, SUBSCRIBE))
     rights, halves, foreign = set(), set(), set()
@@ -261,14 +275,19 @@ def _criteria(endpoints: Iterable[Endpoint], direction: str) -> tuple[Criteria, 
 
 
 def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, ...]:
-    """Return one group per right, in the order of the policy language, with sorted names."""
+    """Return a group for each kind of right, in the order of the policy language.
+
+    Names in a group are sorted, and relative to the node where that is shorter.
+    """
     rights = tuple(rights)
     groups = []
     for kind, both in RIGHTS.items():
-        for right in both:
-            names = sorted(written(each.name, ns, node) for each in rights if each.right == right)
+        for kind_of_right in both:
+            names = sorted(
+                written(right.name, ns, node) for right in rights if right.right == kind_of_right
+            )
             if names:
-                groups.append(Group(kind, ((right, ALLOW),), tuple(names)))
+                groups.append(Group(kind, ((kind_of_right, ALLOW),), tuple(names)))
     return tuple(groups)
 
 
@@ -283,7 +302,7 @@ _CHANGING = (
 )
 _TOOLS = re.compile(r"_ros2cli(_.*)?\Z|(?P<observer>_sros_observer)(_.*)?\Z")
 _OF_OBSERVER = frozenset({Endpoint("rt/parameter_events", PUBLISH)})
-"""The endpoints of an observer of sros: a node of its name that has others is none."""
+"""The endpoints of an observer of sros.  A node with the same name and others is no observer."""
 _ABSOLUTE = frozenset(
     ("/bond", "/clock", "/diagnostics", "/parameter_events", "/rosout", "/tf", "/tf_static")
 )
@@ -297,7 +316,7 @@ def is_tool(node: ObservedNode) -> bool:
 
 
 def is_tool_name(name: str) -> bool:
-    """Return whether a tool that observes the robot gives its node such a name."""
+    """Return whether a node's name is that of a tool that observes the robot."""
     return _TOOLS.match(name) is not None
 
 
@@ -310,10 +329,10 @@ def stable_name(name: str) -> str:
 
 
 def written(fqn: str, ns: str, node: str) -> str:
-    """Return an absolute name in the form for the profile of ``node`` in ``ns``.
+    """Return an absolute name as the profile of ``node`` in ``ns`` writes it.
 
-    ``~/x`` for the node's private names, ``x`` for names in its namespace, ``/x`` for the rest.  In
-    the root namespace only names without a further slash become relative: deeper ones belong to
+    Private names of the node become ``~/x``, names in its namespace ``x``; others stay absolute.
+    In the root namespace only names without a further slash become relative: deeper ones belong to
     other namespaces.  The inverse is `expand`.
     """
     own = expand("~/", ns, node)
@@ -343,15 +362,19 @@ PARTS = (
     "common/node/time.xml",
     "common/node/types.xml",
 )
-"""The parts that a learned policy includes, relative to its folder; the widest first."""
+"""Paths of the common parts that a learned policy can include, relative to the policy's folder.
+
+Parts with more rights come first.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class CommonParts:
-    """The parts that a policy can include.
+    """The common parts that a policy can include.
 
-    ``rights`` are the rights of each part, with names as written there; ``missing`` are the files
-    to copy for each part: their content by path, relative to the folder of the policy.
+    ``rights`` maps the path of a part to its rights, with names as the part writes them.
+    ``missing`` maps the path of a part to the files that have to be copied for it: their content
+    by path, relative to the folder of the policy.
     """
 
     rights: Mapping[str, frozenset[NodeRight]] = field(default_factory=dict)
@@ -360,7 +383,10 @@ class CommonParts:
     def choose(
         self, rights: frozenset[NodeRight], ns: str, node: str
     ) -> tuple[tuple[str, ...], frozenset[NodeRight]]:
-        """Return the parts to include for these absolute rights, and the rights that remain."""
+        """Return the parts to include for these rights, and the rights that no part contains.
+
+        The names of the rights are absolute.
+        """
         chosen, rest = [], rights
         for part, names in self.rights.items():
             given = _expanded(names, ns, node)
@@ -370,19 +396,19 @@ class CommonParts:
         return tuple(chosen), rest
 
     def given(self, parts: Iterable[str], ns: str, node: str) -> frozenset[NodeRight]:
-        """Return the rights that these parts give to a node, with absolute names."""
+        """Return the rights, with absolute names, that ``parts`` give to a node."""
         return frozenset().union(*(_expanded(self.rights[part], ns, node) for part in parts))
 
     def to_copy(self, parts: Iterable[str]) -> dict[str, bytes]:
-        """Return the files that these parts need and that are missing next to the policy."""
+        """Return the content, by path, of files that ``parts`` need and the folder lacks."""
         return {path: data for part in parts for path, data in self.missing[part].items()}
 
 
 def common_parts(folder: Path, shipped: Path) -> CommonParts:
-    """Return the parts that a policy in ``folder`` can include, from there or from ``shipped``.
+    """Return the parts that a policy in ``folder`` can include, read there or from ``shipped``.
 
-    A file in ``folder`` has priority; a shipped part that needs a different version of it is left
-    out, so that the two never mix silently.
+    A part in ``folder`` has priority.  A part of ``shipped`` is left out if ``folder`` has another
+    version of a file that the part needs, so that versions never mix.
     """
     rights, missing = {}, {}
     for part in PARTS:
@@ -412,7 +438,7 @@ def _differs(folder: Path, path: str, needed: Mapping[str, bytes]) -> bool:
 
 
 def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
-    """Return the rights in a part, or None if it cannot be read or denies something."""
+    """Return the rights that a common part allows; None if it denies any or cannot be read."""
     includer = Includer(root.resolve())
     file = (root / part).resolve()
     rights = set()
@@ -428,7 +454,7 @@ def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
 
 
 def _needed_files(root: Path, part: str) -> dict[str, bytes]:
-    """Return the content of a part and of all its includes, by path relative to ``root``."""
+    """Map the paths of a part and all its includes, relative to ``root``, to their content."""
     files: dict[str, bytes] = {}
     waiting = [(root / part).resolve()]
     includer = Includer(root.resolve())
@@ -451,9 +477,9 @@ def _needed_files(root: Path, part: str) -> dict[str, bytes]:
 
 _SHOWN = 5
 _TEXTS = {
-    "ambiguous": "the graph does not show in which enclave each of these nodes of the same name "
-    "runs, so all of these enclaves get their rights; start them one at a time under --watch to "
-    "distinguish them: {}",
+    "ambiguous": "nodes with the same name run in several enclaves, and the graph does not show "
+    "which node runs in which enclave, so each of these enclaves gets the rights of all of them; "
+    "to tell them apart, start one node at a time under --watch: {}",
     "changing-name": "nodes whose name changes with every start have a profile with a wildcard: {}",
     "half-service": "left out, because only the request or the reply of these services was "
     "observed; observe again with a longer --spin-time: {}",
@@ -483,7 +509,7 @@ _TEXTS = {
 
 
 class _Notes:
-    """A collector of subjects (nodes, topics), which makes one note of each kind."""
+    """A collector of the subjects (nodes, topics) of notes; one note lists all of the same kind."""
 
     def __init__(self) -> None:
         self._found: dict[str, set[str]] = {}
@@ -493,7 +519,7 @@ class _Notes:
         self._found.setdefault(kind, set()).add(subject)
 
     def notes(self) -> tuple[Note, ...]:
-        """Return one note for each kind, in the order of their ids."""
+        """Return a note for each kind of subject, sorted by id."""
         return tuple(
             Note(f"graph.{kind}", _TEXTS[kind].format(listed(sorted(subjects))))
             for kind, subjects in sorted(self._found.items())
@@ -501,7 +527,7 @@ class _Notes:
 
 
 def listed(subjects: Sequence[str], separator: str = ", ") -> str:
-    """Return the first subjects in words: "a, b, c, d, e and 2 more"."""
+    """Return the first five subjects, and how many more there are: "a, b, c, d, e and 2 more"."""
     return first_few(subjects, _SHOWN, separator)
 
 
@@ -509,7 +535,7 @@ _EVERY_NODE = "common/node.xml"
 
 
 class News:
-    """The nodes and rights reported so far, without the rights that every node needs."""
+    """The nodes and rights that were reported so far; rights that every node needs do not count."""
 
     def __init__(self, common: CommonParts) -> None:
         self._ordinary = common.rights.get(_EVERY_NODE, frozenset[NodeRight]())
@@ -517,7 +543,7 @@ class News:
         self._rights: set[tuple[str, str, str, NodeRight]] = set()
 
     def lines(self, observation: Observation) -> list[str]:
-        """Return a line for each node and each right that was not reported before."""
+        """Return a line for each node and each right in ``observation`` not reported before."""
         lines = []
         for profile in learn(observation).profiles:
             place = profile.enclave, profile.ns, profile.node
@@ -534,7 +560,7 @@ class News:
 
 
 UNSHOWN = ("/",)
-"""The enclaves of a node whose enclave the graph does not show."""
+"""`ObservedNode.enclaves` of a node whose enclave the graph does not show."""
 
 _CONTAINER = "~/_container/load_node"
 
@@ -547,12 +573,12 @@ class NamedEnclaves(NamedTuple):
 
 
 def enclave_per_node(observation: Observation) -> NamedEnclaves:
-    """Return the observation with an enclave of its own for each process that is shown in /.
+    """Return the observation with a separate enclave for each process that the graph shows in /.
 
-    The enclave has the namespace and name of the process's node.  A process has one enclave, also
-    if it has several nodes: it is named after its component container, or after the node with the
-    shortest name.  Notes say which processes have several nodes, which enclaves several processes
-    share, and which names Cyclone DDS mistakes for each other.
+    The enclave has the namespace and name of the process's node.  If a process has several nodes,
+    its enclave is named after the component container, or else after the node with the shortest
+    name.  Notes say which processes have several nodes, which enclaves several processes share, and
+    which names Cyclone DDS mistakes for each other.
     """
     processes: dict[str, list[ObservedNode]] = {}
     for node in observation.nodes:
@@ -570,16 +596,16 @@ def enclave_per_node(observation: Observation) -> NamedEnclaves:
 
 
 def _enclave_name(nodes: Sequence[ObservedNode]) -> str:
-    """Return the name for the enclave of a process with these nodes.
+    """Return the enclave name for a process with these nodes.
 
-    The part of a node's name that changes with every start is left out.
+    It is the full name of the main node, without the part that changes with every start.
     """
     main = min(nodes, key=_rank)
     return replace(main, name=stable_name(main.name).rstrip("_*") or main.name).fqn
 
 
 def _rank(node: ObservedNode) -> tuple[bool, bool, int, str]:
-    """Return the sort key by which the first node of a process gives its enclave the name."""
+    """Return the sort key of a node: a process's enclave is named after the lowest node."""
     (reply,) = dds_names("reply", expand(_CONTAINER, node.ns, node.name)).publish
     is_container = Endpoint(reply, PUBLISH) in node.endpoints
     return not is_container, stable_name(node.name) != node.name, len(node.fqn), node.fqn
@@ -591,15 +617,15 @@ def _notes(
     nodes: Sequence[ObservedNode],
 ) -> Iterator[Note]:
     several = [
-        f"{names[participant]} has {', '.join(sorted(each.fqn for each in nodes))}"
+        f"{names[participant]} has {', '.join(sorted(node.fqn for node in nodes))}"
         for participant, nodes in processes.items()
         if len(nodes) > 1
     ]
     if several:
         yield Note(
             "graph.several-nodes",
-            "DDS knows processes, and the nodes of one process share its enclave, which has the "
-            f"name of one of them: {listed(sorted(several), '; ')}",
+            "DDS secures processes, so all nodes of a process share its enclave, which is named "
+            f"after one of these nodes: {listed(sorted(several), '; ')}",
         )
     users: dict[str, set[str]] = {}
     for node in nodes:
@@ -613,9 +639,10 @@ def _notes(
     if shared:
         yield Note(
             "graph.shared-enclave",
-            "several processes get the same enclave, with the rights of all of them, because "
-            "their nodes have the same name; unless it is one that was restarted, give the nodes "
-            "different names (-r __node:=NAME), or start each process with --ros-args --enclave: "
+            "several processes share an enclave, which gets the rights of all of them, because "
+            "their nodes have the same name; unless it is a single process that was restarted, "
+            "give the nodes different names (-r __node:=NAME), or start each process with "
+            "--ros-args --enclave: "
             f"{listed(shared)}",
         )
     yield from name_notes(users, set(names.values()))
@@ -645,43 +672,43 @@ _HEADERS = {
 
 
 class AskingLine(NamedTuple):
-    """A line of a log."""
+    """A log line that reports a denied topic."""
 
     log: Path
-    """The log."""
+    """Path of the log."""
     line: int
-    """The line, from 1."""
+    """Number of the line, from 1."""
     process: str | None
-    """The process that printed it, or null."""
+    """The process that printed the line; null if the line does not say."""
     enclave: str | None
-    """The enclave that it names, or null."""
+    """The enclave that the line names; null if the line names none."""
     direction: Annotated[str, Words((PUBLISH, SUBSCRIBE))]
     """What was denied."""
     topic: str
-    """The DDS topic."""
+    """The DDS topic that was denied."""
 
 
 @shows(optional=("accepted", "denials"), spread=("observation",))
 class LearnedPolicy(NamedTuple):
-    """What was learned, and how the policy changes."""
+    """The learned rights, and how the policy file changes."""
 
     file: Path | None
-    """The policy, or null without FILE."""
+    """Path of the policy file; null without FILE."""
     source: RightsFound
     """Where the rights come from."""
     created: bool
-    """Whether the policy is a new file, or would be with `--accept`."""
+    """Whether the policy file is new, or would be with `--accept`."""
     changed: bool
-    """Whether the policy changes, or would with `--accept`."""
+    """Whether the policy file changes, or would change with `--accept`."""
     dry_run: DryRun
     observation: Observation
     """The nodes that were observed; empty for a log."""
     added: Sequence[Right]
-    """The rights that are added."""
+    """The rights that are added to the policy."""
     copied: Sequence[str]
-    """Common parts that are copied next to the policy."""
+    """Paths of common parts that are copied next to the policy."""
     accepted: bool | None
-    """For a log: whether `--accept` was given; if not, no right is written."""
+    """For a log: whether `--accept` was given; without it, no right is written."""
     denials: Sequence[AskingLine] | None
     """For a log: the lines that ask for the rights."""
     changes: FileChanges
@@ -689,11 +716,11 @@ class LearnedPolicy(NamedTuple):
 
 
 class Draft(NamedTuple):
-    """A change of the policy at ``path`` that is not written yet.
+    """A change of the policy file at ``path`` that is not written yet.
 
-    ``before`` is the present content of the policy, None if there is no file; ``document`` is the
-    new content.  ``copies`` are files to create, by their paths relative to the policy's folder.
-    ``document`` must have all rights in ``least`` and none outside of ``most``.
+    ``before`` is the present content of the file, None if there is no file; ``document`` is the
+    new content.  ``copies`` maps the paths of files to create, relative to the policy's folder, to
+    their content.  ``document`` must give all rights in ``least`` and no right outside of ``most``.
     """
 
     path: Path
@@ -712,11 +739,13 @@ class Draft(NamedTuple):
 
 
 def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
-    """Return how ``learned`` changes the policy file at ``path``; nothing is written.
+    """Return the change that adds the ``learned`` rights to the policy file at ``path``.
 
-    ``common`` are the parts that ``learned`` may include (None: one file without includes).  Raises
-    `PolicyError` (or another `DocumentError`) if the file is not a policy, or if nothing can be
-    added to it.
+    Nothing is written.  ``common`` are the parts that ``learned`` may include; None writes one file
+    without includes.
+
+    Raises:
+        PolicyError, DocumentError: the file is not a policy, or no rights can be added to it.
     """
     additions = learned.policy()
     rights = policy_rights(additions)
@@ -747,7 +776,7 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
 def _parted(
     path: Path, before: bytes, merged: bytes, learned: Learned, common: CommonParts
 ) -> tuple[Learned, list[LearnedProfile]]:
-    """Return the rights to write name by name, and the profiles that get includes.
+    """Return the rights to write name by name, and the profiles to write with includes.
 
     An existing profile gets an include only if it neither has nor denies any right of the include.
     """
@@ -778,9 +807,10 @@ def _parted(
 
 
 def write(plan: Draft) -> None:
-    """Write a draft; after a failure, no file is changed.
+    """Write a draft to disk; after a failure, no file is changed.
 
-    Raises `PolicyError` if the new policy, read again, would not have the expected rights.
+    Raises:
+        PolicyError: the new policy, read again, would not give the expected rights.
     """
     if not plan.changes:
         return
@@ -798,7 +828,9 @@ def _check(plan: Draft) -> None:
     except DocumentError as error:
         why = f"{error}"
     raise PolicyError(
-        f"the learned rights cannot be written to '{plan.path}'", why, "Add --flat: no includes."
+        f"the learned rights cannot be written to '{plan.path}'",
+        why,
+        "Add --flat, which writes no includes.",
     )
 
 
@@ -806,7 +838,7 @@ def _check(plan: Draft) -> None:
 
 
 def render(learned: Learned) -> bytes:
-    """Return a policy file with the learned profiles; the same profiles give the same bytes."""
+    """Return the learned profiles as a policy file (XML); same profiles, same bytes."""
     declared = f' xmlns:xi="{_XINCLUDE}"' if learned.includes else ""
     lines = [f'<policy version="{VERSION}"{declared}>', "  <enclaves>"]
     for path, profiles in groupby(learned.profiles, key=lambda profile: profile.enclave):
@@ -822,7 +854,7 @@ def render(learned: Learned) -> bytes:
 
 
 def _content(profile: LearnedProfile, include: str, unit: str) -> Iterator[str]:
-    """Yield the lines inside a profile; ``include`` is the tag name of an include element."""
+    """Yield the XML lines inside a profile; ``include`` is the tag name of an include element."""
     yield from _includes(profile, include)
     for group in profile.groups:
         item = group.kind.removesuffix("s")
@@ -840,10 +872,11 @@ def _includes(profile: LearnedProfile, include: str) -> Iterator[str]:
 def _with_includes(
     path: Path, before: bytes, merged: bytes, profiles: Iterable[LearnedProfile]
 ) -> tuple[bytes, tuple[str, ...]]:
-    """Return ``merged`` (``before`` with the learned rights) with includes, and the included parts.
+    """Return the policy file ``merged`` with includes added, and the included parts.
 
-    A profile that ``before`` already had gets its includes in front of its content.  A new profile
-    gets none if the policy denies one of its rights.
+    ``merged`` is ``before`` with the learned rights.  A profile that ``before`` already had gets
+    its includes in front of its content.  A new profile gets no includes if the policy denies one
+    of its rights.
     """
     name = f"the policy file '{path}'"
     known = _profiles(EditedText(before, name))
@@ -882,12 +915,12 @@ def _profiles(text: EditedText) -> dict[tuple[str, str, str], PlacedElement]:
 
 
 def _profiles_of(path: Path, document: bytes) -> frozenset[tuple[str, str, str]]:
-    """Return enclave, namespace and node of each profile in the file, without its includes."""
+    """Return (enclave, namespace, node) of the profiles in the file itself, not in its includes."""
     return frozenset(_profiles(EditedText(document, f"the policy file '{path}'")))
 
 
 def _in_front(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
-    """Return the includes of a profile as text to insert before its content."""
+    """Return the XML of a profile's includes, to insert before the profile's content."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)
     lead = "" if outer is None else text.newline + outer + text.unit
@@ -895,7 +928,7 @@ def _in_front(profile: LearnedProfile, element: PlacedElement, text: EditedText)
 
 
 def _inside(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
-    """Return the content of a profile as text, indented like its neighbours."""
+    """Return the XML of a profile's content, indented like its neighbours."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)
     if outer is None:

@@ -3,11 +3,11 @@
 Topics have their raw DDS names here (``rt/chatter``, ``rq/addRequest``), because only those are
 unambiguous; `sros_tool.graph.learn` translates them to ROS names.
 
-As a process, ``python -P -m sros_tool.graph.observation FD PERIOD``, this module looks at the ROS
-graph itself, so that the DDS can log to standard output, refuse, or crash without harm to its
-parent.  It writes JSON, one object per line, to the file descriptor FD: first ``{"ready": RMW}`` or
-``{"failed": STAGE, "reason": TEXT}``, then the graph after each change.  It looks every PERIOD
-seconds, and exits when its standard input is closed.
+``python -P -m sros_tool.graph.observation FD PERIOD`` is the observer process: it reads the ROS
+graph through rclpy, so that a DDS that logs to standard output, refuses or crashes does no harm to
+its parent.  It writes JSON, one object per line, to the file descriptor FD: first
+``{"ready": RMW}`` or ``{"failed": STAGE, "reason": TEXT}``, then the graph after each change.  It
+reads the graph every PERIOD seconds, and exits when its standard input is closed.
 """
 
 from __future__ import annotations
@@ -28,65 +28,65 @@ PUBLISH, SUBSCRIBE = "publish", "subscribe"
 
 
 class Endpoint(NamedTuple):
-    """A DDS topic (its raw name), and whether it is written (publish) or read (subscribe)."""
+    """A DDS writer (publish) or reader (subscribe) of a topic."""
 
     topic: str
-    """Its DDS topic."""
+    """Raw DDS name of the topic, such as ``rt/chatter``."""
     direction: Annotated[str, Words((PUBLISH, SUBSCRIBE))]
-    """What it does."""
+    """Whether the endpoint writes or reads the topic."""
 
 
 @shows("enclaves", "namespace", "name", "participant", "publish", "subscribe")
 @dataclass(frozen=True, slots=True, order=True)
 class ObservedNode:
-    """A node of one process.
+    """A node of a process.
 
-    ``enclaves`` holds the enclave of that process; several, sorted, if the graph does not show
-    which of them it is.  ``participant`` is the first 12 bytes of its endpoints' identifiers, in
-    hex (RTPS 2.3, 8.2.4.1): the same for all nodes of a process, different for each process.
+    ``enclaves`` holds the enclave of the process; all candidates, sorted, if the graph does not
+    show which enclave it is.  ``participant`` is the first 12 bytes of the identifiers of the
+    node's endpoints, in hexadecimal (RTPS 2.3, 8.2.4.1): nodes of the same process have the same.
     """
 
     enclaves: tuple[str, ...]
-    """Its enclave; several if the graph does not show which."""
+    """Enclave of the node; several candidates if the graph does not show which."""
     ns: str
     name: str
-    """Its name."""
+    """Name of the node, without its namespace."""
     participant: str
-    """The participant of its process, in hexadecimal."""
+    """DDS participant of the node's process: the GUID prefix, in hexadecimal."""
     endpoints: frozenset[Endpoint]
 
     @property
     def namespace(self) -> str:
-        """Its namespace."""
+        """Namespace of the node."""
         return self.ns
 
     @property
     def publish(self) -> list[str]:
-        """DDS topics that it writes."""
+        """DDS topics that the node writes."""
         return _topics(self, PUBLISH)
 
     @property
     def subscribe(self) -> list[str]:
-        """DDS topics that it reads."""
+        """DDS topics that the node reads."""
         return _topics(self, SUBSCRIBE)
 
     @property
     def fqn(self) -> str:
-        """The node's name with its namespace."""
+        """Full name of the node: namespace and name."""
         return f"{self.ns.rstrip('/')}/{self.name}"
 
 
 @shows("nodes")
 class Observation(NamedTuple):
-    """The nodes of a graph, sorted, and the endpoints that belong to none of them.
+    """The nodes of a ROS graph, sorted, and the endpoints that belong to no node.
 
     ``silent`` are nodes (enclave, namespace, name) that were announced but had no endpoint.
-    ``strays`` are endpoints without a node: of a program that does not use ROS, or of a node
-    that was not discovered completely.
+    ``strays`` are endpoints (participant, endpoint) without a node: of a program that does not use
+    ROS, or of a node that was not discovered completely.
     """
 
     nodes: tuple[ObservedNode, ...] = ()
-    """The nodes that were observed; empty if none were asked for."""
+    """The observed nodes; empty if the graph was not observed."""
     silent: frozenset[tuple[str, str, str]] = frozenset()
     strays: frozenset[tuple[str, Endpoint]] = frozenset()
 
@@ -96,22 +96,22 @@ class Observation(NamedTuple):
         return sum(len(node.endpoints) for node in self.nodes)
 
     def union(self, other: Observation) -> Observation:
-        """Return everything that is in either of the two observations.
+        """Return the nodes and endpoints of both observations together.
 
-        A process never changes its enclave, so only the enclaves remain that are possible in both
-        observations.
+        A process never changes its enclave, so a node keeps only the candidate enclaves that both
+        observations have.
         """
         enclaves: dict[str, tuple[str, ...]] = {}
         endpoints: dict[tuple[str, str, str], frozenset[Endpoint]] = {}
         for node in (*self.nodes, *other.nodes):
             before = enclaves.get(node.participant, node.enclaves)
-            both = tuple(each for each in before if each in node.enclaves)
+            both = tuple(enclave for enclave in before if enclave in node.enclaves)
             enclaves[node.participant] = both or tuple(sorted({*before, *node.enclaves}))
             key = (node.participant, node.ns, node.name)
             endpoints[key] = endpoints.get(key, frozenset()) | node.endpoints
         nodes = sorted(
-            ObservedNode(enclaves[participant], ns, name, participant, found)
-            for (participant, ns, name), found in endpoints.items()
+            ObservedNode(enclaves[participant], ns, name, participant, node_endpoints)
+            for (participant, ns, name), node_endpoints in endpoints.items()
         )
         heard = {(enclave, n.ns, n.name) for n in nodes for enclave in n.enclaves}
         claimed = {(n.participant, endpoint) for n in nodes for endpoint in n.endpoints}
@@ -127,15 +127,15 @@ def make_observation(
     silent: Iterable[tuple[str, str, str]] = (),
     strays: Iterable[tuple[str, Endpoint]] = (),
 ) -> Observation:
-    """Return an observation of these nodes, sorted."""
+    """Return an `Observation` with ``nodes`` sorted."""
     return Observation(tuple(sorted(nodes)), frozenset(silent), frozenset(strays))
 
 
 def from_json(value: Mapping[str, Any]) -> Observation:
-    """Return the observation in JSON that `as_plain` has made of one.
+    """Return the observation that `as_plain` turned into the JSON value ``value``.
 
     Raises:
-        ValueError, TypeError, KeyError: ``value`` is of another form.
+        ValueError, TypeError, KeyError: ``value`` is not such a JSON value.
     """
     return make_observation(
         ObservedNode(
@@ -160,14 +160,14 @@ def _topics(node: ObservedNode, direction: str) -> list[str]:
 
 
 _NODE_NAME = "_sros_observer_" + secrets.token_hex(8)
-"""The name of the node that observes: nobody else can know it before the node is there."""
+"""Name of the observer's node; random, so that no other program knows it before the node starts."""
 
 _PREFIX_BYTES = 12  # of an endpoint's identifier: its participant (RTPS 2.3, 9.3.1)
 _DISCOVERY = "ros_discovery_info"
 # These keep their participants sorted by identifier, and list nodes in that order.
 _ORDERED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp", "rmw_connextdds")
 _LOG_FLUSH_SECONDS = 0.3
-"""Time for the logging thread of Fast DDS: a process that exits at once loses the reason."""
+"""Time to wait before exit, so that the logging thread of Fast DDS prints why it failed."""
 _ATTEMPTS = 5
 
 
@@ -222,7 +222,10 @@ def _look(node: Any, report: Any, period: float, ordered: bool) -> None:
 
 
 class _Observer:
-    """The node that observes, which it leaves out; never another one that takes its name."""
+    """The observer's node, which reads the graph and leaves itself out of it.
+
+    Another node that takes the same name later is not left out.
+    """
 
     def __init__(self, node: Any) -> None:
         self._node = node
@@ -230,7 +233,7 @@ class _Observer:
         self._participant = ""
 
     def sight(self) -> tuple[list[Any], list[Any]] | None:
-        """Return nodes and endpoints that belong together; None if nodes came or went each time."""
+        """Return nodes and endpoints of the same moment; None if nodes changed in every attempt."""
         for _ in range(_ATTEMPTS):
             listed = self._listed()
             endpoints = self._endpoints()
@@ -239,18 +242,21 @@ class _Observer:
         return None
 
     def _listed(self) -> list[tuple[str, str, str]]:
-        """Return enclave, namespace and name of each other node, in the RMW's order."""
-        found = self._node.get_node_names_and_namespaces_with_enclaves()
-        listed = [(enclave, ns, name) for name, ns, enclave in found]
-        itself = self._itself or next((each for each in listed if each[2] == _NODE_NAME), None)
+        """Return (enclave, namespace, name) of all nodes but the observer, in the RMW's order."""
+        nodes = self._node.get_node_names_and_namespaces_with_enclaves()
+        listed = [(enclave, ns, name) for name, ns, enclave in nodes]
+        itself = self._itself or next((node for node in listed if node[2] == _NODE_NAME), None)
         if itself in listed:
             self._itself = itself
             listed.remove(itself)
         return listed
 
     def _endpoints(self) -> list[tuple[str, str, str, str, str]]:
-        """Return the sorted endpoints: participant, node namespace and name, topic, direction."""
-        found = set()
+        """Return all endpoints but the observer's, sorted.
+
+        An endpoint is (participant, namespace of its node, name of its node, topic, direction).
+        """
+        endpoints = set()
         for topic, _ in self._node.get_topic_names_and_types(no_demangle=True):
             if topic == _DISCOVERY:  # every participant has it, and no policy mentions it
                 continue
@@ -260,13 +266,15 @@ class _Observer:
             ):
                 for info in infos:
                     participant = bytes(info.endpoint_gid[:_PREFIX_BYTES]).hex()
-                    found.add((participant, info.node_namespace, info.node_name, topic, direction))
+                    endpoints.add(
+                        (participant, info.node_namespace, info.node_name, topic, direction)
+                    )
         # The first participant with this name is this process: the name is not known elsewhere yet.
-        named = {participant for participant, _, name, *_ in found if name == _NODE_NAME}
+        named = {participant for participant, _, name, *_ in endpoints if name == _NODE_NAME}
         if len(named) == 1 and not self._participant:
             (self._participant,) = named
         own = self._participant, _NODE_NAME
-        return sorted(each for each in found if (each[0], each[2]) != own)
+        return sorted(endpoint for endpoint in endpoints if (endpoint[0], endpoint[2]) != own)
 
 
 def _send(report: Any, value: object) -> None:

@@ -1,7 +1,7 @@
 """Observe the live ROS graph through rclpy, and find the enclave of each node.
 
 `RosGraph` runs rclpy in a separate process (`observation.main`); `settle`, `look_for` and `watch`
-decide for how long.  Times are in seconds; clock and source are passed in.
+decide how long the graph is observed.  Times are in seconds; clock and source are passed in.
 
 rclpy lists nodes with their enclaves, but without their processes; it lists endpoints with the
 names of their nodes and with their participants (processes), but without enclaves.  `resolve`
@@ -37,7 +37,7 @@ from sros_tool.pki.certificates import IDENTITY_DIGITS
 
 _LOG = logging.getLogger(__name__)
 _PERIOD_SECONDS = 0.1
-"""Time between two looks at the graph; a node that lives for a second is seen several times."""
+"""Time between two readings of the graph; a node that runs for a second is read several times."""
 _START_SECONDS = 30.0
 _END_SECONDS = 3.0
 
@@ -50,7 +50,10 @@ class GraphSource(Protocol):
 
 
 class ObserverError(UnavailableError):
-    """A failure of the observer: ``reason`` is from rclpy, ``output`` is what the DDS printed."""
+    """A failure of the observer process.
+
+    ``reason`` is the text from rclpy, ``output`` the text that the DDS printed.
+    """
 
     def __init__(self, what: str, reason: str, output: str) -> None:
         super().__init__(what, reason)
@@ -61,9 +64,12 @@ class ObserverError(UnavailableError):
 class RosGraph:
     """The live ROS graph, observed by a child process; use it as a context manager.
 
-    ``environment`` are additional variables for that process: the domain, and the enclave if the
-    observer shall be secured.  Raises `UnavailableError` without rclpy, and `ObserverError` if
-    rclpy cannot start a node.
+    ``environment`` has additional variables for the child process: the domain, and the enclave if
+    the observer is to be secured.
+
+    Raises:
+        UnavailableError: rclpy is not installed.
+        ObserverError: rclpy cannot start a node.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
@@ -127,7 +133,10 @@ class RosGraph:
         return resolve(Sighting(_parse_listed(line["listed"]), endpoints, line["ordered"]))
 
     def close(self) -> None:
-        """End the observer; first by closing its input, so that it leaves the graph properly."""
+        """Stop the observer process.
+
+        Closing its input lets it leave the graph properly; a process that does not end is killed.
+        """
         if self._process.stdin:
             self._process.stdin.close()
         try:
@@ -139,7 +148,7 @@ class RosGraph:
         self._output.close()
 
     def _line(self, seconds: float) -> dict[str, Any] | None:
-        """Return the next line of the observer, or None if none comes within ``seconds``."""
+        """Return the next JSON object of the observer; None if none comes within ``seconds``."""
         deadline = time.monotonic() + seconds
         with selectors.DefaultSelector() as selector:
             selector.register(self._report, selectors.EVENT_READ)
@@ -163,7 +172,7 @@ class RosGraph:
         if answer is None:
             ended = self._process.poll()
             reason = (
-                f"It ended with status {ended}." if ended is not None else "It does not answer."
+                f"It exited with status {ended}." if ended is not None else "It does not answer."
             )
             return ObserverError("the process that observes the ROS graph failed", reason, output)
         what = {
@@ -187,7 +196,7 @@ def _require_rclpy() -> None:
 
 
 def _parse_listed(listed: Sequence[Sequence[str]]) -> tuple[Listed, ...]:
-    """Return the announced nodes from the JSON of the observer."""
+    """Return the announced nodes in the observer's JSON, as (enclave, namespace, name)."""
     return tuple((enclave, ns, name) for enclave, ns, name in listed)
 
 
@@ -199,12 +208,12 @@ _TICK = 0.2
 
 
 class Settling(NamedTuple):
-    """The times after which an observed graph counts as complete, in seconds.
+    """The times, in seconds, after which an observed graph counts as complete.
 
-    It is complete once ``least`` has passed and it has not changed for ``still``, but at the latest
-    after ``most``.  Fast DDS announces its participants in a first burst, and then every 3 s.  With
-    many participants, parts of the burst get lost: a graph of half a robot did not change from 0.4
-    to 3.4 s.
+    The graph is complete once ``least`` seconds have passed and it has not changed for ``still``
+    seconds, but at the latest after ``most`` seconds.  Fast DDS announces its participants in a
+    first burst, and then every 3 s.  With many participants, parts of the burst get lost: a graph
+    of half a robot did not change from 0.4 to 3.4 s.
     """
 
     least: float = 4.0
@@ -218,9 +227,10 @@ SECURED = Settling(least=6.0, still=5.0, most=45.0)
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A graph, the seconds it took to observe, and whether the graph had stopped changing.
+    """The graph at the end of an observation that took ``seconds`` seconds.
 
-    ``everything`` also has the nodes that were seen and went while the graph was observed.
+    ``everything`` also has the nodes that left while the graph was observed.  ``settled`` says
+    whether the graph had stopped changing.
     """
 
     observation: Observation
@@ -230,7 +240,7 @@ class Snapshot:
 
     @property
     def gone(self) -> frozenset[str]:
-        """The full names of the nodes that were seen and are no longer there."""
+        """Full names of the nodes that left while the graph was observed."""
         stayed = {(node.participant, node.fqn) for node in self.observation.nodes}
         return frozenset(
             node.fqn for node in self.everything.nodes if (node.participant, node.fqn) not in stayed
@@ -238,7 +248,7 @@ class Snapshot:
 
 
 def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
-    """Return the graph once it stops changing, or as it is after ``settling.most``."""
+    """Return the graph once it stops changing, at the latest after ``settling.most`` seconds."""
     begin = changed = clock()
     seen = everything = Observation()
     while True:
@@ -272,10 +282,11 @@ def watch(
     still: float = 0.5,
     patience: float = 2.0,
 ) -> Snapshot:
-    """Return the union of everything seen in ``seconds`` (None: no limit), or until ``stop()``.
+    """Return the union of all graphs in ``seconds`` (None: no limit), or until ``stop()`` is true.
 
-    ``report`` gets the union each time it has grown and then not changed for ``still`` seconds, so
-    that no incompletely discovered node is reported; but at most ``patience`` seconds later.
+    ``report`` is called with the union after it has grown and then not changed for ``still``
+    seconds, so that no node is reported before it is discovered completely; at the latest
+    ``patience`` seconds after the union has grown.
     """
     begin = clock()
     union = reported = Observation()
@@ -308,11 +319,12 @@ NOBODY = "_NODE_NAME_UNKNOWN_"
 
 
 class Sighting(NamedTuple):
-    """One look at the graph: the announced nodes, in their order, and all endpoints.
+    """One reading of the graph.
 
-    Each endpoint comes with its participant, and the namespace and name of its node.  ``ordered``
-    says that the nodes are listed by ascending participant, as rmw_dds_common does (graph_cache
-    keeps its participants in a map by identifier).
+    ``listed`` are the announced nodes, in the order of the RMW.  ``endpoints`` are tuples of
+    participant, namespace and name of the node, and endpoint.  ``ordered`` says that the RMW lists
+    nodes by ascending participant, as rmw_dds_common does (graph_cache keeps its participants in a
+    map by identifier).
     """
 
     listed: tuple[Listed, ...]
@@ -321,7 +333,7 @@ class Sighting(NamedTuple):
 
 
 def resolve(sighting: Sighting) -> Observation:
-    """Return the nodes of a sighting, each with its process and its possible enclaves."""
+    """Return the nodes of a sighting, with their process and their possible enclaves."""
     by_participant: dict[str, dict[_Name, set[Endpoint]]] = {}
     strays = set()
     for participant, ns, name, endpoint in sighting.endpoints:
@@ -331,14 +343,17 @@ def resolve(sighting: Sighting) -> Observation:
             nodes = by_participant.setdefault(participant, {})
             nodes.setdefault((ns, name), set()).add(endpoint)
     candidates = _enclaves(
-        sighting, {each: frozenset(nodes) for each, nodes in by_participant.items()}
+        sighting,
+        {participant: frozenset(nodes) for participant, nodes in by_participant.items()},
     )
     nodes_seen = []
     heard = set()
     for participant, nodes in by_participant.items():
         enclaves = tuple(sorted(candidates[participant]))
         if not enclaves:  # not announced yet, or no longer
-            strays |= {(participant, each) for every in nodes.values() for each in every}
+            strays |= {
+                (participant, endpoint) for endpoints in nodes.values() for endpoint in endpoints
+            }
             continue
         for (ns, name), endpoints in nodes.items():
             heard |= {(enclave, ns, name) for enclave in enclaves}
@@ -349,7 +364,10 @@ def resolve(sighting: Sighting) -> Observation:
 def _enclaves(
     sighting: Sighting, processes: dict[str, frozenset[_Name]]
 ) -> dict[str, frozenset[str]]:
-    """Return the possible enclaves of each process, as few as the sighting allows."""
+    """Map each process to its possible enclaves, as few as the sighting allows.
+
+    ``processes`` maps participants to the names of their nodes.
+    """
     free: dict[str, Counter[_Name]] = {}
     for enclave, ns, name in sighting.listed:
         free.setdefault(enclave, Counter())[(ns, name)] += 1
@@ -368,7 +386,7 @@ def _enclaves(
         ]
         if not news:
             return candidates
-        # A listed node that belongs to one process cannot belong to another: that may decide more.
+        # A listed node of a decided process cannot belong to another: that may decide others.
         for process in news:
             settled.add(process)
             (enclave,) = candidates[process]
@@ -386,10 +404,10 @@ def _by_order(
     processes: dict[str, frozenset[_Name]],
     candidates: dict[str, frozenset[str]],
 ) -> dict[str, frozenset[str]]:
-    """Return the candidates narrowed by the order of the list; unchanged if the order is wrong.
+    """Return ``candidates`` with the enclaves that the order of ``listed`` decides.
 
-    The nth listed node of a name belongs to the nth participant with a node of that name, if both
-    are equally many.
+    The nth listed node of a name belongs to the nth participant with a node of that name, if there
+    are as many nodes as participants.  ``candidates`` stay unchanged if this contradicts them.
     """
     enclaves: dict[_Name, list[str]] = {}
     for enclave, ns, name in listed:
@@ -412,15 +430,15 @@ def _by_order(
 
 
 _SECURED = tuple("89abcdef")
-"""The first hex digits that identifiers of secured participants have: the first bit is set."""
+"""First hexadecimal digits of the identifiers of secured participants: their first bit is set."""
 _DEFAULT_ENCLAVE = ("/",)
 
 
 def identified(observation: Observation, enclaves: Mapping[str, str]) -> Observation:
-    """Return the observation with the enclaves that its participants' certificates show.
+    """Return the observation with the enclaves that the certificates of participants show.
 
-    ``enclaves`` maps the result of `identity_of` to an enclave.  A secured node gets no enclave if
-    neither this map nor the graph shows it.
+    ``enclaves`` maps the result of `identity_of` to an enclave.  A secured node keeps no enclave if
+    neither this map nor the graph shows its enclave.
     """
     nodes = []
     for node in observation.nodes:

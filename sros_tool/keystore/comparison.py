@@ -1,4 +1,4 @@
-"""What becomes looser and what tighter between two governances, or two keystore settings."""
+"""Comparison of two governances or two keystore settings: what becomes looser, what tighter."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from sros_tool.zenoh.configuration import ZenohNetwork
 
 
 class Effect(StrEnum):
-    """Whether a change gives anybody more possibilities, or fewer."""
+    """Whether a change allows more (looser) or less (tighter), or applies only later."""
 
     LOOSER = "looser"
     TIGHTER = "tighter"
     LATER = "later"
-    """Neither today: it holds for what is made later."""
+    """Changes nothing now: applies to what is made later."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,16 +32,16 @@ class SettingChange:
     """A setting that changes."""
 
     effect: Effect
-    """``looser``: something becomes possible; ``tighter``: something is no longer possible;
-    ``later``: it holds for what is made later."""
+    """``looser``: more is allowed; ``tighter``: less is allowed; ``later``: applies only to what
+    is made later."""
     key: str
-    """Its key in sros.toml, or ``domain``."""
+    """Key of the setting in sros.toml, or ``domain``."""
     before: str
-    """The value before."""
+    """Value before the change."""
     after: str
-    """The value after."""
+    """Value after the change."""
     meaning: str
-    """What that means in ROS terms, as a clause."""
+    """Meaning of the change in ROS terms, as a clause."""
 
     def __str__(self) -> str:
         return f"{self.key} {self.before} -> {self.after}: {self.meaning}"
@@ -56,7 +56,7 @@ _PROPERTIES: dict[ProtectionKind, frozenset[str]] = {
         {"integrity", "secrecy", "origin"}
     ),
 }
-"""What each protection kind gives (DDS-Security 1.1, 9.4.1.2.3)."""
+"""Properties that each protection kind gives a message (DDS-Security 1.1, 9.4.1.2.3)."""
 
 _LOSS = {
     "secrecy": "no longer encrypted",
@@ -101,17 +101,17 @@ _FLAG_WORDS = {
         "writing {} needs permissions",
     ),
 }
-"""For each flag, the clauses for its open and its protecting value."""
+"""For each flag of governance, the clauses for its open and its protecting value."""
 
 
 # ── governance ─────────────────────────────────────────────────────────────────────────────
 
 
 def compare_governance(old: Governance, new: Governance) -> tuple[SettingChange, ...]:
-    """Return what changes between two governances, in ROS terms.
+    """Return the changes from governance ``old`` to ``new``, in ROS terms.
 
-    The protection of a topic is that of the first rule that matches it, so rules are compared by
-    what they decide, not by their text.
+    Only the first rule that matches a topic protects it, so rules are compared by the protection
+    that topics get, not by their text.
     """
     return tuple(dict.fromkeys(_governance_changes(old, new)))
 
@@ -127,33 +127,36 @@ def _governance_changes(old: Governance, new: Governance) -> Iterator[SettingCha
     pairs = dict.fromkeys(
         (_rule_of(old, domain), _rule_of(new, domain)) for domain in before if domain in after
     )
-    for one, other in pairs:
-        yield from attribute_changes(one, other, "protection", "")
-        for expression, first, second in _topic_pairs(one, other):
+    for old_rule, new_rule in pairs:
+        yield from attribute_changes(old_rule, new_rule, "protection", "")
+        for expression, old_topic_rule, new_topic_rule in _topic_pairs(old_rule, new_rule):
             key, name = _key_and_name(expression)
-            if first and second:
-                yield from attribute_changes(first, second, key, name)
-            elif second:
+            if old_topic_rule and new_topic_rule:
+                yield from attribute_changes(old_topic_rule, new_topic_rule, key, name)
+            elif new_topic_rule:
                 yield SettingChange(Effect.LOOSER, key, "no rule", "a rule", f"{name} can be used")
             else:
                 text = f"{name} can no longer be used"
                 yield SettingChange(Effect.TIGHTER, key, "a rule", "no rule", text)
 
 
-def _without(one: DomainSet, other: DomainSet) -> DomainSet:
-    return DomainSet.of(*((each, each) for each in one if each not in other))
+def _without(domains: DomainSet, removed: DomainSet) -> DomainSet:
+    return DomainSet.of(*((domain, domain) for domain in domains if domain not in removed))
 
 
 def _rule_of(governance: Governance, domain: int) -> DomainRule:
-    return next(each for each in governance.domain_access_rules if domain in each.domains.closed())
+    return next(rule for rule in governance.domain_access_rules if domain in rule.domains.closed())
 
 
 def _topic_pairs(
     old: DomainRule, new: DomainRule
 ) -> Iterator[tuple[str, TopicRule | None, TopicRule | None]]:
-    """Yield topic expressions with the different rules that decide on them before and after."""
+    """Yield (topic expression, its old rule, its new rule) where the deciding rule differs.
+
+    A rule is None if no rule of the domain covers the expression.
+    """
     rules = (*old.topic_access_rules, *new.topic_access_rules)
-    expressions = list(dict.fromkeys(each.topic_expression for each in rules))
+    expressions = list(dict.fromkeys(rule.topic_expression for rule in rules))
     # A name without wildcards is covered by what it overlaps with.
     for one, other in combinations(filter(is_expression, expressions), 2):
         parted = overlap(one, other) and not covers(one, other) and not covers(other, one)
@@ -161,38 +164,45 @@ def _topic_pairs(
         if parted and (name := common_name((one, other), absolute=False)):
             expressions.append(name)
     before_of, after_of = _deciding(old), _deciding(new)
-    for each in expressions:
-        before, after = before_of(each), after_of(each)
+    for expression in expressions:
+        before, after = before_of(expression), after_of(expression)
         if (before is None) != (after is None) or (before and after and not _equal(before, after)):
-            yield each, before, after
+            yield expression, before, after
 
 
 def _deciding(domain: DomainRule) -> Callable[[str], TopicRule | None]:
-    """Return the function that returns the first rule that covers a topic expression."""
+    """Return a function from a topic expression to the first rule in ``domain`` that covers it.
+
+    The function returns None if no rule covers the expression.
+    """
     numbered = list(enumerate(domain.topic_access_rules))
-    own = {each.topic_expression: (number, each) for number, each in reversed(numbered)}
-    wide = [(number, each) for number, each in numbered if is_expression(each.topic_expression)]
+    own = {rule.topic_expression: (number, rule) for number, rule in reversed(numbered)}
+    wide = [(number, rule) for number, rule in numbered if is_expression(rule.topic_expression)]
 
     def rule_for(expression: str) -> TopicRule | None:
-        place, found = own.get(expression, (len(numbered), None))
-        for number, each in wide:
+        place, exact = own.get(expression, (len(numbered), None))
+        for number, rule in wide:
             if number > place:
                 break
-            if covers(each.topic_expression, expression):
-                return each
-        return found
+            if covers(rule.topic_expression, expression):
+                return rule
+        return exact
 
     return rule_for
 
 
 def _equal(one: TopicRule, other: TopicRule) -> bool:
     return all(
-        getattr(one, each.name) == getattr(other, each.name) for each in attributes(TopicRule)
+        getattr(one, attribute.name) == getattr(other, attribute.name)
+        for attribute in attributes(TopicRule)
     )
 
 
 def _key_and_name(expression: str) -> tuple[str, str]:
-    """Return the prefix of the settings' keys for a topic expression, and its name in ROS terms."""
+    """Return the prefix of setting keys for a topic expression, and the topic's ROS name.
+
+    The name comes with its kind, such as "service /add".
+    """
     if expression == "*":
         return "protection.default", "everything without protection of its own"
     service, _ = service_of(expression)
@@ -209,30 +219,34 @@ def _key_and_name(expression: str) -> tuple[str, str]:
 def attribute_changes(
     old: DomainRule | TopicRule, new: DomainRule | TopicRule, prefix: str, name: str
 ) -> Iterator[SettingChange]:
-    """Yield what changes between two rules of a kind; keys begin with ``prefix``.
+    """Yield the changes between two domain rules or two topic rules.
 
-    ``name`` are the topics of topic rules, in ROS terms.
+    Args:
+        old: the rule before.
+        new: the rule after, of the same class.
+        prefix: beginning of the setting keys of the changes.
+        name: ROS name of the topics that a topic rule covers; "" for domain rules.
     """
-    for each in attributes(type(old)):
-        before, after = getattr(old, each.name), getattr(new, each.name)
+    for attribute in attributes(type(old)):
+        before, after = getattr(old, attribute.name), getattr(new, attribute.name)
         if before == after:
             continue
-        key, one, other = f"{prefix}.{each.term}", _text(before), _text(after)
-        if each.is_flag:
-            effect = Effect.LOOSER if after == each.open else Effect.TIGHTER
-            meaning = _FLAG_WORDS[each.name][effect is Effect.TIGHTER].format(name)
-            yield SettingChange(effect, key, one, other, meaning)
+        key, before_text, after_text = f"{prefix}.{attribute.term}", _text(before), _text(after)
+        if attribute.is_flag:
+            effect = Effect.LOOSER if after == attribute.open else Effect.TIGHTER
+            meaning = _FLAG_WORDS[attribute.name][effect is Effect.TIGHTER].format(name)
+            yield SettingChange(effect, key, before_text, after_text, meaning)
             continue
-        subject = _ROS_WORDS[each.name].format(name)
+        subject = _ROS_WORDS[attribute.name].format(name)
         lost = _PROPERTIES[before] - _PROPERTIES[after]
         gained = _PROPERTIES[after] - _PROPERTIES[before]
-        for effect, found, words in (
+        for effect, properties, words in (
             (Effect.LOOSER, lost, _LOSS),
             (Effect.TIGHTER, gained, _GAIN),
         ):
-            if found:
-                meaning = " and ".join(text for word, text in words.items() if word in found)
-                yield SettingChange(effect, key, one, other, f"{subject}: {meaning}")
+            if properties:
+                meaning = " and ".join(text for word, text in words.items() if word in properties)
+                yield SettingChange(effect, key, before_text, after_text, f"{subject}: {meaning}")
 
 
 def _text(value: bool | ProtectionKind) -> str:
@@ -241,13 +255,13 @@ def _text(value: bool | ProtectionKind) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Mismatch:
-    """What does not communicate while one process has the old governance, another one the new.
+    """Communication that fails between a process with the old governance and one with the new.
 
-    Measured on Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5, which agree: two participants with
-    any difference in the kinds of protection of the domain do not communicate at all, and two with
-    any difference in a topic rule not on its topics.  Join access control, unauthenticated
-    participants and further domains disturb nobody.  ``everything`` says that nothing communicates;
-    ``names`` are topics, services and actions in ROS terms.
+    Measured on Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5, which agree: two participants whose
+    domain rules differ in a protection kind do not communicate at all; two whose rules for a topic
+    differ do not communicate on that topic.  Differences in join access control, unauthenticated
+    participants and domains do no harm.  ``everything`` says that no communication works; ``names``
+    are the topics, services and actions, with ROS names, that do not work.
     """
 
     everything: bool = False
@@ -265,13 +279,14 @@ _DISTURBING = {
 
 
 def mismatch(old: Governance, new: Governance) -> Mismatch:
-    """Return what does not communicate between processes with ``old`` and with ``new``."""
-    domains = [each for each in old.domains().closed() if each in new.domains().closed()]
+    """Return the communication that fails between processes with ``old`` and with ``new``."""
+    domains = [domain for domain in old.domains().closed() if domain in new.domains().closed()]
     names: dict[str, None] = {}
-    for one, other in dict.fromkeys((_rule_of(old, d), _rule_of(new, d)) for d in domains):
-        if any(getattr(one, each) != getattr(other, each) for each in _DISTURBING):
+    pairs = dict.fromkeys((_rule_of(old, d), _rule_of(new, d)) for d in domains)
+    for old_rule, new_rule in pairs:
+        if any(getattr(old_rule, kind) != getattr(new_rule, kind) for kind in _DISTURBING):
             return Mismatch(everything=True)
-        for expression, _, _ in _topic_pairs(one, other):
+        for expression, _, _ in _topic_pairs(old_rule, new_rule):
             if expression == "*":
                 return Mismatch(everything=True)  # also `ros_discovery_info`, which every node has
             names[_key_and_name(expression)[1]] = None
@@ -282,7 +297,7 @@ def mismatch(old: Governance, new: Governance) -> Mismatch:
 
 
 def compare_settings(old: Template, new: Template, now: datetime) -> tuple[SettingChange, ...]:
-    """Return what changes between two settings, apart from protection and names."""
+    """Return the changes between two settings of a keystore, without protection and names."""
     return tuple(_settings_changes(old, new, now))
 
 
@@ -305,8 +320,8 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
             one, other = _choice_text(key, before), _choice_text(key, after)
             yield SettingChange(effect, key, one, other, words[effect is Effect.TIGHTER])
     yield from _zenoh_changes(old.zenoh, new.zenoh)
-    rotated = "holds for the CAs that `sros rotate_ca` makes"
-    listed = "holds for the next revocation list, also of `sros crl --refresh`"
+    rotated = "applies to the CAs that `sros rotate_ca` makes"
+    listed = "applies to the next revocation list, also of `sros crl --refresh`"
     for key, one, other, meaning in (
         (
             "authorities.validity",
@@ -327,7 +342,7 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
 
 
 def _short_lived_changes(old: Template, new: Template) -> Iterator[SettingChange]:
-    """Yield the changes of enclaves that expire earlier than others."""
+    """Yield the changes of settings for enclaves whose files expire earlier than others."""
     lists = [{each.name: each.validity for each in side.short_lived} for side in (old, new)]
     for name in dict.fromkeys(name for side in lists for name in side):
         before, after = (side.get(name) for side in lists)
@@ -341,7 +356,7 @@ def _short_lived_changes(old: Template, new: Template) -> Iterator[SettingChange
 
 
 def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterator[SettingChange]:
-    """Yield what changes in a Zenoh network."""
+    """Yield the changes of a Zenoh network's settings; None: the keystore has no network."""
     if old is None or new is None:
         if old != new:
             one, other = (each.mode.value if each else "none" for each in (old, new))
@@ -349,9 +364,9 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
             yield SettingChange(Effect.LATER, "zenoh", one, other, meaning)
         return
     for key, meaning in (
-        ("router", "the other enclaves trust this one as the router"),
-        ("endpoints", "sessions connect there"),
-        ("listen", "the router listens there"),
+        ("router", "the other enclaves trust this enclave as the router"),
+        ("endpoints", "sessions connect to these endpoints"),
+        ("listen", "the router listens on these endpoints"),
         ("mode", "how sessions reach each other"),
         ("domains", "ROS domains of the network, within those of the governance"),
     ):
@@ -393,7 +408,7 @@ _CHOICES = (
         ),
     ),
 )
-"""Keys of settings, with their fields, open values, and clauses for looser and for tighter."""
+"""Settings with a few values: key, field, open value, and clauses for looser and tighter."""
 
 
 def _choice_text(key: str, value: bool | str) -> str:

@@ -1,6 +1,6 @@
-"""Confirmations: what a robot says that it has, as the digests of the files of its enclaves.
+"""Confirmations of robots: the digests of the enclave files that a robot says it has.
 
-A confirmation proves nothing: whoever has the robot can write what he likes into it.  So it is read
+A confirmation proves nothing: whoever controls the robot can write anything into it.  So it is read
 as hostile input, and only compared with what the keystore knows; no path in it is ever opened.
 `sros_tool/schemas/confirmation.json` describes the format.
 """
@@ -43,13 +43,13 @@ from sros_tool.xml import read_bytes
 
 _FORMAT = 1
 MAX_BYTES = 4 * 1024 * 1024
-"""Largest size of a confirmation: that of a robot with 4,000 enclaves."""
+"""Largest size of a confirmation in bytes; enough for a robot with 4,000 enclaves."""
 CONFIRMED_FILES = (
     *(file for file in REQUIRED_FILES if file != KEY_FILE),
     *OPTIONAL_FILES,
     *ZENOH_FILES,
 )
-"""The files of an enclave that a confirmation names: what is exported, without the key."""
+"""Names of the enclave files that a confirmation lists: all exported files but the key."""
 _CERTIFICATE_FILES = (CERTIFICATE_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 _KEYS = {"format", "robot", "time", "files"}
@@ -62,11 +62,11 @@ _PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERT
 
 @dataclass(frozen=True, slots=True)
 class Confirmation:
-    """What a robot says that it has, and the time of its clock.
+    """The enclave files that a robot says it has, and the time of the robot's clock.
 
-    ``files`` maps the paths of files to the SHA-256 of their bytes; ``certificates`` the paths of
-    files with certificates to the SHA-256 of each certificate (DER), in their order; where they are
-    left out, earlier certificates are not recognised.
+    ``files`` maps paths to the SHA-256 of the files.  ``certificates`` maps the paths of
+    certificate and CA files to the SHA-256 of each certificate (DER) in the file, in order; without
+    an entry, an earlier certificate in that file cannot be recognised.
     """
 
     robot: str
@@ -75,12 +75,12 @@ class Confirmation:
     certificates: Mapping[str, tuple[str, ...]]
 
     def enclaves(self) -> tuple[str, ...]:
-        """Return the names of the enclaves that have a file, sorted."""
+        """Return the names of the enclaves in the confirmation, sorted."""
         return tuple(sorted({enclave_of(path) for path in self.files}))
 
 
 def enclave_of(path: str) -> str:
-    """Return the enclave that a file belongs to, by its path in a keystore."""
+    """Return the name of the enclave that the file at ``path`` of a keystore belongs to."""
     return path.rpartition("/")[0].removeprefix(ENCLAVES) or "/"
 
 
@@ -88,14 +88,14 @@ def enclave_of(path: str) -> str:
 
 
 def make_confirmation(root: Path, robot: str, *, now: datetime) -> Confirmation:
-    """Return the confirmation of all enclaves in a folder of a robot, or in a keystore.
+    """Return a confirmation of all enclaves in ``root``, a keystore or a robot's installed folder.
 
-    A folder whose name is not one of an enclave is left out: no process can run in it.
+    Folders that are not named like an enclave are left out: no process can run in them.
 
     Raises:
         DocumentError: ``robot`` is not a robot's name.
         KeystoreError: ``root`` is no keystore, or a file in it is a link that leads out of it.
-        OSError: a file cannot be read: a confirmation without it would not be true.
+        OSError: a file cannot be read; a confirmation without that file would be false.
     """
     if problem := name_problem(robot):
         raise DocumentError(f"{robot!r} is not the name of a robot", problem)
@@ -117,17 +117,20 @@ def make_confirmation(root: Path, robot: str, *, now: datetime) -> Confirmation:
 
 def certificate_digests(data: bytes) -> tuple[str, ...]:
     """Return the SHA-256 of each certificate (DER) in a PEM file; damaged ones are left out."""
-    found = []
-    for each in _PEM.finditer(data):
+    digests = []
+    for block in _PEM.finditer(data):
         try:
-            found.append(hashlib.sha256(binascii.a2b_base64(each[1])).hexdigest())
+            digests.append(hashlib.sha256(binascii.a2b_base64(block[1])).hexdigest())
         except binascii.Error:
             continue
-    return tuple(found[:_MOST_CERTIFICATES])
+    return tuple(digests[:_MOST_CERTIFICATES])
 
 
 def render_confirmation(confirmation: Confirmation) -> bytes:
-    """Return a confirmation as JSON that `parse_confirmation` reads; the same gives the same."""
+    """Return a confirmation as JSON, which `parse_confirmation` reads.
+
+    The same confirmation always gives the same bytes.
+    """
     return _json(_value_of(confirmation))
 
 
@@ -154,7 +157,7 @@ def parse_confirmation(data: bytes, what: str) -> Confirmation:
     """Return the confirmation in a JSON document; ``what`` names it in errors.
 
     Raises:
-        DocumentError: it is too large, or not a confirmation; the error names the place.
+        DocumentError: the document is too large or not a confirmation; the error names the fault.
     """
     if len(data) > MAX_BYTES:
         raise DocumentError(
@@ -169,13 +172,13 @@ def parse_confirmation(data: bytes, what: str) -> Confirmation:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A confirmation, and when the keystore received it, by the clock at home."""
+    """A confirmation, and when the keystore received it, by the clock of the keystore's machine."""
 
     confirmation: Confirmation
     time: datetime
 
     def clock_note(self) -> str:
-        """Return what is wrong with the clock of the robot, as a clause; "" for up to a minute."""
+        """Return a clause on how far the robot's clock is off; "" for at most a minute."""
         ahead = self.confirmation.time - self.time
         if abs(ahead) <= _CLOCK_TOLERANCE:
             return ""
@@ -186,43 +189,52 @@ class Received:
 
 
 class KeptConfirmation(NamedTuple):
-    """What a robot confirmed that it has, which the keystore keeps."""
+    """A robot's confirmation that the keystore keeps."""
 
     keystore: NamedKeystore
     robot: str
-    """The robot."""
+    """Name of the robot."""
     received: datetime
-    """When it was received, by the clock at home, in UTC."""
+    """When the confirmation was received, by the clock of the keystore's machine, in UTC."""
     clock: datetime
-    """When it was made, by the clock of the robot, in UTC."""
+    """When the confirmation was made, by the clock of the robot, in UTC."""
     enclaves: Sequence[str]
-    """The enclaves that the robot has, sorted."""
+    """Names of the enclaves that the robot has, sorted."""
     files: int
-    """The number of their files, without keys."""
+    """Number of files of these enclaves, without keys."""
     dry_run: DryRun
     changes: Sequence[FileChange]
-    """The file that was written or, with ``--dry-run``, would be."""
+    """The file that was written, or would be with ``--dry-run``."""
     notes: Notes
 
 
 def receive(data: bytes, robot: str, what: str, *, now: datetime) -> Received:
-    """Return the confirmation of ``robot`` that was received ``now``.
+    """Return the confirmation in ``data`` as received from ``robot`` at ``now``.
+
+    Args:
+        data: JSON that `render_confirmation` writes.
+        robot: name of the robot.
+        what: name of the document in errors.
+        now: the present time.
 
     Raises:
-        DocumentError: it is not a confirmation, or the one of another robot.
+        DocumentError: ``data`` is not a confirmation, or is the confirmation of another robot.
     """
     confirmation = parse_confirmation(data, what)
     if confirmation.robot != robot:
         raise DocumentError(
             f"{what} is the confirmation of {confirmation.robot}, not of {robot}",
-            "No robot can confirm for another one.",
-            f"Name the robot that it comes from with --robot {confirmation.robot}.",
+            "A robot can confirm only its own files.",
+            f"If it comes from {confirmation.robot}, name it with --robot {confirmation.robot}.",
         )
     return Received(confirmation, now.replace(microsecond=0))
 
 
 def keep(root: Path, received: Received) -> str:
-    """Keep the last confirmation of a robot in the keystore; return its path there."""
+    """Write a robot's confirmation to the keystore, replacing the previous one.
+
+    Return its path relative to the keystore.
+    """
     path = confirmation_file(received.confirmation.robot)
     value = {"received": iso(received.time), "confirmation": _value_of(received.confirmation)}
     with Folder(root, for_owner=True) as folder:
@@ -234,10 +246,10 @@ def keep(root: Path, received: Received) -> str:
 
 
 def last_confirmation(root: Path, robot: str) -> Received | None:
-    """Return the last confirmation of a robot, or None: there is none.
+    """Return the last confirmation of ``robot``; None if the keystore has none.
 
     Raises:
-        DocumentError: the file is damaged, or cannot be read.
+        DocumentError: the file of the confirmation is damaged or cannot be read.
     """
     path = root / confirmation_file(robot)
     if not os.path.lexists(path):
@@ -248,15 +260,19 @@ def last_confirmation(root: Path, robot: str) -> Received | None:
     except ValueError as error:
         raise _refused(what, "it is not JSON") from error
     if not isinstance(value, dict) or value.keys() != {"received", "confirmation"}:
-        raise _refused(what, "it has other keys than received and confirmation")
+        raise _refused(what, "its keys are not received and confirmation")
     confirmation = _confirmation_from(value["confirmation"], what)
     if confirmation.robot != robot:
-        raise _refused(what, f"it is that of {confirmation.robot}")
+        raise _refused(what, f"it is the confirmation of {confirmation.robot}")
     return Received(confirmation, _moment(value["received"], what))
 
 
 def _confirmation_from(value: Any, what: str) -> Confirmation:
-    """Return the confirmation that a JSON value states, as `parse_confirmation`."""
+    """Return the confirmation in a JSON value; ``what`` names it in errors.
+
+    Raises:
+        DocumentError: as `parse_confirmation`.
+    """
     if not isinstance(value, dict):
         raise _refused(what, "it is not a JSON object")
     if value.get("format") != _FORMAT or type(value["format"]) is not int:
@@ -271,33 +287,37 @@ def _confirmation_from(value: Any, what: str) -> Confirmation:
     files = dict(_entries(value, "files", what))
     for path, digest in files.items():
         if not _is_digest(digest):
-            raise _refused(what, f"the digest of {path} is not a SHA-256")
+            raise _refused(what, f"the digest of {path} is not a SHA-256 digest")
     certificates = {}
     for path, digests in _entries({"certificates": {}, **value}, "certificates", what):
         if path not in files or path.rpartition("/")[2] not in _CERTIFICATE_FILES:
-            raise _refused(what, f"{path} has certificates, but is no file of certificates in it")
+            raise _refused(what, f"it lists certificates of {path}, which is no certificate file")
         listed = isinstance(digests, list) and len(digests) <= _MOST_CERTIFICATES
-        if not listed or not all(_is_digest(each) for each in digests):
-            raise _refused(what, f"the certificates of {path} are not a list of SHA-256")
+        if not listed or not all(_is_digest(digest) for digest in digests):
+            raise _refused(what, f"the certificates of {path} are not a list of SHA-256 digests")
         certificates[path] = tuple(digests)
     return Confirmation(robot, _moment(value["time"], what), files, certificates)
 
 
 def _entries(value: Mapping[str, Any], key: str, what: str) -> Iterator[tuple[str, Any]]:
-    """Yield the entries of a map from the paths of files; each path is one of an enclave."""
-    found = value[key]
-    if not isinstance(found, dict):
+    """Yield the (path, value) pairs of the JSON object at ``key``.
+
+    Raises:
+        DocumentError: a path is not that of an enclave file that confirmations list.
+    """
+    entries = value[key]
+    if not isinstance(entries, dict):
         raise _refused(what, f"{key} is not an object")
     known: set[str] = set()
-    for path, each in found.items():
+    for path, entry in entries.items():
         folder, _, file = path.rpartition("/")
         if folder not in known:
             if not _is_enclave_folder(folder):
                 raise _refused(what, f"{_short(path)} is not the path of a file of an enclave")
             known.add(folder)
         if file not in CONFIRMED_FILES:
-            raise _refused(what, f"{_short(path)} is not one of the files that are confirmed")
-        yield path, each
+            raise _refused(what, f"{_short(path)} is not a file that a confirmation lists")
+        yield path, entry
 
 
 def _is_enclave_folder(folder: str) -> bool:
@@ -322,10 +342,13 @@ def _moment(text: object, what: str) -> datetime:
             return parse_iso(text)
         except ValueError:
             pass
-    raise _refused(what, f"its time {_short(text)} is not such as 2027-05-21T12:50:48Z")
+    raise _refused(what, f"its time {_short(text)} has not the form 2027-05-21T12:50:48Z")
 
 
-def _refused(what: str, why: str, remedy: str = "Make it again on the robot.") -> DocumentError:
+_AGAIN = "Make the confirmation again on the robot."
+
+
+def _refused(what: str, why: str, remedy: str = _AGAIN) -> DocumentError:
     return DocumentError(f"{what} is not a confirmation: {why}", "", remedy)
 
 

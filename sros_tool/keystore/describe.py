@@ -65,8 +65,8 @@ from sros_tool.zenoh.document import parse_configuration
 
 _JSON = (".json5", ".json")
 
-NamedPath = Annotated[Path, "PATH, as it was named."]
-Problems = Annotated[Sequence[str], "What keeps a process from running in it."]
+NamedPath = Annotated[Path, "PATH, as given on the command line."]
+Problems = Annotated[Sequence[str], "Problems that keep a process from running in the enclave."]
 
 
 # ── what is described, and its JSON ────────────────────────────────────────────────────────
@@ -76,40 +76,40 @@ class CertificateFacts(NamedTuple):
     """A certificate: the parts that matter to DDS Security."""
 
     subject: str
-    """Its subject."""
+    """Subject of the certificate."""
     issuer: str
-    """The subject of its issuer."""
+    """Subject of the CA that issued the certificate."""
     serial: str
-    """Its serial number, in hexadecimal."""
+    """Serial number, in hexadecimal."""
     is_ca: bool
     """Whether it is the certificate of a CA."""
     key: str
-    """The kind of its key, such as ``EC secp256r1``."""
+    """Kind of the public key, such as ``EC secp256r1``."""
     signature: str
-    """The hash of its signature, such as ``sha256``."""
+    """Hash algorithm of the signature, such as ``sha256``."""
     sha256: str
     """SHA-256 of the certificate (DER), in hexadecimal."""
     not_before: datetime
-    """Begin of its validity, in UTC."""
+    """Start of the validity, in UTC."""
     not_after: datetime
-    """End of its validity, in UTC."""
+    """Expiry, in UTC."""
     valid_now: bool
-    """Whether it is valid now."""
+    """Whether the certificate is valid now."""
 
 
 class ListFacts(NamedTuple):
     """A revocation list; with an expired one DDS refuses all certificates of its CA."""
 
     issuer: str
-    """The CA that signed it."""
+    """Subject of the CA that signed the list."""
     number: int
-    """Its number; each new list has a higher one."""
+    """Number of the list; each new list has a higher number."""
     not_before: datetime
-    """Begin of its validity, in UTC."""
+    """Start of the validity, in UTC."""
     not_after: datetime
-    """End of its validity, in UTC."""
+    """Expiry, in UTC."""
     valid_now: bool
-    """Whether it is valid now."""
+    """Whether the list is valid now."""
     revoked: Sequence[str]
     """Serial numbers of the revoked certificates, in hexadecimal."""
 
@@ -123,24 +123,24 @@ class CertificateFile(NamedTuple):
     further: Sequence[CertificateFacts] | None
     """The other certificates in the file: the chain, or the other CA during a rotation."""
     crl: ListFacts | None
-    """The revocation list in the file, if there is one."""
+    """The revocation list in the file; left out if the file has none."""
 
 
 @shows(spread=("file",))
 class AuthorityFile(NamedTuple):
-    """A CA certificate."""
+    """The certificate file of a CA."""
 
     file: CertificateFile
-    """Its file."""
+    """Content of the file."""
     key_present: bool
-    """Whether its private key is in the keystore."""
+    """Whether the private key of the CA is in the keystore."""
 
 
 class UnreadableFile(NamedTuple):
     """A file that cannot be read."""
 
     error: str
-    """Why it cannot be read."""
+    """Why the file cannot be read."""
 
 
 class TokenPlace(NamedTuple):
@@ -151,7 +151,7 @@ class TokenPlace(NamedTuple):
     object: str
     """Label of the key."""
     pin_source: str | None
-    """File with the PIN, or null."""
+    """File with the PIN; null if none is named."""
 
 
 RightNames = Mapping[str, Mapping[str, Sequence[str]]]
@@ -159,17 +159,17 @@ RightNames = Mapping[str, Mapping[str, Sequence[str]]]
 
 
 class RuleFacts(NamedTuple):
-    """A rule."""
+    """A rule of a grant."""
 
     qualifier: Annotated[str, Words(("ALLOW", "DENY"))]
-    """Whether it allows or denies."""
+    """Whether the rule allows or denies."""
     domains: str
-    """The domains that it is for."""
+    """The DDS domains that the rule applies to."""
     rights: RightNames
     """Names by kind (``topics``, ``services``, ``actions``, ``dds``) and by right, such as
     ``publish``."""
     partitions: Sequence[str]
-    """The partitions that it is for."""
+    """The DDS partitions that the rule applies to."""
 
 
 @shows(optional=("valid_now",))
@@ -177,68 +177,68 @@ class GrantFacts(NamedTuple):
     """A grant of permissions."""
 
     name: str
-    """Its name."""
+    """Name of the grant."""
     subject: str
-    """The subject that it is for."""
+    """Certificate subject that the grant is for."""
     not_before: str
-    """Begin of its validity, as it is written."""
+    """Start of the validity, as the document writes it."""
     not_after: str
-    """End of its validity, as it is written."""
+    """Expiry, as the document writes it."""
     valid_now: bool | None
-    """Whether it is valid now."""
+    """Whether the grant is valid now."""
     rules: Sequence[RuleFacts]
-    """Its rules, in order."""
+    """Rules of the grant, in order; the first that matches decides."""
     default: Annotated[str, Words(("ALLOW", "DENY"))]
-    """What decides if no rule matches."""
+    """The decision if no rule matches."""
 
 
 class EnclaveFacts(NamedTuple):
-    """An enclave."""
+    """The files of an enclave; a value is null if the file is missing or cannot be read."""
 
     loadable: bool
-    """Whether a process can run in it now."""
+    """Whether a process can run in the enclave now."""
     problems: Problems
     subject: str | None
-    """Subject of its certificate, or null."""
+    """Subject of the certificate, or null."""
     valid_until: datetime | None
-    """Expiry of its certificate, in UTC, or null."""
+    """Expiry of the certificate, in UTC, or null."""
     expires: datetime | None
-    """First expiry of its certificates and permissions, in UTC, or null."""
+    """First expiry of certificates and permissions, in UTC, or null."""
     identity_ca: str | None
-    """Subject of the identity CA that it trusts, or null."""
+    """Subject of the identity CA that the enclave trusts, or null."""
     identity_ca_sha256: str | None
-    """SHA-256 of the certificate of that CA, or null."""
+    """SHA-256 of the identity CA's certificate (DER), in hexadecimal, or null."""
     permissions_ca: str | None
-    """Subject of the permissions CA that it trusts, or null."""
+    """Subject of the permissions CA that the enclave trusts, or null."""
     permissions_ca_sha256: str | None
-    """SHA-256 of the certificate of that CA, or null."""
+    """SHA-256 of the permissions CA's certificate (DER), in hexadecimal, or null."""
     domains: str | None
-    """The ROS domains of its governance, or null."""
+    """The ROS domains of the governance, or null."""
     token: TokenPlace | None
-    """The place of its key on a PKCS#11 token, or null for a key in a file."""
+    """Place of the key on a PKCS#11 token; null for a key in a file."""
     permissions: Sequence[GrantFacts] | None
-    """The grants in its permissions, or null."""
+    """The grants in the permissions, or null."""
     permissions_bytes: int | None
     """Size of permissions.p7s in bytes, or null."""
 
 
 @shows(spread=("facts",))
 class KeystoreEnclave(NamedTuple):
-    """An enclave."""
+    """An enclave of a keystore."""
 
     name: str
-    """The enclave."""
+    """Name of the enclave."""
     key_on_robot: bool
-    """Whether its key was made on its robot and is not here."""
+    """Whether the key was made on the robot and is not in the keystore."""
     facts: EnclaveFacts
-    """What is known of it."""
+    """The enclave's files."""
 
 
 class ZenohFileFacts(NamedTuple):
-    """A configuration."""
+    """A Zenoh configuration file."""
 
     file: str
-    """Its name, such as ``session.json5``."""
+    """Name of the file, such as ``session.json5``."""
     mode: Mode
     """How the process takes part in the network."""
 
@@ -247,19 +247,21 @@ class ZenohFiles(NamedTuple):
     """The Zenoh configurations of an enclave."""
 
     files: Sequence[ZenohFileFacts]
-    """Those that are signed."""
-    problems: Annotated[Sequence[str], "What keeps a process of rmw_zenoh_cpp from running in it."]
+    """The configurations that are signed."""
+    problems: Annotated[
+        Sequence[str], "Problems that keep a process of rmw_zenoh_cpp from running in the enclave."
+    ]
 
 
 class NetworkFacts(NamedTuple):
-    """A Zenoh network."""
+    """The Zenoh network of a keystore."""
 
     router: str
-    """The enclave of the router."""
+    """Name of the router's enclave."""
     endpoints: Sequence[str]
-    """Where sessions connect to the router, as HOST:PORT."""
+    """Endpoints at which sessions connect to the router, as HOST:PORT."""
     listen: Sequence[str]
-    """Where the router listens, as HOST:PORT."""
+    """Endpoints on which the router listens, as HOST:PORT."""
     mode: Mode
     """Whether sessions also connect to each other (``peer``), or only to the router."""
 
@@ -270,13 +272,13 @@ class SignerFacts(NamedTuple):
     signer: str | None
     """Subject of the signer's certificate, or null."""
     signer_sha256: str | None
-    """SHA-256 of that certificate, or null."""
+    """SHA-256 of the signer's certificate (DER), in hexadecimal, or null."""
     digest: str
-    """The hash of the signature, such as ``sha256``."""
+    """Hash algorithm of the signature, such as ``sha256``."""
     bytes: int
     """Size of the signed document in bytes."""
     signature_problem: str
-    """Why it is not valid, or an empty string."""
+    """Why the signature is not valid; empty if it is valid."""
 
 
 @shows(spread=("signer",))
@@ -288,41 +290,41 @@ class SignatureFacts(NamedTuple):
     signature_verified: bool | None
     """Whether the signature is valid; null if no permissions CA is known."""
     signer: SignerFacts | None
-    """By whom."""
+    """The signature; null if the document is not signed."""
 
 
 @shows(spread=("rule",))
 class DomainRuleFacts(NamedTuple):
-    """A domain rule."""
+    """A domain rule of a governance."""
 
     domains: str
-    """The domains that it is for."""
+    """The DDS domains that the rule applies to."""
     rule: DomainRule
-    """Its attributes."""
+    """Attributes of the rule."""
     topic_rules: Sequence[TopicRule]
-    """Its topic rules; the first that matches counts."""
+    """Topic rules, in order; the first that matches a topic decides."""
 
 
 class AccessControlFacts(NamedTuple):
-    """Access control of Zenoh."""
+    """The access control of a Zenoh configuration."""
 
     enabled: bool
-    """Whether it is on."""
+    """Whether access control is on."""
     default: Annotated[str, Words(("allow", "deny"))]
-    """What no rule decides is allowed or denied."""
+    """The decision if no rule matches."""
     rules: int
-    """Number of its rules."""
+    """Number of rules."""
     subjects: int
-    """Number of its subjects."""
+    """Number of subjects."""
 
 
 class RemoteFacts(NamedTuple):
-    """The rights of an enclave."""
+    """The rights that a Zenoh configuration gives a remote enclave."""
 
     enclave: str
-    """The enclave."""
+    """Name of the remote enclave."""
     own_rights_by_router: bool
-    """Whether it is the router of a client, and ``may`` is what the client may do through it."""
+    """Whether the remote is the router of a client: ``may`` then has the client's own rights."""
     may: RightNames
     """Names by kind (``topics``, ``services``) and by right, such as ``publish``; with wildcards,
     as Zenoh writes them."""
@@ -333,33 +335,33 @@ class DescribedKeystore(NamedTuple):
 
     path: NamedPath
     template: str | None
-    """Name of the template in its settings, or null."""
+    """Name of the template in the settings, or null."""
     ledger: Sequence[str]
     """Faults of the ledger."""
     authorities: Mapping[str, AuthorityFile | UnreadableFile]
-    """Its CAs, by role (``identity``, ``permissions``)."""
+    """CAs of the keystore, by role (``identity``, ``permissions``)."""
     governance: DescribedGovernance | UnreadableFile | None
-    """Its governance, or null."""
+    """Governance of the keystore, or null."""
     zenoh: NetworkFacts | None
-    """Its Zenoh network, by its settings; null without one."""
+    """Zenoh network in the settings; null if there is none."""
     enclaves: Sequence[KeystoreEnclave]
-    """Its enclaves."""
+    """Enclaves of the keystore."""
     unreadable: Sequence[str]
-    """Folders that cannot be read, and why."""
+    """Folders that cannot be read, with the reason."""
     problems: Sequence[str]
-    """All problems; if there are any, the exit status is 1."""
+    """All problems of the keystore; if not empty, the exit status is 1."""
     kind: Annotated[Literal["keystore"], "What PATH is."] = "keystore"
 
 
 @shows(spread=("facts",))
 class DescribedEnclave(NamedTuple):
-    """An enclave."""
+    """The folder of an enclave."""
 
     path: NamedPath
     facts: EnclaveFacts
-    """What is known of it."""
+    """The enclave's files."""
     zenoh: ZenohFiles | None
-    """Its Zenoh configurations, or null."""
+    """Zenoh configurations of the enclave, or null."""
     kind: Annotated[Literal["enclave"], "What PATH is."] = "enclave"
 
 
@@ -369,7 +371,7 @@ class DescribedCertificates(NamedTuple):
 
     path: NamedPath
     file: CertificateFile
-    """Its content."""
+    """Content of the file."""
     kind: Annotated[Literal["certificate"], "What PATH is."] = "certificate"
 
 
@@ -379,7 +381,7 @@ class DescribedList(NamedTuple):
 
     path: NamedPath
     facts: ListFacts
-    """Its content."""
+    """Content of the list."""
     kind: Annotated[Literal["revocation list"], "What PATH is."] = "revocation list"
 
 
@@ -388,7 +390,7 @@ class DescribedKey(NamedTuple):
 
     path: NamedPath
     algorithm: str
-    """Its kind, such as ``EC secp256r1``."""
+    """Kind of the key, such as ``EC secp256r1``."""
     mode: str
     """Permission bits of the file, in octal."""
     kind: Annotated[Literal["private key"], "What PATH is."] = "private key"
@@ -400,7 +402,7 @@ class DescribedToken(NamedTuple):
 
     path: NamedPath
     place: TokenPlace
-    """The place."""
+    """Token and object of the key."""
     kind: Annotated[Literal["key on a token"], "What PATH is."] = "key on a token"
 
 
@@ -410,9 +412,9 @@ class DescribedPermissions(NamedTuple):
 
     path: NamedPath
     grants: Sequence[GrantFacts]
-    """Its grants."""
+    """Grants of the permissions."""
     signature: SignatureFacts
-    """Its signature."""
+    """Signature of the permissions."""
     kind: Annotated[Literal["permissions"], "What PATH is."] = "permissions"
 
 
@@ -422,9 +424,9 @@ class DescribedGovernance(NamedTuple):
 
     path: NamedPath
     domain_rules: Sequence[DomainRuleFacts]
-    """The domain rules of the governance."""
+    """Domain rules of the governance."""
     signature: SignatureFacts
-    """Its signature."""
+    """Signature of the governance."""
     kind: Annotated[Literal["governance"], "What PATH is."] = "governance"
 
 
@@ -436,21 +438,21 @@ class DescribedConfiguration(NamedTuple):
     mode: Mode
     """How the process takes part in the network."""
     connect: Sequence[str]
-    """Where it connects, such as ``tls/localhost:7447``."""
+    """Endpoints that the process connects to, such as ``tls/localhost:7447``."""
     listen: Sequence[str]
-    """Where it listens."""
+    """Endpoints on which the process listens."""
     access_control: AccessControlFacts
-    """Its access control."""
+    """Access control of the process."""
     made_by_sros: bool
-    """Whether it is exactly as sros writes it."""
+    """Whether the configuration is exactly as sros writes it."""
     domains: Sequence[int]
-    """The ROS domains that its rules are for; empty if it is not by sros."""
+    """The ROS domains that the rules apply to; empty for a configuration not made by sros."""
     rights: Sequence[RemoteFacts]
-    """What the processes of each enclave may do; empty if it is not by sros."""
+    """The rights of remote enclaves; empty for a configuration not made by sros."""
     problems: Sequence[str]
-    """How it does not fit its signature or its enclave."""
+    """How the configuration differs from its signed document, or contradicts its enclave."""
     signature: SignatureFacts
-    """Its signature."""
+    """Signature of the configuration."""
     kind: Annotated[Literal["Zenoh configuration"], "What PATH is."] = "Zenoh configuration"
 
 
@@ -484,9 +486,9 @@ def describe(
     Args:
         path: a keystore, the folder of an enclave, or a file of one.
         now: the moment for which validity is reported.
-        authority: the permissions CA certificate that verifies a signed document; by default the
-            one next to it.
-        files: those that were read before.
+        authority: file of the permissions CA certificate that verifies a signed document; by
+            default the file next to the document.
+        files: files that were read before.
 
     Raises:
         DocumentError: ``path`` is none of these kinds, or cannot be read.
@@ -513,7 +515,7 @@ def describe(
 
 
 def problems_of(described: Described) -> Sequence[str]:
-    """Return what is wrong with a keystore, an enclave or a Zenoh configuration."""
+    """Return the problems of a keystore, an enclave or a Zenoh configuration; else nothing."""
     if isinstance(described, DescribedEnclave):
         zenoh = described.zenoh
         return (*described.facts.problems, *(zenoh.problems if zenoh else ()))
@@ -569,8 +571,10 @@ def _keystore(root: Path, now: datetime) -> DescribedKeystore:
     names, unread = search_enclaves(root)
     enclaves = [_enclave(keystore, name, now) for name in names]
     governance = _governance_of(keystore, now)
-    problems = [f"{each.name}: {problem}" for each in enclaves for problem in each.facts.problems]
-    unreadable = [f"'{each.path}' cannot be read: {each.why}" for each in unread]
+    problems = [
+        f"{enclave.name}: {problem}" for enclave in enclaves for problem in enclave.facts.problems
+    ]
+    unreadable = [f"'{folder.path}' cannot be read: {folder.why}" for folder in unread]
     problems += unreadable
     for role, authority in authorities.items():
         if isinstance(authority, UnreadableFile):
@@ -598,7 +602,7 @@ def _keystore(root: Path, now: datetime) -> DescribedKeystore:
 def _governance_of(
     keystore: Keystore, now: datetime
 ) -> DescribedGovernance | UnreadableFile | None:
-    """Describe the governance that the enclaves of a keystore share, if there is one."""
+    """Describe the governance that the enclaves of a keystore share; None without a governance."""
     if not keystore.has(GOVERNANCE_P7S):
         return None
     try:
@@ -615,19 +619,19 @@ def _network(network: ZenohNetwork) -> NetworkFacts:
 
 
 def _zenoh(folder: Path, now: datetime) -> ZenohFiles | None:
-    """Describe the Zenoh configurations of an enclave: the files, and what is wrong with them."""
+    """Describe the Zenoh configurations of an enclave, with their problems; None without any."""
     opened = _opened_at(folder, now)
     if opened is None or not opened.files:
         return None
-    modes = {file: each.mode for file, each in opened.configurations.items()}
+    modes = {file: configuration.mode for file, configuration in opened.configurations.items()}
     return ZenohFiles(
         [ZenohFileFacts(file, modes[file]) for file in opened.files if file in modes],
-        [str(each) for each in opened.problems],
+        [str(problem) for problem in opened.problems],
     )
 
 
 def _enclave(keystore: Keystore, name: str, now: datetime) -> KeystoreEnclave:
-    """Describe an enclave of a keystore; a key that stays on its robot is not a problem there."""
+    """Describe an enclave of a keystore; a key that is only on the robot is no problem there."""
     state = keystore.enclave(name, now=now)
     evaluation = evaluated(name, keystore.folder(name), state, at=now)
     problems = [*evaluation.problems, *evaluation.for_some(state.problems)]
@@ -636,7 +640,7 @@ def _enclave(keystore: Keystore, name: str, now: datetime) -> KeystoreEnclave:
 
 
 def _enclave_facts(evaluation: EvaluatedEnclave) -> EnclaveFacts:
-    """Describe an enclave; ``loadable`` says whether a process can run in it now."""
+    """Describe the files of an enclave; ``problems`` has the ones that matter on this machine."""
     state = evaluation.state
     domains, problems = state.domains(), list(evaluation.problems_here)
     identity, identity_sha256 = _subject_and_digest(state.identity_ca)
@@ -663,7 +667,10 @@ def _token(place: TokenUri) -> TokenPlace:
 
 
 def _subject_and_digest(certificate: x509.Certificate | None) -> tuple[str | None, str | None]:
-    """Return the subject of a CA, and its SHA-256, since two CAs can have one name."""
+    """Return the subject and the SHA-256 of a CA's certificate; (None, None) without one.
+
+    Two CAs can have the same subject, so the SHA-256 tells them apart.
+    """
     return (subject_text(certificate.subject), digest(certificate)) if certificate else (None, None)
 
 
@@ -690,7 +697,8 @@ def _certificate(certificate: x509.Certificate, now: datetime) -> CertificateFac
 
 def _certificates(data: bytes, name: str, now: datetime) -> CertificateFile:
     """Describe the certificates of a PEM file, and the revocation list after them."""
-    first, *further = (_certificate(each, now) for each in load_certificates(data, name))
+    certificates = load_certificates(data, name)
+    first, *further = (_certificate(certificate, now) for certificate in certificates)
     crl = _revocation_list(load_crl(data, name), now) if CRL_MARK in data else None
     return CertificateFile(first, further or None, crl)
 
@@ -702,7 +710,7 @@ def _revocation_list(crl: RevocationList, now: datetime) -> ListFacts:
         not_before=crl.this_update,
         not_after=crl.next_update,
         valid_now=crl.this_update <= now <= crl.next_update,
-        revoked=[f"{each.serial:x}" for each in crl.revoked],
+        revoked=[f"{entry.serial:x}" for entry in crl.revoked],
     )
 
 
@@ -711,11 +719,13 @@ def _signature(
 ) -> SignatureFacts:
     """Describe the signature of the signed document ``data`` at ``path``."""
     signed = files.signed(data)
-    found = authority or permissions_ca_for(path)
+    authority_file = authority or permissions_ca_for(path)
     reason = "no permissions CA certificate is next to it; name one with --ca"
     verified: bool | None = None
-    if found:
-        certificates = load_certificates(files.read(found, "certificate"), f"'{found}'")
+    if authority_file:
+        certificates = load_certificates(
+            files.read(authority_file, "certificate"), f"'{authority_file}'"
+        )
         try:
             signed.verify(certificates[0])
             reason = chain_fault(certificates[0], certificates, at=now, checks=Checks.DOCUMENTS)
@@ -730,7 +740,7 @@ def _signature(
 def _signature_next_to(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
 ) -> SignatureFacts:
-    """Describe the signature of a Zenoh configuration: of the same document next to it."""
+    """Describe the signature of a Zenoh configuration, from the signed document next to it."""
     signed = path.with_name(ZENOH_SIGNED.get(path.name, path.name))
     if signed == path or not signed.exists():
         return _NOT_SIGNED
@@ -738,7 +748,7 @@ def _signature_next_to(
     signature = _signature(signed, message, now, authority, files)
     if files.signed(message).text == data or signature.signer is None:
         return signature
-    problem = f"it is not the document that was signed in {signed.name}"
+    problem = f"{path.name} is not the document that {signed.name} signs"
     signer = signature.signer._replace(signature_problem=problem)
     return signature._replace(signature_verified=False, signer=signer)
 
@@ -771,7 +781,9 @@ def _grant(grant: Grant, now: datetime | None) -> GrantFacts:
             RuleFacts(
                 qualifier="ALLOW" if rule.allow else "DENY",
                 domains=str(rule.domains),
-                rights=_by_kind((each.kind, each.right, each.name) for each in ros_rights(rule)),
+                rights=_by_kind(
+                    (right.kind, right.right, right.name) for right in ros_rights(rule)
+                ),
                 partitions=sorted(
                     {p for c in (*rule.publish, *rule.subscribe) for p in c.partitions}
                 ),
@@ -783,7 +795,7 @@ def _grant(grant: Grant, now: datetime | None) -> GrantFacts:
 
 
 def _by_kind(rights: Iterable[tuple[str, str, str]]) -> RightNames:
-    """Map the names of rights, given by kind, right and name, by kind and right."""
+    """Return names grouped by kind and right, from triples of kind, right and name."""
     table: dict[str, dict[str, list[str]]] = {}
     for kind, right, name in rights:
         table.setdefault(kind, {}).setdefault(right, []).append(name)
@@ -804,10 +816,10 @@ _ABOUT_THE_CONTENT = (
 def _configuration(
     path: Path, document: bytes, signature: SignatureFacts, now: datetime
 ) -> DescribedConfiguration:
-    """Describe any Zenoh configuration; ``rights`` only of one that sros wrote.
+    """Describe a Zenoh configuration; ``rights`` and ``domains`` only if sros wrote it.
 
     Raises:
-        DocumentError: Zenoh would not accept it.
+        DocumentError: Zenoh would not accept the configuration.
     """
     read = parse_configuration(document, "its content")
     own: Configuration | None = None
@@ -817,8 +829,8 @@ def _configuration(
     return DescribedConfiguration(
         path=path,
         mode=read.mode,
-        connect=[each.text for each in read.connect],
-        listen=[each.text for each in read.listen],
+        connect=[endpoint.text for endpoint in read.connect],
+        listen=[endpoint.text for endpoint in read.listen],
         access_control=AccessControlFacts(
             enabled=access.enabled,
             default="allow" if access.allows_by_default else "deny",
@@ -834,10 +846,10 @@ def _configuration(
 
 
 def _remote_rights(configuration: Configuration) -> list[RemoteFacts]:
-    """Return what each remote enclave may do here, and whether it is as the router of a session.
+    """Return the rights that a configuration gives remote enclaves.
 
-    The router of a session in client mode may send what the session may get, and the reverse: its
-    entry shows the rights of the session's own enclave.
+    In client mode, the remote is the router, which may send what the client may get, and the
+    reverse: its entry shows the rights of the client's own enclave.
     """
     is_client = configuration.mode is Mode.CLIENT
     remotes = []
@@ -849,7 +861,7 @@ def _remote_rights(configuration: Configuration) -> list[RemoteFacts]:
 
 
 def _opened_at(folder: Path, now: datetime) -> OpenedZenoh | None:
-    """Return the Zenoh configurations of the enclave in ``folder``; None if it is no enclave."""
+    """Return the Zenoh configurations of the enclave in ``folder``; None if there is no enclave."""
     if not all((folder / file).exists() for file in (CERTIFICATE_FILE, PERMISSIONS_FILE)):
         return None
     state = open_enclave(folder, now=now)
@@ -858,19 +870,20 @@ def _opened_at(folder: Path, now: datetime) -> OpenedZenoh | None:
 
 
 def _content_problems(path: Path, now: datetime) -> list[str]:
-    """Return how a configuration, or a signed one, does not fit the enclave that it lies in.
+    """Return how the Zenoh configuration at ``path`` contradicts the enclave that it belongs to.
 
-    Of a configuration, `describe` itself says whether it is the document that was signed.
+    ``path`` can be the signed document, too.  A configuration that differs from its signed document
+    is left out here: `describe` reports it with the signature.
     """
-    told = {ZenohFault.OTHER_DOCUMENT} if path.name in ZENOH_SIGNED else set()
+    reported = {ZenohFault.OTHER_DOCUMENT} if path.name in ZENOH_SIGNED else set()
     names = [pair for pair in ZENOH_SIGNED.items() if path.name in pair]
     opened = _opened_at(path.absolute().parent, now) if names else None
     return [
-        str(each)
-        for each in (opened.problems if opened else ())
-        if each.fault in _ABOUT_THE_CONTENT
-        and each.fault not in told
-        and each.file in (*names[0], CERTIFICATE_FILE)
+        str(problem)
+        for problem in (opened.problems if opened else ())
+        if problem.fault in _ABOUT_THE_CONTENT
+        and problem.fault not in reported
+        and problem.file in (*names[0], CERTIFICATE_FILE)
     ]
 
 
@@ -885,11 +898,11 @@ class HistoryStatus(StrEnum):
     """The state of an issued certificate or document."""
 
     CURRENT = "current"
-    """It is in the keystore, and has not expired."""
+    """The keystore has it, and it has not expired."""
     SUPERSEDED = "superseded"
-    """It is no longer in the keystore, but neither revoked nor expired: DDS still accepts it."""
+    """No longer in the keystore, but neither revoked nor expired: DDS still accepts it."""
     REPLACED = "replaced"
-    """Settings that the keystore had before; DDS never reads any."""
+    """Earlier settings of the keystore, which DDS does not read."""
     REVOKED = "revoked"
     RETIRED = "retired"
     """A CA that was replaced, and is no longer trusted."""
@@ -897,36 +910,36 @@ class HistoryStatus(StrEnum):
     DAMAGED = "damaged"
     """Lines of the ledger were missing or changed when the entry was made."""
     SENT = "sent"
-    """It went to a robot; the keystore keeps no copy."""
+    """Sent to a robot; the keystore keeps no copy."""
 
 
 @shows(spread=("entry",))
 class HistoryItem(NamedTuple):
-    """An entry of the ledger, and what became of it."""
+    """An entry of the ledger, and the present state of what it records."""
 
     entry: Entry
-    """The entry."""
+    """Entry of the ledger."""
     status: HistoryStatus
-    """What became of it."""
+    """Present state of the certificate or document."""
     path: str
-    """Its file in the keystore, or an empty string."""
+    """Its file in the keystore; empty if there is none."""
 
 
 class History(NamedTuple):
-    """Everything that a keystore ever issued."""
+    """All certificates and documents that a keystore issued, by its ledger."""
 
     path: NamedPath
     entries: tuple[HistoryItem, ...]
     """The entries of the ledger, oldest first."""
     unexplained: tuple[str, ...]
-    """Files that the ledger does not have."""
+    """Certificates and signed documents in the keystore that the ledger does not record."""
     gaps: tuple[str, ...]
     """Faults of the ledger: lines that are missing, changed or unreadable."""
     kind: Annotated[Literal["history"], "What PATH is."] = "history"
 
 
 def history(root: Path, *, now: datetime) -> History:
-    """Return the ledger of a keystore, compared with its certificates and signed documents."""
+    """Return the entries of a keystore's ledger, with the present state of what they record."""
     issued, revoked_files = _files(root, _active_paths(root)), _files(root, _revoked_paths(root))
     retired = _files(root, _retired_paths(root))
     keystore = Keystore(root)
@@ -934,7 +947,7 @@ def history(root: Path, *, now: datetime) -> History:
     entries = ledger.entries
     # A new CA starts with an empty revocation list, and lists drop expired certificates, so the
     # ledger is asked too.
-    revoked = {each.serial for each in entries if each.what == "revocation"}
+    revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     revoked |= {f"{entry.serial:x}" for crl in keystore.revocation_lists for entry in crl.revoked}
     moment = iso(now)
     settings = _files(root, iter((SETTINGS,)))
@@ -955,8 +968,8 @@ def history(root: Path, *, now: datetime) -> History:
         return HistoryStatus.CURRENT if entry.sha256 in issued else HistoryStatus.SUPERSEDED
 
     known = {entry.sha256 for entry in entries}
-    found = {**retired, **revoked_files, **issued}
-    places = {**found, **settings}
+    present_files = {**retired, **revoked_files, **issued}
+    places = {**present_files, **settings}
     return History(
         root,
         tuple(
@@ -964,14 +977,22 @@ def history(root: Path, *, now: datetime) -> History:
             for entry in entries
         ),
         tuple(
-            sorted(path for digest, paths in found.items() if digest not in known for path in paths)
+            sorted(
+                path
+                for digest, paths in present_files.items()
+                if digest not in known
+                for path in paths
+            )
         ),
         ledger.gaps,
     )
 
 
 def _active_paths(root: Path) -> Iterator[str]:
-    """Yield the paths where DDS loads certificates and signed documents, missing files included."""
+    """Yield the paths from which DDS loads certificates and signed documents.
+
+    The files may be missing.
+    """
     yield from (f"{PUBLIC}/{path.name}" for path in sorted((root / PUBLIC).glob("*.cert.pem")))
     yield from (GOVERNANCE_P7S, CRL)
     for name in list_enclaves(root):
@@ -988,21 +1009,24 @@ def _retired_paths(root: Path) -> Iterator[str]:
 
 
 def _files(root: Path, paths: Iterator[str]) -> dict[str, list[str]]:
-    """Map SHA-256 digests, as in the ledger, to the paths of existing files."""
-    found: dict[str, list[str]] = {}
+    """Map the SHA-256 digests that the ledger uses to the existing files among ``paths``."""
+    paths_by_digest: dict[str, list[str]] = {}
     for path in paths:
         if (root / path).is_file() and not (root / path).is_symlink():
             for digest in _digests(root / path):
-                found.setdefault(digest, []).append(path)
-    return found
+                paths_by_digest.setdefault(digest, []).append(path)
+    return paths_by_digest
 
 
 def _digests(path: Path) -> list[str]:
-    """Return the digests of a file's content; a CA file may hold several certificates."""
+    """Return the digests that the ledger uses for a file; a CA file can have several certificates.
+
+    The digest of a certificate is the SHA-256 of its DER, of other files that of the bytes.
+    """
     data = read_bytes(path, "file")
     if not path.name.endswith("cert.pem"):
         return [hashlib.sha256(data).hexdigest()]
-    found = []
+    digests = []
     for part in _PEM.finditer(data):
         content = part[0]
         if part[1] == b"CERTIFICATE":
@@ -1010,5 +1034,5 @@ def _digests(path: Path) -> list[str]:
                 content = binascii.a2b_base64(part[2])
             except binascii.Error:
                 return ["unreadable"]
-        found.append(hashlib.sha256(content).hexdigest())
-    return found or ["unreadable"]
+        digests.append(hashlib.sha256(content).hexdigest())
+    return digests or ["unreadable"]

@@ -87,7 +87,7 @@ def test_a_configuration_that_is_not_the_signed_one(folder: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b'"deny"', b'"allow"'))
     found = shown(folder, "ks/enclaves/a/session.json5", 1)
     assert found["signature_verified"] is False
-    assert found["signature_problem"] == "it is not the document that was signed in session.p7s"
+    assert found["signature_problem"] == "session.json5 is not the document that session.p7s signs"
     assert found["made_by_sros"] is False
     found = shown(folder, "ks/enclaves/a/session.p7s", 1)
     assert found["signature_verified"] is True

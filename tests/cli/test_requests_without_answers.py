@@ -45,7 +45,7 @@ def test_requests_of_a_fleet(keystore: Path, tmp_path: Path) -> None:
     for bad, why in {
         b"".join([*requests.values(), requests[A]]): f"two requests are for enclave {A}",
         requests[A] + b"junk": "number 2",
-        b" ": "there is no signing request",
+        b" ": "the input has no signing request",
     }.items():
         (tmp_path / "bad.pem").write_bytes(bad)
         ended = sros("sign_request", keystore, tmp_path / "bad.pem", "--no-answer")

@@ -155,7 +155,7 @@ def test_tools_alone_are_an_empty_graph(program: Program) -> None:
         ("import", "", "rclpy cannot be imported. RuntimeError: invalid allocator"),
         ("init", "", "rclpy cannot start. RuntimeError"),
         ("node", "", "rclpy cannot start a node to observe the graph. RuntimeError"),
-        ("crash", "boom", "the process that observes the ROS graph failed. It ended with status"),
+        ("crash", "boom", "the process that observes the ROS graph failed. It exited with status"),
         (
             "node",
             "\x1b[31mrt/parameter_events topic not found in allow rule.\x1b[m",

@@ -133,7 +133,7 @@ def test_the_life_of_a_key_that_is_on_a_token(token: dict[str, str], tmp_path: P
     other = place.replace("robot?", "robot;object=later?")
     done("renew", root, "/b", "--key", other, "--revoke-old")
     assert secret_files(root / "enclaves") == set()
-    assert done("distribute_key", root, "--all", out).count("there is no key to export") == 3
+    assert done("distribute_key", root, "--all", out).count("the key is not exported") == 3
     assert secret_files(out) == set()
     assert done("verify", out, "--tokens", env=known).count("key on the token robot") == 3
     refused = done(

@@ -331,7 +331,7 @@ def test_an_update_replaces_the_files_of_an_earlier_export(fleet: Path, tmp_path
     (tmp_path / "p.xml").write_text(policy_text({"/base": publish("new")}))
     generate_artifacts(fleet, policies=[read_policy(tmp_path / "p.xml")], now=NOW)
     renew(fleet, ["/base"], now=NOW)
-    with pytest.raises(SrosError, match="different versions"):
+    with pytest.raises(SrosError, match="other versions"):
         distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW)
     distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW, force=True)
     assert not verify_arrival(tmp_path / "robot", now=NOW).findings
@@ -359,5 +359,5 @@ def test_no_export_has_a_private_key_beside_that_of_its_enclave(
         certificates.write((keystore / "private/identity_ca.key.pem").read_bytes())
     for target in ("robot", "robot.tar.gz"):
         ended = sros("distribute_key", keystore, "/a", tmp_path / target)
-        assert (ended.status, "holds a private key" in ended.err) == (2, True), ended
+        assert (ended.status, "contains a private key" in ended.err) == (2, True), ended
         assert not (tmp_path / target).exists()

@@ -85,7 +85,7 @@ def test_the_identity_ca_does_not_vouch_for_the_permissions(robot: Path, tmp_pat
     )
     archive = pack({SEAL: seal(files, 1, authority), **files})
     before = snapshot(robot)
-    with pytest.raises(KeystoreError, match="vouches for the certificate only"):
+    with pytest.raises(KeystoreError, match="signs only the certificate"):
         import_answer(robot, archive, now=NOW, pinned=pin(home, "identity"))
     with pytest.raises(KeystoreError, match=digest(authority.certificate)):
         import_answer(robot, archive, now=NOW, pinned=pin(home))

@@ -16,21 +16,24 @@ SUFFIXES = (".tar.gz", ".tgz")
 _MAX_PACKED = 16 * 1024 * 1024
 MAX_UNPACKED = 40 * 1024 * 1024
 MAX_MEMBER = 17 * 1024 * 1024
-"""Largest size in bytes: of a packed archive, of its unpacked content, and of a file in it.
+"""Largest size in bytes of a packed archive, of its unpacked content, and of a file in it.
 
-There is room for a Zenoh configuration of the largest size that is read, and its signed document.
+A Zenoh configuration of the largest size that sros reads fits, with its signed document.
 """
 _MOST_MEMBERS = 200
 _GZIP = 16 + zlib.MAX_WBITS
 
 
 def file_mode(path: str) -> int:
-    """Return the permission bits of an exported file; only its owner can read a private key."""
+    """Return the permission bits of an exported file: 0600 for a private key, else 0644."""
     return 0o600 if path.rpartition("/")[2] == "key.pem" else 0o644
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """Return a gzipped tar without users, groups and times: the same files give the same bytes."""
+    """Return a ``.tar.gz`` archive of ``files`` (content by path).
+
+    It has no users, groups and times, so the same files always give the same bytes.
+    """
     buffer = io.BytesIO()
     with (
         gzip.GzipFile(fileobj=buffer, mode="wb", filename="", mtime=0) as packed,
@@ -54,9 +57,9 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
 
 def unpack(data: bytes) -> dict[str, bytes]:
-    """Map the paths in a ``.tar.gz`` archive to the content of the files; write nothing to disk.
+    """Map the paths in a ``.tar.gz`` archive to the content of the files, without writing them.
 
-    The paths are not checked: that is left to the caller.
+    The paths are not checked: the caller must do that.
 
     Raises:
         DocumentError: the archive is damaged, or too large, has too many entries, a repeated name,
@@ -89,18 +92,18 @@ def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
         name = entry.name
         if name in seen or len(seen) >= _MOST_MEMBERS:
             raise DocumentError(
-                f"it holds {name!r} twice"
+                f"it contains {name!r} twice"
                 if name in seen
-                else f"it holds more than {_MOST_MEMBERS} entries"
+                else f"it contains more than {_MOST_MEMBERS} entries"
             )
         seen.add(name)
         if entry.isdir():
             continue
         if entry.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or entry.issparse():
-            raise DocumentError(f"it holds {name!r}, which is not a regular file")
+            raise DocumentError(f"it contains {name!r}, which is not a regular file")
         if entry.size > MAX_MEMBER:
             raise DocumentError(
-                f"it holds {name!r} with {entry.size} bytes; the limit is {MAX_MEMBER} bytes"
+                f"it contains {name!r} with {entry.size} bytes; the limit is {MAX_MEMBER} bytes"
             )
         content = tar.extractfile(entry)
         read = content.read() if content else b""

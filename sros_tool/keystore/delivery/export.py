@@ -56,7 +56,7 @@ _ANSWER_AGAIN = (
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """The result of an export: the enclaves and the changes below ``target``, and notes."""
+    """The result of an export: the exported enclaves, and the changed files below ``target``."""
 
     target: Path
     enclaves: tuple[str, ...]
@@ -66,9 +66,9 @@ class Export:
 
 @dataclass(frozen=True, slots=True)
 class ExportSelection:
-    """The names of the enclaves to export.
+    """The enclaves to export, and the enclaves that an export has to leave out.
 
-    ``left_out`` enclaves match a pattern too, but their keys are on their robots.
+    The enclaves in ``left_out`` match the selection, too, but their keys are on their robots.
     """
 
     names: tuple[str, ...]
@@ -84,13 +84,14 @@ def select(
     every: bool = False,
     keyless: bool = False,
 ) -> ExportSelection:
-    """Return the enclaves to export: ``names``, and what `select_enclaves` finds.
+    """Return the enclaves to export, selected as by `select_enclaves`.
 
-    Unless ``keyless`` is set, an enclave whose key is on its robot is left out if it is not named;
-    a named one is refused by `distribute`.
+    Unless ``keyless`` is set, an enclave whose key is on its robot is left out if only a pattern,
+    ``robots`` or ``every`` selects it; `distribute` refuses such an enclave in ``names``.
 
     Raises:
-        KeystoreError: a pattern matches no enclave, or the keys of all are on robots.
+        KeystoreError: a pattern matches no enclave, or all selected enclaves have their keys on
+            robots.
     """
     chosen: list[str] = []
     left_out: list[str] = []
@@ -119,14 +120,15 @@ def distribute(
     keyless: bool = False,
     dry_run: bool = False,
 ) -> Export:
-    """Export enclaves to ``target``: an archive if it is named ``.tar.gz``, else a folder.
+    """Export enclaves to ``target``: an archive if its name ends with ``.tar.gz``, else a folder.
 
-    The same enclaves give the same bytes.  In the folder of an earlier export, other enclaves
-    stay.  With ``keyless``, enclaves whose keys are on their robots are exported without them.
+    The same enclaves always give the same bytes.  In the folder of an earlier export, other
+    enclaves stay.  With ``keyless``, enclaves whose keys are on their robots are exported, too,
+    without keys.
 
     Raises:
-        KeystoreError: an enclave does not exist or cannot run, ``target`` cannot be used, or holds
-            other content that only ``force`` replaces.
+        KeystoreError: an enclave does not exist or cannot run, ``target`` cannot be used, or
+            ``target`` has other content, which only ``force`` replaces.
     """
     files = exported_files(root, names, now, keyless=keyless)
     notes = tuple(_token_notes(files))
@@ -137,20 +139,20 @@ def distribute(
 
 
 def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
-    """Yield a note for each enclave of which there is no key to export."""
+    """Yield a note for each exported enclave whose key is on a PKCS#11 token."""
     for path in files:
         folder, _, file = path.rpartition("/")
         if file == KEY_URI_FILE:
             place = read_token_file(files[path])
             text = (
-                f"{folder.removeprefix(ENCLAVES) or '/'}: there is no key to export. It is "
+                f"{folder.removeprefix(ENCLAVES) or '/'}: the key is not exported. It is "
                 f"{place.object} on the token {place.token}, which has to be in the robot."
             )
             yield Note("export.key-on-token", text)
 
 
 def _notes(root: Path, target: Path) -> Iterator[Note]:
-    """Yield a note for each enclave of an earlier export that the keystore does not have now."""
+    """Yield a note for each enclave in ``target`` that the keystore does not have now."""
     for name in search_enclaves(target)[0]:
         if not has_enclave(root, name):
             yield Note(
@@ -163,7 +165,7 @@ def _notes(root: Path, target: Path) -> Iterator[Note]:
 
 @dataclass(frozen=True, slots=True)
 class PackedEnclaves:
-    """An archive (``.tar.gz``), the paths of the files in it, and notes."""
+    """An archive (``.tar.gz``) of enclaves, and the paths of the files in it."""
 
     data: bytes
     paths: tuple[str, ...]
@@ -173,7 +175,7 @@ class PackedEnclaves:
 def pack_enclaves(
     root: Path, names: Sequence[str], *, now: datetime, keyless: bool = False
 ) -> PackedEnclaves:
-    """Return enclaves as an archive in memory; ``keyless`` as in `distribute`.
+    """Return the export of enclaves as an archive in memory; ``keyless`` as in `distribute`.
 
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
@@ -217,8 +219,10 @@ def exported_files(
         _check_zenoh(root, folder, name, state)
         authorities = (state.identity_ca, state.permissions_ca)
         if any(
-            each and state.certificate and each.public_key() == state.certificate.public_key()
-            for each in authorities
+            authority
+            and state.certificate
+            and authority.public_key() == state.certificate.public_key()
+            for authority in authorities
         ):
             raise _holds_ca_key(folder / KEY_FILE)
         with Folder(root) as opened:
@@ -232,19 +236,19 @@ def exported_files(
 
 
 def _check_zenoh(root: Path, folder: Path, name: str, state: OpenedEnclave) -> None:
-    """Refuse an enclave with Zenoh configurations that `sros run` would refuse on the robot."""
-    found = open_zenoh(folder, name, state)
-    if found.files and found.problems:
+    """Raise `KeystoreError` if `sros run` on the robot would refuse the Zenoh configurations."""
+    zenoh = open_zenoh(folder, name, state)
+    if zenoh.files and zenoh.problems:
         raise KeystoreError(
             f"the Zenoh configuration of enclave {name} could not be used on a robot",
-            "; ".join(map(str, found.problems)) + ".",
+            "; ".join(map(str, zenoh.problems)) + ".",
             f"Write it again: `sros zenoh {quote(str(root))}`.",
         )
 
 
 def _holds_ca_key(path: Path) -> KeystoreError:
     return KeystoreError(
-        f"'{path}' holds a private key that is not the one of an enclave",
+        f"'{path}' contains a private key that is not the key of an enclave",
         "A CA key would get to the robot, and whoever has the robot could issue any identity.",
         "Remove the key from the file, or make the enclave again with a key of its own.",
     )
@@ -268,7 +272,7 @@ def _write_folder(
         )
     if (target / PRIVATE).exists():
         raise KeystoreError(
-            f"'{target}' holds CA keys",
+            f"'{target}' contains CA keys",
             "It is a keystore with CAs, not an export.",
             "Choose another folder.",
         )
@@ -282,7 +286,7 @@ def _write_folder(
     replaced = [path for path in (*different, *stale) if os.path.lexists(target / path)]
     if replaced and not force:
         raise KeystoreError(
-            f"'{target}' already holds different versions of {', '.join(replaced)}",
+            f"'{target}' already has other versions of {', '.join(replaced)}",
             "Nothing was changed.",
             "Add --force to replace these files, or choose another folder.",
         )
@@ -296,9 +300,9 @@ def _write_folder(
 
 
 def _stale(target: Path, files: dict[str, bytes]) -> list[str]:
-    """Return the Zenoh files and keys of earlier exports that the enclaves do not have now.
+    """Return the paths in ``target`` of Zenoh files and keys that the enclaves no longer have.
 
-    An enclave that is exported without a key keeps the one that is there: no other copy exists.
+    An enclave that is exported without a key keeps the key in ``target``: no other copy exists.
     """
     folders = {path.rpartition("/")[0] for path in files}
     keyed = {folder for folder in folders for file in KEY_FILES if f"{folder}/{file}" in files}
@@ -325,7 +329,7 @@ def _write_archive(
             return ()
         if not force:
             raise KeystoreError(
-                f"'{target}' already exists and differs",
+                f"'{target}' already exists, with other content",
                 "Nothing was changed.",
                 "Add --force to replace it, or choose another name.",
             )
@@ -345,7 +349,7 @@ class ExportedEnclaves(NamedTuple):
     keystore: NamedKeystore
     dry_run: DryRun
     target: Path
-    """TARGET, as it was named."""
+    """TARGET, as given on the command line."""
     enclaves: Sequence[
         EnclaveResult[
             Annotated[
@@ -357,7 +361,7 @@ class ExportedEnclaves(NamedTuple):
     ]
     """The exported enclaves."""
     left_out: Sequence[str]
-    """Enclaves that fit ``--all`` or ``--match``, but whose key was made on its robot."""
+    """Enclaves that ``--all`` or ``--match`` selects, but whose key was made on the robot."""
     changes: FileChanges
     notes: Notes
 
@@ -365,7 +369,10 @@ class ExportedEnclaves(NamedTuple):
 def exported_outcomes(
     root: Path, names: Sequence[str], folder: Path, *, changed: bool
 ) -> list[EnclaveResult[str]]:
-    """Return what was done with exported enclaves, which are below ``folder``."""
+    """Return the outcomes of exported enclaves, whose files are below ``folder``.
+
+    ``changed`` says whether the export changed any file.
+    """
     keystore, outcome = Keystore(root), "exported" if changed else "kept"
     return [
         enclave_result(keystore, name, outcome, written=True, folder=folder / enclave_folder(name))

@@ -1,4 +1,4 @@
-"""The folder of a robot: signing requests made there, the CAs it trusts, and answers installed."""
+"""The security folder on a robot: making signing requests, and installing the answers."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ from sros_tool.xml import read_bytes
 class Requested:
     """A new signing request for the enclave ``name``; ``key`` is the SHA-256 of its public key.
 
-    ``token`` is the place of the key, if it is on a PKCS#11 token.
+    ``token`` is the place of the key on a PKCS#11 token, None for a key in a file.
     """
 
     name: str
@@ -113,11 +113,12 @@ def create_request(
     secrets: Secrets = no_secrets,
     dry_run: bool = False,
 ) -> Requested:
-    """Create an enclave's private key in ``folder``, and a signing request for it.
+    """Create an enclave's private key in ``folder``, and a signing request for the key.
 
     ``folder`` becomes a keystore without CAs.  With ``again`` the request is made for the existing
-    key; a key is never replaced.  With ``key``, a ``pkcs11:`` URI, the key is on a token, where it
-    is made if it is not there, and ``folder`` gets its place; ``secrets`` is asked for the PIN.
+    key; a key is never replaced.  With ``key``, a ``pkcs11:`` URI, the key is on that token: it is
+    created there if it does not exist, and ``folder`` gets a file with the URI.  ``secrets`` is
+    asked for the PIN.
 
     Raises:
         KeystoreError: the enclave has a key already (without ``again``), or a certificate without
@@ -129,8 +130,8 @@ def create_request(
     if again and place_of_key:
         raise UsageError(
             "--again and --key exclude each other",
-            "The request is made again for the key that the enclave has.",
-            "Leave one of them out.",
+            "With --again, the request is for the key that the enclave already has.",
+            "Leave one of the two options out.",
         )
     if not dry_run and folder.is_dir():
         tidy(folder)
@@ -143,7 +144,7 @@ def create_request(
         on_token = folder / place / KEY_URI_FILE
         if has_key(folder / place) and not again:
             raise KeystoreError(
-                f"enclave {name} has a key in '{folder}' already",
+                f"enclave {name} already has a key in '{folder}'",
                 "A key is never replaced, because its certificate would become useless.",
                 "Add --again to make the request again for this key, or choose another folder.",
             )
@@ -185,10 +186,10 @@ def create_request(
 
 
 def read_pin(text: str) -> frozenset[str]:
-    """Return the SHA-256 of the pinned CAs, in lower-case hexadecimal.
+    """Return the SHA-256 of the CA certificates that ``text`` pins, in lower-case hexadecimal.
 
-    ``text`` is a fingerprint or the path of a certificate file.  A fingerprint can have colons and
-    capitals, as ``openssl x509 -fingerprint -sha256`` prints it.
+    ``text`` is a SHA-256 fingerprint or the path of a certificate file.  A fingerprint can have
+    colons and capital letters, as in the output of ``openssl x509 -fingerprint -sha256``.
 
     Raises:
         UsageError: ``text`` is neither a fingerprint nor a certificate file.
@@ -207,38 +208,41 @@ def read_pin(text: str) -> frozenset[str]:
 
 
 def _trusted_in(folder: Path, file: str) -> list[x509.Certificate]:
-    """Return the distinct certificates in all files named ``file`` of a folder's enclaves."""
-    found: dict[str, x509.Certificate] = {}
+    """Return the distinct certificates in the ``file`` files of all enclaves in ``folder``."""
+    certificates: dict[str, x509.Certificate] = {}
     for path in sorted((folder / ENCLAVES).rglob(file)):
         if path.exists():
-            found |= {digest(each): each for each in _certificates(path)}
-    return list(found.values())
+            certificates |= {
+                digest(certificate): certificate for certificate in _certificates(path)
+            }
+    return list(certificates.values())
 
 
 def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
-    """Refuse to mix enclaves of two keystores in one folder: they could not communicate.
+    """Check that the enclaves in ``target`` and the new files trust the same identity CA.
+
+    Enclaves of two keystores in one folder could not communicate.
 
     Args:
-        target: the folder of a robot.
+        target: the security folder of a robot.
         files: the content of the new files, by their paths relative to ``target``.
 
     Raises:
-        KeystoreError: ``target`` holds an enclave that trusts none of the identity CAs in
-            ``files``.
+        KeystoreError: an enclave in ``target`` trusts none of the identity CAs in ``files``.
     """
-    ours: set[str] = set()
+    new_authorities: set[str] = set()
     for path, data in files.items():
         if path.endswith(f"/{IDENTITY_CA_FILE}"):
-            ours |= fingerprints(data)
-    for place in sorted((target / ENCLAVES).rglob(IDENTITY_CA_FILE)):
-        if f"{place.relative_to(target)}" in files or not place.exists():
+            new_authorities |= fingerprints(data)
+    for ca_file in sorted((target / ENCLAVES).rglob(IDENTITY_CA_FILE)):
+        if f"{ca_file.relative_to(target)}" in files or not ca_file.exists():
             continue
-        theirs = _certificates(place)
-        if ours.isdisjoint(map(digest, theirs)):
+        present_authorities = _certificates(ca_file)
+        if new_authorities.isdisjoint(map(digest, present_authorities)):
             raise KeystoreError(
-                f"'{target}' holds enclaves of another keystore",
-                f"They trust {subject_text(theirs[0].subject)}, and could not communicate with the "
-                "new enclaves.",
+                f"'{target}' contains enclaves of another keystore",
+                f"They trust {subject_text(present_authorities[0].subject)}, and could not "
+                "communicate with the new enclaves.",
                 "Choose another folder.",
             )
 
@@ -262,15 +266,15 @@ _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
 _REQUIRED = tuple(file for file in REQUIRED_FILES if file != KEY_FILE)
 _AGAIN = "Have the request signed again, and import the new answer."
 _SEALED = re.compile(rb"sros answer (?:1|2\nnumber ([1-9][0-9]{0,12}))\n")
-"""The first lines of a seal; earlier versions wrote no number."""
+"""First lines of a seal; earlier versions of sros wrote no number."""
 
 
 @dataclass(frozen=True, slots=True)
 class RequestAnswer:
-    """The answer to a request: the files of one enclave by their paths, without its key.
+    """The answer to a signing request: the files of an enclave, by path, without its key.
 
-    ``seal`` is the signed list of the files (`SEAL`).  The list begins with a number, which is
-    higher than those of all answers that the keystore gave before.
+    ``seal`` is the signed list of the files (`SEAL`).  The list begins with the number of the
+    answer, which is higher than the numbers of all earlier answers from the keystore.
     """
 
     name: str
@@ -278,17 +282,17 @@ class RequestAnswer:
     seal: bytes
 
     def file(self, name: str) -> bytes | None:
-        """Return the content of a file of the enclave, such as ``cert.pem``, or None."""
+        """Return the content of the enclave's file ``name``, such as ``cert.pem``, or None."""
         return self.files.get(f"{enclave_folder(self.name)}/{name}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImportedEnclave(Changed):
-    """An enclave that was imported; without ``changes``, the same answer was installed already.
+    """The result of installing an answer; ``changes`` is empty if it was installed already.
 
-    ``first`` says whether the folder trusted no CA before, so that nothing vouched for the new
-    ones.  ``until`` is the first expiry of certificate and permissions.  ``restart`` is the enclave
-    if processes on Zenoh that run have other rules until they are restarted.
+    ``first`` says whether the folder trusted no CA before, so that nothing verified the CAs of the
+    answer.  ``until`` is the first expiry of certificate and permissions.  ``restart`` has the
+    enclave if its running processes on Zenoh keep the old rules until they are restarted.
     """
 
     name: str
@@ -299,7 +303,7 @@ class ImportedEnclave(Changed):
 
 
 def seal(files: dict[str, bytes], number: int, authority: Authority) -> bytes:
-    """Return the file list of an answer as an S/MIME message that ``authority`` signed.
+    """Return the file list of an answer as an S/MIME message signed by ``authority``.
 
     ``number`` is from `sros_tool.keystore.ledger.Ledger.next_number`.
     """
@@ -308,13 +312,13 @@ def seal(files: dict[str, bytes], number: int, authority: Authority) -> bytes:
 
 
 def _listed(files: dict[str, bytes]) -> bytes:
-    """Return the list of files that is signed: one SHA-256 and path per line, sorted."""
+    """Return the file list for the seal: a line "SHA-256, two spaces, path" per file, sorted."""
     digests = (f"{hashlib.sha256(data).hexdigest()}  {path}" for path, data in files.items())
     return "\n".join([*sorted(digests), ""]).encode()
 
 
 def _number_of(message: bytes) -> int:
-    """Return the number in a seal, or 0 if an earlier version of sros made it."""
+    """Return the number in a seal; 0 for the seal of an earlier version of sros, without number."""
     head = _SEALED.match(smime.parse(message).text)
     return int(head[1] or 0) if head else 0
 
@@ -323,7 +327,8 @@ def _read_answer(data: bytes) -> RequestAnswer:
     """Read an answer from its archive (``.tar.gz``), without verifying it.
 
     Raises:
-        DocumentError: the archive is damaged, or does not hold exactly the files of one enclave.
+        DocumentError: the archive is damaged, or its content is not exactly the files of one
+            enclave.
     """
     try:
         files = unpack(data)
@@ -335,7 +340,7 @@ def _read_answer(data: bytes) -> RequestAnswer:
         folder = enclave_folder(name)
         welcome = {f"{folder}/{file}" for file in (*_REQUIRED, *_OPTIONAL)}
         if strange := sorted(files.keys() - welcome):
-            raise DocumentError(f"it holds {strange[0]!r}, which does not belong to an answer")
+            raise DocumentError(f"it contains {strange[0]!r}, which does not belong to an answer")
         if missing := [file for file in _REQUIRED if f"{folder}/{file}" not in files]:
             raise DocumentError(f"it lacks {', '.join(missing)}")
         if not signed:
@@ -348,11 +353,10 @@ def _read_answer(data: bytes) -> RequestAnswer:
 
 
 def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> OpenedEnclave:
-    """Return the enclave of an answer, after checking that DDS would load it with its key.
+    """Return the enclave in an answer, after checking that DDS would load it.
 
-    Its Zenoh configurations have to be signed, and to fit its permissions.
-
-    ``key`` is the public key of the enclave.
+    Its Zenoh configurations have to be signed, and to fit its permissions.  ``key`` is the public
+    key of the enclave, which has to be the key of the certificate.
 
     Raises:
         PkiError: the answer has problems; the error lists all of them, such as a certificate for
@@ -368,7 +372,7 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
         zenoh = open_zenoh(Path(folder), answer.name, state)
     problems = list(evaluation.problems)
     if zenoh.files:
-        problems += [str(each) for each in zenoh.problems if each.file != CERTIFICATE_FILE]
+        problems += [str(fault) for fault in zenoh.problems if fault.file != CERTIFICATE_FILE]
     certificate = state.certificate
     if certificate and certificate.public_key() != key:
         problems.insert(0, "cert.pem: it does not belong to the enclave's key")
@@ -390,7 +394,7 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
 
 
 def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate]) -> str:
-    """Return why none of the CAs has signed the list of files, or "" if one has."""
+    """Return why no CA in ``authorities`` signed the file list of an answer; "" if a CA did."""
     try:
         signed = smime.parse(answer.seal)
     except SrosError as error:
@@ -418,21 +422,21 @@ def import_answer(
     allow_refusal: Sequence[Vendor] = (),
     dry_run: bool = False,
 ) -> ImportedEnclave:
-    """Install an answer next to the enclave's key in ``folder``, or change nothing.
+    """Install the answer to a request next to the enclave's key in ``folder``, whole or not at all.
 
     Args:
         data: the answer (``.tar.gz``).
-        pinned: SHA-256 of permissions CAs; if any, one of them must have signed the answer, also
-            with ``force``.
+        pinned: SHA-256 of permissions CAs; if not empty, one of these CAs must have signed the
+            answer, also with ``force``.
         force: accept an answer that is older than the present files, or comes from other CAs.
-        allow_refusal: vendors on which nodes of the enclave may stop.
+        allow_refusal: vendors whose nodes of the enclave may stop to work.
 
     Raises:
         DocumentError: ``data`` is not an answer.
         PkiError: the answer is not valid, see `check_answer`.
-        KeystoreError: the key is missing, was revoked or is the key of another enclave, or the
-            answer is refused without ``force``; or no vendor would accept the enclave, or one would
-            not that does today.
+        KeystoreError: the key is missing, was revoked or is the key of another enclave; only
+            ``force`` accepts the answer; no vendor would accept the enclave; or a vendor that
+            accepts it today would no longer do so.
     """
     answer = _read_answer(data)
     name = answer.name
@@ -471,7 +475,7 @@ def import_answer(
         notes = refuse_stopping(transaction, now, allowed=allow_refusal, remedy=lambda: _AGAIN)
         transaction.commit()
     changes = transaction.changes
-    other_rules = ran and any(Path(each.path).name in ZENOH_SIGNED for each in changes)
+    other_rules = ran and any(Path(change.path).name in ZENOH_SIGNED for change in changes)
     return ImportedEnclave(
         root=folder,
         dry_run=dry_run,
@@ -488,10 +492,12 @@ def import_answer(
 
 
 def _public_key(place: Path, name: str) -> PublicKey:
-    """Return the public key of an enclave; of one on a token it is in the request, which it signed.
+    """Return the public key of an enclave, from its key file or its signing request.
+
+    A key on a token has no file, but it signed the request.
 
     Raises:
-        SrosError: the key, or the request, is missing or cannot be read.
+        SrosError: key and request are missing, or the file cannot be read.
     """
     path = place / KEY_FILE
     if path.exists():
@@ -506,10 +512,10 @@ def _check_pinned(
     permissions_ca: x509.Certificate,
     pinned: frozenset[str],
 ) -> None:
-    """Refuse an answer unless a pinned CA is the permissions CA that signed it.
+    """Raise `KeystoreError` unless the permissions CA that signed an answer is pinned.
 
-    A pinned identity CA is not enough, because it vouches for the certificate only: an attacker
-    could add other permissions and another governance.
+    A pinned identity CA is not enough, because it signs only the certificate: an attacker could
+    add other permissions and another governance.  Without ``pinned``, any CA is accepted.
     """
     if not pinned or digest(permissions_ca) in pinned:
         return
@@ -518,7 +524,7 @@ def _check_pinned(
     )
     remedy = "Ask for the SHA-256 that `sros sign_request` printed. Nothing was changed."
     if digest(identity_ca) in pinned:
-        why = "The pinned CA is its identity CA, which vouches for the certificate only."
+        why = "The pinned CA is its identity CA, which signs only the certificate."
         remedy = "Pin the permissions CA, which signs the whole answer. Nothing was changed."
     raise KeystoreError(
         f"the answer for enclave {answer.name} is not signed by the pinned CA", why, remedy
@@ -526,7 +532,7 @@ def _check_pinned(
 
 
 def _check_key(folder: Path, answer: RequestAnswer, key: PublicKey) -> None:
-    """Refuse an answer for a revoked key, or for the key of another enclave of this folder."""
+    """Raise `KeystoreError` if the answer revokes ``key``, or another enclave here has it."""
     remedy = f"Make a new key with `sros create_request {answer.name}` in another folder."
     path = folder / enclave_folder(answer.name) / "cert.pem"
     present = read_certificate(path) if path.exists() else None
@@ -534,28 +540,31 @@ def _check_key(folder: Path, answer: RequestAnswer, key: PublicKey) -> None:
         KnownKeys(Keystore(folder)).refuse_second(key, answer.name, remedy)
         return
     crl = answer.file("crl.pem")
-    for each in load_crl(crl, "of the answer").revoked if crl else ():
-        if each.serial == present.serial_number and each.reason != SUPERSEDED:
+    for revoked in load_crl(crl, "of the answer").revoked if crl else ():
+        if revoked.serial == present.serial_number and revoked.reason != SUPERSEDED:
             raise KeystoreError(
                 f"the key of enclave {answer.name} was revoked",
-                f"The answer certifies it again, and its list revokes '{path}'.",
+                f"The answer certifies this key again, but its revocation list revokes '{path}'.",
                 remedy,
             )
 
 
 def _check_known(folder: Path, answer: RequestAnswer, known: list[x509.Certificate]) -> None:
-    """Refuse an answer that no permissions CA trusted by ``folder`` signed."""
+    """Raise `KeystoreError` unless a CA in ``known`` signed the answer.
+
+    ``known`` are the permissions CAs that ``folder`` trusts; if empty, any CA is accepted.
+    """
     if known and (problem := _broken_seal(answer, known)):
         raise KeystoreError(
             f"the answer for enclave {answer.name} comes from another keystore",
             f"The permissions CA that '{folder}' trusts has not signed it: {problem.rstrip('.')}.",
-            "Add --force to move this robot to that keystore.",
+            "To move this robot to the other keystore, add --force.",
         )
     check_same_authority(folder, answer.files)
 
 
 def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certificate) -> None:
-    """Refuse an answer that is older than the installed files: it may be replayed."""
+    """Raise `KeystoreError` if the answer is older than the installed files, as in a replay."""
     remedy = "Have the request signed again, or add --force to go back to the older answer."
     path = place / "cert.pem"
     numbered = _check_number(place / SEAL, answer, remedy)
@@ -583,10 +592,12 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
 
 
 def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
-    """Refuse an answer with a lower number than the installed one, or with the same number.
+    """Return whether both answers have numbers, which decide that the new answer is not older.
 
-    ``path`` is the seal of the installed answer.  Return whether both have a number, so that no
-    clock has to tell which is newer.
+    Without numbers, the caller has to compare times.  ``path`` is the seal of the installed answer.
+
+    Raises:
+        KeystoreError: the number of the new answer is not higher than the installed one's.
     """
     if not path.exists():
         return False
@@ -595,11 +606,11 @@ def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
     if not old or present == answer.seal:
         return bool(old)
     if not new:
-        why = f"It has no number, the installed one has {old}: an earlier version of sros made it."
+        why = f"It has no number, the installed answer has {old}: an earlier sros made it."
     elif new < old:
-        why = f"It has the number {new}, the installed one has {old}."
+        why = f"It has the number {new}, the installed answer has {old}."
     elif new == old:
-        why = f"Both have the number {old}, so the keystore's ledger was set back in between."
+        why = f"Both have the number {old}, so the keystore's ledger was reset in between."
     else:
         return True
     raise KeystoreError(
@@ -614,13 +625,13 @@ class RequestedEnclave(NamedTuple):
     """An enclave with a signing request."""
 
     name: str
-    """The enclave."""
+    """Name of the enclave."""
     outcome: Annotated[str, Words(("requested", "requested_again"))]
-    """``requested_again``: for the existing key."""
+    """``requested``: for a new key; ``requested_again``: for the existing key."""
     folder: Path
-    """The enclave's folder."""
+    """Folder of the enclave."""
     request: Path
-    """The file to have signed."""
+    """File with the signing request."""
     key_sha256: str | None
     """SHA-256 of the enclave's public key (DER), in hexadecimal; null if a dry run made none."""
 
@@ -629,27 +640,27 @@ class MadeRequest(NamedTuple):
     """The signing request that was made."""
 
     folder: Path
-    """DIR, as it was named."""
+    """DIR, as given on the command line."""
     dry_run: DryRun
     enclaves: Sequence[RequestedEnclave]
-    """The enclave."""
+    """The enclave that the request is for."""
     changes: FileChanges
     notes: Notes
 
 
 def shown_request(folder: Path, made: Requested, *, again: bool, dry_run: bool) -> MadeRequest:
-    """Return what is printed of a signing request."""
-    key = made.key if again or not dry_run else None  # a dry run makes one, but does not keep it
+    """Return the value that ``--json`` prints for a new signing request."""
+    key = made.key if again or not dry_run else None  # a dry run does not keep the key it makes
     outcome = "requested_again" if again else "requested"
     enclave = RequestedEnclave(made.name, outcome, made.file.parent, made.file, key)
     return MadeRequest(folder, dry_run, (enclave,), changes_below(folder, made.changes), made.notes)
 
 
 class ImportedAnswer(NamedTuple):
-    """The enclave that was imported."""
+    """The installed answer to a signing request."""
 
     folder: Path
-    """DIR, as it was named."""
+    """DIR, as given on the command line."""
     dry_run: DryRun
     enclaves: Sequence[
         EnclaveResult[
@@ -660,19 +671,22 @@ class ImportedAnswer(NamedTuple):
             ]
         ]
     ]
-    """The enclave."""
+    """The enclave of the answer."""
     authorities: Sequence[AuthorityFacts]
     """The CAs that the enclave trusts."""
     authorities_verified: bool
-    """Whether ``--ca`` or earlier answers vouch for the CAs; if not, compare their SHA-256."""
+    """Whether ``--ca`` or an earlier answer verified the CAs; if not, compare their SHA-256."""
     restart_zenoh: Sequence[str]
-    """The enclave, if its processes on Zenoh have to be restarted."""
+    """The enclave, if its processes on Zenoh have to be restarted; else empty."""
     changes: FileChanges
     notes: Notes
 
 
 def shown_import(imported: ImportedEnclave, *, pinned: bool) -> ImportedAnswer:
-    """Return what is printed of an imported answer."""
+    """Return the value that ``--json`` prints for an installed answer.
+
+    ``pinned`` says whether ``--ca`` was given.
+    """
     return shown(
         imported,
         ImportedAnswer,

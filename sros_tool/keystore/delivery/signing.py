@@ -1,4 +1,4 @@
-"""Answers to signing requests: all files that an enclave on a robot needs, except its key."""
+"""Signing of requests from robots, and the answers: the files of an enclave, except its key."""
 
 from __future__ import annotations
 
@@ -90,12 +90,12 @@ from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Not
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Signed(Changed):
-    """Signed requests.
+    """The result of signing requests.
 
-    ``keys`` maps each enclave to the SHA-256 of its public key.  ``outcomes`` has the enclaves that
-    were created, renewed, and kept because their key had a certificate already.  ``identity_ca``
-    and ``permissions_ca`` are the CAs that robots will trust.  ``archive`` is the answer for the
-    robot (``.tar.gz``), if one was made.
+    ``keys`` maps each enclave to the SHA-256 of its public key (DER, hexadecimal).  ``outcomes``
+    maps each enclave to "created", "renewed", or "kept": its key had a certificate already.
+    ``identity_ca`` and ``permissions_ca`` are the CAs that robots will trust.  ``archive`` is the
+    answer for the robot (``.tar.gz``), empty if no answer was made.
     """
 
     keys: Mapping[str, str]
@@ -122,26 +122,30 @@ def sign_request(
 ) -> Signed:
     """Certify the key of a request, sign the permissions, and make the answer for the robot.
 
-    The keystore gets all files of the enclave except the key.  The rights come from ``policy``.
-    Without a policy they come from the present permissions if ``renew`` is set, otherwise from the
-    keystore's template.  If the policy is for a fleet, that of the keystore records the path.
+    The keystore gets all files of the enclave except the key.  The rights come from ``policy``;
+    without a policy, from the present permissions if ``renew`` is set, otherwise from the
+    keystore's template.  If ``policy`` is for a fleet, the keystore's fleet records the enclave's
+    path with its placeholders.
 
     Args:
+        root: the keystore.
         data: the request (PEM).
-        only: the enclave that the request has to be for, if it is known: a robot chooses what its
-            request says.
+        only: the name of the enclave that the request has to be for; empty for any.  A robot can
+            write any name into its request.
         refuse_revoked: refuse a revoked enclave also if ``only`` names it.
-        answer: the path for the answer, which is put in place after the keystore has changed.
+        renew: the enclave has to exist; it gets a new certificate.
+        answer: the path for the answer, which is written after the keystore has changed.
         force: replace ``answer`` if it exists.
-        domain: refuse a keystore that is not made for this domain.
-        allow_refusal: vendors on which nodes may stop.
+        domain: the ROS domain that the keystore has to be for.
+        allow_refusal: vendors whose nodes may stop to work.
 
     Raises:
         PkiError: the request is not valid.
-        KeystoreError: the enclave exists (without ``renew``) or does not (with it), it was revoked
-            and ``only`` does not name it, it is another one than ``only`` says, its key was revoked
-            or belongs to another enclave, ``answer`` exists, the keystore cannot issue, no vendor
-            would accept the enclave, or one would not that does today.
+        KeystoreError: the enclave exists (without ``renew``) or does not exist (with ``renew``);
+            the enclave was revoked and ``only`` does not name it; the request is for another
+            enclave than ``only``; the key was revoked or belongs to another enclave; ``answer``
+            exists; the keystore cannot issue; no vendor would accept the enclave, or a vendor that
+            accepts it today would no longer do so.
     """
     request = load_request(data, "that was given")
     if only:
@@ -173,25 +177,32 @@ def sign_request(
 
 
 class _Stated(NamedTuple):
-    """What a policy states for an enclave; ``path`` has its placeholders, or is ""."""
+    """The rights that a policy states for an enclave; None: the policy states none.
+
+    ``path`` is the enclave's path in the policy, if it has placeholders of a fleet, else "".
+    """
 
     enclave: Enclave | None = None
     path: str = ""
 
 
 def _stated(policy: Policy | FleetPolicy | None, names: Sequence[str]) -> dict[str, _Stated]:
-    """Map enclaves to what a policy states for them; raise `PolicyError` if it lacks one."""
+    """Map enclaves to the rights that a policy states for them.
+
+    Raises:
+        PolicyError: the policy lacks an enclave.
+    """
     if policy is None:
         return dict.fromkeys(names, _Stated())
     expanded = policy.policy() if isinstance(policy, FleetPolicy) else policy
-    found = {name: _Stated(stated_enclave(expanded, name)) for name in names}
+    stated = {name: _Stated(stated_enclave(expanded, name)) for name in names}
     if isinstance(policy, FleetPolicy):
         paths = {name: policy.stated(name)[0].path for name in names}
-        found = {
-            name: each._replace(path=paths[name] if has_placeholder(paths[name]) else "")
-            for name, each in found.items()
+        stated = {
+            name: of_enclave._replace(path=paths[name] if has_placeholder(paths[name]) else "")
+            for name, of_enclave in stated.items()
         }
-    return found
+    return stated
 
 
 def certify_requests(
@@ -212,21 +223,25 @@ def certify_requests(
 
     As `sign_request`, but no answers are made: an export without keys brings the enclaves to their
     robots.  Unless ``renew`` is set, an enclave whose key is certified already stays as it is.
-    With ``only``, these are the enclaves that the requests have to be for, in their order: a robot
-    chooses what its request says.
+    ``only`` has the names of the enclaves that the requests have to be for, in the same order;
+    empty for any.
 
     Raises:
         PkiError: a request is not valid.
-        KeystoreError: as for `sign_request`, two requests are for one enclave or one key, or one is
-            for another enclave than ``only`` says.
+        KeystoreError: as for `sign_request`, or two requests are for the same enclave or key.
     """
-    requests = [load_request(each, f"number {at}") for at, each in enumerate(_each(data), 1)]
+    requests = [
+        load_request(request, f"number {number}")
+        for number, request in enumerate(_split_requests(data), 1)
+    ]
     if not requests:
-        raise DocumentError("there is no signing request", "", "Give the request.pem of enclaves.")
+        raise DocumentError(
+            "the input has no signing request", "", "Give the request.pem files of enclaves."
+        )
     if only:
         _check_asked(requests, only)
     _check_distinct(requests)
-    stated = _stated(policy, [check_enclave_name(each.name) for each in requests])
+    stated = _stated(policy, [check_enclave_name(request.name) for request in requests])
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
     )
@@ -235,7 +250,9 @@ def certify_requests(
         if not renew:
             existing = frozenset(change.names)
             kept = tuple(
-                each.name for each in requests if _is_certified(change.keystore, each, existing)
+                request.name
+                for request in requests
+                if _is_certified(change.keystore, request, existing)
             )
         signer = _Signer(change, domain, stated)
         for request in requests:
@@ -253,36 +270,41 @@ def certify_requests(
 _END = b"-----END CERTIFICATE REQUEST-----"
 
 
-def _each(data: bytes) -> list[bytes]:
-    """Return the requests in a series of them; what is no request is left to the reader."""
+def _split_requests(data: bytes) -> list[bytes]:
+    """Return the PEM requests in ``data``; text after the last request counts as a request, too.
+
+    `load_request` reports parts that are no request.
+    """
     *parts, rest = data.split(_END)
     return [part + _END + b"\n" for part in parts] + ([rest] if rest.strip() else [])
 
 
 def _check_asked(requests: Sequence[SigningRequest], only: Sequence[str]) -> None:
-    """Refuse a request that is for another enclave than the one in its place of ``only``."""
+    """Raise `KeystoreError` unless the requests are for the enclaves ``only``, in this order."""
     if len(requests) != len(only):
         raise KeystoreError(
             f"there are {len(requests)} requests for {len(only)} enclaves",
             "",
-            "Name the enclave of each request with --enclave, in their order.",
+            "Name the enclaves with --enclave, one for each request, in the order of the requests.",
         )
     for number, (request, name) in enumerate(zip(requests, only, strict=True), 1):
         if request.name != name:
             raise KeystoreError(
                 f"request number {number} is for enclave {request.name}, and should be for {name}",
-                "Whoever made it asks for the identity of another enclave. Nothing was signed.",
-                "Look at the robot that it comes from.",
+                "Whoever made the request asks for the identity of another enclave. Nothing was "
+                "signed.",
+                "Examine the robot that the request comes from.",
             )
 
 
 def _check_distinct(requests: Sequence[SigningRequest]) -> None:
-    names = Counter(each.name for each in requests)
-    keys = Counter(key_digest(each.public_key) for each in requests)
+    """Raise `KeystoreError` if two requests are for the same enclave or for the same key."""
+    names = Counter(request.name for request in requests)
+    keys = Counter(key_digest(request.public_key) for request in requests)
     for request in requests:
         if names[request.name] > 1:
             raise KeystoreError(
-                f"two requests are for enclave {request.name}", "", "Give only one of them."
+                f"two requests are for enclave {request.name}", "", "Give only one request for it."
             )
         if keys[key_digest(request.public_key)] > 1:
             raise KeystoreError(
@@ -293,14 +315,14 @@ def _check_distinct(requests: Sequence[SigningRequest]) -> None:
 
 
 def _is_certified(keystore: Keystore, request: SigningRequest, existing: Collection[str]) -> bool:
-    """Return whether the enclave of a request has a certificate for its key."""
+    """Return whether the enclave of a request already has a certificate for the request's key."""
     if request.name not in existing:
         return False
     return keystore.certificate_of(request.name).public_key() == request.public_key
 
 
 class _Signer:
-    """The certification of requests in one change."""
+    """The certification of requests within one change of a keystore."""
 
     def __init__(
         self, change: KeystoreChange, domain: int | None, stated: Mapping[str, _Stated]
@@ -317,19 +339,19 @@ class _Signer:
         self._new: list[str] = []
 
     def _record_paths(self) -> None:
-        """Add the paths of what is stated to the fleet of the keystore.
+        """Add the policy's paths with placeholders to the fleet of the keystore.
 
-        Its robots stay the same, whatever fleet the policy was filled in for.
+        The robots of that fleet stay the same, also if the policy was expanded for another fleet.
         """
         change, root, stated = self._change, self._root, self._stated
         fleet = change.fleet
-        paths = {each.path for each in stated.values() if each.path}
+        paths = {of_enclave.path for of_enclave in stated.values() if of_enclave.path}
         if fleet and not paths <= set(fleet.enclaves):
             before = EnclaveDomains(change.domains, fleet)
             fleet = change.write_fleet(fleet, paths)
             refuse_stale_domains(root, before, fleet, stated)
-        for name, each in stated.items():
-            if each.path and not (fleet and robot_of(fleet, name)):
+        for name, of_enclave in stated.items():
+            if of_enclave.path and not (fleet and robot_of(fleet, name)):
                 lacks = "its fleet does not have the robot" if fleet else "it has no fleet for that"
                 change.notes.append(
                     Note(
@@ -342,9 +364,12 @@ class _Signer:
                 )
 
     def certify(self, request: SigningRequest, *, renew: bool, named: bool) -> Issued:
-        """Write all files of an enclave except its key; its rights are stated, or kept.
+        """Write all files of the request's enclave except its key.
 
-        ``named`` is whether the enclave was named at home, and not by the request alone.
+        Args:
+            request: the request whose key is certified.
+            renew: the enclave exists; it keeps its present rights unless the policy states others.
+            named: whether the operator named the enclave, and not the request alone.
         """
         change, root, name = self._change, self._root, request.name
         known, authority = change.known, change.permissions.certificate
@@ -357,8 +382,8 @@ class _Signer:
         if not renew and not named and name in known.revoked_enclaves:
             raise KeystoreError(
                 f"enclave {name} was revoked in keystore '{root}'",
-                "Whoever has the revoked key could have made this request, to be let in again.",
-                f"If the robot is yours again and shall have the enclave, add --enclave {name}.",
+                "Whoever has the revoked key could have made this request to get access again.",
+                f"If you have the robot back and it may have the enclave, add --enclave {name}.",
             )
         if present:
             note = _new_key_note(present, request)
@@ -389,7 +414,7 @@ class _Signer:
         return issued
 
     def keep_zenoh(self) -> None:
-        """Write what follows for the files of Zenoh, after all requests."""
+        """Stage the Zenoh configurations that follow from all certified requests."""
         change = self._change
         change.notes += [*self._writer.notes, *change.edit_notes()]
         change.keep_zenoh(self._writer.signed, stated=self._certified)
@@ -397,7 +422,7 @@ class _Signer:
         change.entries += self._writer.entries
 
     def name_notes(self) -> Iterator[Note]:
-        """Yield notes on names of new enclaves."""
+        """Yield notes on the names of new enclaves that vendors or users may confuse."""
         return name_notes({*self._change.names, *self._new}, self._new)
 
     def result(
@@ -408,12 +433,14 @@ class _Signer:
         kept: Collection[str] = (),
         archive: bytes = b"",
     ) -> Signed:
-        """Return what was done with requests, of which ``kept`` had a certificate already."""
+        """Return the result for ``requests``; enclaves in ``kept`` had a certificate already."""
         done = "renewed" if renew else "created"
         return self._change.result(
             Signed,
-            outcomes={each.name: "kept" if each.name in kept else done for each in requests},
-            keys={each.name: key_digest(each.public_key) for each in requests},
+            outcomes={
+                request.name: "kept" if request.name in kept else done for request in requests
+            },
+            keys={request.name: key_digest(request.public_key) for request in requests},
             identity_ca=self._change.identity.certificate,
             permissions_ca=self._change.permissions.certificate,
             archive=archive,
@@ -438,7 +465,7 @@ def _check_free(answer: Path, force: bool) -> None:
 def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
     if exists and not renew:
         raise KeystoreError(
-            f"enclave {name} exists already in keystore '{root}'",
+            f"enclave {name} already exists in keystore '{root}'",
             "The sender of the request would get the rights of this enclave.",
             "If that is intended, add --renew; otherwise create the request for another name.",
         )
@@ -453,9 +480,10 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
 def _check_key(
     keystore: Keystore, request: SigningRequest, known: KnownKeys, present: x509.Certificate | None
 ) -> None:
-    """Refuse a revoked key, the key of another enclave, and a key that does not fit the keystore.
+    """Raise `KeystoreError` if the key of a request cannot be certified.
 
-    An enclave that already shares its key with another one is renewed with a note.
+    These are revoked keys, keys of other enclaves, and keys other than the one in the keystore.  An
+    enclave that already shares its key with another enclave is renewed, with a note.
     """
     remedy = "Create a new key on the robot, with `sros create_request` in another folder."
     same = present if present and present.public_key() == request.public_key else None
@@ -485,12 +513,12 @@ def _check_result(answer: RequestAnswer, request: SigningRequest, now: datetime)
         raise KeystoreError(
             f"the robot would reject the answer for {answer.name}: {error.what}",
             error.why,
-            "Nothing was changed. See `sros inspect` of the keystore.",
+            "Nothing was changed. Look for the fault with `sros inspect` of the keystore.",
         ) from error
 
 
 def _new_key_note(old: x509.Certificate, request: SigningRequest) -> list[Note]:
-    """Return a note if the request's key is not the key of the present certificate."""
+    """Return a note if the request's key is not the key of the present certificate ``old``."""
     if old.public_key() == request.public_key:
         return []
     until = iso(validity_of(old).not_after)
@@ -506,7 +534,7 @@ def _new_key_note(old: x509.Certificate, request: SigningRequest) -> list[Note]:
 def _lost_rights(
     root: Path, earlier: EarlierPermissions, issued: Issued, now: datetime
 ) -> list[Note]:
-    """Return a note on rights that the enclave loses, and on what still works of them."""
+    """Return a note on the rights that the enclave loses, and how long its old files work."""
     (grant,) = issued.permissions.grants
     replaced = replaced_rights(issued.issuance.name, earlier, grant, now)
     text = lasting_text(root, replaced)
@@ -525,7 +553,7 @@ def _earlier_rights(change: KeystoreChange, name: str, present: x509.Certificate
     if old.grant is None:
         raise PkiError(
             f"the permissions of enclave {name} have no grant for {subject}",
-            "They belong to another certificate.",
+            "These permissions belong to another certificate.",
             "State the rights with -p POLICY_FILE.",
         )
     return change.recorded.of(name, old.digest, old.grant)
@@ -551,8 +579,8 @@ def _answer_files(root: Path, issued: Issued, zenoh: KeptZenoh) -> dict[str, byt
             files[f"{folder}/{file}"] = data = opened.read_inside(source)
             if holds_private_key(data):
                 raise KeystoreError(
-                    f"'{root / source}' holds a private key",
-                    "It would get into the answer, and so to the robot.",
+                    f"'{root / source}' contains a private key",
+                    "The key would get into the answer, and so to the robot.",
                     "Remove the key from the file.",
                 )
     return dict(sorted(files.items()))
@@ -577,14 +605,14 @@ class CertifiedKey(NamedTuple):
 
 
 class SignedRequest(NamedTuple):
-    """The enclave that was certified, and the answer for its robot."""
+    """The enclaves that were certified, and the answer for the robot."""
 
     keystore: NamedKeystore
     dry_run: DryRun
     answer: Path | None
-    """The file with the answer; ``-`` is standard output; null with ``--no-answer``."""
+    """File with the answer; ``-`` is standard output; null with ``--no-answer``."""
     enclaves: Sequence[CertifiedKey]
-    """The enclave; with ``--no-answer``, all of them."""
+    """The certified enclave; with ``--no-answer``, all certified enclaves."""
     authorities: Sequence[AuthorityFacts]
     """The CAs that the robot will trust."""
     changes: FileChanges
@@ -594,7 +622,10 @@ class SignedRequest(NamedTuple):
 def shown_signed(
     signed: Signed, answer: Path | None = None, more: Sequence[FileChange] = ()
 ) -> SignedRequest:
-    """Return what is printed of signed requests; ``more`` are changes outside of the keystore."""
+    """Return the value that ``--json`` prints for signed requests.
+
+    ``more`` are changes outside of the keystore.
+    """
     keys = [CertifiedKey(enclave, signed.keys[enclave.name]) for enclave in enclave_results(signed)]
     return shown(
         signed,
