@@ -25,7 +25,8 @@ from sros_tool.validity import BACKDATE, Window, iso, parse_duration
 class Threshold:
     """The limit from which an enclave is due for renewal.
 
-    Exactly one is set: ``remaining`` time, or ``elapsed`` fraction of the validity (0 to 1).
+    Exactly one field is set: ``remaining``, the time until expiry, or ``elapsed``, the fraction of
+    the validity (0 to 1) that is over.
     """
 
     remaining: timedelta | None = None
@@ -50,8 +51,8 @@ class Lifetime:
             return self.expires() - now <= threshold.remaining
         assert threshold.elapsed is not None
         return any(
-            _elapsed(each, now) >= threshold.elapsed
-            for each in (self.certificate, self.permissions)
+            _elapsed(validity, now) >= threshold.elapsed
+            for validity in (self.certificate, self.permissions)
         )
 
 
@@ -59,7 +60,8 @@ class Lifetime:
 class Credentials:
     """The certificate of an enclave and the grant that DDS reads, both not verified yet.
 
-    ``signed`` is the permissions document with the grant, ``digest`` its SHA-256 in hexadecimal.
+    ``signed`` is the permissions document with the grant, ``digest`` the SHA-256 of
+    ``permissions.p7s`` in hexadecimal.
     """
 
     name: str
@@ -82,14 +84,14 @@ class UnreadableEnclave:
 
 
 class DueEnclave(NamedTuple):
-    """An enclave that expires."""
+    """An enclave that is due for renewal."""
 
     enclave: str
     """The enclave."""
     certificate_until: datetime
-    """Expiry of its certificate, in UTC."""
+    """Expiry of the certificate, in UTC."""
     permissions_until: datetime
-    """Expiry of its permissions, in UTC."""
+    """Expiry of the permissions, in UTC."""
 
 
 class EnclaveProblem(NamedTuple):
@@ -98,14 +100,14 @@ class EnclaveProblem(NamedTuple):
     enclave: str
     """The enclave."""
     problem: str
-    """Why."""
+    """Why the expiry cannot be read."""
 
 
 class ExpiringEnclaves(NamedTuple):
-    """The enclaves that expire."""
+    """The enclaves of a keystore that are due for renewal."""
 
     enclaves: Sequence[DueEnclave]
-    """The enclaves that are due."""
+    """Enclaves that are due, with their expiry."""
     unreadable: Sequence[EnclaveProblem]
     """Enclaves whose expiry cannot be read."""
 
@@ -113,9 +115,14 @@ class ExpiringEnclaves(NamedTuple):
 def expiring_enclaves(
     due: Sequence[Lifetime], unreadable: Sequence[UnreadableEnclave]
 ) -> ExpiringEnclaves:
-    """Return what ``--json`` prints of enclaves that are due."""
+    """Return the value that ``--json`` prints for enclaves that are due for renewal."""
     return ExpiringEnclaves(
-        [DueEnclave(it.name, it.certificate.not_after, it.permissions.not_after) for it in due],
+        [
+            DueEnclave(
+                lifetime.name, lifetime.certificate.not_after, lifetime.permissions.not_after
+            )
+            for lifetime in due
+        ],
         [EnclaveProblem(enclave.name, str(enclave.error)) for enclave in unreadable],
     )
 
@@ -130,7 +137,7 @@ def parse_threshold(text: str) -> Threshold:
     if not match:
         return Threshold(remaining=parse_duration(text))
     if int(match[1]) > 100:
-        raise UsageError(f"{text!r} is more than 100% of a validity")
+        raise UsageError(f"{text!r} is more than 100% of the validity")
     return Threshold(elapsed=int(match[1]) / 100)
 
 
@@ -138,11 +145,11 @@ def _lifetimes(keystore: Keystore) -> tuple[Lifetime, ...]:
     """Return the lifetimes of a keystore's enclaves, sorted by name.
 
     Raises:
-        KeystoreError: some enclaves cannot be read; it names all of them.
+        KeystoreError: enclaves cannot be read; the error names all of them.
     """
-    found, unreadable = survey(keystore)
+    lifetimes, unreadable = survey(keystore)
     refuse_unreadable(unreadable, "read")
-    return found
+    return lifetimes
 
 
 def survey(keystore: Keystore) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
@@ -156,34 +163,39 @@ def survey(keystore: Keystore) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEn
             return UnreadableEnclave(name, error)
 
     slices = map_slices(keystore.names, lambda names: list(map(read, names)))
-    found = [each for _, part in slices for each in part]
+    results = [result for _, part in slices for result in part]
     return (
-        tuple(each for each in found if isinstance(each, Lifetime)),
-        tuple(each for each in found if isinstance(each, UnreadableEnclave)),
+        tuple(result for result in results if isinstance(result, Lifetime)),
+        tuple(result for result in results if isinstance(result, UnreadableEnclave)),
     )
 
 
 def due_enclaves(
     keystore: Keystore, threshold: Threshold, moment: datetime, settings: Template
 ) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...], int]:
-    """Return the enclaves of a keystore that need to be renewed, those unreadable, and a count.
+    """Return the enclaves that are due for renewal, the unreadable enclaves, and a count.
 
-    Enclaves that the settings let be valid for a short time are renewed in another way.  The count
-    is that of all readable enclaves.
+    The count is the number of readable enclaves.  Short-lived enclaves, which the settings let
+    expire earlier than others, are never due: they are renewed in another way.
     """
-    found, unreadable = survey(keystore)
-    lasting = (each for each in found if settings.longest_validity(each.name) is None)
-    due = tuple(each for each in lasting if each.due(threshold, moment))
-    return due, unreadable, len(found)
+    lifetimes, unreadable = survey(keystore)
+    lasting = (
+        lifetime for lifetime in lifetimes if settings.longest_validity(lifetime.name) is None
+    )
+    due = tuple(lifetime for lifetime in lasting if lifetime.due(threshold, moment))
+    return due, unreadable, len(lifetimes)
 
 
 def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> None:
-    """Raise an error that names all ``unreadable`` enclaves, if there are any."""
+    """Raise an error that names all ``unreadable`` enclaves; return if there are none.
+
+    ``verb`` is the past participle for the message, such as "read" or "renewed".
+    """
     if len(unreadable) == 1:
         raise unreadable[0].error
     if unreadable:
-        names = ", ".join(each.name for each in unreadable)
-        reasons = " ".join(f"{each.error.what}." for each in unreadable)
+        names = ", ".join(enclave.name for enclave in unreadable)
+        reasons = " ".join(f"{enclave.error.what}." for enclave in unreadable)
         raise KeystoreError(
             f"{len(unreadable)} enclaves cannot be {verb}: {names}",
             f"{reasons} Nothing was changed.",
@@ -229,7 +241,7 @@ def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
 
 
 def _elapsed(validity: Window, now: datetime) -> float:
-    """Return the elapsed fraction of a validity, without back-dating; above 1 once it expired."""
+    """Return the elapsed fraction of a validity, without its back-dating; above 1 after expiry."""
     begin = validity.not_before
     if validity.not_after - begin > BACKDATE:
         begin += BACKDATE

@@ -1,6 +1,6 @@
-"""The fleet that a keystore records: its robots, which enclave is whose, and their domains.
+"""The fleet that a keystore records: its robots, their enclaves, and their ROS domains.
 
-The ledger has the SHA-256 of the file as sros wrote it last, so that an edit is noticed.
+The ledger has the SHA-256 of the fleet file as sros wrote it last, so that an edit is noticed.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ _SHOWN = 5
 
 
 def load_fleet(keystore: Keystore) -> Fleet | None:
-    """Return the fleet of a keystore, or None: nobody named one.
+    """Return the fleet of a keystore; None if the keystore has no fleet.
 
     Raises:
-        DocumentError: the file cannot be read, or is not a fleet.
+        DocumentError: the fleet file cannot be read, or is not a fleet.
     """
 
     def read() -> Fleet | None:
@@ -53,10 +53,12 @@ def load_fleet(keystore: Keystore) -> Fleet | None:
 
 
 def checked_fleet(keystore: Keystore) -> Fleet | None:
-    """Return the fleet as `load_fleet`, for what is issued or sent because of it.
+    """Return the fleet as `load_fleet`, after checking that nobody edited its file.
+
+    Verbs that issue or send files by the fleet use this.
 
     Raises:
-        KeystoreError: the file is not the one that sros wrote last.
+        KeystoreError: the fleet file is not the file that sros wrote last.
     """
     if problem := edited_fleet(keystore, keystore.ledger_with("what", "fleet")):
         raise KeystoreError(
@@ -68,22 +70,22 @@ def checked_fleet(keystore: Keystore) -> Fleet | None:
 
 
 def edited_fleet(keystore: Keystore, ledger: Ledger) -> str:
-    """Return how the file of the fleet is not the one that sros wrote, as a clause, or ""."""
+    """Return a clause on how the fleet file differs from what sros wrote; "" if it does not."""
     return _edited(ledger, _read(keystore))
 
 
 def _edited(ledger: Ledger, data: bytes | None) -> str:
     # What somebody else adds to the ledger is not among the entries that are certain.
-    last = next((each for each in reversed(ledger.certain) if each.what == "fleet"), None)
-    if last is None and any(each.what == "fleet" for each in ledger.entries):
-        state = "is missing" if data is None else "is not certainly the one that sros wrote"
-        return f"{state}, because the ledger was changed by something else"
+    last = next((entry for entry in reversed(ledger.certain) if entry.what == "fleet"), None)
+    if last is None and any(entry.what == "fleet" for entry in ledger.entries):
+        state = "is missing" if data is None else "may not be the file that sros wrote"
+        return f"{state}: the ledger was changed by another program"
     if last is None:
         return "" if data is None else "was not written by sros"
     if data is None:
-        return f"is missing, which sros wrote at {last.time}"
+        return f"is missing, although sros wrote it at {last.time}"
     same = hashlib.sha256(data).hexdigest() == last.sha256
-    return "" if same else f"is not the one that sros wrote at {last.time}"
+    return "" if same else f"is not the file that sros wrote at {last.time}"
 
 
 def _read(keystore: Keystore) -> bytes | None:
@@ -102,11 +104,11 @@ def _parse(root: Path, data: bytes) -> Fleet:
 
 
 def recorded_fleet(keystore: Keystore) -> Fleet:
-    """Return the fleet of a keystore.
+    """Return the fleet of a keystore, which has to have one.
 
     Raises:
-        KeystoreError: it is no keystore, or nobody named a fleet.
-        DocumentError: the file cannot be read, or is not a fleet.
+        KeystoreError: it is no keystore, or the keystore has no fleet.
+        DocumentError: the fleet file cannot be read, or is not a fleet.
     """
     keystore.check()
     fleet = load_fleet(keystore)
@@ -121,13 +123,13 @@ def recorded_fleet(keystore: Keystore) -> Fleet:
 
 
 def enclaves_of_robot(root: Path, fleet: Fleet, robot: Robot) -> tuple[str, ...]:
-    """Return the enclaves of a robot that the keystore has, sorted."""
+    """Return the names of the robot's enclaves that exist in the keystore, sorted."""
     return tuple(name for name in enclaves_of(fleet, robot) if has_enclave(root, name))
 
 
 @dataclass(frozen=True, slots=True)
 class EnclaveDomains:
-    """The ROS domains of each enclave: those of the keystore, or the one of its robot."""
+    """The ROS domains of enclaves: the domain of the robot, or else the keystore's domains."""
 
     keystore: DomainSet
     fleet: Fleet | None = None
@@ -137,7 +139,7 @@ class EnclaveDomains:
         return self.fleet.robots.values() if self.fleet else ()
 
     def of(self, enclave: str) -> DomainSet:
-        """Return the domains of an enclave.
+        """Return the ROS domains that an enclave gets permissions for.
 
         Raises:
             KeystoreError: its robot is in a domain that the keystore is not for.
@@ -149,9 +151,9 @@ class EnclaveDomains:
             raise KeystoreError(
                 f"the robot {robot.name} is in domain {robot.domain}, and the keystore is for "
                 f"domain {self.keystore}",
-                "In a domain that the governance does not name, nobody communicates.",
+                "In a domain that the governance does not name, no enclave can communicate.",
                 f"Add it with `sros update_keystore KEYSTORE --domain "
-                f"{self.keystore},{robot.domain} --allow-looser`, or name another in the fleet "
+                f"{self.keystore},{robot.domain} --allow-looser`, or change it in the fleet "
                 "file.",
             )
         return DomainSet.of((robot.domain, robot.domain))
@@ -167,20 +169,21 @@ def write_fleet(
     patterns: Collection[str],
     now: datetime,
 ) -> tuple[Fleet, tuple[Entry, ...]]:
-    """Stage ``fleet`` as that of the keystore, if it is another; return it, and ledger entries.
+    """Stage ``fleet`` as the fleet of the keystore; return the fleet as staged, and ledger entries.
 
-    It gets the paths of enclaves that it names itself, that the keystore had, and ``patterns``.
+    The staged fleet has the enclave paths of ``fleet``, of the keystore's fleet until now, and
+    ``patterns``.  If it is the same as until now, nothing is staged.
     """
     from sros_tool.fleet.fleet_file import render_fleet
 
     before = load_fleet(keystore)
     known = (before.enclaves if before else (), fleet.enclaves, patterns)
-    paths = dict.fromkeys(sorted(each for paths in known for each in paths))
+    paths = dict.fromkeys(sorted(path for paths in known for path in paths))
     fleet = fleet.with_enclaves(tuple(paths))
     if problem := size_problem(fleet):
         raise KeystoreError(
             f"the fleet of keystore '{transaction.root}' would be too large",
-            f"{problem} Those of earlier policies count, too.",
+            f"{problem} The paths of earlier policies count, too.",
             "Divide the fleet between keystores.",
         )
     _refuse_shared(fleet)
@@ -213,31 +216,31 @@ def _refuse_shared(fleet: Fleet) -> None:
 def refuse_stale_domains(
     root: Path, before: EnclaveDomains, fleet: Fleet, stated: Collection[str]
 ) -> None:
-    """Raise `KeystoreError` if an enclave would keep permissions for other domains.
+    """Raise `KeystoreError` if an enclave would keep permissions for its former domains.
 
     Args:
         root: the keystore.
-        before: the domains of its enclaves until now.
-        fleet: its robots from now on.
-        stated: the enclaves that get new permissions.
+        before: the domains of the keystore's enclaves until now.
+        fleet: the robots of the keystore from now on.
+        stated: the names of enclaves that get new permissions.
     """
     after = EnclaveDomains(before.keystore, fleet)
-    if not any(each.domain is not None for one in (before, after) for each in one.robots()):
+    if not any(robot.domain is not None for side in (before, after) for robot in side.robots()):
         return
     for name in enclave_names(root):
         if name in stated or robot_of(fleet, name) is None:
             continue
         if before.of(name) != (domains := after.of(name)):
             raise KeystoreError(
-                f"the enclave {name} would have to be for domain {domains} by the fleet, and has "
+                f"enclave {name} belongs to domain {domains} by the fleet, but would keep its "
                 f"permissions for domain {before.of(name)}",
-                "No policy here states its rights, so it gets no other permissions.",
-                "Name the policies of all enclaves whose robots are in another domain now.",
+                "No policy of this command states its rights, so it gets no new permissions.",
+                "Name the policies of all enclaves whose robots change their domain.",
             )
 
 
 def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
-    """Yield a note for each robot that has enclaves in the keystore which are no longer its own.
+    """Yield a note for each robot that loses enclaves which the keystore still has.
 
     No two robots of ``after`` have an enclave in common, as `write_fleet` makes sure.
     """
@@ -248,20 +251,23 @@ def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
         left = [name for name in names if has_enclave(root, name)]
         if left:
             is_there = robot.name in after.robots
-            why = "has other paths of enclaves now" if is_there else "is no longer in the fleet"
+            why = "has other enclave paths now" if is_there else "is no longer in the fleet"
             shown = first_few(left, _SHOWN)
             yield Note(
                 "fleet.left-enclaves",
-                f"the robot {robot.name} {why}: {shown} stay as they are, and work. To take "
+                f"the robot {robot.name} {why}: {shown} stay valid. To take "
                 f"them back, run `sros revoke {quote(str(root))} {words_for(root, left)}`.",
             )
 
 
 def words_for(root: Path, names: Sequence[str]) -> str:
-    """Return the words that name exactly these enclaves of a keystore."""
+    """Return the command line arguments that select exactly the enclaves ``names``.
+
+    These are ``--match 'PREFIX*'`` if that selects no others, else the names.
+    """
     begin = f"{os.path.commonpath(names).rstrip('/')}/"
     if len(names) > 1 and begin != "/":
-        fitting = [each for each in enclave_names(root) if each.startswith(begin)]
+        fitting = [name for name in enclave_names(root) if name.startswith(begin)]
         if fitting == sorted(names):
             return f"--match {quote(f'{begin}*')}"
     return " ".join(names)

@@ -1,7 +1,7 @@
-"""What is where: what each robot of a fleet last confirmed, compared with what it should have.
+"""The deployment status of a fleet: the robots' last confirmations, compared with the keystore.
 
-A robot should have what an export would give now.  What it has instead is looked up in the ledger,
-so an earlier file is known by when it was issued, and another robot's by whose it is.
+A robot should have the files that an export would give now.  Other files are looked up in the
+ledger, which tells when an earlier file was issued, and which enclave a foreign file belongs to.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from sros_tool.values import NamedKeystore, Words, shows
 
 
 class State(StrEnum):
-    """How a confirmed file compares with the present one, and the worst of a robot's files.
+    """The state of a robot's file, compared with the keystore; for a robot, that of its worst file.
 
     The order is from good to bad.
     """
@@ -62,14 +62,14 @@ class State(StrEnum):
     EARLIER = "earlier"
     """An earlier file that the keystore issued for the same enclave."""
     DIFFERENT = "different"
-    """A file of Zenoh that is not the present one; the ledger does not have earlier ones."""
+    """A Zenoh file that is not the present one; the ledger does not record earlier Zenoh files."""
     MISSING = "missing"
     BROKEN = "broken"
-    """The file at home is missing or cannot be read, so no export can be made."""
+    """The file in the keystore is missing or cannot be read, so no export can be made."""
     NEVER = "never"
-    """The robot has confirmed nothing."""
+    """The robot has sent no confirmation."""
     UNKNOWN = "unknown"
-    """A file that the keystore did not issue, as far as its ledger tells."""
+    """A file that the ledger does not record as issued."""
     REVOKED = "revoked"
     ANOTHER = "another"
     """A file of an enclave of another robot, or of an enclave of no robot."""
@@ -91,7 +91,7 @@ _AUTHORITIES = ("identity_ca", "permissions_ca")
 
 
 def _kind_of(path: str) -> str:
-    """Return what the file at a path is, such as ``permissions``; all files of Zenoh are one."""
+    """Return the kind of a file, such as ``permissions``; ``zenoh`` for all Zenoh files."""
     return _KINDS.get(path.rpartition("/")[2], _ZENOH)
 
 
@@ -101,31 +101,32 @@ def _kind_of(path: str) -> str:
 )
 @dataclass(frozen=True, slots=True)
 class ConfirmedFile:
-    """A file that is not the one that an export would give now.
+    """A file on a robot that differs from the file that an export would give now.
 
-    With ``surplus``, the robot should have no such file.
+    With ``surplus``, the robot should have no file at this path.
     """
 
     path: str
-    """The path of the file in the keystore."""
+    """Path of the file in the keystore."""
     kind: FileKind
-    """What the file is."""
+    """Kind of the file."""
     state: State
-    """What the robot has instead: an ``earlier`` file of the same enclave; a ``different`` one of
-    Zenoh, whose earlier files the ledger does not have; none (``missing``); one that the keystore
-    did not issue (``unknown``); a ``revoked`` one; one of ``another`` robot, or of no robot.
-    ``broken``: the file at home is missing or cannot be read."""
+    """The file that the robot has instead: an ``earlier`` file of the same enclave; a ``different``
+    Zenoh file (the ledger does not record earlier Zenoh files); no file (``missing``); a file that
+    the keystore did not issue (``unknown``); a ``revoked`` file; a file of ``another`` robot, or of
+    no robot. ``broken``: the file in the keystore is missing or cannot be read."""
     since: str = ""
-    """When the keystore issued what the robot has, in UTC; null if it is not known."""
+    """When the keystore issued the robot's file, in UTC; null if the ledger does not record it."""
     enclave: str = ""
-    """The enclave that what the robot has belongs to, if it is another's, or null."""
+    """The enclave that the robot's file belongs to, if it is the file of another enclave; else
+    null."""
     robot: str = ""
-    """The robot of that enclave, or null."""
+    """The robot that ``enclave`` belongs to, or null."""
     surplus: bool = False
 
     @property
     def action(self) -> Annotated[str, Words(("deliver", "remove"))]:
-        """What has to be done on the robot."""
+        """Whether the file has to be delivered to the robot, or removed there."""
         return "remove" if self.surplus else "deliver"
 
 
@@ -136,32 +137,35 @@ class ConfirmedFile:
 )
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """What a robot last confirmed; ``others`` are enclaves that the fleet does not record."""
+    """The deployment status of a robot, by its last confirmation.
+
+    ``others`` are enclaves of the robot that the fleet does not record.
+    """
 
     robot: str
-    """Its name."""
+    """Name of the robot."""
     state: State
-    """The worst state of its files; ``never``: it has confirmed nothing; ``none``: it has no
+    """The worst state of the robot's files; ``never``: it sent no confirmation; ``none``: it has no
     enclave in the keystore."""
     enclaves: int
-    """The number of its enclaves in the keystore."""
+    """Number of the robot's enclaves in the keystore."""
     revoked: tuple[str, ...]
-    """Its enclaves that were revoked and are not in the keystore, whatever it confirmed."""
+    """The robot's revoked enclaves that are no longer in the keystore, whether confirmed or not."""
     others: Unrecorded
     received: datetime | None
-    """When its last confirmation was received, by the clock at home, in UTC, or null."""
+    """When the last confirmation was received, by the clock of the keystore's machine, in UTC, or
+    null."""
     clock: datetime | None
-    """The time of its own clock in that confirmation, in UTC, or null."""
+    """The time of the robot's clock in the last confirmation, in UTC, or null."""
     stage: Annotated[str, Words(("unknown", "before", "distribute", "reissue", "complete"))]
-    """The stage of a CA rotation that its CA files are of, or null: it has confirmed none.
-    ``before``: it does not trust the CA that issues next, or now; ``complete``: it trusts no other
-    one."""
+    """The stage of a CA rotation that the robot's CA files have reached; null if it confirmed no CA
+    file. ``before``: it does not trust the new CA yet; ``complete``: it trusts only the new CA."""
     files: Mapping[str, Mapping[State, int]]
-    """The number of its files, by kind and state."""
+    """Number of the robot's files, by kind and state."""
     pending: tuple[ConfirmedFile, ...]
-    """The files that are not as at home; empty if it has confirmed nothing."""
+    """Files that differ from the keystore; empty if the robot sent no confirmation."""
     notes: tuple[str, ...]
-    """Remarks, as clauses, such as on its clock."""
+    """Remarks, as clauses, such as on the robot's clock."""
 
     @property
     def unrecorded(self) -> tuple[str, ...]:
@@ -185,18 +189,19 @@ class FleetStatus:
 
     keystore: NamedKeystore
     stage: Annotated[str, Words(("complete", "distribute", "reissue"))]
-    """The stage of the CA rotation of the keystore; ``complete`` if none is under way."""
+    """Stage of the keystore's CA rotation; ``complete`` if no rotation is in progress."""
     robots: tuple[RobotStatus, ...]
     """The robots, sorted by name."""
     unassigned: int
-    """The number of enclaves that belong to no robot, of which nothing is known; 0 with --robot."""
+    """Number of enclaves that belong to no robot, so that no confirmation covers them; 0 with
+    --robot."""
     overdue: frozenset[str] = frozenset()
     """The robots whose last confirmation is older than --max-age, sorted by name."""
 
     @property
     def counts(self) -> Mapping[State, int]:
         """The number of robots by state."""
-        counts = Counter(each.state for each in self.robots)
+        counts = Counter(robot.state for robot in self.robots)
         return {state: counts[state] for state in State if counts[state]}
 
     @property
@@ -205,33 +210,33 @@ class FleetStatus:
         status is 0.
         """
         return not self.overdue and all(
-            each.state in (State.CURRENT, State.NONE) for each in self.robots
+            robot.state in (State.CURRENT, State.NONE) for robot in self.robots
         )
 
     def with_overdue(self, max_age: timedelta, now: datetime) -> FleetStatus:
-        """Return the same with the robots whose last confirmation is older than ``max_age``."""
+        """Return a copy that names the robots whose last confirmation is older than ``max_age``."""
         late = (
-            each.robot
-            for each in self.robots
-            if each.enclaves and each.received and now - each.received > max_age
+            robot.robot
+            for robot in self.robots
+            if robot.enclaves and robot.received and now - robot.received > max_age
         )
         return replace(self, overdue=frozenset(late))
 
 
 @shows(spread=("status",))
 class ComparedFleet(NamedTuple):
-    """What each robot of the fleet has, by what it last confirmed."""
+    """The deployment status of a fleet at a moment."""
 
     at: datetime
-    """When it was compared, in UTC."""
+    """When the robots were compared with the keystore, in UTC."""
     status: FleetStatus
 
 
 def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
-    """Return what is where, of the robots with these names, or of all.
+    """Return the deployment status of the named robots, or of the whole fleet.
 
     Raises:
-        KeystoreError: it is no keystore, has no fleet, or enclaves of it may be missing.
+        KeystoreError: it is no keystore, has no fleet, or some of its enclaves may be missing.
         DocumentError: the fleet has no such robot.
     """
     root, fleet = keystore.root, recorded_fleet(keystore)
@@ -240,21 +245,22 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
     stages = _Stages(keystore)
     known = _Known(keystore, fleet, compared)
     existing = keystore.names
-    unassigned = 0 if names else len(existing) - sum(len(each.enclaves) for each in compared)
-    unrecorded = unrecorded_enclaves(fleet, existing, {each.name for each in robots})
-    found = tuple(_status(each, known, stages, unrecorded[each.robot.name]) for each in compared)
-    return FleetStatus(root, stages.at_home, found, unassigned)
+    unassigned = 0 if names else len(existing) - sum(len(robot.enclaves) for robot in compared)
+    unrecorded = unrecorded_enclaves(fleet, existing, {robot.name for robot in robots})
+    statuses = tuple(_status(one, known, stages, unrecorded[one.robot.name]) for one in compared)
+    return FleetStatus(root, stages.at_home, statuses, unassigned)
 
 
 # ── comparing a confirmation with the files at home ────────────────────────────────────────
 
 
 class _Difference(NamedTuple):
-    """A file that is not as at home.
+    """A confirmed file that differs from the keystore.
 
-    ``confirmed`` is the SHA-256 of what the robot has, or "": it has none; ``certificates`` are
-    those in it.  ``at_home`` says whether an export would give another one, None that the file at
-    home cannot be read.
+    ``confirmed`` is the SHA-256 of the robot's file, "" if the robot has none; ``certificates`` are
+    the SHA-256 of the certificates in the robot's file.  ``at_home`` says whether an export has a
+    file at this path; None: the file in the keystore cannot be read.  ``own`` says whether the path
+    belongs to an enclave of the robot.
     """
 
     path: str
@@ -265,10 +271,10 @@ class _Difference(NamedTuple):
 
 
 class _ComparedRobot(NamedTuple):
-    """What a robot confirmed, compared with the files of its enclaves at home.
+    """A robot's confirmation, compared with the files of its enclaves in the keystore.
 
-    ``authorities`` has, by the kind of a CA file, the certificates in the files of each enclave as
-    the robot confirmed them.  ``current`` counts the files that are as at home, by kind.
+    ``current`` counts the files that are as in the keystore, by kind.  ``authorities`` maps the
+    kind of a CA file to the certificates in the confirmed CA files of all enclaves.
     """
 
     robot: Robot
@@ -282,14 +288,14 @@ class _ComparedRobot(NamedTuple):
 
 
 def _compare_robots(root: Path, fleet: Fleet, robots: Sequence[Robot]) -> list[_ComparedRobot]:
-    """Return what each robot confirmed, compared with the files at home, on all cores."""
+    """Compare the robots' confirmations with the keystore, on all cores."""
 
     def work(part: Sequence[Robot]) -> list[_ComparedRobot]:
         with Folder(root) as folder:
             at_home = _Home(root, folder)
             return [_compare(root, fleet, robot, at_home) for robot in part]
 
-    return [each for _, part in map_slices(robots, work) for each in part]
+    return [compared for _, part in map_slices(robots, work) for compared in part]
 
 
 def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _ComparedRobot:
@@ -318,8 +324,8 @@ def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _Compare
                 certificates = file.certificates
             else:
                 certificates = confirmed.certificates.get(path, ())
-                there = None if file is None else True
-                different.append(_Difference(path, sha256, certificates, there, own=True))
+                at_keystore = None if file is None else True
+                different.append(_Difference(path, sha256, certificates, at_keystore, own=True))
             if kind in authorities:
                 authorities[kind].add(certificates)
     folders = {enclave_folder(name) for name in enclaves}
@@ -334,7 +340,7 @@ def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _Compare
         confirmed.time,
         current,
         tuple(different),
-        {kind: frozenset(found) for kind, found in authorities.items()},
+        {kind: frozenset(certificates) for kind, certificates in authorities.items()},
         tuple(notes),
     )
 
@@ -345,7 +351,7 @@ class _FileAtHome(NamedTuple):
 
 
 class _Home:
-    """The digests of the files of enclaves; a file that many enclaves share is read once."""
+    """Reader of the digests of enclave files in a keystore; shared files are read once."""
 
     def __init__(self, root: Path, folder: Folder) -> None:
         self._root = root
@@ -353,24 +359,28 @@ class _Home:
         self._shared: dict[tuple[str, str], _FileAtHome | None] = {}
 
     def files_of(self, name: str) -> Mapping[str, _FileAtHome | None]:
-        """Map the paths of the files that an export has, without the key, to their digests.
+        """Map the paths of an enclave's exported files, without the key, to their digests.
 
-        A file that is missing although every export has it, or that cannot be read, is None.
+        A path maps to None if its file cannot be read, or is missing although every export needs
+        it.
         """
         folder = enclave_folder(name)
-        found: dict[str, _FileAtHome | None] = dict.fromkeys(
+        files: dict[str, _FileAtHome | None] = dict.fromkeys(
             f"{folder}/{file}" for file in REQUIRED_FILES if file != KEY_FILE
         )
         up = "../" * folder.count("/")
         with suppress(OSError), os.scandir(f"{self._root}/{folder}") as entries:
-            for each in entries:
-                if each.name in CONFIRMED_FILES:
-                    path = f"{folder}/{each.name}"
-                    found[path] = self._linked(path, up) if each.is_symlink() else self._file(path)
-        return found
+            for entry in entries:
+                if entry.name in CONFIRMED_FILES:
+                    path = f"{folder}/{entry.name}"
+                    files[path] = self._linked(path, up) if entry.is_symlink() else self._file(path)
+        return files
 
     def _linked(self, path: str, up: str) -> _FileAtHome | None:
-        """Return what a link leads to; ``up`` leads from it to the folder of all enclaves."""
+        """Return the digests of the file that a link leads to; None if it cannot be read.
+
+        ``up`` is the relative path from the link to the folder of all enclaves.
+        """
         with suppress(SrosError, OSError):
             link = self._folder.link_target(path) or ""
             if not link.startswith(up):
@@ -398,7 +408,7 @@ class _Home:
 
 
 class _Known:
-    """What the ledger tells of files that are not the present ones."""
+    """Identification, by the ledger, of confirmed files that differ from the keystore."""
 
     def __init__(
         self, keystore: Keystore, fleet: Fleet, compared: Sequence[_ComparedRobot]
@@ -408,9 +418,9 @@ class _Known:
         self._issued: dict[str, Entry] = {}
         self._revoked_serials: set[str] = set()
         self._revoked: set[str] = set()
-        different = [each for robot in compared for each in robot.different if each.confirmed]
-        wanted = {each.confirmed for each in different}
-        wanted.update(one for each in different for one in each.certificates)
+        different = [file for robot in compared for file in robot.different if file.confirmed]
+        wanted = {file.confirmed for file in different}
+        wanted.update(certificate for file in different for certificate in file.certificates)
         ledger = keystore.ledger if wanted else keystore.ledger_with("what", "revocation")
         for entry in ledger.entries:
             if entry.sha256 in wanted:
@@ -421,7 +431,7 @@ class _Known:
                 self._revoked_serials.add(entry.serial)
                 if entry.reason != SUPERSEDED:
                     self._revoked.add(entry.enclave)
-        robots = {each.robot.name for each in compared}
+        robots = {robot.robot.name for robot in compared}
         self._unrecorded = unrecorded_enclaves(fleet, self._revoked, robots)
 
     def revoked(self, robot: Robot) -> tuple[str, ...]:
@@ -432,42 +442,45 @@ class _Known:
         names.update(self._unrecorded[robot.name].below)
         return tuple(sorted(name for name in names if not has_enclave(self._root, name)))
 
-    def file(self, robot: Robot, each: _Difference) -> ConfirmedFile:
-        """Return what a robot has instead of the file at home."""
-        kind, name = _kind_of(each.path), enclave_of(each.path)
-        state, since, owner = self._identify(each, kind, name)
-        if not each.own and state is not State.REVOKED:
+    def file(self, robot: Robot, difference: _Difference) -> ConfirmedFile:
+        """Return the state and the origin of a robot's file that differs from the keystore."""
+        kind, name = _kind_of(difference.path), enclave_of(difference.path)
+        state, since, owner = self._identify(difference, kind, name)
+        if not difference.own and state is not State.REVOKED:
             if name in self._revoked and not has_enclave(self._root, name):
                 state = State.REVOKED
             elif has_enclave(self._root, name) or robot_of(self._fleet, name) not in (None, robot):
                 state, owner = State.ANOTHER, name
-        whose = robot_of(self._fleet, owner) if owner else None
+        other_robot = robot_of(self._fleet, owner) if owner else None
         return ConfirmedFile(
-            each.path,
+            difference.path,
             kind,
             state,
             since,
             owner,
-            whose.name if whose else "",
-            surplus=each.at_home is False,
+            other_robot.name if other_robot else "",
+            surplus=difference.at_home is False,
         )
 
-    def _identify(self, each: _Difference, kind: str, name: str) -> tuple[State, str, str]:
-        """Return the state of a file, when it was issued, and the enclave that it is of instead."""
-        if each.at_home is None:
+    def _identify(self, difference: _Difference, kind: str, name: str) -> tuple[State, str, str]:
+        """Return the state of a file, when it was issued ("": unknown), and its enclave if another.
+
+        The name is "" unless the file belongs to another enclave than ``name``.
+        """
+        if difference.at_home is None:
             return State.BROKEN, "", ""
-        if not each.confirmed:
+        if not difference.confirmed:
             return State.MISSING, "", ""
         if kind == _ZENOH:
             return State.DIFFERENT, "", ""
         if kind in _AUTHORITIES:
-            entries = [self._issued.get(one) for one in each.certificates]
-            if not entries or not all(one and one.what == "ca" for one in entries):
+            entries = [self._issued.get(entry) for entry in difference.certificates]
+            if not entries or not all(entry and entry.what == "ca" for entry in entries):
                 return State.UNKNOWN, "", ""
-            return State.EARLIER, max(one.time for one in entries if one), ""
-        sha256 = each.confirmed
+            return State.EARLIER, max(entry.time for entry in entries if entry), ""
+        sha256 = difference.confirmed
         if kind == "certificate":
-            sha256 = each.certificates[0] if each.certificates else ""
+            sha256 = difference.certificates[0] if difference.certificates else ""
         entry = self._issued.get(sha256)
         if entry is None or entry.what != kind:
             return State.UNKNOWN, "", ""
@@ -481,14 +494,14 @@ class _Known:
 def _status(
     compared: _ComparedRobot, known: _Known, stages: _Stages, unrecorded: Unrecorded
 ) -> RobotStatus:
-    different = tuple(known.file(compared.robot, each) for each in compared.different)
+    different = tuple(known.file(compared.robot, file) for file in compared.different)
     counts: dict[str, Counter[State]] = {}
     for kind, number in compared.current.items():
         counts.setdefault(kind, Counter())[State.CURRENT] = number
-    for each in different:
-        counts.setdefault(each.kind, Counter())[each.state] += 1
+    for file in different:
+        counts.setdefault(file.kind, Counter())[file.state] += 1
     if different:
-        state = max((each.state for each in different), key=_BADNESS.__getitem__)
+        state = max((file.state for file in different), key=_BADNESS.__getitem__)
     elif not compared.enclaves:
         state = State.NONE
     else:
@@ -512,7 +525,7 @@ def _status(
 
 
 class _Stages:
-    """The stage of a rotation that the CA files of a robot are of."""
+    """Comparison of robots' CA files with the stages of the keystore's CA rotation."""
 
     BEFORE, COMPLETE, UNKNOWN = "before", "complete", "unknown"
     ORDER = (UNKNOWN, BEFORE, "distribute", "reissue", COMPLETE)
@@ -525,13 +538,13 @@ class _Stages:
         self._at_home: dict[str, tuple[tuple[str, ...], str]] = {}
         for file, roles in keystore.authority_files.items():
             certificates = tuple(map(digest, keystore.certificates_of(file)))
-            new = [each.new for each in rotation.replacements if each.file == file]
+            new = [replaced.new for replaced in rotation.replacements if replaced.file == file]
             for kind in (f"{role}_ca" for role in roles):
                 self._new[kind] = new[0] if new else certificates[0]
                 self._at_home[kind] = certificates, self.at_home if new else self.COMPLETE
 
     def of(self, compared: _ComparedRobot) -> str:
-        """Return the stage of the CA file that is behind; "" if the robot confirmed none."""
+        """Return the stage of the robot's least advanced CA file; "" if it confirmed none."""
         stages = {
             self._stage(kind, certificates)
             for kind, files in compared.authorities.items()
@@ -556,9 +569,9 @@ class _Stages:
 
 
 def fleet_metrics(status: FleetStatus, *, now: datetime) -> tuple[Metric, ...]:
-    """Return the metrics of a fleet; ``now`` is the moment of the comparison."""
+    """Return the Prometheus metrics of a fleet; ``now`` is the time of the comparison."""
     place = {"keystore": str(status.keystore.absolute())}
-    robots = [({**place, "robot": each.robot}, each) for each in status.robots]
+    robots = [({**place, "robot": robot.robot}, robot) for robot in status.robots]
     return (
         Metric(
             "sros_fleet_compared_timestamp_seconds",
@@ -575,37 +588,37 @@ def fleet_metrics(status: FleetStatus, *, now: datetime) -> tuple[Metric, ...]:
         Metric(
             "sros_fleet_robot_state",
             "The state of each robot, with the value 1.",
-            tuple(Sample(1, {**labels, "state": each.state}) for labels, each in robots),
+            tuple(Sample(1, {**labels, "state": robot.state}) for labels, robot in robots),
         ),
         Metric(
             "sros_fleet_confirmed_timestamp_seconds",
             "When the last confirmation of a robot was received, in seconds since 1970.",
             tuple(
-                Sample(int(each.received.timestamp()), labels)
-                for labels, each in robots
-                if each.received
+                Sample(int(robot.received.timestamp()), labels)
+                for labels, robot in robots
+                if robot.received
             ),
         ),
         Metric(
             "sros_fleet_clock_ahead_seconds",
             "How far the clock of a robot was ahead when its confirmation was received.",
             tuple(
-                Sample(int((each.clock - each.received).total_seconds()), labels)
-                for labels, each in robots
-                if each.clock and each.received
+                Sample(int((robot.clock - robot.received).total_seconds()), labels)
+                for labels, robot in robots
+                if robot.clock and robot.received
             ),
         ),
         Metric(
             "sros_fleet_pending_files",
-            "Number of files by kind that a robot has to get or to lose; only of robots that "
-            "confirmed something.",
+            "Number of files by kind to deliver to a robot or to remove there, for robots that "
+            "sent a confirmation.",
             tuple(
                 Sample(
                     sum(number for state, number in states.items() if state is not State.CURRENT),
                     {**labels, "kind": kind},
                 )
-                for labels, each in robots
-                for kind, states in each.files.items()
+                for labels, robot in robots
+                for kind, states in robot.files.items()
             ),
         ),
     )

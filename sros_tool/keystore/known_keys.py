@@ -1,6 +1,6 @@
-"""The public keys that a keystore knows: those of its enclaves, and the revoked ones.
+"""The public keys that a keystore knows: the keys of its enclaves, and revoked keys.
 
-A revocation list names certificates, so whoever certifies a revoked key again undoes its
+A revocation list names certificates, so a new certificate for a revoked key would undo its
 revocation.  Two enclaves with one key are one identity: each can act as the other.  Keys are
 compared by the SHA-256 of their SubjectPublicKeyInfo (DER).
 """
@@ -45,62 +45,68 @@ class KnownKeys:
     def _revocations(self) -> Sequence[Entry]:
         """The revocations in the ledger."""
         entries = self._keystore.ledger_with("what", "revocation").entries
-        return [each for each in entries if each.what == "revocation"]
+        return [entry for entry in entries if entry.what == "revocation"]
 
     @cached_property
     def _revoked(self) -> Mapping[str, str]:
         """Map the digests of revoked keys to a description of the revoked certificate."""
-        recorded = [each for each in self._revocations if each.key]
-        found = {each.key: f"certificate {each.serial} of {each.subject}" for each in recorded}
-        serials = {each.serial for each in recorded}
+        recorded = [entry for entry in self._revocations if entry.key]
+        descriptions = {
+            entry.key: f"certificate {entry.serial} of {entry.subject}" for entry in recorded
+        }
+        serials = {entry.serial for entry in recorded}
         for path in revoked_certificates(self._keystore.root):
             try:
-                found.update([_described(self._keystore.certificate(path))])
+                descriptions.update([_described(self._keystore.certificate(path))])
             except SrosError:
                 if path.parent.name not in serials:
                     raise
-        return found
+        return descriptions
 
     @cached_property
     def _revoked_serials(self) -> Collection[int]:
         """The serial numbers of certificates that were revoked together with their keys."""
-        found = {int(each.serial, 16) for each in self._revocations if each.reason != SUPERSEDED}
+        serials = {
+            int(revocation.serial, 16)
+            for revocation in self._revocations
+            if revocation.reason != SUPERSEDED
+        }
         lists = (entry for crl in self._keystore.revocation_lists for entry in crl.revoked)
-        return found | {entry.serial for entry in lists if entry.reason != SUPERSEDED}
+        return serials | {entry.serial for entry in lists if entry.reason != SUPERSEDED}
 
     @cached_property
     def revoked_enclaves(self) -> Collection[str]:
-        """The enclaves whose last certificate was revoked, and not superseded.
+        """The names of enclaves whose last certificate was revoked, and not superseded.
 
-        Where the ledger was lost, those whose files are in ``revoked``, with a certificate that a
+        If the ledger was lost, these are the enclaves in the folder ``revoked`` whose certificate a
         revocation list names.
         """
         files = revoked_certificates(self._keystore.root)
-        if not files and all(each.reason == SUPERSEDED for each in self._revocations):
+        if not files and all(entry.reason == SUPERSEDED for entry in self._revocations):
             return set()
-        found, recorded = set(), set()
-        for each in self._keystore.ledger.entries:
-            recorded.add(each.serial)
-            if each.what == "certificate":
-                found.discard(each.enclave)
-            elif each.what == "revocation" and each.reason != SUPERSEDED:
-                found.add(each.enclave)
+        enclaves, recorded = set(), set()
+        for entry in self._keystore.ledger.entries:
+            recorded.add(entry.serial)
+            if entry.what == "certificate":
+                enclaves.discard(entry.enclave)
+            elif entry.what == "revocation" and entry.reason != SUPERSEDED:
+                enclaves.add(entry.enclave)
         for path in files:
             if path.parent.name not in recorded:
                 with suppress(SrosError):  # a file that is no certificate
                     certificate = self._keystore.certificate(path)
                     if certificate.serial_number in self._revoked_serials:
-                        found.add(common_name_of(certificate.subject))
-        return found
+                        enclaves.add(common_name_of(certificate.subject))
+        return enclaves
 
     def revoked_before_notes(self, names: Iterable[str]) -> Iterator[Note]:
-        """Yield a note for each of ``names`` that was revoked, and is created again."""
+        """Yield a note for each new enclave in ``names`` that was revoked before."""
         for name in names:
             if name in self.revoked_enclaves:
                 yield Note(
                     "keystore.revoked-before",
-                    f"{name} was revoked, and now exists again, with another key and certificate; "
-                    "the revoked ones stay revoked.",
+                    f"{name} was revoked, and now exists again with a new key and certificate; "
+                    "the old key and certificate stay revoked.",
                 )
 
     @cached_property
@@ -110,19 +116,19 @@ class KnownKeys:
         def read(names: Sequence[str]) -> list[tuple[str, str]]:
             return [(digest, name) for name in names for digest in _digests(self._keystore, name)]
 
-        found: dict[str, list[str]] = defaultdict(list)
+        enclaves_by_key: dict[str, list[str]] = defaultdict(list)
         for _, part in map_slices(self._keystore.names, read):
             for digest, name in part:
-                found[digest].append(name)
-        return found
+                enclaves_by_key[digest].append(name)
+        return enclaves_by_key
 
     def refuse_revoked(
         self, key: PublicKey, whose: str, remedy: str, certificate: x509.Certificate | None = None
     ) -> None:
         """Raise `KeystoreError` if ``key`` was revoked; ``whose`` names its holder in the error.
 
-        ``certificate`` is the present certificate for the key: a revoked one may have been put
-        back from a backup.
+        ``certificate`` is the present certificate for the key: a backup may have restored a revoked
+        certificate.
         """
         revoked = self._revoked.get(key_digest(key))
         if certificate and certificate.serial_number in self._revoked_serials:
@@ -142,7 +148,7 @@ class KnownKeys:
             )
 
     def shared_notes(self, names: Sequence[str]) -> Iterator[Note]:
-        """Yield a note for each of the enclaves that has its key together with others."""
+        """Yield a note for each enclave in ``names`` that shares its key with other enclaves."""
         if not names:
             return
         shared = {
@@ -150,18 +156,18 @@ class KnownKeys:
             for enclaves in self._enclaves.values()
             if len(enclaves) > 1
             for name in enclaves
-            if (others := [each for each in enclaves if each != name])
+            if (others := [other for other in enclaves if other != name])
         }
         for name in names:
             if name in shared:
                 yield Note(
                     "keystore.key-twice",
-                    f"{name} has the same key as {', '.join(shared[name])}: each can act as the "
-                    "other. Renew one of them with a new key.",
+                    f"{name} has the same key as {', '.join(shared[name])}: each enclave can "
+                    "act as the others. Renew it with a new key.",
                 )
 
     def _others(self, key: PublicKey, name: str) -> list[str]:
-        return [each for each in self._enclaves.get(key_digest(key), ()) if each != name]
+        return [enclave for enclave in self._enclaves.get(key_digest(key), ()) if enclave != name]
 
 
 def _described(certificate: x509.Certificate) -> tuple[str, str]:
@@ -175,7 +181,10 @@ def _digest_of(certificate: x509.Certificate) -> str:
 
 
 def _digests(keystore: Keystore, name: str) -> Iterator[str]:
-    """Yield the digest of an enclave's key, from its certificate, or else its key or request."""
+    """Yield the digest of an enclave's key, read from its certificate, key file or request.
+
+    Yield nothing if there is none of them, or the file is damaged.
+    """
     folder = keystore.folder(name)
     try:
         if (folder / CERTIFICATE_FILE).exists():
@@ -194,7 +203,7 @@ def _digests(keystore: Keystore, name: str) -> Iterator[str]:
 
 
 def enclaves_by_identity(keystore: Keystore) -> dict[str, str]:
-    """Map `identity_of` each certificate's subject in a keystore to its enclave.
+    """Map the DDS identity of each enclave's certificate subject (`identity_of`) to the enclave.
 
     A secured participant shows this identity in its GUID.  An enclave whose certificate cannot be
     read is left out.

@@ -20,9 +20,9 @@ ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 SETTINGS = "sros.toml"
 """The settings of the keystore; keystores of ros2/sros2 do not have this file."""
 FLEET = "fleet.toml"
-"""The robots whose enclaves the keystore has; it exists once a fleet was named."""
+"""The robots whose enclaves the keystore has; the file exists only in a keystore with a fleet."""
 CONFIRMED = "confirmed"
-"""The folder of what robots say that they have, in a file for each robot of the fleet."""
+"""The folder with the last confirmation of each robot of the fleet."""
 LEDGER = "ledger.jsonl"
 """The log of issued certificates and documents; keystores of ros2/sros2 do not have it."""
 LEDGER_HEAD = "ledger.p7s"
@@ -32,7 +32,7 @@ IDENTITY, PERMISSIONS = "identity", "permissions"
 ROLES = (IDENTITY, PERMISSIONS)
 
 CRL = f"{PUBLIC}/identity_ca.crl.pem"
-"""The revocation list of the identity CA; it exists once a certificate was revoked."""
+"""The revocation list of the identity CA; the file exists after the first revocation."""
 REVOKED = "revoked"
 """The folder for the files of revoked enclaves."""
 
@@ -43,7 +43,7 @@ RETIRED = "retired"
 STAGE = ".sros-transaction"
 """The folder of a transaction that is in progress, or was interrupted."""
 LOCK = ".sros-lock"
-"""The file that the writing process has locked; it exists only meanwhile."""
+"""The file that a writing process locks; it exists only while that process writes."""
 
 GOVERNANCE_XML = f"{ENCLAVES}/governance.xml"
 GOVERNANCE_P7S = f"{ENCLAVES}/governance.p7s"
@@ -61,9 +61,9 @@ REQUIRED_FILES = (
 )
 """The files that rcl and the RMWs read from an enclave; without one of them no node starts."""
 KEY_URI_FILE = "key.p11"
-"""In place of ``key.pem``: the PKCS#11 URI of a key on a token (REP 2015).
+"""The file in place of ``key.pem`` with the PKCS#11 URI of a key on a token (REP 2015).
 
-Source: rmw_dds_common of ROS 2 Jazzy and later (security.cpp); only rmw_fastrtps asks it for one.
+Source: rmw_dds_common of ROS 2 Jazzy and later (security.cpp); only rmw_fastrtps uses it.
 """
 KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 
@@ -73,7 +73,7 @@ OPTIONAL_FILES = (CRL_FILE,)
 SESSION_FILE, ROUTER_FILE = "session.json5", "router.json5"
 """The configurations of Zenoh for the processes of an enclave, and for the router's enclave."""
 ZENOH_SIGNED = {SESSION_FILE: "session.p7s", ROUTER_FILE: "router.p7s"}
-"""The same documents signed by the permissions CA: Zenoh itself verifies nothing."""
+"""Zenoh configurations and their copies signed by the permissions CA, which only sros verifies."""
 ZENOH_FILES = (*ZENOH_SIGNED, *ZENOH_SIGNED.values())
 
 REQUEST = "request.pem"
@@ -81,13 +81,13 @@ REQUEST = "request.pem"
 SEAL = "answer.p7s"
 """The list of all files of an answer with their digests, signed by the permissions CA.
 
-Without it, anyone who transports an answer could put an older governance or another CA into it.
-On the robot it stays next to the files, because its number says which answer they came from.
+Without this list, anyone who transports an answer could exchange the governance or a CA in it.  On
+the robot the list stays next to the files: its number tells which answer they came from.
 """
 
 
 def confirmation_file(robot: str) -> str:
-    """Return the path of the last confirmation of a robot."""
+    """Return the path of a robot's last confirmation, relative to the keystore."""
     return f"{CONFIRMED}/{robot}.json"
 
 
@@ -102,7 +102,7 @@ def ca_key(role: str) -> str:
 
 
 def permissions_ca_for(document: Path) -> Path | None:
-    """Return the permissions CA certificate next to a signed document, or None."""
+    """Return the path of the permissions CA certificate next to a signed document, or None."""
     folder = document.absolute().parent
     places = (folder / PERMISSIONS_CA_FILE, folder.parent / PUBLIC / PERMISSIONS_CA_FILE)
     return next((path for path in places if path.exists()), None)
@@ -124,7 +124,7 @@ def key_path(root: Path, place: str) -> Path:
 
 
 def folder_mode(path: str) -> int:
-    """Return the permission bits of a folder: closed to others if it may hold keys."""
+    """Return the permission bits of a folder of a keystore: 0700 if it may have keys, else 0755."""
     return 0o755 if path in ("", PUBLIC) else 0o700
 
 
@@ -139,7 +139,7 @@ _TOP_FOLDERS = frozenset((ENCLAVES, PUBLIC, PRIVATE, REVOKED, RETIRED))
 
 
 def is_layout_path(path: str) -> bool:
-    """Return whether sros may put a file at ``path``, which is relative to a keystore."""
+    """Return whether sros may write a file at ``path``, which is relative to a keystore."""
     top, *rest = path.split("/")
     if not rest:
         return top in _TOP_FILES
@@ -183,7 +183,7 @@ def key_on_robot(folder: Path) -> bool:
 
 
 def has_key(folder: Path) -> bool:
-    """Return whether an enclave's folder has its key, or names the one on a token."""
+    """Return whether an enclave's folder has the enclave's key, or names a key on a token."""
     return any((folder / file).exists() for file in KEY_FILES)
 
 
@@ -196,22 +196,22 @@ _FOLDER_ELSEWHERE = "It is a symbolic link to a folder elsewhere, which sros doe
 
 
 class UnreadPath(NamedTuple):
-    """A file or folder of a keystore that sros does not read, and ``why``, as a clause."""
+    """A file or folder of a keystore that sros cannot or will not read; ``why`` is a clause."""
 
     path: str
     why: str
 
     @classmethod
     def of(cls, error: OSError) -> UnreadPath:
-        """Return the path that the system refuses to read."""
+        """Return the path that the operating system refused to read, with its reason."""
         return cls(os.fsdecode(error.filename), error.strerror or str(error))
 
     def remedy(self, root: Path) -> str:
-        """Return what to do, as a sentence; ``root`` is the keystore."""
+        """Return the remedy, as a sentence; ``root`` is the keystore."""
         if self.why == _FOLDER_ELSEWHERE:
             return "Replace the link with a real folder."
         return (
-            "Run sros as the user who owns it, or give the keystore to one user: `sudo chown -R "
+            "Run sros as the owner of the file, or give the keystore to one user: `sudo chown -R "
             f"USER {quote(str(root))}`."
         )
 
@@ -219,11 +219,11 @@ class UnreadPath(NamedTuple):
 def search_enclaves(
     root: Path, *, hidden: bool = False
 ) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
-    """Return the sorted names of the enclaves, and the folders that may hold others.
+    """Return the sorted names of the enclaves, and the folders that could not be searched.
 
     An enclave is a folder that has a certificate or a key.  A link to a folder elsewhere is not
-    followed.  With ``hidden``, enclaves in folders whose names begin with a dot are among them,
-    which sros never writes, and DDS loads.
+    followed.  With ``hidden``, folders whose names begin with a dot are searched, too; sros never
+    writes enclaves there, but DDS loads them.
     """
     top = os.fspath(root / ENCLAVES)
     return _search(top, top, hidden=hidden)
@@ -232,10 +232,10 @@ def search_enclaves(
 def _search(
     top: str, start: str, *, hidden: bool = False
 ) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
-    """Return what `search_enclaves` does, of the folder ``start`` in the folder of enclaves."""
+    """Return the result of `search_enclaves` for the folder ``start`` below ``top``."""
     unread: list[UnreadPath] = []
-    found = _names_in(top, _walk(start, unread, hidden=hidden))
-    return found, tuple(unread)
+    names = _names_in(top, _walk(start, unread, hidden=hidden))
+    return names, tuple(unread)
 
 
 _Walked: TypeAlias = tuple[str, list[str]]
@@ -254,34 +254,34 @@ def _names_in(top: str, folders: Iterable[_Walked]) -> tuple[str, ...]:
 
 
 def _walk(top: str, unread: list[UnreadPath], *, hidden: bool = False) -> Iterator[_Walked]:
-    """Yield each folder that can hold an enclave, with its files; add the others to ``unread``.
+    """Yield each folder below ``top``, with its files; add unreadable folders to ``unread``.
 
-    ``hidden`` ones have a name that begins with a dot.
+    With ``hidden``, folders whose names begin with a dot are among them.
     """
     pending = [top]
     while pending:
         folder = pending.pop()
         files = []
         try:
-            with os.scandir(folder) as found:
-                entries = list(found)
+            with os.scandir(folder) as listing:
+                entries = list(listing)
         except OSError as error:
             if error.errno not in (errno.ENOENT, errno.ENOTDIR):
                 unread.append(UnreadPath.of(error))
             continue
-        for each in entries:
-            name = each.name
-            if each.is_symlink():
+        for entry in entries:
+            name = entry.name
+            if entry.is_symlink():
                 # No enclave has a name of a file: where it leads is a fault of its folder alone.
                 of_file = name.endswith(_FILE_TYPES)
-                if (of_file and name not in _OF_IDENTITY) or not _is_folder(each):
+                if (of_file and name not in _OF_IDENTITY) or not _is_folder(entry):
                     files.append(name)
-                elif not of_file and (hidden or name[0] != ".") and not _is_inside(each.path, top):
-                    unread.append(UnreadPath(each.path, _FOLDER_ELSEWHERE))
-            elif not each.is_dir(follow_symlinks=False):
+                elif not of_file and (hidden or name[0] != ".") and not _is_inside(entry.path, top):
+                    unread.append(UnreadPath(entry.path, _FOLDER_ELSEWHERE))
+            elif not entry.is_dir(follow_symlinks=False):
                 files.append(name)
             elif hidden or name[0] != ".":
-                pending.append(each.path)
+                pending.append(entry.path)
         yield folder, files
 
 
@@ -310,7 +310,7 @@ def enclave_names(root: Path, *, hidden: bool = False) -> tuple[str, ...]:
 
 
 def enclaves_below(root: Path, name: str) -> tuple[str, ...]:
-    """Return the sorted names of the enclaves in the folder of an enclave, but not its own.
+    """Return the sorted names of the enclaves in subfolders of the enclave ``name``, without it.
 
     Raises:
         KeystoreError: an enclave may be missing, because a folder cannot be read.
@@ -319,7 +319,7 @@ def enclaves_below(root: Path, name: str) -> tuple[str, ...]:
     names, unread = _search(top, start)
     if unread:
         raise _unreadable(root, unread, "Enclaves in it would be missing from the result.")
-    return tuple(each for each in names if each != name)
+    return tuple(enclave for enclave in names if enclave != name)
 
 
 def has_zenoh_files(root: Path, *, hidden: bool = False) -> bool:
@@ -335,11 +335,13 @@ def has_zenoh_files(root: Path, *, hidden: bool = False) -> bool:
 
 
 def readable_enclaves(root: Path) -> tuple[str, ...]:
-    """Return the sorted names of the enclaves, for a verb that writes.
+    """Return the sorted names of the enclaves, after checking that all their files can be read.
+
+    Verbs that write use this.
 
     Raises:
-        KeystoreError: this user cannot read every file of all enclaves, so one would be left
-            behind, such as with a replaced CA.
+        KeystoreError: this user cannot read some file of an enclave, so that the enclave would keep
+            old files, such as a replaced CA.
     """
     top = os.fspath(root / ENCLAVES)
     unread: list[UnreadPath] = []
@@ -381,8 +383,8 @@ def revoked_certificates(root: Path) -> tuple[Path, ...]:
     except OSError as error:
         effect = "Revoked certificates would be left out."
         raise _unreadable(root, [UnreadPath.of(error)], effect) from error
-    files = (folder / each / CERTIFICATE_FILE for each in places)
-    return tuple(each for each in files if os.path.lexists(each))
+    files = (folder / name / CERTIFICATE_FILE for name in places)
+    return tuple(name for name in files if os.path.lexists(name))
 
 
 def _refused(path: str) -> Iterator[UnreadPath]:
@@ -404,11 +406,11 @@ def _unreadable(root: Path, unread: Sequence[UnreadPath], effect: str) -> Keysto
 
 
 def hidden_enclaves(root: Path, among: Iterable[str] | None = None) -> tuple[str, ...]:
-    """Return the enclaves in hidden folders, which `enclave_names` leaves out, sorted.
+    """Return the sorted names of enclaves in hidden folders, which `enclave_names` leaves out.
 
-    ``among`` are the names that a search with hidden ones found; None searches for them.  Left out
-    are an interrupted change of sros, and the folder of an enclave's own files that Kubernetes
-    makes next to the link ``..data`` where it mounts a Secret.
+    ``among`` are the names from a search with ``hidden``; None searches for them.  Left out are
+    enclaves in the folder of an interrupted transaction, and the folder with an enclave's own files
+    that Kubernetes makes next to the link ``..data`` where it mounts a Secret.
     """
     names = search_enclaves(root, hidden=True)[0] if among is None else among
     folders = {name: enclave_path(root, name) for name in names if "/." in name}
@@ -422,11 +424,11 @@ def hidden_enclaves(root: Path, among: Iterable[str] | None = None) -> tuple[str
 
 
 def _is_own_secret(folder: Path) -> bool:
-    """Return whether a folder is the one that all files of the enclave above it are links into."""
+    """Return whether Kubernetes made ``folder``: the enclave above it links to all its files."""
     link = folder.parent / "..data"
     try:
         return link.is_symlink() and all(
-            (folder.parent / each.name).samefile(each) for each in folder.iterdir()
+            (folder.parent / file.name).samefile(file) for file in folder.iterdir()
         )
     except OSError:
         return False
@@ -445,14 +447,14 @@ def list_enclaves(root: Path) -> tuple[str, ...]:
 def refuse_earlier(root: Path) -> None:
     """Raise `KeystoreError` if ``root`` is a flat keystore of ROS 2 Eloquent or earlier.
 
-    A keystore of today is not refused, even if the files of an earlier one lie in it.
+    A keystore in today's layout is not refused, even if it also has files of the flat layout.
     """
     if not root.is_dir() or is_keystore(root):
         return
     if any((root / file).is_file() for file in _EARLIER_CA):
         raise KeystoreError(
             f"'{root}' is not a valid keystore",
-            "It is one of ROS 2 Eloquent or earlier, which ended in 2020.",
+            "It is a keystore of ROS 2 Eloquent or earlier, which reached its end of life in 2020.",
             "Create a keystore, and generate artifacts from the policy: `sros create_keystore NEW` "
             "and `sros generate_artifacts -k NEW -p POLICY`.",
         )
@@ -493,7 +495,7 @@ def locate_enclave(folder: Path) -> tuple[Path, str]:
     raise DocumentError(
         f"'{folder}' is not below a folder named {ENCLAVES}",
         "rcl finds an enclave by its path below that folder.",
-        "Name the keystore, or the enclave's folder in it. If this folder is all that there is, "
+        "Name the keystore, or the enclave's folder in it. If you have only this folder, "
         f"put it where rcl looks for it, and check that: `mkdir -p robot/{ENCLAVES} && cp -a "
         f"{quote(str(whole))} robot/{ENCLAVES}/ && sros check robot`.",
     )

@@ -4,10 +4,10 @@ The file has one JSON object per line; lines are only added.  Entries are part o
 that issues, so the ledger has exactly the certificates and documents that were installed.
 
 The lines are a chain: ``previous`` is the SHA-256 of the line before, without its line end; on the
-first line that has one, it is the SHA-256 of all lines before, joined by line ends (earlier
-versions wrote no chain).  The signed document ``ledger.p7s`` states the number of lines and the
-SHA-256 of the last one.  So a line that was changed, removed, added or cut off is noticed.  What
-was noticed when a line was added stays visible as an entry ``gap`` before it.
+first line with ``previous``, it is the SHA-256 of all lines before, joined by line ends (earlier
+versions of sros wrote no chain).  The signed document ``ledger.p7s`` states the number of lines and
+the SHA-256 of the last line.  So a line that was changed, removed, added or cut off is noticed.  A
+fault that was noticed when a line was added stays visible as an entry ``gap`` before that line.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 GAP = "gap"
 SAME_KEY = "same key"
-"""The ``reason`` of a CA certificate for the key of the certificate before."""
+"""The ``reason`` of a CA certificate that has the same key as the CA's certificate before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,13 +58,14 @@ class Entry:
     """
 
     time: str
-    """When it was made, in UTC."""
+    """When the entry was written, in UTC."""
     what: str
     """What was issued or done: ``ca``, ``certificate``, ``permissions``, ``governance``, ``crl``,
     ``revocation``, ``answer`` (the signed list of the files sent to a robot), ``settings`` (of the
     keystore), ``fleet``, or ``gap``: lines before were missing or changed."""
     enclave: str = ""
-    """The enclave, or an empty string; so for all that follow."""
+    """Name of the enclave; empty if the entry is for no enclave. All later keys are empty, too, if
+    they do not apply."""
     subject: str = ""
     """Subject of the certificate."""
     serial: str = ""
@@ -72,17 +73,17 @@ class Entry:
     sha256: str = ""
     """SHA-256 of the certificate (DER), or of the document."""
     not_before: str = ""
-    """Begin of its validity, in UTC."""
+    """Start of the validity, in UTC."""
     not_after: str = ""
-    """End of its validity, in UTC."""
+    """Expiry, in UTC."""
     policy: str = ""
     """SHA-256 of the policy that permissions were made from, with its includes."""
     reason: str = ""
-    """Reason of a revocation, or what is wrong with a gap."""
+    """Reason of a revocation, or fault that a gap records."""
     key: str = ""
-    """SHA-256 of the public key (DER) of the certificate, or of the one that was revoked."""
+    """SHA-256 of the public key (DER) of the certificate, or of the revoked certificate."""
     number: int = 0
-    """Number of an answer, which orders it, or the last line of a gap; else 0."""
+    """Number of an answer (later answers have higher numbers), or last line of a gap; else 0."""
     settings: str = ""
     """The settings of the keystore, as TOML."""
     nodes: str = ""
@@ -94,13 +95,13 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """The readable entries of a ledger, oldest first, and what is wrong with it.
+    """The readable entries of a ledger, oldest first, and its faults.
 
-    ``gaps`` are sentences about lines that are missing, changed or unreadable; what came before
-    the present CAs is left out, because nothing that other CAs signed is valid.  ``certain`` are
-    the entries after the last gap: nothing is missing among them.  ``unchained`` is the number of
-    lines from before the chain, of which some may have been removed.  ``lines`` is the number of
-    all lines.
+    ``gaps`` are clauses about lines that are missing, changed or unreadable; faults from before the
+    present CAs are left out, because nothing that other CAs signed is valid.  ``certain`` are the
+    entries after the last gap: nothing is missing among them.  ``unchained`` is the number of lines
+    from before the chain, some of which may have been removed.  ``lines`` is the number of all
+    lines.
     """
 
     entries: tuple[Entry, ...] = ()
@@ -110,12 +111,12 @@ class Ledger:
     lines: int = 0
 
     def next_number(self) -> int:
-        """Return a number that is higher than those of all answers before."""
-        return max([self.lines, *(each.number for each in self.entries)]) + 1
+        """Return the number for a new answer, higher than the numbers of all earlier answers."""
+        return max([self.lines, *(entry.number for entry in self.entries)]) + 1
 
 
 class _Fault(NamedTuple):
-    """Something wrong with the lines up to ``line``."""
+    """A fault in the lines up to ``line``; ``text`` describes it as a clause."""
 
     line: int
     text: str
@@ -126,11 +127,11 @@ _MOST_BYTES = 4 * 1024**3
 _MOST_LINES = 8_000_000
 _LONGEST_LINE = 4 * 1024**2
 _BLOCK = 1024**2
-_FIELDS = tuple(each.name for each in fields(Entry))
-_TEXTS = tuple(each.name for each in fields(Entry) if each.type == "str")
+_FIELDS = tuple(field.name for field in fields(Entry))
+_TEXTS = tuple(field.name for field in fields(Entry) if field.type == "str")
 _SERIAL = re.compile(r"[0-9a-f]{1,40}")
 _MOST_BITS = 159
-"""The length of a serial number (RFC 5280, 4.1.2.2)."""
+"""Largest length of a serial number, in bits (RFC 5280, 4.1.2.2)."""
 _MOST_NUMBER = 10**12
 _MOST_KEPT = 16 * 1024 * 1024
 _HEAD = re.compile(rb"sros ledger 1\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n")
@@ -149,7 +150,7 @@ _WRITTEN = re.compile(
     )
     + r"\}"
 )
-"""A line as `_line` writes it, where no text has to be escaped; a group for each field."""
+"""Pattern of a line as `_line` writes it, without escaped characters; a group for each field."""
 _quoted = json.encoder.encode_basestring_ascii
 
 
@@ -159,7 +160,7 @@ _quoted = json.encoder.encode_basestring_ascii
 def certificate_entry(
     now: datetime, what: str, certificate: x509.Certificate, enclave: str = "", reason: str = ""
 ) -> Entry:
-    """Return the entry of an issued certificate; ``what`` is ca or certificate."""
+    """Return the entry of an issued certificate; ``what`` is "ca" or "certificate"."""
     from sros_tool.pki.certificates import key_digest  # only writing needs it
 
     validity = validity_of(certificate)
@@ -189,7 +190,7 @@ def document_entry(
     nodes: str = "",
     number: int = 0,
 ) -> Entry:
-    """Return the entry of a signed document."""
+    """Return the entry of the signed document ``message``; ``what`` is its kind, as in `Entry`."""
     return Entry(
         time=iso(now),
         what=what,
@@ -208,10 +209,10 @@ def document_entry(
 
 
 class _Reading(NamedTuple):
-    """The ledger, and what is needed to add to it.
+    """The ledger, and the values that are needed to add lines.
 
     ``unrecorded`` are the faults that no entry ``gap`` records yet.  ``previous`` is the digest for
-    the next line; ``ended`` says that the last line has its line end.
+    the next line; ``ended`` says whether the last line has its line end.
     """
 
     ledger: Ledger
@@ -222,14 +223,15 @@ class _Reading(NamedTuple):
 
 _EVERY = b""
 _NONE = b"\n"
-"""A text that is in every line, and one that is in none, as ``having`` of a reading."""
+"""Texts for ``having`` of a reading: ``_EVERY`` is in every line, ``_NONE`` in no line."""
 _GAP, _CA = b'"what":"gap"', b'"what":"ca"'
 
 
 class _Files(NamedTuple):
-    """The ledger and its head at one moment.
+    """The ledger and its head at the same moment.
 
-    ``state`` is None without a ledger; ``lines`` is its content, None if it is too long to keep.
+    ``state`` is None without a ledger; ``lines`` is the content of the file, None if it is too long
+    to keep in memory.
     """
 
     head: _Head | None
@@ -238,11 +240,11 @@ class _Files(NamedTuple):
 
 
 class LedgerFile:
-    """The lines of a ledger and their signed head, which are read once.
+    """The ledger file of a keystore and its signed head, which are read once.
 
     ``authorities`` returns the certificates of the CAs that the keystore trusts.  Only a ledger of
-    more than 16 MiB is read again for each question.  Who has the lock of the keystore does not
-    follow a link (``follow_link``).  ``read`` reads the head the first time.
+    more than 16 MiB is read again for each question.  ``follow_link`` is False for the process that
+    has locked the keystore.  ``read`` reads the head the first time.
     """
 
     def __init__(
@@ -269,9 +271,10 @@ class LedgerFile:
         return self._reading(_EVERY).ledger
 
     def with_field(self, name: str, value: str) -> Ledger:
-        """Return the ledger, in which entries without this value of a field may be missing.
+        """Return the ledger with at least the entries whose field ``name`` has ``value``.
 
-        The chain is proven as always, and that is all that the lines of the others cost.
+        The chain of all lines is verified as always, but other entries may be left out, to save
+        time.
 
         Raises:
             KeystoreError: the file cannot be read at all.
@@ -281,7 +284,7 @@ class LedgerFile:
         return self._reading(f'"{name}":{_quoted(value)}'.encode()).ledger
 
     def end(self) -> _Reading:
-        """Return what is needed to add lines; entries may be missing from the ledger in it."""
+        """Return the values that are needed to add lines; their ``ledger`` may lack entries."""
         return self._readings.get(_EVERY) or self._reading(_NONE)
 
     def content(self) -> Iterator[bytes]:
@@ -293,7 +296,7 @@ class LedgerFile:
             yield from iter(lambda: file.read(_BLOCK), b"")
 
     def _reading(self, having: bytes) -> _Reading:
-        """Return the ledger; lines without the text ``having`` are only proven, if chained."""
+        """Return the ledger; chained lines without the text ``having`` are verified, not parsed."""
         if having not in self._readings:
             self._readings[having] = self._compared(having)
         return self._readings[having]
@@ -337,7 +340,7 @@ class LedgerFile:
         return _Head(int(stated[1]), stated[2].decode())
 
     def _is_still(self, files: _Files) -> bool:
-        """Return whether what was read is what is there now."""
+        """Return whether ledger and head on disk are still as they were read."""
         state = None
         with suppress(OSError):
             state = (self.root / LEDGER).stat()
@@ -386,8 +389,9 @@ class LedgerFile:
 class _Lines(NamedTuple):
     """The entries in a ledger with the ``numbers`` of their lines, and the faults of the chain.
 
-    ``unchained`` is the number of lines before the chain, ``lines`` that of all.  ``signed`` is the
-    digest of the line that is the last one by the head; the rest is as in `_Reading`.
+    ``unchained`` is the number of lines before the chain, ``lines`` the number of all lines.
+    ``signed`` is the digest of the line that the head states as the last; the rest is as in
+    `_Reading`.
     """
 
     entries: tuple[Entry, ...]
@@ -404,7 +408,7 @@ class _Lines(NamedTuple):
 def _read_lines(
     file: BinaryIO, having: bytes, stated: int, most: int, most_bytes: int
 ) -> _Lines | None:
-    """Return the lines of a ledger, or None if there are more than ``most``, or more bytes.
+    """Return the lines of a ledger; None if they exceed ``most`` lines or ``most_bytes`` bytes.
 
     ``stated`` is the number of lines that the head states; ``having`` is as in `LedgerFile`.
     """
@@ -473,7 +477,10 @@ def _remembered(
 
 
 def _without_lines(root: Path, *, is_there: bool) -> _Reading:
-    """Return the ledger where the file has no line, or is missing."""
+    """Return the reading of a ledger file that is missing or has no line.
+
+    It is a fault unless the keystore never had a ledger, as a keystore of ros2/sros2.
+    """
     if not is_there and not any((root / file).exists() for file in (SETTINGS, LEDGER_HEAD)):
         return _Reading(Ledger())
     missing = _Fault(0, f"{LEDGER} is empty" if is_there else f"there is no {LEDGER}")
@@ -488,10 +495,10 @@ def _not_entries(last: int, count: int) -> _Fault:
 
 
 def _open(root: Path, follow_link: bool) -> BinaryIO | None:
-    """Return the ledger, open for reading, or None without one.
+    """Return the ledger file, open for reading; None if there is none.
 
-    While a transaction is being committed, the file is a link.  Whoever holds the lock of the
-    keystore does not follow it: another link could lead to a file that is not of the keystore.
+    While a transaction is being committed, the file is a link.  The process that has locked the
+    keystore does not follow it: the link could lead to a file outside the keystore.
     """
     path = root / LEDGER
     try:
@@ -531,7 +538,7 @@ def _too_large(path: Path) -> KeystoreError:
     return KeystoreError(
         f"the ledger '{path}' is too large",
         f"It has more than {_MOST_BYTES // 1024**2} MiB or {_MOST_LINES} lines.",
-        f"If all of it is of this keystore, move {LEDGER} and {LEDGER_HEAD} to an archive, state "
+        f"If it belongs to this keystore, move {LEDGER} and {LEDGER_HEAD} to an archive, state "
         f"all rights again with `sros generate_artifacts -k {quote(str(root))} -p POLICY_FILE`, "
         "and replace "
         f"the CAs with `sros rotate_ca {quote(str(root))} --next`, so that nothing that the new "
@@ -541,14 +548,14 @@ def _too_large(path: Path) -> KeystoreError:
 
 
 def _parse(line: bytes) -> Entry | None:
-    """Return the entry of a line, or None if it is not an entry."""
-    found = _WRITTEN.fullmatch(line.decode()) if line.isascii() else None
-    if not found or (found["serial"] and not found["serial"].strip("0")):
+    """Return the ledger entry in a line; None if the line is not an entry."""
+    match = _WRITTEN.fullmatch(line.decode()) if line.isascii() else None
+    if not match or (match["serial"] and not match["serial"].strip("0")):
         return _parse_any(line)
-    (time, what, enclave, subject, serial, sha256, begin, end, policy, reason, key) = found.groups(
+    (time, what, enclave, subject, serial, sha256, begin, end, policy, reason, key) = match.groups(
         ""
     )[:11]
-    number, settings, nodes, previous = found.groups("")[11:]
+    number, settings, nodes, previous = match.groups("")[11:]
     # Texts that many lines have are in the memory once.
     return Entry(
         intern(time),
@@ -570,7 +577,7 @@ def _parse(line: bytes) -> Entry | None:
 
 
 def _parse_any(line: bytes) -> Entry | None:
-    """Return the entry of a line that has another form than `_line` gives it, as `_parse`."""
+    """Return the entry in a line that is not written as `_line` does; None as in `_parse`."""
     if not line.startswith(b"{"):
         return None
     try:
@@ -592,11 +599,11 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _first_of(authorities: Iterable[x509.Certificate], found: Iterable[tuple[int, Entry]]) -> int:
-    """Return the line of the first of the trusted CAs, or 0 if the ledger does not tell."""
-    wanted = {digest(each) for each in authorities}
+def _first_of(authorities: Iterable[x509.Certificate], entries: Iterable[tuple[int, Entry]]) -> int:
+    """Return the number of the first line about the trusted CAs; 0 if a CA has no line."""
+    wanted = {digest(authority) for authority in authorities}
     lines: dict[str, int] = {}
-    for number, entry in found:
+    for number, entry in entries:
         if entry.what == "ca" and entry.sha256 in wanted:
             # Certificates from before a CA was renewed with the same key are still valid.
             lines.setdefault(entry.sha256, 0 if entry.reason == SAME_KEY else number)
@@ -604,7 +611,7 @@ def _first_of(authorities: Iterable[x509.Certificate], found: Iterable[tuple[int
 
 
 class _Head(NamedTuple):
-    """What the signed head states: the number of lines and the digest of the last, or a fault."""
+    """The signed head of a ledger: number of lines, digest of the last line, or a fault."""
 
     lines: int = 0
     last: str = ""
@@ -612,9 +619,9 @@ class _Head(NamedTuple):
 
 
 def _head_fault(head: _Head | None, lines: int, signed: str, *, chained: bool) -> _Fault | None:
-    """Return what is wrong between the ledger and its signed head, or None.
+    """Return the fault between a ledger and its signed head; None if they agree.
 
-    ``signed`` is the digest of the line in the ledger that is the last one by the head.
+    ``signed`` is the digest of the ledger's line that the head states as the last.
     """
     if not head:
         text = f"{LEDGER_HEAD}, which signs its end, is missing"
@@ -634,9 +641,9 @@ def _head_fault(head: _Head | None, lines: int, signed: str, *, chained: bool) -
 
 def _verify(signed: smime.SignedDocument, authorities: Sequence[x509.Certificate]) -> None:
     """Raise `PkiError` unless one of the CAs signed the document."""
-    for each in authorities:
+    for authority in authorities:
         with suppress(PkiError):
-            return signed.verify(each)
+            return signed.verify(authority)
     raise PkiError("no CA of this keystore signed it")
 
 
@@ -650,11 +657,11 @@ def append(
     now: datetime,
     file: LedgerFile,
 ) -> None:
-    """Stage the ledger with ``entries`` added at its end, and its head.
+    """Stage the ledger with ``entries`` added at its end, and its signed head.
 
     ``sign`` signs the head with a CA, as `Authority.sign` does.  ``file`` is the ledger as it was
-    read under the lock.  What is wrong with it is recorded first, so that the new head hides
-    nothing.
+    read under the lock.  Faults that are not recorded yet are added first, so that the new head
+    does not hide them.
     """
     present = file.end()
     gaps = (Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded)
@@ -674,9 +681,9 @@ def append(
 
 
 class _Links:
-    """The lines of new entries, each linked to the one before; they can be taken once.
+    """Iterator over the lines of new entries; each line gets the digest of the line before.
 
-    ``previous`` is the digest of the last line that was taken, ``count`` their number.
+    ``previous`` is the digest of the last line so far, ``count`` the number of lines so far.
     """
 
     def __init__(self, entries: Iterable[Entry], previous: str) -> None:
@@ -693,7 +700,7 @@ class _Links:
 
 
 def _line(entry: Entry, previous: str) -> bytes:
-    """Return the line of an entry, with the digest of the line before it: JSON without spaces."""
+    """Return an entry as a line of compact JSON; ``previous`` is the digest of the line before."""
     filled = ((name, getattr(entry, name)) for name in _FIELDS[:-1])
     parts = [
         f'"{name}":{_quoted(value) if isinstance(value, str) else value}'

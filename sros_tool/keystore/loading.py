@@ -1,7 +1,7 @@
 """Reasons why a DDS vendor refuses to load an enclave or a CA.
 
-Vendors differ by the traits in `sros_tool.dds.decision.vendors`.  Faults that all vendors refuse
-are found by `sros_tool.keystore.reader` and not checked here again.
+Vendors differ by the traits in `sros_tool.dds.decision.vendors`.  `sros_tool.keystore.reader` finds
+the faults that all vendors refuse; they are not checked here again.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _UNREADABLE = (Fault.NOT_SIGNED, Fault.CERTIFICATE_MALFORMED)
 CRASHES = (Fault.CA_CRASH, Fault.CERTIFICATE_CRASH)
 """Faults that crash a process."""
 BEFORE_DDS = (Fault.FILE_MISSING, Fault.LINK_DANGLING)
-"""Faults that end a process before DDS reads a file: the RMW looks for all files."""
+"""Faults that end a process before DDS reads a file: the RMW checks first that all files exist."""
 _READ_FIRST = (IDENTITY_CA_FILE, CRL_FILE, CERTIFICATE_FILE)
 _ON_READING = (
     Fault.FILE_UNREADABLE,
@@ -88,7 +88,7 @@ _ON_READING = (
 )
 """Faults that a process meets before it verifies a chain."""
 _OF_CA = (Fault.SIGNATURE_HASH, Fault.CA_CHAIN)
-"""Faults that are met with these in the file of a CA."""
+"""Faults in the file of a CA that a process meets together with ``_ON_READING``."""
 
 
 def vendor_problems(
@@ -96,8 +96,8 @@ def vendor_problems(
 ) -> tuple[Problem, ...]:
     """Return the problems for which a vendor refuses to load an enclave at the time ``at``.
 
-    They are in the order in which a process meets them.  Of governance and permissions, only
-    signature and size are checked here; problems in their content are taken from ``state``.
+    They are in the order in which a process meets them.  Only signature and size of governance and
+    permissions are checked here; problems in their content are taken from ``state``.
     """
     specific = [each for each in state.problems if _is_specific(each, state)]
     kept = [each for each in state.problems if each not in specific]
@@ -132,7 +132,7 @@ def vendor_problems(
 
 
 def _when_met(problem: Problem) -> int:
-    """Return the place of a problem among those that a process would meet."""
+    """Return the sort key of a problem: the order in which a process meets problems."""
     if problem.fault in BEFORE_DDS:
         return 0
     early = (*_ON_READING, *_OF_CA) if problem.file == IDENTITY_CA_FILE else _ON_READING
@@ -161,10 +161,10 @@ def _is_specific(problem: Problem, state: OpenedEnclave) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Trust:
-    """What a vendor makes of the CAs that the enclaves of a keystore share.
+    """The CA files of a keystore, as a vendor reads them.
 
     ``authorities`` and ``signers`` are the certificates of the identity CA's and the permissions
-    CA's file, in order; none if it cannot be read.
+    CA's file, in order; empty if the file cannot be read.
     """
 
     authorities: Certificates
@@ -231,12 +231,16 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
 
 
 def _content(traits: VendorTraits, data: bytes) -> bytes:
-    """Return what the vendor reads of a file with certificates or lists."""
+    """Return the part of a file with certificates or lists that the vendor reads."""
     return read_as_text(data) if traits.reads_files_as_text else data
 
 
 def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
-    """Return the certificates that the vendor reads from a file; raise `PkiError` if it cannot."""
+    """Return the certificates that the vendor reads from a file.
+
+    Raises:
+        PkiError: the vendor cannot read the file.
+    """
     data = _content(traits, data)
     if not traits.reads_trusted_certificates and (
         traits.reads_first_authority or file == CERTIFICATE_FILE
@@ -251,7 +255,7 @@ def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
 def _signature_problems(
     traits: VendorTraits, file: str, state: OpenedEnclave, signers: Certificates, at: datetime
 ) -> Iterator[Problem]:
-    """Yield why the vendor refuses the signature of a document, if the document is there."""
+    """Yield the problem for which the vendor refuses the signature of a document, if it exists."""
     if file not in state.files or not signers:
         return
     try:
@@ -265,7 +269,7 @@ def _signature_problems(
 def _authority_fault(
     traits: VendorTraits, certificates: Certificates, at: datetime
 ) -> tuple[str, Fault] | None:
-    """Return why the vendor refuses a CA file, and the fault; None if it accepts the file.
+    """Return why the vendor refuses a CA file (clause, fault); None if it accepts the file.
 
     ``certificates`` are all certificates of the file, in order.
     """
@@ -327,7 +331,7 @@ def refusals_text(refusals: Mapping[Vendor, str]) -> str:
 def _signer_fault(
     traits: VendorTraits, signed: smime.SignedDocument, certificates: Certificates, at: datetime
 ) -> str:
-    """Return why the vendor refuses the signature of a document, or "".
+    """Return a clause on why the vendor refuses the signature of a document; "" if it accepts it.
 
     ``certificates`` are all certificates of the permissions CA's file, in order.
     """
@@ -390,7 +394,7 @@ def _identity_faults(
     authorities: Certificates,
     at: datetime,
 ) -> Iterator[Problem]:
-    """Yield why the vendor refuses an identity: the certificate, its key, or its issuer."""
+    """Yield the problems of certificate, key or issuer for which the vendor refuses an identity."""
     if not _hash_fits(traits, certificate):
         pss = certificate.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
         text = "it is signed with RSA-PSS" if pss else "it is not signed with SHA-256"
@@ -424,7 +428,7 @@ def _list_faults(
     authorities: Certificates,
     at: datetime,
 ) -> Iterator[Problem]:
-    """Yield why the vendor refuses an enclave whose chain is valid, by revocation lists."""
+    """Yield the problems of revocation lists for which the vendor refuses a certificate."""
     lists: list[tuple[x509.CertificateRevocationList, str]] = []
     try:
         if traits.reads_lists_of_authorities:

@@ -1,4 +1,4 @@
-"""What was done with enclaves, CAs and files of a keystore, as ``--json`` prints it."""
+"""The outcomes of a verb for enclaves, CAs and files of a keystore, as ``--json`` prints them."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ RestartZenoh = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class KeptZenoh:
-    """What a change of a keystore meant for its Zenoh configurations.
+    """The Zenoh configurations after a change of a keystore.
 
-    ``files`` maps the enclaves to their files in the keystore, ``written`` the paths that were
-    staged to their content.  ``restart`` are the enclaves whose
-    processes have to be restarted, because their configurations changed.
+    ``files`` maps the enclaves to their files in the keystore, ``written`` the paths of staged
+    files to their content.  ``restart`` are the enclaves whose processes have to be restarted,
+    because their configurations changed.
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
@@ -44,38 +44,38 @@ class KeptZenoh:
     notes: tuple[Note, ...] = ()
 
     def without(self, names: Collection[str]) -> KeptZenoh:
-        """Return the same without restarting the enclaves ``names``."""
-        return replace(self, restart=tuple(each for each in self.restart if each not in names))
+        """Return a copy in which the enclaves ``names`` need no restart."""
+        return replace(self, restart=tuple(name for name in self.restart if name not in names))
 
 
 class EnclaveResult(NamedTuple, Generic[Outcome]):
-    """An enclave."""
+    """An enclave, and what was done with it."""
 
     name: str
-    """The enclave."""
+    """Name of the enclave."""
     outcome: Outcome
     folder: Path
-    """The enclave's folder; in an archive, its path in the archive."""
+    """Folder of the enclave; in an archive, its path in the archive."""
     serial: str | None
-    """Serial number of its certificate, in hexadecimal; null if a dry run did not issue it, or it
+    """Serial number of the certificate, in hexadecimal; null if a dry run did not issue it, or it
     cannot be read."""
     sha256: str | None
     """SHA-256 of its certificate (DER), in hexadecimal; null as above."""
     valid_until: datetime | None
-    """First expiry of its certificate and its permissions, in UTC; null as above."""
+    """First expiry of certificate and permissions, in UTC; null if ``serial`` is null."""
 
 
 def enclave_result(
     keystore: Keystore, name: str, outcome: str, *, written: bool, folder: Path | None = None
 ) -> EnclaveResult[str]:
-    """Return what was done with an enclave of ``keystore``, with its certificate.
+    """Return the outcome of a verb for an enclave, with facts about the enclave's certificate.
 
     Args:
         keystore: the keystore, opened after the change.
-        name: the enclave.
-        outcome: what was done with it, such as ``created``.
-        written: whether its files are there; those of a dry run have no certificate yet.
-        folder: where the enclave is, if it is not the one in the keystore.
+        name: the name of the enclave.
+        outcome: what was done with the enclave, such as ``created``.
+        written: whether its files exist; in a dry run they have no certificate yet.
+        folder: the folder of the enclave, if it is not in the keystore.
     """
     folder = folder or keystore.folder(name)
     if written:
@@ -88,22 +88,22 @@ def enclave_result(
 
 
 class AuthorityFacts(NamedTuple):
-    """A CA."""
+    """A CA, and its certificate."""
 
     roles: Sequence[Annotated[str, Words(ROLES)]]
     """What the CA signs."""
     subject: str | None
-    """Subject of its certificate; null if a dry run did not make it."""
+    """Subject of the certificate; null if a dry run did not make it."""
     serial: str | None
     """Serial number of its certificate, in hexadecimal; null as above."""
     sha256: str | None
     """SHA-256 of its certificate (DER), in hexadecimal; null as above."""
     valid_until: datetime | None
-    """Expiry of its certificate, in UTC; null as above."""
+    """Expiry of the certificate, in UTC; null if ``subject`` is null."""
 
 
 def authority_facts(roles: Sequence[str], certificate: x509.Certificate | None) -> AuthorityFacts:
-    """Return what is shown of a CA; ``certificate`` is None if a dry run did not make it."""
+    """Return the facts about a CA; ``certificate`` is None if a dry run did not make it."""
     if certificate is None:
         return AuthorityFacts(roles, None, None, None, None)
     return AuthorityFacts(
@@ -118,7 +118,7 @@ def authority_facts(roles: Sequence[str], certificate: x509.Certificate | None) 
 def trusted_authorities(
     identity: x509.Certificate, permissions: x509.Certificate
 ) -> tuple[AuthorityFacts, ...]:
-    """Return the CAs that a robot trusts; a single CA of both roles once."""
+    """Return the facts about the CAs that a robot trusts; a single CA appears once."""
     if identity == permissions:
         return (authority_facts(ROLES, identity),)
     pairs = zip(ROLES, (identity, permissions), strict=True)
@@ -126,5 +126,5 @@ def trusted_authorities(
 
 
 def changes_below(root: Path, changes: Iterable[Change]) -> tuple[FileChange, ...]:
-    """Return the changes below the folder ``root``, with whole paths."""
-    return tuple(FileChange(each.action, str(root / each.path)) for each in changes)
+    """Return ``changes``, whose paths are relative to ``root``, with complete paths."""
+    return tuple(FileChange(change.action, str(root / change.path)) for change in changes)

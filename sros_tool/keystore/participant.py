@@ -1,7 +1,7 @@
 """An enclave as DDS loads it, and the participant that each vendor makes of it.
 
-This is the only place that joins what a vendor decides: which files it refuses to load, how it
-reads the documents, and whether it and its peers then let the participant join.
+Only this module combines the decisions of a vendor: which files it refuses to load, how it reads
+the documents, and whether the participant may join.
 """
 
 from __future__ import annotations
@@ -72,14 +72,15 @@ _PLANNED = timedelta(days=365)
 class LoadedEnclave:
     """An enclave as DDS loads it.
 
-    ``governance`` and ``permissions`` are the XML in the signed documents; ``signed`` is the
-    signed permissions, b"" if they are not signed yet.  ``state`` is the state of the files in
-    ``folder`` at the time ``at``; None if they do not exist yet.  ``key_elsewhere`` says that the
-    key is on the robot that generated it.
+    ``governance`` and ``permissions`` are the XML in the signed documents; ``signed`` is the signed
+    permissions, b"" if they are not signed yet.  ``state`` is the state of the files in ``folder``
+    at the time ``at``; None if they do not exist yet.  ``key_elsewhere`` says that the key is on
+    the robot that generated it.
 
-    ``keystore`` is that of the enclave, and ``policy`` its part of ``policy_file``, if known.
-    ``portable`` are its permissions if all vendors read them alike, because sros wrote them.
-    What is planned has them in place of XML, and ``plain_governance`` in place of ``governance``.
+    ``keystore`` is the keystore of the enclave, and ``policy`` its part of ``policy_file``, if
+    known.  ``portable`` are its permissions if all vendors read them alike, because sros wrote
+    them.  An enclave that is only planned has no XML: ``portable`` and ``plain_governance`` replace
+    it.
     """
 
     name: str
@@ -100,12 +101,15 @@ class LoadedEnclave:
 
     @property
     def root(self) -> Path | None:
-        """The folder of its keystore, if known."""
+        """The folder of the enclave's keystore; None if it is not known."""
         return self.keystore.root if self.keystore else None
 
     @property
     def joined_domains(self) -> DomainSet | None:
-        """The domains of its permissions, too, if they exist: `sros run` takes one of these."""
+        """The ROS domains that governance and permissions allow; None without a governance.
+
+        `sros run` takes one of these domains.
+        """
         return (self.state.joined_domains() if self.state else None) or self.domains
 
     def expiries(self) -> tuple[tuple[str, datetime], ...]:
@@ -155,7 +159,7 @@ def loaded(name: str, folder: Path, state: OpenedEnclave, *, at: datetime) -> Lo
 
 
 def _portable(permissions: Permissions | None, document: bytes) -> Permissions | None:
-    """Return permissions from a document if all vendors read it alike."""
+    """Return ``permissions`` if all vendors read the document alike; else None."""
     return permissions if permissions and canonical_permissions(permissions, document) else None
 
 
@@ -228,7 +232,7 @@ _ONLY_PEERS_NOTICE = {
 def _governed_as(
     vendor: Vendor, document: Governance | bytes, domain: int
 ) -> GovernedDomain | Refusal:
-    """Return what a governance, or its document, says of a domain to a vendor, or its refusal."""
+    """Return the rules of a governance for a domain, as ``vendor`` reads them, or its refusal."""
     governance: Governance | Refusal
     if isinstance(document, Governance):
         governance = document
@@ -241,7 +245,7 @@ def _governed_as(
 
 @dataclass(frozen=True, slots=True)
 class JoinContext:
-    """The domain and time of joining; ``zone`` is the time zone of the host."""
+    """The ROS domain and the time of joining; ``zone`` is the time zone of the host."""
 
     domain: int
     at: datetime
@@ -250,10 +254,10 @@ class JoinContext:
 
 @dataclass(frozen=True, slots=True)
 class RefusalCause:
-    """A reason why no node of a vendor can run in an enclave, or none that peers let in.
+    """A reason why no node of a vendor can run in an enclave, or peers refuse the node.
 
-    ``reason`` is the id of a fault, or that of a decision; ``text`` is a clause with the file.
-    ``hits_peers`` says that the processes of peers crash, and its own does not.
+    ``reason`` is the id of a fault or of a decision; ``text`` is a clause with the name of the
+    file.  ``hits_peers`` says that the processes of peers crash, but not the node's own process.
     """
 
     outcome: Outcome
@@ -267,7 +271,7 @@ _OF_GOVERNANCE = {
     *(Fault.GOVERNANCE_MALFORMED.id, "domain-not-in-governance", "no-topic-rule"),
     "unauthenticated-with-rtps-protection",
 }
-"""The reasons that lie in the governance, where no fault names the file."""
+"""Ids of decisions that the governance causes, without a fault that names the file."""
 
 
 def _crashes_before(problem: Problem, governed: GovernedDomain | Refusal) -> bool:
@@ -281,12 +285,12 @@ def _crashes_before(problem: Problem, governed: GovernedDomain | Refusal) -> boo
 
 
 class VendorParticipant:
-    """The participant of one vendor in an enclave.
+    """The participant of a vendor in an enclave.
 
-    ``problems`` are the faults of files for which the vendor, or all peers, refuse it.
-    ``governance`` and ``permissions`` are the documents as the vendor reads them, None if it does
-    not; ``permissions_document`` is the XML of the latter.  ``refusal`` is the decision that keeps
-    the process from running, None if nothing does.
+    ``problems`` are the faults of files for which the vendor, or all peers, refuse the participant.
+    ``governance`` and ``permissions`` are the documents as the vendor reads them, None if it
+    cannot; ``permissions_document`` is the XML of the permissions.  ``refusal`` is the decision
+    that keeps the process from running, or None.
     """
 
     def __init__(self, vendor: Vendor, enclave: LoadedEnclave, context: JoinContext) -> None:
@@ -297,7 +301,7 @@ class VendorParticipant:
         self.problems = enclave.problems(vendor.traits)
         made = self._make(enclave, context)
         self.access = made if isinstance(made, Access) else None
-        """The access of the process; None if it does not run, or no peer accepts it."""
+        """The rights of the process; None if it does not run, or no peer accepts it."""
         self.refusal = made if isinstance(made, Decision) else None
 
     def join(self) -> Decision:
@@ -308,9 +312,9 @@ class VendorParticipant:
         return self.refusal
 
     def causes(self) -> tuple[RefusalCause, ...]:
-        """Return why no node can run in it, or none that peers let in; empty if nothing is wrong.
+        """Return why no node can run in the enclave, or peers refuse it; empty if nodes run.
 
-        What permissions say of topics is a matter of their policy.
+        Rights to topics are not considered here: they are a matter of the policy.
         """
         join = self.join()
         if join.reason in {each.fault.id for each in self.problems}:
@@ -328,7 +332,7 @@ class VendorParticipant:
         return (RefusalCause(stopped.outcome, stopped.reason, file, text, stopped.hits_peers),)
 
     def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
-        """Return the access of the vendor's process, or the decision that keeps it from running."""
+        """Return the rights of the vendor's process, or the decision that keeps it from running."""
         late: Decision | None = None
         governed = _governed_as(
             self.vendor, enclave.plain_governance or enclave.governance, context.domain
@@ -361,15 +365,15 @@ class VendorParticipant:
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedEnclave:
-    """An enclave as it is for some vendors, and the participants that they make of it."""
+    """An enclave as given vendors load it, and their participants in it."""
 
     state: OpenedEnclave
     participants: tuple[VendorParticipant, ...]
 
     def stopped(self, ignored: Collection[str] = ()) -> str:
-        """Return why none of the vendors runs a process in it, as sentences; "" if some do.
+        """Return sentences on why no vendor runs a process in the enclave; "" if a vendor does.
 
-        Causes with a reason in ``ignored`` are none.
+        Causes whose reason is in ``ignored`` do not count.
         """
         sentences = []
         for each in self.participants:
@@ -380,7 +384,7 @@ class EvaluatedEnclave:
         return " ".join(sentences)
 
     def for_some(self, problems: Sequence[Problem]) -> list[str]:
-        """Return those of some problems for which not all of the vendors refuse it, as clauses."""
+        """Return clauses on the problems for which only some of the vendors refuse the enclave."""
         clauses = []
         for problem in problems:
             titles = [
@@ -394,13 +398,13 @@ class EvaluatedEnclave:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What keeps a process from running in it, apart from a key that is on its robot."""
+        """Clauses on problems that keep a process from running, but not a key on the robot."""
         named = tuple(map(str, self.state.problems_at_home))
         return named or tuple(filter(None, (self.stopped().removesuffix("."),)))
 
     @property
     def problems_here(self) -> tuple[str, ...]:
-        """What keeps a process from running in it where it is, also a missing key."""
+        """Clauses on the problems that keep a process from running here, also a missing key."""
         return tuple(map(str, self.state.problems)) or self.problems
 
 
@@ -414,9 +418,9 @@ def evaluated(
     zone: tzinfo = UTC,
     vendors: Sequence[Vendor] = MEASURED,
 ) -> EvaluatedEnclave:
-    """Return what vendors make of an enclave that was opened at the time ``at``.
+    """Return an opened enclave as ``vendors`` load it at the time ``at``.
 
-    ``domain`` is the ROS domain to join, None for the first of its documents.
+    ``domain`` is the ROS domain to join; None for the first domain of its documents.
     """
     number = domain if domain is not None else next(iter(state.joined_domains() or ()), 0)
     there, context = loaded(name, folder, state, at=at), JoinContext(number, at, zone)
@@ -425,11 +429,11 @@ def evaluated(
 
 
 def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> OpenedEnclave:
-    """Return an enclave as it is for the vendors of these participants, of which there is one.
+    """Return an enclave's state without the faults that some vendor in ``made`` accepts.
 
-    Left out are faults that some of them do not refuse, and faults of documents that some of them
-    accept.  Documents that one of them loads are those of the enclave, if a CA signed them: what an
-    enclave has signed for itself stays a fault, whoever takes it (CVE-2023-24011).
+    Documents that a vendor loads count as the enclave's documents if a CA signed them; a document
+    that the enclave signed itself stays a fault, whatever vendor accepts it (CVE-2023-24011).
+    ``made`` has at least one participant.
     """
     loading = [each for each in made if each.permissions is not None]
     if not (state.problems and loading):
@@ -458,7 +462,7 @@ def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> O
 def _with_acceptance(
     state: OpenedEnclave, problem: Problem, made: Sequence[VendorParticipant]
 ) -> Problem:
-    """Return a problem of a signature with who accepts it nevertheless, if a vendor does."""
+    """Return a signature's problem, with the vendors that accept it anyway in its text."""
     titles: dict[bool, list[str]] = {True: [], False: []}
     for each in made:
         titles[problem not in each.problems].append(each.vendor.title)
@@ -474,7 +478,7 @@ def _with_acceptance(
 
 
 def _signers(state: OpenedEnclave, file: str) -> set[x509.Certificate | None]:
-    """Return the certificates of all who signed a document, None for one that is not there."""
+    """Return the certificates of a document's signers; None stands for a missing certificate."""
     with suppress(SrosError):
         signed = state.signed(file)
         data = state.files.get(PERMISSIONS_CA_FILE, b"")

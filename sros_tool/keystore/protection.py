@@ -1,7 +1,7 @@
-"""What policies say about the protection of names, as the protection of a keystore.
+"""The protection that policies state for names, as the protection of a keystore.
 
-A keystore has one governance, so what one enclave says about a name holds for all.  The levels are
-the least that a name needs: what the keystore protects better stays as it is.
+A keystore has one governance, so the statement of one enclave about a name holds for all.  Levels
+are minimums: a name that the keystore protects better stays as it is.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sros_tool.translate import governance_for, protected_topics
 def contradictions(
     stated: Sequence[StatedProtection],
 ) -> Iterator[tuple[StatedProtection, StatedProtection]]:
-    """Yield pairs that state different levels for some name, each pair once, in their order."""
+    """Yield each pair of statements with different levels for some common name, in order."""
     limit = ComparisonLimit()
     signed: dict[str, list[StatedProtection]] = {}
     for each in stated:
@@ -56,11 +56,11 @@ def contradictions(
 def with_stated(
     protection: DomainProtection, stated: Sequence[StatedProtection]
 ) -> DomainProtection:
-    """Return ``protection``, raised where it is less than policies state; never lowered.
+    """Return ``protection``, raised where policies state more; never lowered.
 
     Raises:
-        PolicyError: statements contradict each other, or the settings have a wildcard that meets a
-            statement in some names only, so that it is unclear which of the two decides.
+        PolicyError: statements contradict each other, or a wildcard in the settings matches only a
+            part of a statement's names, so that it is unclear which of both decides.
     """
     for one, other in contradictions(stated):
         raise PolicyError(
@@ -126,14 +126,17 @@ class _Raising:
             self._added.append(NamedProtection(stated.kind, stated.name, needed))
 
     def _means(self, number: int, topics: Sequence[str]) -> bool:
-        """Return whether an entry of the settings is for just these topics."""
+        """Return whether an entry of the settings is for exactly these topics."""
         own = protected_topics(self._named[number].kind, self._named[number].name)
         return len(own) == len(topics) and all(
             any(covers(one, other) and covers(other, one) for other in own) for one in topics
         )
 
     def _deciding(self, topic: str, stated: StatedProtection) -> int | None:
-        """Return the entry that decides on all of a topic, or None; raise those for parts of it."""
+        """Return the number of the settings entry that decides on all names of ``topic``, or None.
+
+        Entries for a part of the names are raised to the stated level.
+        """
         wide: list[str] = []
         for each in self._topics.meeting(topic):
             number = self._owner[each]
@@ -191,10 +194,10 @@ def _strength(level: str) -> int:
 def less_protected(
     governance: Governance, stated: Iterable[StatedProtection]
 ) -> Iterator[tuple[StatedProtection, Level]]:
-    """Yield the statements that a governance does not keep for every name, with what it gives.
+    """Yield the statements that a governance does not fulfil, with the level that it gives.
 
-    Of a name, the least counts that any of its DDS topics has in any domain.  A topic without a
-    rule does not count: no vendor lets it be used.
+    The level of a name is the lowest of its DDS topics in all domains.  A topic without a rule does
+    not count: no vendor allows its use.
     """
     domains = [_DomainRules(rule) for rule in governance.domain_access_rules]
     for each in stated:
@@ -210,7 +213,7 @@ def less_protected(
 
 
 class _DomainRules:
-    """The topic rules of a domain, and a fast search for those that decide on a topic."""
+    """The topic rules of a domain, with a fast search for the rules that decide on a topic."""
 
     def __init__(self, rule: DomainRule) -> None:
         self._rtps = rule.rtps_protection_kind
@@ -221,7 +224,7 @@ class _DomainRules:
         self._names = Names(self._rules)
 
     def levels(self, topic: str) -> Iterator[Level]:
-        """Yield what the rules give that may decide on some name of a topic expression."""
+        """Yield the levels of all rules that decide on some name of a topic expression."""
         for _, rule in sorted(
             (self._rules[each] for each in self._names.meeting(topic)), key=lambda each: each[0]
         ):

@@ -1,7 +1,7 @@
 """The only reader of keystores and enclaves: their files, their grants, and their problems.
 
 It repeats the checks that Fast DDS 2.14.5 and Cyclone DDS 0.10 make when a participant is created,
-and names the cause of a refusal, which the vendors seldom do.  `sros_tool.keystore.loading` has the
+and names the cause of a refusal, which vendors seldom do.  `sros_tool.keystore.loading` has the
 differences between vendors.
 """
 
@@ -94,11 +94,10 @@ _Parsed = TypeVar("_Parsed")
 
 
 class FilesReadOnce:
-    """Files, each of which is read at most once, whatever links lead to it.
+    """Cache of files, which reads each file at most once, also through different links.
 
-    What is known of a path stays as it was first read; a file that could not be read fails again.
-    Of many thousand enclaves not all content is kept: what was read once 16 MiB are `full` is read
-    again.
+    A path keeps the content that was read first; a file that could not be read fails again.  Once
+    the cache holds 16 MiB it is `full`, and other files are read each time.
     """
 
     def __init__(self) -> None:
@@ -131,7 +130,7 @@ class FilesReadOnce:
 
     @property
     def full(self) -> bool:
-        """Whether nothing more is kept."""
+        """Whether the cache keeps no more files."""
         return self._size > _MOST_KEPT
 
     def _read(self, path: Path, what: str, most: int) -> bytes:
@@ -146,7 +145,7 @@ class FilesReadOnce:
         return data
 
     def signed(self, message: bytes) -> smime.SignedDocument:
-        """Return a signed document, which is parsed once, so that it is also verified once.
+        """Return the signed document in ``message``, which is parsed and verified only once.
 
         Raises:
             PkiError: it is not a signed message.
@@ -175,7 +174,7 @@ def _identity(state: os.stat_result) -> tuple[int, int, int, int]:
 
 
 class _Part(Generic[_Parsed]):
-    """A property of a keystore that is read when it is first asked for, and never again."""
+    """A property of a keystore that is read when it is first used, and never again."""
 
     def __init__(self, read: Callable[[Keystore], _Parsed]) -> None:
         self._read = read
@@ -192,15 +191,15 @@ class _Part(Generic[_Parsed]):
 
 
 class Keystore:
-    """A keystore, or an export for a robot, as it was when each of its parts was first asked for.
+    """A keystore, or an export for a robot, opened for reading.
 
-    Every part is read when it is first asked for, and never again: a change needs a new
-    `Keystore`.  A part that exists and cannot be read raises `SrosError`, each time the same.
+    Every part is read when it is first used, and never again: to see a change, open a new
+    `Keystore`.  A part that exists and cannot be read raises the same `SrosError` each time.
 
     Args:
         root: its folder.
-        locked: whether this process has the lock of the keystore, so that no link of a change that
-            is under way is followed.
+        locked: whether this process has locked the keystore, so that links of a transaction in
+            progress are not followed.
     """
 
     def __init__(self, root: Path, *, locked: bool = False) -> None:
@@ -212,15 +211,16 @@ class Keystore:
         return f"Keystore({str(self.root)!r})"
 
     def forget(self) -> None:
-        """Forget what was read: the keystore was changed meanwhile."""
+        """Forget everything that was read, after a change of the keystore."""
         self.files = FilesReadOnce()
-        """The files that were read, also of what lies next to it."""
+        """Cache of the files that were read, in the keystore and next to it."""
         self._parts: dict[Hashable, object] = {}
 
     def once(self, key: Hashable, read: Callable[[], _Parsed]) -> _Parsed:
-        """Return what ``read`` returns or raises, and call it only the first time for a ``key``.
+        """Return the result of ``read()``, which is called only the first time for a ``key``.
 
-        Of an enclave, which is one of many, it is not kept when the content of files is not either.
+        An exception is raised again, too.  The result for an enclave is not kept once `files` is
+        full.
         """
         if key not in self._parts:
             if self.files.full and isinstance(key, tuple) and key[0] in _OF_ENCLAVES:
@@ -235,7 +235,7 @@ class Keystore:
         return part  # type: ignore[return-value]
 
     def read(self, path: str | Path, what: str) -> bytes:
-        """Return the content of a file: a path, or a name relative to the keystore.
+        """Return the content of the file at ``path``; a text is relative to the keystore.
 
         ``what`` describes the file in errors.
 
@@ -254,21 +254,21 @@ class Keystore:
     # ── what it is ──
 
     def check(self) -> None:
-        """Raise `KeystoreError` if its folder is no keystore."""
+        """Raise `KeystoreError` if the folder is no keystore."""
         self.once("check", lambda: check_keystore(self.root))
 
     @property
     def is_home(self) -> bool:
-        """Whether it is a keystore with CAs or settings, not an export for a robot."""
+        """Whether it is a keystore with CAs or settings, and not an export for a robot."""
         return any(map(self.has, (PUBLIC, PRIVATE, SETTINGS)))
 
     @_Part
     def is_of_ros2(self) -> bool:
-        """Whether ros2/sros2 made it, and sros has written nothing to it yet.
+        """Whether ros2/sros2 made the keystore, and sros has not written to it yet.
 
-        It has neither settings nor a ledger, and its CA has no key identifier, which sros gives to
-        every CA that it makes: a keystore of sros is not taken for one of ros2/sros2 because
-        somebody removed the records of what was taken away.
+        Such a keystore has neither settings nor a ledger, and its CA has no key identifier.  sros
+        gives a key identifier to every CA, so removing the ledger of an sros keystore does not make
+        it look like a keystore of ros2/sros2.
         """
         if any(os.path.lexists(self.root / name) for name in (SETTINGS, LEDGER, LEDGER_HEAD)):
             return False
@@ -283,7 +283,11 @@ class Keystore:
 
     @_Part
     def names(self) -> tuple[str, ...]:
-        """The sorted names of the enclaves; raises `KeystoreError` if one may be missing."""
+        """The sorted names of the enclaves.
+
+        Raises:
+            KeystoreError: an enclave may be missing, because a folder cannot be read.
+        """
         return enclave_names(self.root)
 
     @_Part
@@ -308,7 +312,7 @@ class Keystore:
 
     @_Part
     def ledger_file(self) -> LedgerFile:
-        """The ledger of all issued files, to ask for some entries, and to add to it."""
+        """The file of the ledger, to read some entries or to add entries."""
         return LedgerFile(
             self.root,
             lambda: self._trusted,
@@ -322,13 +326,13 @@ class Keystore:
         return self.once("ledger", lambda: self.ledger_file.ledger())
 
     def ledger_with(self, name: str, value: str) -> Ledger:
-        """Return the ledger, in which entries without this value of a field may be missing."""
+        """Return the ledger with at least the entries whose field ``name`` has ``value``."""
         return self.once(("ledger", name, value), lambda: self.ledger_file.with_field(name, value))
 
     # ── CAs ──
 
     def authority(self, role: str) -> tuple[x509.Certificate, ...]:
-        """Return the certificates in a CA's file, the issuing CA first; empty without a file."""
+        """Return the certificates in a role's CA file, the issuing CA first; empty without one."""
         path = self.root / ca_certificate(role)
 
         def read() -> tuple[x509.Certificate, ...]:
@@ -343,7 +347,7 @@ class Keystore:
         return self.certificate(ca_certificate(role), f"{role} CA certificate")
 
     def certificate(self, path: str | Path, what: str = "certificate") -> x509.Certificate:
-        """Return the first certificate of a PEM file, named as in `read`.
+        """Return the first certificate of a PEM file; arguments as for `read`.
 
         Raises:
             SrosError: the file is missing, or is not a readable certificate.
@@ -356,7 +360,7 @@ class Keystore:
 
     @_Part
     def _trusted(self) -> list[x509.Certificate]:
-        """The certificates of the CAs that the keystore trusts; none where unreadable."""
+        """The certificates of the CAs that the keystore trusts, without unreadable files."""
         trusted: list[x509.Certificate] = []
         for role in ROLES:
             with suppress(SrosError):
@@ -422,10 +426,7 @@ class Keystore:
 
     @property
     def revocation_lists(self) -> tuple[RevocationList, ...]:
-        """The revocation lists that DDS reads: of the issuing identity CA, and of the other one.
-
-        Only during a rotation is there another identity CA.
-        """
+        """The revocation lists that DDS reads: a second one only in a rotation."""
         file = self.identity_file
         lists = (self.revocation_list, self.embedded_list(file) if file else None)
         return tuple(filter(None, lists))
@@ -468,7 +469,7 @@ class Keystore:
         return self.governance.domains().closed()
 
     def check_domain(self, domain: int | None) -> None:
-        """Raise `KeystoreError` if ``domain`` is given and the governance does not name it."""
+        """Raise `KeystoreError` if the governance lacks ``domain``; None is accepted."""
         if domain is not None:
             check_domain(self.domains, domain, self.root)
 
@@ -538,7 +539,7 @@ def open_keystore(root: Path) -> Keystore:
 
 
 def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
-    """Raise `KeystoreError` if ``domain`` is given and not among ``domains``."""
+    """Raise `KeystoreError` if ``domain`` is not in ``domains``; None is always accepted."""
     if domain is None or domain in domains:
         return
     raise KeystoreError(
@@ -563,10 +564,10 @@ def read_certificate(path: Path) -> x509.Certificate:
 
 @dataclass(frozen=True, slots=True)
 class SignedGrant:
-    """A signed permissions document, not verified yet, and its grant to one subject.
+    """A signed permissions document, not verified yet, and its grant to a subject.
 
-    ``digest`` is the SHA-256 of the whole file, in hexadecimal.  ``grant`` is the first grant for
-    the subject, which is the one that DDS reads, or None.
+    ``digest`` is the SHA-256 of the whole file, in hexadecimal.  ``grant`` is the first grant to
+    the subject, the only one that DDS reads; None if there is none.
     """
 
     signed: smime.SignedDocument
@@ -593,17 +594,17 @@ def _read_signed_grant(path: Path, subject: str, files: FilesReadOnce | None = N
 @shows("file", "text", "code")
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A fault."""
+    """A fault in a file of an enclave."""
 
     file: str
-    """The file."""
+    """Name of the file."""
     text: str
-    """What is wrong, as a clause."""
+    """Description of the fault, as a clause."""
     fault: Fault
 
     @property
     def code(self) -> str:
-        """A stable name, such as ``key-mismatch``."""
+        """Stable name of the fault, such as ``key-mismatch``."""
         return self.fault.id
 
     def __str__(self) -> str:
@@ -612,7 +613,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class OpenedEnclave:
-    """The content of an enclave's files as far as they can be read, and their problems.
+    """The content of an enclave's files, as far as they can be read, and their problems.
 
     ``permissions_bytes`` is the size of ``permissions.p7s``.
     """
@@ -625,7 +626,7 @@ class OpenedEnclave:
     permissions_bytes: int
     problems: tuple[Problem, ...]
     files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
-    """The content of the files that can be read, by name: the required ones, and ``crl.pem``."""
+    """The content of the readable files, by name: required files and ``crl.pem``."""
     permissions_document: bytes = field(default=b"", repr=False)
     """The XML in ``permissions.p7s``, even if malformed; empty if its signature is not valid."""
     key_on_robot: bool = False
@@ -636,17 +637,17 @@ class OpenedEnclave:
     The key is not compared with the certificate, because no token is opened to read an enclave.
     """
     public_key: object = field(default=None, repr=False)
-    """The public key of ``key.pem``; None if that cannot be read."""
+    """The public key of ``key.pem``; None if the file cannot be read."""
     read_once: FilesReadOnce = field(
         default_factory=lambda: FilesReadOnce(), repr=False, compare=False
     )
-    """What was read and parsed of its files, and of those that it shares with other enclaves."""
+    """Cache of the enclave's files, and of files that it shares with other enclaves."""
 
     def signed(self, file: str) -> smime.SignedDocument:
-        """Return a signed document of the enclave, which may not be verified yet.
+        """Return a signed document of the enclave, whose signature may not be verified yet.
 
         Raises:
-            PkiError: the file is not there, or is not a signed message.
+            PkiError: the file does not exist, or is not a signed message.
         """
         return self.read_once.signed(self.files.get(file, b""))
 
@@ -672,7 +673,8 @@ class OpenedEnclave:
     def joined_domains(self) -> DomainSet | None:
         """Return the ROS domains that governance and permissions name, or None without governance.
 
-        If they have none in common, those of the governance: what is wrong is a problem.
+        If they have no domain in common, return the domains of the governance; `problems` has the
+        fault.
         """
         governed = self.domains()
         if governed is None or self.grant is None:
@@ -738,8 +740,8 @@ def open_enclave(
 ) -> OpenedEnclave:
     """Return the content of an enclave's files, and their problems at the time ``now``.
 
-    With ``domain``, also check whether the enclave may join that ROS domain.  ``files`` are those
-    that were read before, such as of its keystore (`Keystore.enclave`).
+    With ``domain``, also check whether the enclave may join that ROS domain.  ``files`` is a cache
+    of files that were read before, such as the cache of the keystore (`Keystore.enclave`).
     """
     return _EnclaveFiles(folder, now, files or FilesReadOnce()).check(domain)
 
@@ -760,7 +762,7 @@ _parse_governance = lru_cache(maxsize=8)(parse_governance)
 def _load_crl(
     data: bytes, authority: x509.Certificate | None, authorities: bytes
 ) -> tuple[x509.CertificateRevocationList, x509.Certificate | None]:
-    """Return a revocation list, and the CA of the file ``authorities`` that signed it, or None."""
+    """Return a revocation list, and the CA in the file ``authorities`` that signed it, or None."""
     crl = read_list(data, CRL_FILE)
     trusted: tuple[x509.Certificate, ...] = (authority,) if authority else ()
     with suppress(SrosError):
@@ -769,7 +771,7 @@ def _load_crl(
 
 
 class _EnclaveFiles:
-    """Checker of the files of one enclave, which collects the problems."""
+    """Checker of the files of an enclave, which collects the problems."""
 
     def __init__(self, folder: Path, now: datetime, files: FilesReadOnce) -> None:
         self._folder = folder
@@ -879,7 +881,7 @@ class _EnclaveFiles:
         return self._read(KEY_URI_FILE) or b"" if os.path.lexists(path) else None
 
     def _token(self, data: bytes, key: bytes | None) -> TokenUri | None:
-        """Return the key that ``key.p11`` names; ``key`` is that of ``key.pem``."""
+        """Return the place that ``key.p11`` names; ``key`` is the content of ``key.pem``."""
         if key is not None:
             text = f"{KEY_FILE} is there, too"
             self._add(KEY_URI_FILE, text, Fault.KEY_TWICE)
@@ -949,7 +951,10 @@ class _EnclaveFiles:
         return public_key
 
     def _fault_with_all(self, certificate: x509.Certificate, authorities: bytes) -> str:
-        """Return why no chain of all CAs of a file is valid if its issuer is among them, or ""."""
+        """Return a clause on why no chain to the CAs in a file is valid; "" if a chain is valid.
+
+        Also return "" if the issuer of ``certificate`` is not in the file.
+        """
         with suppress(SrosError):
             chain = load_certificates(authorities, "")
             if any(issued_by(certificate, each) for each in chain):
@@ -1073,10 +1078,9 @@ Opened = TypeVar("Opened", Path, Keystore)
 def of_one_state(
     read: Callable[Concatenate[Opened, Arguments], Result],
 ) -> Callable[Concatenate[Opened, Arguments], Result]:
-    """Return ``read``, a function of a keystore, so that it reads again what was changed meanwhile.
+    """Decorate a function of a keystore so that it reads again if the keystore changes meanwhile.
 
-    A keystore that is changed all the time is read five times; what the last one returns or raises
-    counts.
+    It is called at most five times; then its last result or exception counts.
     """
 
     @wraps(read)
@@ -1100,7 +1104,7 @@ def of_one_state(
 
 
 def _state(root: Path) -> object:
-    """Return what each change of a keystore changes: the ledger gets another file."""
+    """Return a value that differs after each change of a keystore: the ledger file's identity."""
     found: list[tuple[int, int, int] | None] = []
     for name in (LEDGER, SETTINGS):
         try:

@@ -1,8 +1,8 @@
 """The rights that a policy, permissions, an enclave, a keystore or a Zenoh configuration gives.
 
-The rights of enclaves and keystores are read from ``permissions.p7s``, which is the file that DDS
-loads.  Its signature is verified with the permissions CA next to it.  A configuration of Zenoh
-gives what its access control lets other enclaves do.
+The rights of enclaves and keystores are read from ``permissions.p7s``, the file that DDS loads.
+Its signature is verified with the permissions CA next to it.  A Zenoh configuration gives the
+rights that its access control gives other enclaves.
 """
 
 from __future__ import annotations
@@ -67,24 +67,23 @@ class RightsSource:
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh".  ``scope`` are the
     enclaves that it can give rights to; None for all.  ``sound`` is False if DDS would refuse a
     part of it: a signature that does not verify, or permissions that are missing or malformed.
-    ``fleet`` knows which enclave is whose, if the file or folder is for one.  ``protections`` are
-    what a policy says about the protection of names; None for anything else.  ``documents`` are the
-    permissions of enclaves, as far as there are any, and ``enforcers`` the access control of each
-    Zenoh process that checks others; ``router`` is the enclave of a keystore's router, or "".
-    ``configurations`` are the files of Zenoh that were read, also those of clients.
-    ``policy`` is what a policy file holds.
+    ``fleet`` is the fleet that it is for, or None.  ``protections`` are a policy's statements about
+    the protection of names; None for anything else.  ``documents`` are the permissions of enclaves,
+    ``enforcers`` the access control of each Zenoh process that checks others; ``router`` is the
+    enclave of a keystore's router, or "".  ``configurations`` are the Zenoh configurations that
+    were read, also those of clients.  ``policy`` is the policy in a policy file.
     """
 
     path: Path
-    """It, as it was named."""
+    """Path of the file or folder, as given on the command line."""
     kind: SourceKind
-    """What it is."""
+    """Kind of the file or folder."""
     rights: frozenset[Right]
     scope: frozenset[str] | None
     sound: bool
-    """Whether DDS would accept all of it."""
+    """Whether DDS would accept all of its files."""
     notes: tuple[Note, ...]
-    """Notes on it."""
+    """Notes on the file or folder."""
     fleet: Fleet | None = None
     protections: tuple[StatedProtection, ...] | None = None
     documents: Mapping[str, Permissions] = field(default_factory=dict)
@@ -95,18 +94,18 @@ class RightsSource:
 
     @property
     def enclaves(self) -> list[str] | None:
-        """The enclaves that it can give rights to; null for all."""
+        """Enclaves that the file or folder can give rights to; null for all."""
         return None if self.scope is None else sorted(self.scope)
 
 
 def load_rights(
     path: Path | Keystore, fleet: Fleet | None = None, *, hidden: bool = False
 ) -> RightsSource:
-    """Return the rights that ``path`` gives; a policy's are those for ``fleet``, if there is one.
+    """Return the rights that ``path`` gives; a policy with placeholders is expanded for ``fleet``.
 
     ``path`` is a policy file, ``permissions.p7s`` or ``permissions.xml``, an enclave folder, a
-    keystore, or a configuration of Zenoh such as ``router.json5``.  With ``hidden``, enclaves of a
-    keystore in folders whose names begin with a dot are among them.
+    keystore, or a Zenoh configuration such as ``router.json5``.  With ``hidden``, the enclaves of a
+    keystore in folders whose names begin with a dot are included.
 
     Raises:
         DocumentError: ``path`` is anything else, or malformed.
@@ -142,10 +141,10 @@ def load_rights(
 
 
 def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSource:
-    """Return the rights that the Zenoh configurations of a keystore give its enclaves together.
+    """Return the rights that the Zenoh configurations of a keystore together give its enclaves.
 
-    Those are of the router, and of peers, which are connected without it.  ``hidden`` is that of
-    `load_rights`.
+    These are the configurations of the router, and of peers, which also connect without the router.
+    ``hidden`` is as in `load_rights`.
 
     Raises:
         KeystoreError: there is no configuration of a router, or there are several.
@@ -160,17 +159,17 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
     if not routers:
         raise KeystoreError(
             f"keystore '{root}' has no {ROUTER_FILE}",
-            "Without it, it is not known what Zenoh enforces.",
-            f"Write it: `sros zenoh {quote(str(root))}`.",
+            "Only this file shows which rights Zenoh enforces.",
+            f"Write the file with `sros zenoh {quote(str(root))}`.",
         )
     if len(routers) > 1:
         raise KeystoreError(
             f"keystore '{root}' has the files of several routers",
-            f"{ROUTER_FILE} is in {', '.join(routers[:5])}, and it is not known which one routes.",
-            "Remove those that no process uses, or write all files again: "
+            f"{ROUTER_FILE} is in {', '.join(routers[:5])}, and nothing shows which is in use.",
+            "Remove the files that no process uses, or write all files again: "
             f"`sros zenoh {quote(str(root))}`.",
         )
-    found = []
+    sources = []
     configurations: dict[Path, ConfigurationDocument] = {}
     for name, folder in files.items():
         for file in (folder / ROUTER_FILE, folder / SESSION_FILE):
@@ -183,22 +182,24 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
             if file.name == ROUTER_FILE or (
                 name not in routers and document.mode is not Mode.CLIENT
             ):
-                found.append(_zenoh_rights(file, document))
+                sources.append(_zenoh_rights(file, document))
     return RightsSource(
         root,
         "zenoh",
-        frozenset(each for one in found for each in one.rights if each.enclave not in routers),
+        frozenset(
+            item for source in sources for item in source.rights if item.enclave not in routers
+        ),
         None,
         True,
-        tuple(dict.fromkeys(note for one in found for note in one.notes)),
-        enforcers=tuple(each for one in found for each in one.enforcers),
+        tuple(dict.fromkeys(note for source in sources for note in source.notes)),
+        enforcers=tuple(item for source in sources for item in source.enforcers),
         router=routers[0],
         configurations=configurations,
     )
 
 
 def is_zenoh(data: bytes) -> bool:
-    """Return whether a file looks like a configuration of Zenoh: JSON5 with access control."""
+    """Return whether ``data`` looks like a Zenoh configuration: JSON5 with access control."""
     return data.lstrip()[:1] in (b"{", b"/") and b"access_control" in data
 
 
@@ -213,7 +214,7 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
         if access.enabled:
             text = "it allows everything that no rule denies, to everybody."
         notes.append(Note("rights.zenoh-open", f"{path}: {text}"))
-    if any(each.cert_common_names is None for each in access.subjects):
+    if any(subject.cert_common_names is None for subject in access.subjects):
         text = "it has rules for processes without a name, which are no enclaves: they are left out"
         notes.append(Note("rights.zenoh-nameless", f"{path}: {text}; `sros check` shows them."))
     if unclear := document.open_link():
@@ -286,7 +287,7 @@ def _keystore_rights(keystore: Keystore, *, hidden: bool) -> RightsSource:
 class _Reader:
     """Reader of permissions documents, which collects notes about them.
 
-    ``unverified`` are notes about documents whose signature is missing or was not verified.
+    ``unverified`` are notes on documents whose signature is missing or was not verified.
     """
 
     files: FilesReadOnce
@@ -339,7 +340,7 @@ class _Reader:
 
 
 def _first_of_each(permissions: Permissions) -> dict[str, Grant]:
-    """Map each enclave to its first grant, which is the only one that DDS reads."""
+    """Map each enclave to its first grant, the only grant that DDS reads."""
     grants: dict[str, Grant] = {}
     for grant in permissions.grants:
         grants.setdefault(_enclave_of(grant), grant)
@@ -353,7 +354,7 @@ def _enclave_of(grant: Grant) -> str:
 
 
 def _left_out(grants: Iterable[Grant]) -> Iterator[Note]:
-    """Yield notes on the parts of grants that the rights in ROS terms leave out."""
+    """Yield notes on parts of grants that cannot be stated as rights in ROS terms."""
     seen: set[str] = set()
     for grant in grants:
         name = _enclave_of(grant)
@@ -386,18 +387,18 @@ class DifferentRight(NamedTuple):
     """A right that only one side has."""
 
     only: OnlySide
-    """The side that has it."""
+    """The side that has the right."""
     right: Right
     covered_by: Sequence[Right]
-    """Rights of the other side that include it, such as wildcards."""
+    """Rights of the other side that include this right, such as wildcards."""
 
 
 @shows(spread=("protection",))
 class DifferentProtection(NamedTuple):
-    """What only one side says about a name."""
+    """A protection of a name that only one side demands."""
 
     only: OnlySide
-    """The side that says it."""
+    """The side that demands it."""
     protection: StatedProtection
 
 
@@ -417,7 +418,7 @@ class PolicyDifference(NamedTuple):
 
 
 class SourcesDifference(NamedTuple):
-    """What differs between two sources of rights; false if nothing does."""
+    """The difference between two sources of rights; false if there is none."""
 
     scope: frozenset[str] | None
     """The enclaves that were compared; None for all."""
@@ -430,7 +431,10 @@ class SourcesDifference(NamedTuple):
 
 
 def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDifference:
-    """Return what differs; if one of both is only for some enclaves, these are compared."""
+    """Return the difference between two sources of rights.
+
+    If a source is only for some enclaves, only these are compared.
+    """
     scope = None
     if first.scope is None or second.scope is None:
         scope = second.scope if first.scope is None else first.scope
@@ -459,7 +463,7 @@ _SIDES = {"-": "a", "+": "b"}
 def policy_difference(
     first: RightsSource, second: RightsSource, compared: SourcesDifference
 ) -> PolicyDifference:
-    """Return what is printed of a comparison."""
+    """Return the value that ``--json`` prints for a comparison."""
     return PolicyDifference(
         not compared,
         first,
@@ -476,8 +480,8 @@ def policy_difference(
 class SignedRights:
     """The rights in signed permissions.
 
-    ``policy`` is the SHA-256 of the policy that they were made from, or "" if the ledger does not
-    have it; ``nodes`` are those of the policy that they do not show, as in the ledger.
+    ``policy`` is the SHA-256 of the policy that they were made from; "" if the ledger lacks it.
+    ``nodes`` are the nodes of the policy that the permissions do not show, as in the ledger.
     """
 
     grant: Grant
@@ -486,9 +490,9 @@ class SignedRights:
 
 
 class RecordedRights:
-    """The rights that the ledger says were last signed for each enclave.
+    """The rights that were last signed for each enclave, by the ledger.
 
-    The signature of older permissions is as valid as ever, so whoever puts them back could have
+    The signature of older permissions stays valid, so whoever puts them back could otherwise have
     their rights signed again, with a new date.
     """
 
@@ -516,7 +520,7 @@ class RecordedRights:
         return self._last[name].nodes if name in self._last else ""
 
     def latest(self, name: str, digest: str) -> Entry | None:
-        """Return the entry of permissions if they are certainly the last ones of an enclave.
+        """Return the entry of permissions that are certainly the enclave's last, or None.
 
         ``name`` and ``digest`` are as for `policy`.
         """
@@ -526,20 +530,20 @@ class RecordedRights:
         return None
 
     def unproven(self) -> dict[str, Entry]:
-        """Return the last entries of enclaves that only lines from before the chain vouch for."""
+        """Map enclaves to their last entries, if these are on lines from before the chain."""
         if not self._unchained:
             return {}
         return {name: each for name, each in self._last.items() if name not in self._chained}
 
     def policy(self, name: str, digest: str) -> str:
-        """Return the SHA-256 of the policy of an enclave's permissions, or "".
+        """Return the SHA-256 of the policy of an enclave's permissions; "" if the ledger lacks it.
 
         Args:
             name: the enclave.
             digest: the SHA-256 of its present permissions document, in hexadecimal.
 
         Raises:
-            KeystoreError: it is not the last document that the ledger has for the enclave.
+            KeystoreError: it is not the last document that the ledger records for the enclave.
         """
         last, trust = self._last.get(name), ""
         if last and last.sha256 != digest:

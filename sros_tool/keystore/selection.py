@@ -1,4 +1,4 @@
-"""The enclaves that a verb works on: named ones, those that match a pattern, those of a robot.
+"""Selection of the enclaves that a verb works on: by name, by pattern, or by robot.
 
 The error for a missing enclave says whether it was revoked, or its name may be a typo.
 """
@@ -33,15 +33,15 @@ class EnclaveList(NamedTuple):
 
     keystore: NamedKeystore
     enclaves: Sequence[str]
-    """Their names, sorted."""
+    """Names of the enclaves, sorted."""
     hidden: Sequence[str]
-    """Enclaves in hidden folders, which DDS loads and the verbs of sros leave out, sorted."""
+    """Names of enclaves in hidden folders, sorted; DDS loads them, but sros leaves them out."""
     robots: Mapping[str, str] | None
-    """The robots of those that belong to one, in a keystore with a fleet."""
+    """Robot of each enclave that belongs to a robot; null for a keystore without a fleet."""
 
 
 def robots_of(keystore: Keystore, names: Sequence[str]) -> dict[str, str] | None:
-    """Return the robots of the enclaves that belong to one; None without a fleet."""
+    """Map each enclave in ``names`` that belongs to a robot to the robot; None without a fleet."""
     fleet = load_fleet(keystore)
     if fleet is None:
         return None
@@ -58,16 +58,16 @@ def select_enclaves(
     every: bool = False,
     checked: bool = False,
 ) -> tuple[str, ...]:
-    """Return ``names``, then the enclaves that match ``patterns``, those of ``robots``; each once.
+    """Return ``names``, then the enclaves that match ``patterns``, then those of ``robots``.
 
-    In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  ``every`` means
-    all enclaves.  The enclaves of robots are found without a list of all; with ``checked``, only if
-    the fleet is what sros wrote.
+    Each enclave is returned once.  In a pattern ``*`` stands for any part of a name, "/" included,
+    as in policies.  ``every`` selects all enclaves.  With ``checked``, ``robots`` are only accepted
+    if nobody edited the fleet file.
 
     Raises:
-        KeystoreError: a pattern matches no enclave, a robot has none, or ``every`` is given and
-            there is none.
-        DocumentError: the fleet of the keystore has no such robot; the error names near ones.
+        KeystoreError: a pattern matches no enclave, a robot has none, or ``every`` is given and the
+            keystore has none.
+        DocumentError: the fleet of the keystore has no such robot; the error names similar robots.
     """
     keystore.check()
     chosen = dict.fromkeys(names)
@@ -93,9 +93,9 @@ def select_to_revoke(
     *,
     every: bool,
 ) -> tuple[tuple[str, ...], tuple[Note, ...]]:
-    """Return the enclaves to revoke, and notes on what the fleet does not record of ``robots``.
+    """Return the enclaves to revoke, and notes on enclaves of ``robots`` that the fleet lacks.
 
-    As `select_enclaves`, but a robot also has what lies in its folder, such as ``/r3/spare``.
+    As `select_enclaves`, but a robot also has all enclaves in its folder, such as ``/r3/spare``.
 
     Raises:
         KeystoreError: as `select_enclaves`.
@@ -180,11 +180,11 @@ def _named_after(keystore: Keystore, robot: str) -> list[str]:
 
 
 _SHOWN = 5
-"""The number of enclaves that an error names; it counts the others."""
+"""Largest number of enclaves that an error names."""
 _ALIKE = 0.75
-"""The lowest similarity (`difflib`) of a typo: one of four letters differs, or two of eight."""
+"""Lowest similarity (`difflib`) that counts as a typo: one of four letters differs."""
 _WHOLE_ALIKE = 0.9
-"""The lowest similarity of a typo in a whole name: names of one namespace begin alike."""
+"""Lowest similarity for a typo in a full name: names in the same namespace begin alike."""
 
 
 def no_such_enclave(
@@ -253,9 +253,9 @@ def _was_revoked(root: Path, entry: Entry) -> SrosError:
 def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
     """Return at most three enclaves that a mistyped ``name`` may mean.
 
-    These are the enclaves whose names end with ``name``, because people leave out the namespace;
-    if there are none, the enclaves whose last part is spelled almost alike, and else those whose
-    whole name is.  Capital letters do not count.
+    These are the enclaves whose names end with ``name``, because people leave out the namespace; if
+    there are none, enclaves whose last part is similar; if there are none, enclaves whose full name
+    is similar.  Capital letters do not count.
     """
     end = "/" + name.strip("/").lower()
     if end == "/":
@@ -269,7 +269,7 @@ def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
 
 
 def _alike(text: str, texts: Mapping[str, str], least: float) -> list[str]:
-    """Return the enclaves whose text (the value) is spelled almost as ``text``."""
+    """Return the enclaves (keys of ``texts``) whose value is similar to ``text``."""
     import difflib
 
     alike = difflib.get_close_matches(text, set(texts.values()), n=3, cutoff=least)

@@ -1,7 +1,7 @@
-"""The settings of a keystore: writing ``sros.toml``, those in force, and what was edited by hand.
+"""The settings of a keystore: writing ``sros.toml``, reading it, and finding edits by hand.
 
-The ledger has the text of the settings as sros wrote them last, so that an edit is noticed, can be
-carried out (`sros_tool.keystore.lifecycle.update`) or undone.
+The ledger has the text of the settings as sros wrote them last, so that an edit is noticed, and can
+be applied (`sros_tool.keystore.lifecycle.update`) or undone.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _recorded_settings(ledger: Ledger) -> Template | None:
 
 @dataclass(frozen=True, slots=True)
 class HandEdits:
-    """What somebody edited in a keystore, and sros has not carried out.
+    """Edits by hand in a keystore that sros has not applied.
 
     ``settings`` are clauses about keys of ``sros.toml``; ``governance`` is a clause about
     ``governance.xml``, or "".  ``unsigned`` are clauses about protection that ``sros.toml`` states
@@ -74,19 +74,19 @@ class HandEdits:
         return bool(self.settings or self.governance or self.unsigned)
 
     def clauses(self) -> tuple[str, ...]:
-        """Return all clauses, each once."""
-        found = (*self.settings, *self.unsigned, self.governance)
-        return tuple(dict.fromkeys(each for each in found if each))
+        """Return all clauses, without duplicates."""
+        clauses = (*self.settings, *self.unsigned, self.governance)
+        return tuple(dict.fromkeys(clause for clause in clauses if clause))
 
 
 @dataclass(frozen=True, slots=True)
 class PresentSettings:
-    """The settings that are in force in a keystore, and what was edited by hand.
+    """The settings in force in a keystore, and edits by hand.
 
-    ``settings`` are as sros wrote them last, with the protection of the signed ``governance``.
-    ``written`` are those that ``sros.toml`` states now; None if it is missing or cannot be read,
-    and for a keystore ``without_settings``, as ros2/sros2 makes them.  ``recorded`` are those of
-    the ledger.
+    ``settings`` are the settings as sros wrote them last, with the protection of the signed
+    ``governance``.  ``written`` are the settings in ``sros.toml`` now; None if it is missing or
+    cannot be read, and for a keystore ``without_settings``, as ros2/sros2 makes them.  ``recorded``
+    are the settings in the ledger.
     """
 
     settings: Template
@@ -102,7 +102,7 @@ class PresentSettings:
         return self.governance.domains().closed()
 
     def undone(self) -> Template:
-        """Return the settings without the edits: as recorded, or else as the governance has it.
+        """Return the settings without the edits: from the ledger, or else as `base`.
 
         Raises:
             KeystoreError: as `base`.
@@ -130,7 +130,7 @@ def present_settings(keystore: Keystore) -> PresentSettings:
 
     Raises:
         KeystoreError: it is no keystore, or its governance cannot be used.
-        DocumentError: its settings are malformed, and the ledger does not have those of before.
+        DocumentError: its settings are malformed, and the ledger has no earlier settings.
     """
     keystore.check()
     governance = keystore.governance
@@ -148,7 +148,7 @@ def present_settings(keystore: Keystore) -> PresentSettings:
             raise DocumentError(
                 error.what,
                 error.why,
-                "The ledger does not have the settings of before: correct the file, or restore it "
+                "The ledger has no earlier settings: correct the file, or restore it "
                 "from a backup.",
             ) from error
         loaded, unreadable = recorded, f"{error.what}: {error.why}".removesuffix(".")
@@ -166,7 +166,7 @@ _SHOWN = 3
 
 
 def edit_notes(keystore: Keystore, governance: Governance) -> tuple[Note, ...]:
-    """Return a note on files that were edited by hand, for a verb that does not carry it out.
+    """Return a note on files that were edited by hand, for a verb that does not apply the edits.
 
     ``governance`` is the signed governance of the keystore.
     """
@@ -180,13 +180,13 @@ def edit_notes(keystore: Keystore, governance: Governance) -> tuple[Note, ...]:
 
 
 def found_edits(keystore: Keystore, governance: Governance | None) -> HandEdits:
-    """Return what was edited in a keystore; ``governance`` is the signed one, if it is readable."""
+    """Return the edits by hand; ``governance`` is the signed one, None if unreadable."""
     ledger = keystore.ledger_with("what", "settings")
     return hand_edits(keystore, ledger, keystore.settings, governance)
 
 
 def edit_remedy(root: Path | str) -> str:
-    """Return what to do with edited files, as a sentence with commands."""
+    """Return the remedy for edited files, as a sentence with commands."""
     shown = root if isinstance(root, str) else quote(str(root))
     return (
         f"`sros update_keystore {shown} --take-edits --dry-run` shows what it would change, "
@@ -200,9 +200,11 @@ def hand_edits(
     present: Template | None,
     governance: Governance | None,
 ) -> HandEdits:
-    """Return what was edited by hand; ``governance`` is the signed one, ``present`` sros.toml.
+    """Return the edits by hand, found by comparing ``sros.toml`` with ledger and governance.
 
-    A keystore of ros2/sros2 has no settings, so only its ``governance.xml`` is compared.
+    ``present`` are the settings in ``sros.toml``, ``governance`` is the signed governance; None if
+    unreadable.  A keystore of ros2/sros2 has no settings, so only its ``governance.xml`` is
+    compared.
     """
     recorded = _recorded_settings(ledger)
     settings: tuple[str, ...] = ()
@@ -210,8 +212,8 @@ def hand_edits(
     if present and recorded:
         settings = tuple(_differences(recorded, present, "written by sros"))
     if present and governance:
-        meant = governance_for(present.protection, governance.domains().closed())
-        if meant != governance:
+        stated = governance_for(present.protection, governance.domains().closed())
+        if stated != governance:
             unsigned = tuple(_unsigned(present, recorded, settings))
     return HandEdits(settings, _governance_edit(keystore), unsigned)
 
@@ -225,36 +227,36 @@ def _unsigned(
 
 
 def _differences(old: Template, new: Template, origin: str) -> Iterator[str]:
-    """Yield a clause for each key with another value; names and descriptions do not count."""
+    """Yield a clause for each key with different values; name and description do not count."""
     before, after = settings_values(old), settings_values(new)
     for key in dict.fromkeys((*before, *after)):
-        one, other = before.get(key, "nothing"), after.get(key, "nothing")
-        if one != other and key not in ("name", "description"):
-            yield f"{key} in {SETTINGS} is {other}, and {one} was {origin}"
+        old_value, new_value = before.get(key, "nothing"), after.get(key, "nothing")
+        if old_value != new_value and key not in ("name", "description"):
+            yield f"{key} in {SETTINGS} is {new_value}, but {old_value} was {origin}"
 
 
 def _governance_edit(keystore: Keystore) -> str:
-    """Return a clause if ``governance.xml`` is another document than the signed one, else ""."""
+    """Return a clause if ``governance.xml`` differs from the signed governance, else ""."""
     if not all((keystore.root / file).is_file() for file in (GOVERNANCE_XML, GOVERNANCE_P7S)):
         return ""
     try:
-        one = keystore.read(GOVERNANCE_XML, "governance document")
+        plain = keystore.read(GOVERNANCE_XML, "governance document")
         message = keystore.read(GOVERNANCE_P7S, "governance document")
-        other = keystore.files.signed(message).document
+        signed = keystore.files.signed(message).document
     except SrosError:
         return ""
-    if one.replace(b"\r\n", b"\n").strip() == other.replace(b"\r\n", b"\n").strip():
+    if plain.replace(b"\r\n", b"\n").strip() == signed.replace(b"\r\n", b"\n").strip():
         return ""
     with suppress(SrosError):
-        if parse_governance(one) == parse_governance(other):
+        if parse_governance(plain) == parse_governance(signed):
             return ""
-    return f"{GOVERNANCE_XML} is not the signed governance"
+    return f"{GOVERNANCE_XML} differs from the signed governance"
 
 
 def with_places(template: Template, places: Template) -> Template:
-    """Return ``template`` with what no other template changes: where the CA keys of ``places`` are.
+    """Return ``template`` with the places of the CA keys of ``places``.
 
-    Unless it has a Zenoh network of its own, it gets that of ``places``, too.
+    Unless it has its own Zenoh network, it also gets the Zenoh network of ``places``.
     """
     return replace(
         template,

@@ -50,7 +50,7 @@ class Template:
     ``identity_key`` and ``permissions_key`` are the URIs of CA keys outside of the keystore.  With
     ``unique_subject``, the subject of every certificate has a unique part.  ``short_lived`` are
     enclaves whose certificates and permissions expire earlier than the others.  ``zenoh`` is the
-    network for which enclaves get configurations of Zenoh, or None.
+    network for which enclaves get Zenoh configurations, or None.
     """
 
     name: str
@@ -99,12 +99,16 @@ def load_template(choice: str) -> Template:
 
 
 def read_template(path: Path) -> Template:
-    """Return the template in a file; raise `DocumentError` if it is malformed."""
+    """Return the template in the file at ``path``.
+
+    Raises:
+        DocumentError: the file cannot be read, or is malformed.
+    """
     return decode_template(read_bytes(path, "template"), path, "template", "")
 
 
 def decode_template(data: bytes, path: Path, what: str, remedy: str) -> Template:
-    """Return the template in a file's content; ``what`` and ``remedy`` are for the error."""
+    """Return the template in ``data``; ``path``, ``what`` and ``remedy`` are for errors."""
     table = read_toml(data, f"the {what} '{path}'", remedy)
     try:
         return _template(table, path.stem)
@@ -117,7 +121,7 @@ class _TemplateError(ValueError):
 
 
 def parse_template(text: str, name: str) -> Template:
-    """Parse a template from TOML text; ``name`` is its name if the text has none.
+    """Return the template in TOML text; ``name`` is its name if the text states none.
 
     Raises:
         tomllib.TOMLDecodeError: the text is not TOML.
@@ -279,17 +283,17 @@ def with_values(
     rules: Sequence[NamedValues] = (),
     dropped: Sequence[tuple[str, str]] = (),
 ) -> Template:
-    """Return ``template`` with other values.
+    """Return ``template`` with changed values.
 
     Args:
         template: the template.
         values: keys, such as ``protection.rtps``, with their new values as text.
-        rules: protection of names, each in place of the one that the name has.
-        dropped: kinds and names (``topic``, ``/camera/*``) whose own protection is removed.
-            Names without a leading / count from the root, as in a template.
+        rules: protections of names, which replace the present protection of these names.
+        dropped: kinds and names (``topic``, ``/camera/*``) whose own protection is removed.  Names
+            without a leading / count from the root, as in a template.
 
     Raises:
-        UsageError: a key or value is not one of a template, or a dropped name has no protection.
+        UsageError: a template has no such key or value, or a dropped name has no protection.
     """
     table = parse_toml(render_template(template))
     protection = table["protection"]
@@ -332,7 +336,7 @@ def with_values(
 
 
 def _means(one: str, other: str) -> bool:
-    """Return whether two names in settings match the same names."""
+    """Return whether two name expressions in settings match the same names."""
     one, other = (expand(each, "/", "") for each in (one, other))
     return covers(one, other) and covers(other, one)
 
@@ -436,7 +440,7 @@ def _topic_protection(table: _Table, default: TopicProtection) -> TopicProtectio
 
 
 class _Table:
-    """A TOML table; each method removes a key, and `finish` refuses the keys that are left."""
+    """Reader of a TOML table: each method removes a key, and `finish` refuses remaining keys."""
 
     def __init__(self, values: object, path: str) -> None:
         if not isinstance(values, dict):
@@ -473,14 +477,14 @@ class _Table:
         return str(self._take(key, str, default))
 
     def texts(self, key: str, default: list[str] | None = None) -> list[str]:
-        """Return a list of texts, which is empty only if that is the ``default``."""
+        """Return a list of texts, which must not be empty; ``default`` if the key is missing."""
         values = self._take(key, list, default)
         if not (values or default == []) or not all(isinstance(value, str) for value in values):
             raise _TemplateError(f"{self._at(key)} is not a list of names")
         return list(values)
 
     def numbers(self, key: str, most: int) -> list[int]:
-        """Return a list of numbers from 0 to ``most``, which may be missing."""
+        """Return a list of numbers from 0 to ``most``; empty if the key is missing."""
         values = self._take(key, list, [])
         if not all(type(value) is int and 0 <= value <= most for value in values):
             raise _TemplateError(f"{self._at(key)} is not a list of numbers from 0 to {most}")

@@ -27,9 +27,9 @@ from sros_tool.files import unpacked_dds_dir
 _Value = TypeVar("_Value")
 
 FOLDER_VARIABLE = "SROS_CYCLONEDDS_DIR"
-"""The variable that names the only folder to search for libddsc.
+"""Environment variable with the only folder to search for libddsc.
 
-It may also be a folder into which Debian's packages were unpacked.
+The folder may also be one into which Debian's packages were unpacked.
 """
 
 _SYSTEM_NAMES = ("libddsc.so.0debian", "libddsc.so.0t64", "libddsc.so.0")
@@ -132,7 +132,7 @@ class Participant:
         return Reader(self._library, self._endpoint("reader", topic), self.handle)
 
     def publications(self) -> tuple[Publication, ...]:
-        """Return this participant's writers and those it has discovered, sorted by topic."""
+        """Return this participant's writers and the discovered writers, sorted by topic."""
         api = self._library.api
         reader = api.dds_create_reader(self.handle, _BUILTIN_PUBLICATIONS, None, None)
         if reader < 0:
@@ -209,7 +209,7 @@ class Writer:
         self.handle = handle
 
     def write(self, text: str) -> None:
-        """Send one message.
+        """Send a message.
 
         Raises:
             DdsError: the message could not be written.
@@ -234,7 +234,7 @@ class Reader:
         self.handle = handle
 
     def wait(self, seconds: float) -> bool:
-        """Wait for a message, at most ``seconds``; return whether there is one."""
+        """Wait at most ``seconds`` for a message; return whether a message has arrived."""
         api = self._library.api
         if not self._waitset:
             condition = api.dds_create_readcondition(self.handle, _ANY_STATE)

@@ -1,13 +1,13 @@
-"""What makes a process run secured: variables, arguments, containers; on DDS and on Zenoh.
+"""The environment that makes a process run secured: variables, arguments and containers.
 
 ROS_SECURITY_ENCLAVE_OVERRIDE decides which enclave secures a process.  The ROS graph shows the
 enclave of ``--ros-args --enclave`` instead, even if it is a different one.
 
-rmw_zenoh_cpp reads more: ZENOH_SESSION_CONFIG_URI names the configuration of nodes,
-ZENOH_ROUTER_CONFIG_URI that of the router; without a value its default is used, which is open.
-ZENOH_CONFIG_OVERRIDE has the form ``KEY=VALUE;KEY=VALUE``, with values in JSON5, and is applied
-after either file.  Earlier versions do not read it; there, a session with the configuration of an
-enclave does not open.
+rmw_zenoh_cpp also reads ZENOH_SESSION_CONFIG_URI, the configuration of nodes, and
+ZENOH_ROUTER_CONFIG_URI, the configuration of the router; without a value it uses its default, which
+is open.  ZENOH_CONFIG_OVERRIDE has the form ``KEY=VALUE;KEY=VALUE``, with values in JSON5, and is
+applied after either file.  Earlier versions do not read it; there, a session with the configuration
+of an enclave does not open.
 
 A service of Docker Compose and the objects of Kubernetes add the enclave to a container, and take
 away what a ROS node does not need.  ROS writes its logs to /tmp, the only place that stays
@@ -45,7 +45,7 @@ OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
 _VARIABLES = (SESSION_URI, ROUTER_URI, OVERRIDE)
 
 NO_CONFIGURATION = "/dev/null/refused-by-sros.json5"
-"""A path that can never exist: a process that has to read it as its configuration ends."""
+"""A path that can never exist: a process that has to read its configuration there exits."""
 
 _TLS = "transport/link/tls"
 _LINE_ENDS = {point: f"\\u{point:04x}" for point in (0x2028, 0x2029)}
@@ -63,9 +63,9 @@ class PrintedEnvironment(NamedTuple):
     """
 
     keystore: Path | None
-    """The keystore, as it was named; null after an error."""
+    """Path of the keystore, as given on the command line; null after an error."""
     enclave: str | None
-    """The enclave; null after an error."""
+    """Name of the enclave; null after an error."""
     variables: Mapping[str, str]
     """The environment variables and their values."""
     notes: Notes
@@ -74,8 +74,8 @@ class PrintedEnvironment(NamedTuple):
 def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
     """Return the domain for a process that uses the keystore at ``root``, which is for ``domains``.
 
-    Prefers ``wanted`` (from an option or ROS_DOMAIN_ID), then 0, the default of ROS, if the
-    keystore is for it, then the first domain of the keystore.
+    This is ``wanted`` (from an option or ROS_DOMAIN_ID) unless it is None; else 0, the default of
+    ROS, if the keystore is for it; else the first domain of the keystore.
 
     Raises:
         KeystoreError: The keystore is not for the ``wanted`` domain.
@@ -114,12 +114,12 @@ REFUSING: Mapping[str, str] = {
 
 
 def render_refusal(form: str) -> str:
-    """Return text that keeps a node from starting, for a form that cannot be given its variables.
+    """Return text in the format ``form`` that keeps a node from starting, after an error.
 
-    What reads nothing, such as a shell that evaluates an empty output, or jq, would start nodes
-    unsecured: see `REFUSING`.  In a shell, the text also fails as a
-    command, also where ``eval $(...)`` without quotes makes it a single line; in a unit, it keeps
-    systemd from starting the service.  Compose and Kubernetes refuse it as it is.
+    Empty output would start nodes unsecured, for example through a shell or jq: see `REFUSING`.  In
+    a shell, the text also fails as a command, also where ``eval $(...)`` without quotes makes it a
+    single line; in a unit, it keeps systemd from starting the service.  Compose and Kubernetes
+    refuse it as it is.
     """
     if form in CONTAINER_FORMS:
         return yaml_text({"refused-by-sros": "the enclave cannot be used"})
@@ -130,12 +130,12 @@ def render_refusal(form: str) -> str:
 
 
 def render_environment(variables: Mapping[str, str], form: str) -> str:
-    """Return the variables as text in a form: sh, fish, json, systemd or docker.
+    """Return the variables as text in the format ``form``: sh, fish, json, systemd or docker.
 
     ``docker`` is an env-file, ``systemd`` the lines of a unit.
 
     Raises:
-        UsageError: The form cannot express a value so that everything that reads it finds the same.
+        UsageError: The format cannot express a value so that all its readers get the same value.
     """
     for name, value in variables.items():
         if form in _UNREADABLE and _UNREADABLE[form](value):
@@ -191,7 +191,7 @@ _UNREADABLE: dict[str, Callable[[str], bool]] = {
     "systemd": _is_not_printable,
     "docker": _is_interpreted,
 }
-"""Whether a form cannot express a value; sh and fish quote every value."""
+"""For each format, whether it cannot express a value; sh and fish can express all values."""
 
 # ── the command line of a node ─────────────────────────────────────────────────────────────
 
@@ -227,9 +227,9 @@ def enclave_argument(command: Sequence[str]) -> str:
 
 
 def named_enclave(command: Sequence[str]) -> str:
-    """Return the enclave that ``--ros-args --enclave`` names in a command, or "".
+    """Return the enclave that ``--ros-args --enclave`` names in a command; "" if it names none.
 
-    The last one counts.  ``--`` ends the arguments for ROS until the next ``--ros-args``
+    The last occurrence counts.  ``--`` ends the arguments for ROS until the next ``--ros-args``
     (rcl/src/rcl/arguments.c).
     """
     enclave, of_ros = "", False
@@ -297,13 +297,14 @@ def _is_of_package(command: Sequence[str]) -> bool:
 def zenoh_environment(
     configurations: Mapping[str, str], authority: Path, certificate: Path, key: Path
 ) -> dict[str, str]:
-    """Return the variables that make processes of rmw_zenoh_cpp run in an enclave, or not open.
+    """Return the variables that make processes of rmw_zenoh_cpp run in an enclave, or not start.
 
-    ``configurations`` maps `SESSION_URI` and `ROUTER_URI` to the absolute path of the file; a
-    process of the kind that is left out does not start.  The other paths are absolute, too.
+    ``configurations`` maps `SESSION_URI` and `ROUTER_URI` to the absolute paths of the files; a
+    process whose kind is left out does not start.  The other paths are absolute, too.
 
     Raises:
-        KeystoreError: a path is not UTF-8, or has a ";" or "?", so that Zenoh would read another.
+        KeystoreError: a path is not UTF-8, or has a ";" or "?", so that Zenoh would read another
+            path.
     """
     files = {"root_ca_certificate": authority}
     for side in ("connect", "listen"):
@@ -333,9 +334,9 @@ def _text(path: Path) -> str:
 
 
 def override_pairs(text: str) -> Iterator[tuple[str, str]]:
-    """Yield the keys and values of ZENOH_CONFIG_OVERRIDE, as rmw_zenoh_cpp divides it.
+    """Yield the (key, value) pairs of ZENOH_CONFIG_OVERRIDE, divided as by rmw_zenoh_cpp.
 
-    A value ends at a line end; what has no key or no value is skipped.
+    A value ends at a line end; an entry without key or value is skipped.
     """
     for pair in text.split(";"):
         key, _, value = pair.partition("=")
@@ -380,7 +381,7 @@ MAX_SECRET = 1024 * 1024
 """Largest size of the files in a Secret, in bytes (MaxSecretSize of core/v1)."""
 
 _USER = 1000
-"""The user and group of the process: that of the user in most images for ROS."""
+"""User id and group id of the process, which most ROS images use."""
 _OWNER_READS = 0o400
 _LOGS = {"ROS_LOG_DIR": "/tmp"}  # noqa: S108 (a path in the container, which has it alone)
 _ENCLAVE_VOLUME, _LOG_VOLUME = "sros-enclave", "tmp"
@@ -397,8 +398,8 @@ class Container:
     """A container whose process runs in an enclave.
 
     ``folder`` is the absolute path of the enclave's files, in the container and, for Compose, on
-    the machine that runs it.  Without ``image`` the result is to be merged with a definition that
-    has one.
+    the machine that runs it.  Without ``image`` the result has to be merged with a definition that
+    has an image.
     """
 
     enclave: str
@@ -427,10 +428,10 @@ def secret_name(enclave: str) -> str:
 
 
 def check_name(name: str, form: str) -> str:
-    """Return the name of a service or an object if it is valid in this form.
+    """Return the name of a service or an object, after checking it for the format ``form``.
 
     Raises:
-        UsageError: it is not.
+        UsageError: the name is not valid.
     """
     if form == COMPOSE and not _SERVICE.match(name):
         raise UsageError(

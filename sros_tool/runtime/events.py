@@ -43,10 +43,11 @@ class ProcessStage(StrEnum):
 
 @dataclass(frozen=True)
 class Event:
-    """One event that a process reported.
+    """An event that a process reported.
 
-    ``text`` is the message sent or heard, or the reason of a refusal or failure; ``count`` is the
-    number of messages so far; ``publishers`` is the number that an observer counts, by topic.
+    ``text`` is the message sent or received, or the reason of a refusal or failure; ``count`` is
+    the number of messages so far; ``publishers`` maps topics to the number of publishers that an
+    observer counts.
     """
 
     kind: EventKind
@@ -75,7 +76,7 @@ class EventWriter:
         stage: ProcessStage | None = None,
         publishers: Mapping[str, int] | None = None,
     ) -> None:
-        """Append one event with the current time."""
+        """Append an event with the current time."""
         if self._file is None:
             return
         record: dict[str, Any] = {"event": kind.value, "time": round(time.monotonic(), 6)}
@@ -130,7 +131,7 @@ def read_events(path: Path) -> list[Event]:
 
 
 def parse_event(line: bytes, path: Path) -> Event:
-    """Return the event that a line of the file at ``path`` has.
+    """Return the event in a line of the file at ``path``.
 
     Raises:
         DocumentError: The line is not an event.

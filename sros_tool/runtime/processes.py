@@ -1,17 +1,17 @@
-"""The running processes that speak ROS 2, DDS or Zenoh, as /proc shows them, and their files.
+"""The running processes that use ROS 2, DDS or Zenoh, as /proc shows them, and their files.
 
-A process is known by the libraries that it has mapped, by ``--ros-args``, or by its program.  What
-it says in /proc (command, environment, mapped files) is chosen by the process itself, also after
-its start: every text is bounded, and read through a handle of its folder, which never becomes that
-of another process.  A process that links its DDS statically and has no arguments of ROS is not
-recognised; one that cannot be looked at is reported.
+A process is recognised by the libraries that it has mapped, by ``--ros-args``, or by its program.
+A process itself chooses the texts that /proc shows of it (command, environment, mapped files), also
+after its start: so every text is bounded, and read through a handle of the process's folder, which
+never becomes that of another process.  A process that links its DDS statically and has no arguments
+of ROS is not recognised; a process that cannot be examined is reported.
 
-A process names its files by paths that mean other files to this process if it has a root directory
-or mounts of its own, as in a container.  Paths are therefore resolved below the root directory of
-the process, part by part: no link can lead out of it.  Only regular files are opened for reading,
-so no pipe is waited for and no device is touched.  What tells that a file was replaced is the time
-of its last status change (st_ctime), which the kernel sets by its own clock: copying programs can
-preserve other times, but not this one.
+The paths that a process names can mean other files to this process, if it has its own root
+directory or mounts, as in a container.  So paths are resolved below the root directory of the
+process, part by part: no link can lead out of it.  Only regular files are opened for reading, never
+pipes or devices.  The time of a file's last status change (st_ctime) shows that it was replaced:
+the kernel sets it by its own clock, and copying programs can preserve other times, but not this
+one.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _INTERPRETER = re.compile(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
 _SCRIPTS_OF_SROS = ("sros", "sros_tool")
 
 _LOADING = timedelta(milliseconds=20)
-"""No process loads its enclave sooner after its start, which is known in steps of 10 ms."""
+"""Shortest time from a process's start (known in steps of 10 ms) to loading its enclave."""
 _MOST_BYTES = 4 * 1024 * 1024
 _MOST_MAPS = 32 * 1024 * 1024
 _MOST_TRIES = 3
@@ -62,12 +62,13 @@ _LONGEST = 40
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """A running process that speaks ROS 2, DDS or Zenoh.
+    """A running process that uses ROS 2, DDS or Zenoh.
 
     ``started`` is the earliest moment at which it can have loaded its files.  ``libraries`` are the
-    names of those of ROS 2, DDS and Zenoh that it has mapped, such as "libddsc".  ``network`` names
-    its network namespace; "" is that of this process.  ``enclave`` is the one that it names, if it
-    asks for security, and ``configuration`` the file that it names for Zenoh.
+    names of the libraries of ROS 2, DDS and Zenoh that it has mapped, such as "libddsc".
+    ``network`` names its network namespace; "" is the namespace of this process.  ``enclave`` is
+    the enclave that it names, if it asks for security, and ``configuration`` the file that it names
+    for Zenoh.
     """
 
     pid: int
@@ -87,17 +88,17 @@ class Process:
 
     @property
     def asks_for_security(self) -> bool:
-        """Whether it runs with ROS_SECURITY_ENABLE=true."""
+        """Whether the process runs with ROS_SECURITY_ENABLE=true."""
         return self.environment.get(ENABLE) == "true"
 
     @property
     def domain(self) -> str:
-        """The domain that it names, as text that can be shown."""
+        """The ROS domain that the process names, as text that is safe to print."""
         return plain(self.environment.get(DOMAIN) or "0")
 
     @property
     def rmw(self) -> str:
-        """The RMW of the middleware that it has mapped, or else that it names."""
+        """The RMW of the middleware that the process has mapped, or else the RMW that it names."""
         named = self.environment.get(RMW, "")
         mapped = {rmw for library, rmw in _RMW_OF.items() if library in self.libraries}
         if len(mapped) == 1 and not any(named.startswith(each) for each in mapped):
@@ -106,17 +107,17 @@ class Process:
 
     @property
     def is_zenoh(self) -> bool:
-        """Whether it speaks Zenoh, by rmw_zenoh or without an RMW."""
+        """Whether the process uses Zenoh, by rmw_zenoh or without an RMW."""
         return self.rmw.startswith(RMW_ZENOH) or self.is_router
 
     @property
     def is_router(self) -> bool:
-        """Whether it is the router of Zenoh."""
+        """Whether the process is a Zenoh router."""
         return any(Path(word).name in _ROUTERS for word in self.command[:3])
 
     @property
     def is_daemon(self) -> bool:
-        """Whether it is the ros2 daemon."""
+        """Whether the process is the ros2 daemon."""
         return any(mark in word for word in self.command for mark in _DAEMON)
 
 
@@ -132,9 +133,9 @@ _RMW_OF = {
 
 
 class UnseenProcess(NamedTuple):
-    """A process that could not be looked at, and ``why``, as a clause.
+    """A process that could not be examined, and ``why``, as a clause.
 
-    ``speaks`` is whether its command shows that it speaks ROS 2; of others that is not known.
+    ``speaks`` says whether its command shows that it uses ROS 2; if not, that is not known.
     """
 
     pid: int
@@ -150,10 +151,11 @@ class UnseenProcess(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RunningProcesses:
-    """The processes that speak ROS 2, without those that only wait for one; and the unseen ones.
+    """The processes that use ROS 2, and the processes that could not be examined.
 
-    ``hidden`` says which processes /proc does not show, as a clause, or "".  ``container`` is
-    whether only the processes of a container can be seen.
+    Processes that only wait for another process are left out.  ``hidden`` is a clause on the
+    processes that /proc does not show, or "".  ``container`` says whether only the processes of a
+    container can be seen.
     """
 
     processes: tuple[Process, ...] = ()
@@ -163,7 +165,7 @@ class RunningProcesses:
 
 
 def plain(text: str, longest: int = _LONGEST) -> str:
-    """Return a text that a process chose, so that it can be taken for nothing else in a message."""
+    """Return a text that a process chose, shortened and escaped for a message."""
     return re.sub(r"[^\w.+/ -]", "?", text[:longest])
 
 
@@ -179,7 +181,7 @@ def _program(command: tuple[str, ...]) -> str:
 
 
 class _Stat(NamedTuple):
-    """What /proc/PID/stat says: ``identity`` changes when the process starts another program."""
+    """The numbers in /proc/PID/stat; ``identity`` changes with the program."""
 
     parent: int
     ticks: int
@@ -189,7 +191,7 @@ class _Stat(NamedTuple):
 
 
 class _Looked(NamedTuple):
-    """What was read of a process, as long as ``stat`` is the same."""
+    """The values that were read of a process, valid as long as ``stat`` is the same."""
 
     stat: _Stat
     process: Process | None
@@ -197,7 +199,7 @@ class _Looked(NamedTuple):
 
 
 class ProcessTable:
-    """The processes of /proc, to be looked at again and again; only what changes is read again."""
+    """Reader of the processes in /proc, which reads only changed processes again."""
 
     def __init__(self, proc: Path = Path("/proc")) -> None:
         self._proc = proc
@@ -206,7 +208,7 @@ class ProcessTable:
         self._ticks = os.sysconf("SC_CLK_TCK")
 
     def look(self, now: datetime) -> RunningProcesses:
-        """Return the processes that run, except this one.
+        """Return the running processes, except this process.
 
         ``now`` is the time on the clock of this machine.
         """
@@ -250,7 +252,7 @@ class ProcessTable:
     def _look(
         self, pid: int, folder: int, before: _Looked | None, begin: datetime
     ) -> _Looked | None:
-        """Return what is known of a process, or None if it has ended or runs no program.
+        """Return the values read of a process; None if it has ended or runs no program.
 
         ``begin`` is the moment from which the starts of processes count.
         """
@@ -278,7 +280,7 @@ class ProcessTable:
         return _Looked(stat, None, UnseenProcess(pid, command, why, _may_speak(command)))
 
     def _with_files(self, process: Process, folder: int) -> Process:
-        """Return a process with the files that it names, as it sees them."""
+        """Return the process with the state of its files, resolved as the process sees them."""
         try:
             own = os.readlink("cwd", dir_fd=folder)
             root = os.open("root", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
@@ -291,22 +293,22 @@ class ProcessTable:
         finally:
             os.close(root)
 
-    def _waiting(self, found: list[Process]) -> set[int]:
-        """Return the processes that speak nothing themselves: they wait for one that does.
+    def _waiting(self, processes: list[Process]) -> set[int]:
+        """Return the ids of processes that only wait for another, which uses ROS 2 or DDS.
 
-        Such as ``timeout 60 sros run ROOT NAME -- talker --ros-args``: without a library of ROS 2
-        or DDS, and with a process below it that speaks.
+        An example is ``timeout 60 sros run ROOT NAME -- talker --ros-args``: no library of ROS 2 or
+        DDS, and a process below it that has them.
         """
         parents = {pid: each.stat.parent for pid, each in self._looked.items()}
         above: set[int] = set()
-        for each in found:
+        for each in processes:
             pid = parents.get(each.pid, 0)
             while pid in parents and pid not in above:
                 above.add(pid)
                 pid = parents[pid]
         return {
             each.pid
-            for each in found
+            for each in processes
             if not each.libraries and (each.pid in above or _is_sros_run(each.command))
         }
 
@@ -328,10 +330,10 @@ class _TooLongError(OSError):
 
 
 def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime) -> Process | None:
-    """Return a process if it speaks ROS 2, DDS or Zenoh.
+    """Return a process if it uses ROS 2, DDS or Zenoh; else None.
 
     Raises:
-        OSError: It cannot be looked at, or has ended.
+        OSError: The process cannot be examined, or has ended.
     """
     environment: dict[str, str] = {}
     for word in _words(folder, "environ"):
@@ -359,7 +361,7 @@ _FIRST_PID_NAMESPACE = "pid:[4026531836]"
 
 
 def _may_speak(command: tuple[str, ...]) -> bool:
-    """Return whether a command shows that it speaks ROS 2 or Zenoh."""
+    """Return whether a command shows that its process uses ROS 2 or Zenoh."""
     return ROS_ARGS in command or any(
         Path(word).name in (*_ROUTERS, *_BRIDGES) or any(mark in word for mark in _DAEMON)
         for word in command[:3]
@@ -373,9 +375,9 @@ def _is_sros_run(command: tuple[str, ...]) -> bool:
 
 
 def _configuration_of(process: Process) -> LoadedFile | None:
-    """Return the name of the file with which a process of Zenoh is configured, not read yet.
+    """Return the configuration file of a Zenoh process, not read yet; None for other processes.
 
-    Its problem says why that is not known.
+    If the file is not known, the `problem` of the result says why.
     """
     if not process.is_zenoh:
         return None
@@ -454,11 +456,11 @@ _MOST_FOLDERS = 200
 
 @dataclass(frozen=True, slots=True)
 class LoadedFile:
-    """A file that a process loads at its start, as it is now.
+    """The present state of a file that a process loads at its start.
 
     ``changed`` is when the file, or a link to it, was last written, replaced or given another mode
-    or owner; None if there is no such file.  ``problem`` says why it could not be looked at, as a
-    clause.
+    or owner; None if the file does not exist.  ``problem`` is a clause on why it could not be
+    examined.
     """
 
     name: str
@@ -469,13 +471,13 @@ class LoadedFile:
 
 @dataclass(frozen=True, slots=True)
 class ProcessEnclave:
-    """The enclave that a process names, and its files as they are now.
+    """The enclave that a process names, and the present state of its files.
 
-    ``keystore`` is the path that the process names.  ``moved`` maps the folders of the keystore in
-    which nothing was added or removed since their last change to that change: they were moved, or
-    got another mode.  ``writable`` says which folder others than the owner of the keystore can
-    change.  ``here`` is the path of the keystore for this process, or None if it is another one
-    here.  ``problem`` says why the enclave could not be looked at.
+    ``keystore`` is the path that the process names.  ``moved`` maps folders of the keystore whose
+    last change added or removed no file (they were moved, or got another mode) to the time of that
+    change.  ``writable`` names a folder that others than the owner of the keystore can change.
+    ``here`` is the path of the keystore for this process; None if that path is another folder here.
+    ``problem`` is a clause on why the enclave could not be examined.
     """
 
     keystore: str
@@ -493,14 +495,14 @@ class ProcessEnclave:
 
     @property
     def lacking(self) -> tuple[str, ...]:
-        """The names of the required files that are not there."""
+        """The names of the required files that are missing."""
         there = {file.name for file in self.files if file.changed or file.problem}
         there |= {_KEY} if _KEY_ON_TOKEN in there else set()
         return tuple(each for each in ENCLAVE_FILES if each not in there)
 
 
 class FileReader:
-    """Reads the files of processes, at most 64 MiB of them, and the same file once."""
+    """Reader of the files of processes, which reads at most 64 MiB, and the same file only once."""
 
     def __init__(self) -> None:
         self._left = _MOST_BYTES_OF_FILES
@@ -530,7 +532,7 @@ class FileReader:
         return self._read[key]
 
     def begin(self) -> None:
-        """Forget the files that were not asked for since the last time."""
+        """Forget the files that were not read since the last call."""
         self._left = _MOST_BYTES_OF_FILES
         self._before, self._read = self._read, {}
 
@@ -557,10 +559,10 @@ class ProcessRoot:
         return LoadedFile(name, _moment(changed), data)
 
     def folders(self, path: str) -> dict[str, os.stat_result]:
-        """Map the folders on the way to a folder, and itself, to their states.
+        """Map the folders on the way to a folder, and the folder itself, to their states.
 
         Raises:
-            OSError: There is no such folder, or it cannot be looked at.
+            OSError: The folder does not exist, or cannot be examined.
         """
         with self._opened(path) as (_, way):
             if not stat.S_ISDIR(way[-1][1].st_mode):
@@ -569,11 +571,11 @@ class ProcessRoot:
 
     @contextmanager
     def _opened(self, path: str) -> Iterator[tuple[int, list[tuple[str, os.stat_result]]]]:
-        """Open what is at a path with O_PATH.
+        """Open the file or folder at a path with O_PATH, in a context.
 
-        Yields the handle, and the path and state of each folder and link on the way, which ends
-        with what is there.  Each part is opened in the folder before it and no link is followed by
-        the system, so nothing outside of the root directory is reached.
+        Yields the handle, and the path and state of each folder and link on the way, and of the
+        file or folder itself.  Each part is opened in the folder before it, and the system follows
+        no link, so nothing outside of the root directory is reached.
         """
         rest = [each for each in path.split("/")[::-1] if each]
         way = [("/", os.fstat(self._handle))]
@@ -670,14 +672,14 @@ def _loaded_enclave(
 
 
 def _reason(error: OSError) -> str:
-    """Return why a folder could not be looked at, or "" if it is not there."""
+    """Return why a folder could not be examined; "" if it does not exist."""
     if error.errno in (errno.ENOENT, errno.ENOTDIR):
         return ""
     return error.strerror or str(error)
 
 
 def _writable(folders: list[tuple[str, os.stat_result]], user: int) -> str:
-    """Return which folder users can change who are neither root, ``user`` nor the owner."""
+    """Return a clause on a folder that users other than root, ``user`` and the owner can change."""
     trusted = frozenset({0, user, folders[0][1].st_uid})
     for path, state in folders:
         if why := other_writers(state, trusted):
@@ -686,7 +688,7 @@ def _writable(folders: list[tuple[str, os.stat_result]], user: int) -> str:
 
 
 def _same_here(path: str, folders: Mapping[str, os.stat_result]) -> Path | None:
-    """Return the path of a folder of a process if it is the same folder for this process."""
+    """Return ``path`` if it is the same folder for this process as for the examined process."""
     with suppress(OSError, ValueError):
         if os.path.samestat(Path(path).stat(), list(folders.values())[-1]):
             return Path(path)

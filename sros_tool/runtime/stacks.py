@@ -89,28 +89,28 @@ class ProbeEnclave(NamedTuple):
 
 
 class Stack(NamedTuple):
-    """A DDS or RMW."""
+    """An installed or missing DDS stack, and whether it enforces security."""
 
     name: str
-    """Its name."""
+    """Name of the stack."""
     kind: Annotated[str, Words(("cyclone", "rmw", "cyclonedds"))]
-    """What it is: libddsc, an RMW of rclpy, or the Python package."""
+    """Kind of the stack: libddsc, an RMW of rclpy, or the Python package ``cyclonedds``."""
     dds: str
-    """The DDS."""
+    """Name of the DDS."""
     version: str = ""
-    """Its version, or an empty string."""
+    """Version of the DDS; empty if unknown."""
     where: str = ""
-    """Its library, or an empty string."""
+    """Path of the DDS library; empty if unknown."""
     present: bool = True
-    """Whether it is installed."""
+    """Whether the stack is installed."""
     enforces: bool | None = None
-    """Whether it enforces security; null if it could not be tried."""
+    """Whether the stack enforces security; null if it could not be tried."""
     evidence: str = ""
-    """What was tried and observed."""
+    """Description of the attempt and the observed result."""
     advice: str = ""
-    """What to do, or an empty string."""
+    """Advice on what to do; empty if there is none."""
     rmw: str = ""
-    """The RMW, or an empty string."""
+    """Name of the RMW; empty if the stack is not an RMW."""
 
 
 # ── the stacks ──────────────────────────────────────────────────────────────────────────
@@ -196,7 +196,7 @@ def _without_rclpy() -> Stack:
 def _probed(
     stack: Stack, kind: str, probe: ProbeEnclave, variables: Mapping[str, str] | None = None
 ) -> Stack:
-    """Return a stack with what a probe of a kind observed of it."""
+    """Return ``stack`` with the result of a probe of the given kind."""
     run = _run_probe(kind, probe, variables or {})
     verdict = judge(run, probe.allowed, probe.denied)
     dds, version, where = _identity(run)
@@ -231,7 +231,7 @@ def _package_version(name: str) -> str:
 
 
 class ProbeRun(NamedTuple):
-    """The reports, the output and the exit status of one probe process.
+    """The reports, the output and the exit status of a probe process.
 
     ``status`` is negative for a signal, and None if the process had to be stopped.
     """

@@ -1,7 +1,7 @@
 """Units of systemd: nodes that run in their enclaves, and the regular work on a keystore.
 
-A node gets what a ROS node over DDS or Zenoh needs, and nothing else: sockets of IP, the list of
-network interfaces (netlink), shared memory, devices, and its own enclave without those of others.
+A node gets only what a ROS node over DDS or Zenoh needs: sockets of IP, the list of network
+interfaces (netlink), shared memory, devices, and its own enclave, but no other enclaves.
 
 Sources: systemd.exec(5), systemd.service(5), systemd.unit(5) of systemd 247 and later.
 """
@@ -39,7 +39,7 @@ TEMPLATE = "sros@.service"
 """The unit of all nodes; its instance name is the enclave, as `unit_instance` writes it."""
 
 _NODES = "/etc/sros/nodes"
-"""The folder with a program for each enclave, where no command is named."""
+"""Folder with a program for each enclave, used if no command is named."""
 
 METRICS_FILE = "/var/lib/sros-metrics/sros.prom"
 FLEET_FILE = "/var/lib/sros-metrics/fleet.prom"
@@ -95,10 +95,10 @@ def unit_instance(enclave: str) -> str:
 
 
 def _check_path(path: str, what: str) -> str:
-    """Return a path that is the same for every directive of a unit.
+    """Return ``path``, after checking that every directive of a unit reads it alike.
 
     Raises:
-        UsageError: it is not absolute, or has characters with a meaning in some directives.
+        UsageError: the path is not absolute, or has characters with a meaning in some directives.
     """
     if not _PLAIN_PATH.match(path):
         raise UsageError(
@@ -111,16 +111,20 @@ def _check_path(path: str, what: str) -> str:
 
 
 def _check_user(name: str) -> str:
-    """Return the name of a user.  Raises `UsageError` if it is not a valid one."""
+    """Return ``name``, after checking that it is a valid user name.
+
+    Raises:
+        UsageError: it is not a valid user name.
+    """
     if not _USER.match(name):
         raise UsageError(f"{name!r} is not the name of a user", "", "Name one such as ros.")
     return name
 
 
 def node_template(user: str) -> str:
-    """Return the unit of all nodes, `TEMPLATE`.
+    """Return the text of `TEMPLATE`, the unit of all nodes.
 
-    It starts nothing for an enclave without `node_settings`, which have its command.
+    For an enclave without `node_settings`, which contain its command, the unit starts nothing.
     """
     return f"""\
 # Runs a node in the enclave of its instance name, which sros@NAME.service.d/enclave.conf adds.
@@ -160,15 +164,15 @@ def node_settings(
     below: Iterable[str] = (),
     sros: str = "",
 ) -> str:
-    """Return what `TEMPLATE` lacks for an enclave: its environment, its files and its command.
+    """Return the settings that an enclave adds to `TEMPLATE`: environment, files and command.
 
     Args:
         enclave: the name of the enclave.
-        variables: its environment.
+        variables: its environment variables.
         keystore: the path of the keystore.
-        command: the command with its arguments; without it, the program in `_NODES` with the path
-            of the enclave.
-        below: the enclaves whose names begin with the parts of this one, and so are in its folder.
+        command: the command with its arguments; if empty, the program in `_NODES` with the path of
+            the enclave.
+        below: the enclaves in subfolders of this enclave's folder.
         sros: the path of the program sros, which then verifies the enclave first, or "".
 
     Raises:
@@ -320,7 +324,7 @@ def _lines(lines: Iterable[str]) -> str:
 
 
 def _words(command: Sequence[str]) -> Iterable[str]:
-    """Yield each word as one that systemd changes nothing in.
+    """Yield the words of a command, quoted so that systemd passes them on unchanged.
 
     Raises:
         UsageError: the program is not an absolute path, or a word cannot be printed.
@@ -341,10 +345,10 @@ def _words(command: Sequence[str]) -> Iterable[str]:
 
 
 def unit_changes(folder: Path, files: Mapping[str, str], *, force: bool) -> dict[str, str]:
-    """Map the files that are missing or differ to `create` or `replace`.
+    """Map the names of missing files to `create`, and of different files to `replace`.
 
     Raises:
-        UsageError: a file differs, and not ``force``.
+        UsageError: a file differs, and ``force`` is not set.
     """
     _refuse_folders_of_others(folder, files)
     changes: dict[str, str] = {}

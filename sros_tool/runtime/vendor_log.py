@@ -588,20 +588,20 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _text("refusal", _CYCLONE, r"denied by default rule|found in deny_rule",
           refuses=Refused.TOPIC),
 )  # fmt: skip
-"""In the order of matching: the first text that matches a line counts."""
+"""All known log texts, in order: the first text that matches a line counts."""
 
 _OF_DDS_SECURITY = (
     r"DDS[-:. ]?sec|dds_sec|ROS_SECURITY_|identity[_ ]ca|permissions[_ ]ca"
     r"|(?:cert|key|crl)\.pem|(?:governance|permissions)\.(?:p7s|xml)|\.p7s\b"
     r"|validate_(?:local|remote)_|PKCS ?#?7|\bS/?MIME|X\.?509|TRUSTED CERTIFICATE"
 )
-"""Words that nothing but DDS Security and its files bring into the log of a robot."""
+"""Words that occur in the log of a robot only because of DDS Security and its files."""
 _SUBJECT = (
     rf"{_OF_DDS_SECURITY}|\bsecurity|non.?secure|permissions?[_ ]ca|\bgovernance\b|\bpermissions\b"
     r"|\bPEM\b|handshake|certificate|private key|authenticated\b|crypto|decrypt"
     r"|access[ _]?control|\benclave|keystore|\bCRL\b"
 )
-"""Words that speak of DDS Security, or of the security or the packages of something else."""
+"""Words about DDS Security, or about the security or packages of something else."""
 _MIDDLEWARE = (
     r"\b(?:rcl|rmw)\w{0,40}\b|fast.?(?:dds|rtps)|cyclone|\bdds|openssl|\bwhat\(\): "
     r"|\[\w{1,40} (?:Error|Warning)\]"
@@ -784,7 +784,7 @@ def plain_text(output: str) -> str:
 def plain_refusal(line: str) -> str:
     """Return the message in a line of a DDS log, without time, severity and source positions.
 
-    Without a message, returns the name of the failed function; returns "" only for an empty line.
+    A line without a message gives the name of the failed function; only an empty line gives "".
     """
     line = " ".join(plain_text(line).split())
     if words := " ".join(_FRAME.sub("", line).split()):
@@ -824,9 +824,9 @@ _SAME = (
 _WRITTEN = "Let `sros zenoh KEYSTORE` write the file, and do not edit it."
 
 ZENOH_IDS = "zenoh-"
-"""How the ids of texts of Zenoh begin."""
+"""Prefix of the ids of Zenoh's log texts."""
 ZENOH_LINE = re.compile(r"\A\s*(?:\S+Z\s+)?(?:TRACE|DEBUG|INFO|WARN|ERROR)\b.*?\bzenoh[\w:]*: ")
-"""A line of Zenoh's log: what is not in the table is no trouble of security."""
+"""Pattern of a line of Zenoh's log; lines that match no text are no security problem."""
 
 
 def _zenoh_text(name: str, pattern: str, cause: str, remedy: str, weak: int = 0) -> LogText:
@@ -993,10 +993,10 @@ def zenoh_text(line: str) -> tuple[LogText, re.Match[str]] | None:
 
 
 class DroppedMessage(NamedTuple):
-    """A message that access control dropped, as the log of the enforcing process says.
+    """A message that access control dropped, as the log of the enforcing process reports it.
 
     ``line`` counts from 1; ``name`` is the common name of the remote process, "" if the log does
-    not tell it; ``message`` is as Zenoh writes it, such as "Declare Subscriber".
+    not show it; ``message`` is as Zenoh writes it, such as "Declare Subscriber".
     """
 
     line: int
@@ -1018,11 +1018,11 @@ _BOTH = "Declare/Undeclare"
 
 
 def dropped_messages(lines: Iterable[tuple[int, str, str]]) -> Iterator[DroppedMessage]:
-    """Yield the dropped messages in lines: their numbers, processes and texts.
+    """Yield the dropped messages in lines (number, process, text) of a log.
 
     When a key is declared, Zenoh tries all kinds of messages for it and logs each result.  These
-    lines, which have "Declare/Undeclare" among them, are of no message: only "Using cached result"
-    is, and lines for keys that were not declared.
+    lines, which contain "Declare/Undeclare", report no message; the lines "Using cached result",
+    and lines for keys that were not declared, do.
     """
     found = []
     names: dict[tuple[str, str], str] = {}

@@ -167,7 +167,7 @@ def test_one_pipe_from_the_request_to_the_answer(keystore: Path, tmp_path: Path)
     assert "imported enclave" in ended.stdout
     sros("verify", tmp_path / "robot").ok()
     ended = shell(line, tmp_path)
-    assert "exists already" in ended.stderr
+    assert "already exists" in ended.stderr
     assert "the answer is empty" in ended.stderr
     assert shell(line.replace("ks -", "ks - --renew"), tmp_path).returncode == 0
 

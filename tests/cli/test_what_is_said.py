@@ -48,7 +48,7 @@ def test_what_still_works_after_taking_a_right_away(verb: str, root: Path) -> No
     before = certificate(folder / "cert.pem")
     ended = sros(*TAKES_AWAY[verb].split(), cwd=root.parent).ok()
     assert "/robot loses: publish topic /secret" in ended.err
-    (line,) = [each for each in ended.err.splitlines() if "works until" in each]
+    (line,) = [each for each in ended.err.splitlines() if "lost rights work until" in each]
     assert f"{before.not_valid_after_utc:%Y-%m-%d}" in line
     assert "until they are restarted" in line
     # What it names as the remedy runs, and ends it.
@@ -70,7 +70,7 @@ def test_taking_a_right_away_at_once(verb: str, root: Path) -> None:
     assert snapshot(root) == state
     assert "/robot would lose: publish topic /secret" in would.err
     ended = sros(*words, cwd=root.parent).ok()
-    assert "works until" not in ended.err
+    assert "work until" not in ended.err
     assert "restart the processes of 2 enclaves" in ended.err
     crl = Keystore(root).revocation_list
     assert crl
@@ -96,7 +96,7 @@ def test_a_request_that_is_answered_with_less(root: Path) -> None:
     assert "rights-lost" not in sros(*words, "more.xml", "-o", "two.tar.gz", cwd=work).ok().err
     ended = sros(*words, "less.xml", "-o", "three.tar.gz", cwd=work).ok()
     (line,) = [each for each in ended.err.splitlines() if "rights-lost" in each]
-    assert "/remote loses: publish topic /secret. /remote: what it lost works until" in line
+    assert "/remote loses: publish topic /secret. /remote: its lost rights work until" in line
     sros(*commands(line)[0], cwd=work).ok()
 
 
@@ -104,7 +104,7 @@ def test_gaining_a_right_leaves_nothing_behind(root: Path) -> None:
     sros("create_permission", "ks", "/robot", "narrow.xml", cwd=root.parent).ok()
     ended = sros("create_permission", "ks", "/robot", "wide.xml", cwd=root.parent).ok()
     assert "/robot gains: publish topic /secret" in ended.err
-    assert "works until" not in ended.err
+    assert "work until" not in ended.err
 
 
 def test_a_denial_takes_a_right_away(root: Path) -> None:
@@ -130,7 +130,7 @@ def test_another_template_for_an_existing_keystore_is_refused(root: Path) -> Non
     ended = generate(root, "production")
     assert ended.status == 2
     assert snapshot(root) == before
-    assert "exists already, with the template development" in ended.err
+    assert "already exists, with the template development" in ended.err
     (command,) = commands(ended.err)
     sros(*command).ok()
     sros(*command[:-1]).ok()  # without --dry-run

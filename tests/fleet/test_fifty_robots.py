@@ -280,7 +280,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
         "generate_artifacts", "-k", "ks", "-p", "one.xml", "--fleet", "fleet.toml", cwd=folder
     )
     assert ended.status == 2
-    assert "/lift would have to be for domain 0 by the fleet" in ended.err
+    assert "/lift belongs to domain 0 by the fleet" in ended.err
     assert "Name the policies of all enclaves" in ended.err
 
     # Another domain of the keystore leaves the one of a robot as it is.
@@ -299,7 +299,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
                  "create_enclave ks /new"):  # fmt: skip
         ended = sros(*line.split(), cwd=folder)
         assert ended.status == 2, line
-        assert "fleet.toml' is not the one that sros wrote at" in ended.err
+        assert "fleet.toml' is not the file that sros wrote at" in ended.err
     found = sros("check", "ks", "--include", "keystore.fleet-edited", cwd=folder)
     assert found.status == 1
     (folder / "fleet.toml").write_text(fleet_file())

@@ -52,7 +52,10 @@ def test_what_one_robot_used_stays_for_all(folder: Path) -> None:
     ended = sros(*WORDS, "-o", "narrow.xml", cwd=folder).ok()
     assert "publish topic {namespace}/unused" in ended.out
     assert "observed, and not allowed\n    publish topic /hall/r1/no\n" in ended.out
-    assert "/{robot}/base was never observed for r2: what only these use is removed" in ended.err
+    assert (
+        "/{robot}/base was never observed for r2: rights that only these robots use are removed"
+        in ended.err
+    )
     assert "observed, but not in the policy: /stranger." in ended.err
     wanted = POLICY.replace("<topic>{namespace}/unused</topic>", "")
     wanted = wanted.replace("<topic>{namespaces}/never</topic>", "")

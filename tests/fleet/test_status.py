@@ -257,7 +257,7 @@ def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> No
     assert json.loads(ended.out)["cut_off"] == ["r2"]
     assert "cut off: r2 are unable" in ended.err
     (field.root / "fleet.toml").write_text("[robots.r1]\n")
-    assert "is not the one that sros wrote" in field.run("rotate_ca", "ks", "--next", status=2).err
+    assert "is not the file that sros wrote" in field.run("rotate_ca", "ks", "--next", status=2).err
     told = field.run("rotate_ca", "ks", "--status").out
     assert "which robots confirmed this stage is unknown: " in told
     told = field.run("rotate_ca", "ks", "--status", "--json").out

@@ -216,7 +216,7 @@ def test_a_template_takes_no_key_of_the_token(token: dict[str, str], tmp_path: P
     known = token | {"PKCS11_MODULE_PATH": str(MODULE)}
     refused = sros(known, "create_keystore", new, "--template", template)
     assert (refused.returncode, new.exists()) == (2, False), refused.stderr
-    assert "names a key that exists" in refused.stderr
+    assert "names an existing key" in refused.stderr
     keys = ["--identity-key", uri("identity"), "--permissions-key", uri("permissions")]
     named = sros(known, "create_keystore", new, "--template", template, *keys)
     assert named.returncode == 0, named.stderr

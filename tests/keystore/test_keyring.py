@@ -86,7 +86,7 @@ def test_a_template_takes_no_key_that_exists(tmp_path: Path) -> None:
     place = f"file:{tmp_path / 'one/private/ca.key.pem'}"
     hostile = replace(single, identity_key=place, permissions_key=place)
     for dry_run in (False, True):
-        with pytest.raises(KeystoreError, match=r"names a key that exists.*--identity-key file:"):
+        with pytest.raises(KeystoreError, match=r"names an existing key.*--identity-key file:"):
             create_keystore(tmp_path / "two", template=hostile, now=NOW, dry_run=dry_run)
     assert not (tmp_path / "two").exists()
     named = Keyring(places={"identity": place, "permissions": place})

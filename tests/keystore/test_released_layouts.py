@@ -65,7 +65,7 @@ def test_every_verb_refuses_a_flat_keystore_in_one_line(words: str, tmp_path: Pa
     ended = sros(*words.format(old, old).split(), cwd=tmp_path)
     assert ended.status == 2, ended
     assert f"'{old}' is not a valid keystore" in ended.err, ended
-    assert "one of ROS 2 Eloquent or earlier" in ended.err, ended
+    assert "a keystore of ROS 2 Eloquent or earlier" in ended.err, ended
     assert "`sros create_keystore NEW`" in ended.err, ended
     assert ended.err.count("\n") == 1, ended
     assert snapshot(old) == before
@@ -75,7 +75,9 @@ def test_a_variable_that_names_a_flat_keystore_is_explained(tmp_path: Path) -> N
     make_flat(tmp_path / "old")
     told = {"ROS_SECURITY_KEYSTORE": str(tmp_path / "old"), "ROS_SECURITY_ENABLE": "true"}
     said = " ".join(sros("check", "runtime", env=told).out.split())
-    assert "one of ROS 2 Eloquent or earlier" in said and "`sros create_keystore NEW`" in said
+    assert (
+        "a keystore of ROS 2 Eloquent or earlier" in said and "`sros create_keystore NEW`" in said
+    )
 
 
 def test_the_files_of_a_flat_keystore_in_one_of_today_do_not_matter(tmp_path: Path) -> None:

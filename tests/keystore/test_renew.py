@@ -249,7 +249,7 @@ def tampered(root: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lose_key, "the key of the identity CA is not at"),
+        (lose_key, "the key of the identity CA is missing"),
         (foreign_certificate, "was not issued by the identity CA|no grant for"),
         (foreign_permissions, "not by the permissions CA|no grant for"),
         (tampered, "signature does not match"),
@@ -424,7 +424,7 @@ def test_the_program(tmp_path: Path) -> None:
     every = sros("renew", root, "--all-expiring", "200d").ok().out
     assert every == "renewed enclave /a\nrenewed enclave /b\n"
     again = sros("renew", root, "--all-expiring", "9000d").ok().err
-    assert "what is renewed now expires within 9000d again" in again
+    assert "the new files expire within 9000d again" in again
     assert "the replaced certificates work until" in sros("renew", root, "/a", "/b").ok().err
     told = sros("renew", root, "/a", "--revoke-old").ok()
     assert "restart the processes of 2 enclaves" in told.err

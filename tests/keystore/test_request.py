@@ -216,7 +216,7 @@ def test_a_request_for_an_existing_enclave_is_refused(
     sign(home, robot)
     thief = create_request(tmp_path / "thief", NAME)
     before = snapshot(home)
-    with pytest.raises(KeystoreError, match="exists already"):
+    with pytest.raises(KeystoreError, match="already exists"):
         sign_request(home, thief.file.read_bytes(), now=NOW)
     base = create_request(tmp_path / "thief", "/base")
     with pytest.raises(KeystoreError, match="has another key"):

@@ -73,7 +73,7 @@ def test_its_expiry_is_said_when_it_is_issued(tmp_path: Path) -> None:
     sros("create_keystore", tmp_path / "ks").ok()
     ended = sros("create_enclave", tmp_path / "ks", SHORT, LONG).ok()
     assert ended.err.count("note [enclave.short-lived]") == 1
-    assert f"{SHORT}: it expires at 20" in ended.err
+    assert f"{SHORT} expires at 20" in ended.err
 
 
 @pytest.mark.parametrize("days", [0.0, 0.9, 2.0])

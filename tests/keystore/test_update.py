@@ -584,7 +584,7 @@ BROKEN: dict[str, tuple[Callable[[Path], None], str]] = {
     "an unknown key": (_append("sros.toml", b"foo = 1\n"), "foo is not a known key"),
     "no text": (_append("sros.toml", b"\xff\xfe"), "is not valid TOML"),
     "no settings": (lambda root: (root / "sros.toml").unlink(), "there is no sros.toml"),
-    "no XML": (_append("enclaves/governance.xml", b"</foo"), "is not the signed governance"),
+    "no XML": (_append("enclaves/governance.xml", b"</foo"), "differs from the signed governance"),
 }
 
 

@@ -1,11 +1,12 @@
 """Acceptance of enclaves by DDS vendors, before a transaction puts new files in place.
 
-Every verb that changes trust calls `refuse_stopping` before it commits.  Each changed enclave is
-evaluated as every measured vendor would load it, now and after the change.  What a vendor accepts
-today and would refuse then, its nodes would stop at their next start, so the change is refused.
+Every verb that changes trust calls `refuse_stopping` before it commits.  It evaluates each changed
+enclave as every measured vendor would load it, before and after the change.  If a vendor accepts an
+enclave before and would refuse it after, its nodes would stop at their next start, so the change is
+refused.
 
-All enclaves are read; of those that do not differ in anything that a vendor looks at, one is
-evaluated for all.
+All enclaves are read; of enclaves that differ in nothing that a vendor looks at, only one is
+evaluated.
 """
 
 from __future__ import annotations
@@ -76,20 +77,20 @@ _LOADED = (
     CRL_FILE,
     KEY_URI_FILE,
 )
-"""The files that DDS loads, but for the key, which no change exchanges without its certificate."""
+"""The files that DDS loads, except the key, which never changes without its certificate."""
 _NEEDED = _LOADED[:5]
 _ONLY_IDENTITY = {IDENTITY_CA_FILE, CRL.rpartition("/")[2]}
-"""Shared files with which vendors verify no governance and no permissions."""
+"""Shared files that vendors do not use to verify governance or permissions."""
 _CHOSEN = {Fault.DOCUMENT_SIZE, Fault.KEY_ON_TOKEN}
-"""Faults that follow from what the user asked for, and of which notes tell."""
+"""Faults that follow from what the user asked for; notes report them."""
 _SHOWN = 5
 _EXAMPLE = "/example"
 _MOST_BROKEN = 20
-"""Enclaves of one kind that are tried until a vendor accepts one of them."""
+"""Largest number of enclaves of the same kind that are tried until a vendor accepts one."""
 
 Files = dict[str, bytes]
 _Kind = tuple[tuple[str, ...], frozenset[str], tuple[object, ...]]
-"""Where an enclave's files lie, which of them change, and what vendors see in them."""
+"""The paths of an enclave's files, the files that change, and the content that vendors look at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,44 +111,46 @@ def refuse_stopping(
 ) -> tuple[Note, ...]:
     """Refuse a transaction after which vendors refuse enclaves that they accept today.
 
-    An enclave that is new is refused if no vendor would accept it.
+    A new enclave is refused if no vendor would accept it.
 
     Args:
         transaction: the transaction, with all its files staged.
         now: the time at which the enclaves are evaluated.
         keystore: the keystore as it was opened for the change.
         allowed: vendors whose nodes may stop, because the user named them.
-        remedy: returns what to do instead, as sentences; by default the changed files are named.
+        remedy: function that returns a remedy, as sentences; by default the error names the changed
+            files.
 
     Returns:
-        Notes on what stops on the ``allowed`` vendors, and on what a dry run did not look at.
+        Notes on enclaves that stop on the ``allowed`` vendors, and on enclaves that a dry run did
+            not evaluate.
 
     Raises:
         KeystoreError: nodes of a vendor that is not ``allowed`` would stop.
     """
     files = _FilesOfChange(transaction, keystore or Keystore(transaction.root))
-    found = _stopped_enclaves(files, now)
-    if refused := {vendor: each for vendor, each in found.items() if vendor not in allowed}:
+    stopped = _stopped_enclaves(files, now)
+    if refused := {vendor: why for vendor, why in stopped.items() if vendor not in allowed}:
         raise _would_stop(transaction.root, refused, remedy())
     old = _authority_without_list(files)
-    if old and (cut_off := [each for each in _READ_SEVERAL if each not in allowed]):
+    if old and (cut_off := [vendor for vendor in _READ_SEVERAL if vendor not in allowed]):
         raise _would_be_shut_out(transaction.root, old, cut_off, remedy())
     notes = [
         Note(
             "vendor.refuses",
-            f"{vendor.title} refuses {_some(each.enclaves)} from now on: "
-            f"{'; '.join(each.reasons)}. Its nodes that run go on until they are started again.",
+            f"{vendor.title} refuses {_some(refusals.enclaves)} from now on: "
+            f"{'; '.join(refusals.reasons)}. Running nodes go on until they are started again.",
         )
-        for vendor, each in found.items()
+        for vendor, refusals in stopped.items()
     ]
     if unseen := transaction.not_kept():
-        text = f"vendors were not asked about {_some(unseen)}: this dry run makes too many files"
+        text = f"{_some(unseen)} not checked against vendors: this dry run makes too many files"
         notes.append(Note("vendor.not-asked", text))
     return tuple(notes)
 
 
 def _stopped_enclaves(files: _FilesOfChange, now: datetime) -> dict[Vendor, _Refusals]:
-    """Return the vendors that would refuse enclaves which they accept today, or which are new."""
+    """Map vendors to the enclaves that they would refuse, and either accept today or are new."""
     stopped: dict[Vendor, dict[str, list[str]]] = {}
     for (_, own, _), names in _kinds(files, now).items():
         for tried, name in enumerate(names, 1):
@@ -171,9 +174,9 @@ def _stopped_enclaves(files: _FilesOfChange, now: datetime) -> dict[Vendor, _Ref
 
 
 def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
-    """Map each measured vendor that refuses an enclave with these files to its reason.
+    """Map each measured vendor that refuses an enclave with these files to the reason.
 
-    The key is taken to be that of the certificate.
+    The private key is assumed to belong to the certificate.
     """
     import tempfile
 
@@ -185,40 +188,40 @@ def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
         enclave = load_enclave(name, Path(folder), at=now)
     domains = enclave.joined_domains
     domain = next(iter(domains), 0) if domains else 0
-    found = {}
+    reasons = {}
     for vendor in MEASURED:
         participant = VendorParticipant(vendor, enclave, JoinContext(domain, now))
         decision = participant.join()
-        faults = {each.fault for each in participant.problems}
+        faults = {problem.fault for problem in participant.problems}
         if not decision.outcome.ok and not (faults and faults <= _CHOSEN):
-            found[vendor] = _reason(participant, decision)
-    return found
+            reasons[vendor] = _reason(participant, decision)
+    return reasons
 
 
 def _reason(participant: VendorParticipant, decision: Decision) -> str:
     return str(participant.problems[0]).rstrip(".") if participant.problems else decision.clause
 
 
-def _would_stop(root: Path, found: Mapping[Vendor, _Refusals], remedy: str) -> KeystoreError:
-    names = tuple(sorted({name for each in found.values() for name in each.enclaves}))
-    why = {vendor: "; ".join(each.reasons[:_SHOWN]) for vendor, each in found.items()}
+def _would_stop(root: Path, refused: Mapping[Vendor, _Refusals], remedy: str) -> KeystoreError:
+    names = tuple(sorted({name for refusals in refused.values() for name in refusals.enclaves}))
+    why = {vendor: "; ".join(refusals.reasons[:_SHOWN]) for vendor, refusals in refused.items()}
     whose = "its" if len(names) == 1 else "their"
-    options = " ".join(f"--allow-refusal {vendor.value}" for vendor in found)
+    options = " ".join(f"--allow-refusal {vendor.value}" for vendor in refused)
     return KeystoreError(
         f"no node could start in {_some(names)} of '{root}'",
         f"{_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
-        f"{remedy or 'Replace the file that is named.'} If no node runs on "
-        f"{enumerated([each.title for each in found])}, add {options}.",
+        f"{remedy or 'Replace the file that the error names.'} If no node runs on "
+        f"{enumerated([vendor.title for vendor in refused])}, add {options}.",
     )
 
 
-_READ_SEVERAL = tuple(each for each in MEASURED if not each.traits.reads_first_authority)
+_READ_SEVERAL = tuple(vendor for vendor in MEASURED if not vendor.traits.reads_first_authority)
 
 
 def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
-    """Return a CA before the present one that may not sign lists, where a first list is added.
+    """Return an earlier CA that may not sign revocation lists, if the change adds the first list.
 
-    Where there is a list, OpenSSL asks for one of the CA of a certificate.
+    As soon as there is a list, OpenSSL demands a list of the CA of every certificate.
     """
     if not files.content_after(CRL) or files.content(CRL):
         return None
@@ -226,9 +229,11 @@ def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
     present, *others = load_certificates(data, "of the identity CA")
     return next(
         (
-            each
-            for each in others
-            if is_self_issued(each) and not may_sign_lists(each) and not issued_by(present, each)
+            authority
+            for authority in others
+            if is_self_issued(authority)
+            and not may_sign_lists(authority)
+            and not issued_by(present, authority)
         ),
         None,
     )
@@ -240,15 +245,15 @@ def _would_be_shut_out(
     name, titles = subject_text(old.subject), enumerated([each.title for each in vendors])
     options = " ".join(f"--allow-refusal {vendor.value}" for vendor in vendors)
     return KeystoreError(
-        f"processes that still run with certificates of {name} would be shut out of '{root}'",
-        f"Where there is a revocation list, {titles} ask for one of each CA, and the keyUsage of "
+        f"processes that still have certificates of {name} would be refused in '{root}'",
+        f"With any revocation list, {titles} demand a list of each CA, and the keyUsage of "
         f"{name} lacks cRLSign. Nothing was changed.",
         f"{remedy} If no process runs with such a certificate, add {options}.",
     )
 
 
 def _clauses(refused: Mapping[Vendor, str], what: str) -> str:
-    """Return which vendors refuse ``what``, by reason."""
+    """Return clauses such as "A and B refuse ``what`` (reason)", one for each reason."""
     by_reason: dict[str, list[str]] = {}
     for vendor, reason in refused.items():
         by_reason.setdefault(reason, []).append(vendor.title)
@@ -272,10 +277,10 @@ def imported_notes(
     domains: DomainSet,
     now: datetime,
 ) -> tuple[Note, ...]:
-    """Return which vendors refuse enclaves of imported CAs, from now on or after a revocation.
+    """Return notes on vendors that refuse enclaves of imported CAs, now or after a revocation.
 
-    An enclave is issued and evaluated that is not written, without and with a revocation list.
-    Vendors that the notes of ``authorities`` name already are left out.
+    An example enclave, which is not written, is issued and evaluated without and with a revocation
+    list.  Vendors that the notes of ``authorities`` already name are left out.
 
     Raises:
         KeystoreError: no vendor would accept an enclave of the keystore.
@@ -286,7 +291,7 @@ def imported_notes(
         raise KeystoreError(
             f"no DDS vendor would accept an enclave of keystore '{transaction.root}'",
             f"{_clauses(refused, 'it')}. Nothing was written.",
-            "Name CAs that vendors accept, or let sros make them.",
+            "Name CAs that vendors accept, or let sros create the CAs.",
         )
     known = " ".join(note.text for note in authorities.notes)
     notes = []
@@ -311,7 +316,7 @@ def imported_notes(
     if later := {vendor: why for vendor, why in listed.items() if vendor not in refused}:
         text = (
             f"with a revocation list of this identity CA, no enclave would work any more: "
-            f"{_clauses(later, 'it')}. So `sros revoke` refuses to sign one. To revoke enclaves, "
+            f"{_clauses(later, 'it')}. So `sros revoke` signs no list. To revoke enclaves, "
             "have the CA's certificate issued again with keyUsage cRLSign, or let sros make the "
             "identity CA."
         )
@@ -326,7 +331,7 @@ def _example(
     domains: DomainSet,
     now: datetime,
 ) -> Files:
-    """Return the files of an enclave of a new keystore."""
+    """Return the files of an example enclave of a new keystore, by name."""
     files = {
         f"{role}_ca.cert.pem": transaction.content_after(
             transaction.place_after(ca_certificate(role))
@@ -357,7 +362,7 @@ def _example(
 
 
 class _FilesOfChange:
-    """The files of enclaves before and after a transaction; a shared one is read once."""
+    """The files of enclaves before and after a transaction; shared files are read once."""
 
     def __init__(self, transaction: Transaction, keystore: Keystore) -> None:
         self.transaction = transaction
@@ -367,12 +372,12 @@ class _FilesOfChange:
         self._places: dict[str, str] = {}
 
     def places_after(self, name: str) -> dict[str, str]:
-        """Map the files of an enclave to where their content will be."""
+        """Map the file names of an enclave to the paths that their content will be read from."""
         folder = enclave_folder(name)
         return {file: self._place_after(f"{folder}/{file}") for file in _LOADED}
 
     def _place_after(self, path: str) -> str:
-        """Return where the content of a path will be; enclaves have links to the same files."""
+        """Return the path that ``path`` will lead to, which may be a link to a shared file."""
         target = self.transaction.target_after(path)
         if target is None:
             return path
@@ -384,24 +389,24 @@ class _FilesOfChange:
         return self._places[linked]
 
     def before(self, name: str) -> Files:
-        """Return the files of an enclave as they are; none if one is missing."""
+        """Return the present files of an enclave; empty if a required file is missing."""
         folder = enclave_folder(name)
         return _complete({file: self.content(f"{folder}/{file}") for file in _LOADED})
 
     def after(self, name: str) -> Files:
-        """Return the files of an enclave as they will be; none if one is missing."""
+        """Return an enclave's files after the transaction; empty if a required file is missing."""
         places = self.places_after(name)
         return _complete({file: self.content_after(place) for file, place in places.items()})
 
     def content(self, path: str) -> bytes:
-        """Return the content of a file as it is, or nothing."""
+        """Return the present content of a file; empty if it cannot be read."""
         try:
             return self._keystore.read(path, "file")
         except SrosError:
             return b""
 
     def content_after(self, place: str) -> bytes:
-        """Return the content that a file, not a link, will have, or nothing."""
+        """Return the content of a file (not a link) after the transaction; empty without one."""
         if not self.transaction.is_staged(place):
             return self.content(place)
         if place not in self._after:
@@ -410,7 +415,7 @@ class _FilesOfChange:
 
 
 def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
-    """Return the complete enclaves that change, by all in which vendors could see a difference."""
+    """Group the complete, changed enclaves by everything that vendors could treat differently."""
     changed, enclaves = files.changed, files.transaction.enclaves
     shared = changed.get(PUBLIC, set()) | changed.get(ENCLAVES, set()) & {GOVERNANCE_FILE}
     documents = not shared <= _ONLY_IDENTITY
@@ -452,13 +457,13 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
     return kinds
 
 
-def _complete(found: Mapping[str, bytes | None]) -> Files:
-    files = {file: data for file, data in found.items() if data}
-    return files if all(file in files for file in _NEEDED) else {}
+def _complete(files: Mapping[str, bytes | None]) -> Files:
+    complete = {file: data for file, data in files.items() if data}
+    return complete if all(file in complete for file in _NEEDED) else {}
 
 
 def _certificate_kind(data: bytes, listed: frozenset[int], now: datetime) -> tuple[object, ...]:
-    """Return all of a certificate in which vendors could see a difference, but its name and key."""
+    """Return the parts of a certificate, but name and key, that vendors could treat differently."""
     form = read_form(data)
     if form is None:
         return (data,)
@@ -468,13 +473,13 @@ def _certificate_kind(data: bytes, listed: frozenset[int], now: datetime) -> tup
 def _listed(crl: bytes) -> frozenset[int]:
     """Return the serial numbers on a revocation list."""
     try:
-        return frozenset(each.serial_number for each in read_list(crl, ""))
+        return frozenset(entry.serial_number for entry in read_list(crl, ""))
     except SrosError:
         return frozenset()
 
 
 def _signers(message: bytes) -> tuple[object, ...] | None:
-    """Return by whom and how permissions are signed."""
+    """Return the certificates and the hash of the signature of permissions; None if unreadable."""
     try:
         signed = smime.parse(message)
     except SrosError:

@@ -1,7 +1,8 @@
 """The identity CA and the permissions CA of a keystore: creating them, and loading them to sign.
 
 The issuing CA is the first certificate of a CA file, because Cyclone DDS 0.10.2 reads only the
-first one.  Fast DDS 2.9.1 trusts all CAs in the file, and also reads a revocation list in it.
+first certificate.  Fast DDS 2.9.1 trusts all CAs in the file, and also reads a revocation list in
+it.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Authority:
 
     @property
     def on_token(self) -> bool:
-        """Whether a token has the key, so that forked processes cannot sign."""
+        """Whether the key is on a token, so that forked processes cannot sign."""
         return isinstance(self.key, TokenKey)
 
     def __post_init__(self) -> None:
@@ -84,38 +85,39 @@ class Authority:
         return self.sign_all((document,), what)[0]
 
     def sign_all(self, documents: Sequence[bytes], what: str) -> list[bytes]:
-        """Return each of some documents as `sign` does.
+        """Return ``documents`` as signed S/MIME messages, in order, as `sign` does.
 
-        Small ones take less time, because each step is done for several of them in a row.
+        Small documents take less time than with `sign`, because each step is done for several in a
+        row.
         """
         messages: list[bytes] = []
-        for some in _in_a_row(documents):
-            signed = [smime.sign(each, self.certificate, self.key) for each in some]
-            parsed = [smime.parse_new(each) for each in signed]
-            for document, found in zip(some, parsed, strict=True):
-                meant = document.replace(b"\r\n", b"\n")
-                check_meaning((found.digest_matches(), found.text), (True, meant), what)
+        for batch in _batches(documents):
+            signed = [smime.sign(document, self.certificate, self.key) for document in batch]
+            parsed = [smime.parse_new(message) for message in signed]
+            for document, message in zip(batch, parsed, strict=True):
+                text = document.replace(b"\r\n", b"\n")
+                check_meaning((message.digest_matches(), message.text), (True, text), what)
             messages += signed
         return messages
 
 
-_BYTES_IN_A_ROW = 1 << 18
+_BATCH_BYTES = 1 << 18
 
 
-def _in_a_row(documents: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
-    """Yield the documents in order, several small ones together and each large one alone."""
+def _batches(documents: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
+    """Yield the documents in batches of up to 256 KiB; a larger document is a batch alone."""
     begin = size = 0
-    for end, each in enumerate(documents):
-        size += len(each)
-        if size > _BYTES_IN_A_ROW and end > begin:
+    for end, document in enumerate(documents):
+        size += len(document)
+        if size > _BATCH_BYTES and end > begin:
             yield documents[begin:end]
-            begin, size = end, len(each)
+            begin, size = end, len(document)
     yield documents[begin:]
 
 
 @dataclass(frozen=True, slots=True)
 class Authorities:
-    """The identity CA and permissions CA of a keystore, which may be the same CA."""
+    """The identity CA and the permissions CA of a keystore, which may be the same CA."""
 
     identity: Authority
     permissions: Authority
@@ -147,12 +149,12 @@ def create_authorities(
     notes: list[Note] = []
 
     def make(file: str, role: str, name: str) -> Authority:
-        at = f"{PRIVATE}/{file}.key.pem"
-        key = keyring.make(transaction, at, role, template, compared=role in imported)
+        path = f"{PRIVATE}/{file}.key.pem"
+        key = keyring.make(transaction, path, role, template, compared=role in imported)
         if role in imported:
-            found = check_imported(role, imported[role], key, now)
-            certificate, bundle = found.certificate, found.bundle
-            notes.extend(found.notes)
+            existing = check_imported(role, imported[role], key, now)
+            certificate, bundle = existing.certificate, existing.bundle
+            notes.extend(existing.notes)
         else:
             certificate = issue_ca(key, common_name(name), validity)
             bundle = pem(certificate)
@@ -200,7 +202,7 @@ def load_authority(
     if not keystore.has(ca_certificate(role)) and not keystore.has(ca_key(role)):
         raise KeystoreError(
             f"keystore '{root}' has no {role} CA",
-            "It may be an export for a robot, which holds enclaves but no CA to create new ones.",
+            "It may be an export for a robot, which has enclaves but no CA to create more.",
             "Use the keystore that it was exported from.",
         )
     certificate = keystore.ca_certificate(role)
@@ -241,7 +243,7 @@ def write_bundle(
 
 
 def write_copies(transaction: Transaction, names: Sequence[str], name: str, data: bytes) -> None:
-    """Stage ``data`` as file ``name`` in each enclave that has a regular file there, not a link."""
+    """Stage ``data`` as file ``name`` in each enclave that has its own copy instead of a link."""
     for enclave in names:
         path = f"{enclave_folder(enclave)}/{name}"
         if (transaction.root / path).is_file() and not (transaction.root / path).is_symlink():
@@ -276,7 +278,7 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
         PkiError: the CA cannot be the ``role`` CA.
     """
     certificates = list(load_certificates(data, f"of the {role} CA"))
-    own = [each for each in certificates if same_key(each, key)]
+    own = [certificate for certificate in certificates if same_key(certificate, key)]
     if len(certificates) > _MOST_CERTIFICATES:
         raise PkiError(
             f"the certificate file of the {role} CA has {len(certificates)} certificates",
@@ -286,7 +288,7 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
     if not own:
         raise PkiError(
             f"the certificate of the {role} CA does not fit its key",
-            f"The key belongs to none of the certificates in the file ({len(certificates)}).",
+            f"The key belongs to no certificate in the file, which has {len(certificates)}.",
             "Name the certificate and the key of the same CA.",
         )
     for weak in filter(None, map(weakness, certificates)):
@@ -297,8 +299,8 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
             "one.",
         )
     chain = list(_chain(own[0], certificates, role))
-    for each in chain:
-        _check_ca(each, role, now)
+    for authority in chain:
+        _check_ca(authority, role, now)
     refusals = authority_refusals(role, tuple(chain), now)
     if len(refusals) == len(MEASURED):
         raise PkiError(
@@ -316,10 +318,10 @@ def _chain(
     start: x509.Certificate, certificates: list[x509.Certificate], role: str
 ) -> Iterator[x509.Certificate]:
     """Yield ``start`` and its issuers, up to the self-signed root."""
-    current, left = start, [each for each in certificates if each != start]
+    current, left = start, [issuer for issuer in certificates if issuer != start]
     yield current
     while not issued_by(current, current):
-        above = next((each for each in left if issued_by(current, each)), None)
+        above = next((issuer for issuer in left if issued_by(current, issuer)), None)
         if above is None:
             raise PkiError(
                 f"the chain of the {role} CA has no root",
@@ -332,9 +334,9 @@ def _chain(
 
 
 def _check_ca(certificate: x509.Certificate, role: str, now: datetime) -> None:
-    """Raise `PkiError` if a certificate says that it is no CA's, or is not valid ``now``.
+    """Raise `PkiError` if a certificate says that it is not a CA, or is not valid at ``now``.
 
-    Whether a certificate that says neither is one of a CA is left to the vendors.
+    A certificate that does not say whether it is a CA is left to the vendors.
     """
     name = subject_text(certificate.subject)
     if denies_issuing(certificate):
@@ -362,13 +364,13 @@ def _notes(
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain), "")):
         yield Note(
             "portable.ca-purpose",
-            f"{fault}: Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse every document that it signs "
+            f"{fault}: Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse all documents that it signs "
             '("unsuitable certificate purpose"), and only Fast DDS 2.14 accepts them. Issue its '
             "certificate again with keyUsage digitalSignature and without extendedKeyUsage, unless "
             "all robots run Fast DDS 2.14.",
         )
-    for each in chain:
-        key, name = each.public_key(), subject_text(each.subject)
+    for certificate in chain:
+        key, name = certificate.public_key(), subject_text(certificate.subject)
         fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
             isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
         )
@@ -378,7 +380,7 @@ def _notes(
                 f"{name} has a key of {algorithm(key)}; Cyclone DDS accepts only EC secp256r1 and "
                 "RSA 2048.",
             )
-        if not isinstance(each.signature_hash_algorithm, hashes.SHA256):
+        if not isinstance(certificate.signature_hash_algorithm, hashes.SHA256):
             yield Note(
                 "portable.signature-hash",
                 f"{name} is not signed with SHA-256, so Fast DDS rejects this CA.",

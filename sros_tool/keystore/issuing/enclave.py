@@ -1,9 +1,8 @@
 """The only writer of enclaves: it issues, proves and stages their certificates and permissions.
 
-Every command that issues passes an `Issuance` to `EnclaveWriter.write`.  It turns the rights into
-permissions and proves that they match the policy, then signs certificate and permissions, stages
-them in a transaction, and records them for the ledger.  For many enclaves, several processes share
-the work.
+Every command that issues passes an `Issuance` to `EnclaveWriter.write`, which turns the rights into
+permissions, proves that they match the policy, signs certificate and permissions, stages them in a
+transaction, and records them for the ledger.  For many enclaves, several processes share the work.
 """
 
 from __future__ import annotations
@@ -71,8 +70,8 @@ _NOTED_LOSS = 0.01
 class NewIdentity:
     """The subject and the key that a certificate is issued for.
 
-    ``new_key`` is the private key if it was just generated; it is staged with the certificate,
-    or if it is on a token, its place.
+    ``new_key`` is the private key if it was just generated; the key, or its place if it is on a
+    token, is staged with the certificate.
     """
 
     subject: x509.Name
@@ -82,7 +81,7 @@ class NewIdentity:
 
 @dataclass(frozen=True, slots=True)
 class StatedRights:
-    """The rights that a policy states for an enclave, on the domains of the keystore."""
+    """The rights that a policy states for an enclave, and the ROS domains that they apply to."""
 
     enclave: Enclave
     domains: DomainSet
@@ -90,10 +89,10 @@ class StatedRights:
 
 @dataclass(frozen=True, slots=True)
 class Issuance:
-    """The certificate and permissions to issue for one enclave.
+    """The certificate and permissions to issue for an enclave.
 
-    ``identity`` is the certificate that the enclave keeps, or the subject and key of a new one.
-    Without ``rights`` the permissions do not change.
+    ``identity`` is the certificate that the enclave keeps, or the subject and key of a new
+    certificate.  With ``rights`` None, the permissions do not change.
     """
 
     name: str
@@ -117,7 +116,8 @@ class Issued:
     short_lived: bool = False
 
     def notes(self) -> Iterator[Note]:
-        """Yield notes on permissions that are not portable, or differ from those of ros2/sros2."""
+        """Yield notes on short-lived enclaves, and on permissions that ros2/sros2 treats
+        otherwise."""
         name, rights = self.issuance.name, self.issuance.rights
         if isinstance(rights, StatedRights) and len(rights.enclave.profiles) > 1:
             yield Note(
@@ -129,8 +129,8 @@ class Issued:
             end = validity_of(self.certificate).not_after
             yield Note(
                 "enclave.short-lived",
-                f"{name}: it expires at {iso(end)}, as [[enclaves]] of the keystore's sros.toml "
-                "chooses for it. `sros renew` issues it again.",
+                f"{name} expires at {iso(end)}, as [[enclaves]] in the keystore's sros.toml "
+                "sets. `sros renew` issues it again.",
             )
         if self.document:
             yield from document_notes(name, self.permissions, len(self.document))
@@ -140,12 +140,12 @@ class Issued:
 
 
 class EnclaveWriter:
-    """Writer of enclaves: issues certificates and permissions within one transaction.
+    """Writer of enclaves, which issues certificates and permissions within one transaction.
 
-    ``identity`` signs certificates, ``permissions`` signs permissions.  ``entries`` are for the
-    ledger; ``grants`` are the new permissions of enclaves, kept where there is a Zenoh network.
-    ``notes`` report CAs that expire too early for the validity that the template chooses.
-    ``keys_on_token``: enclaves get keys on a token.
+    ``identity`` signs certificates, ``permissions`` signs permissions.  ``entries`` collects
+    entries for the ledger; ``grants`` collects the new grants of enclaves, if the keystore has a
+    Zenoh network.  ``notes`` report CAs that expire too early for the validity that the template
+    chooses.  ``keys_on_token`` says that enclaves get keys on a token.
     """
 
     def __init__(
@@ -180,16 +180,19 @@ class EnclaveWriter:
             self._permissions_validity = self._permissions_validity.within(
                 validity_of(permissions.certificate)
             )
-        signs = (each.on_token for each in (identity, permissions) if each)
+        signs = (authority.on_token for authority in (identity, permissions) if authority)
         self._key_on_token = keys_on_token or any(signs)
 
     @property
     def expiry(self) -> datetime:
-        """When the first of what is written expires, unless its enclave is short-lived."""
+        """The first expiry of the certificates and permissions that are written.
+
+        Short-lived enclaves expire earlier.
+        """
         return min(self._certificate_validity.not_after, self._permissions_validity.not_after)
 
     def write(self, issuance: Issuance) -> Issued:
-        """Issue, prove, sign and stage ``issuance``, and record it for the ledger.
+        """Issue, prove, sign, stage and record an enclave's certificate and permissions.
 
         A certificate expires with the identity CA at the latest; permissions expire with their
         certificate and with the permissions CA at the latest.
@@ -231,10 +234,10 @@ class EnclaveWriter:
     def would_only_date(
         self, rights: StatedRights, certificate: x509.Certificate, validity: Window, text: bytes
     ) -> bool:
-        """Return whether `write` would sign a document again only to change its dates, too early.
+        """Return whether `write` would only change dates that are still far enough away.
 
-        ``text`` is the document, with LF line ends, and ``validity`` its own, which lasts until two
-        thirds of what a new one would have are over (`Window.lasts`).
+        ``text`` is the present document, with LF line ends, and ``validity`` its validity, which is
+        long enough until two thirds of a new validity are over (`Window.lasts`).
 
         Raises:
             KeystoreError: the permissions would not decide as the policy does.
@@ -247,7 +250,7 @@ class EnclaveWriter:
         return render_permissions(permissions) == text
 
     def _validity(self, name: str, usual: Window) -> Window:
-        """Return the validity of what is issued for an enclave; shorter if it is short-lived."""
+        """Return the validity ``usual``, shortened if the enclave is short-lived."""
         longest = self._template.longest_validity(name)
         return usual if longest is None else usual.within(window(self._now, longest))
 
@@ -288,10 +291,11 @@ class EnclaveWriter:
         work: Callable[[str], Result],
         progress: Progress | None = None,
     ) -> dict[str, Result]:
-        """Run ``work`` for each enclave on all cores, and map the enclaves to the results.
+        """Run ``work`` for each enclave on all cores; map the enclaves to the results.
 
-        All that forked workers issue and stage is added to this writer and its transaction.  The
-        session of a token does not survive a fork, so with a key on a token there are no workers.
+        Everything that forked workers issue and stage is added to this writer and its transaction.
+        With a CA key on a token, no workers are forked: the session of a token does not survive a
+        fork.
         """
         own_process = os.getpid()
 
@@ -308,15 +312,15 @@ class EnclaveWriter:
             return results, self.entries[first:], signed
 
         slices = self._transaction.on_all_cores(names, work_on, alone=self._key_on_token)
-        found: dict[str, Result] = {}
+        results_by_name: dict[str, Result] = {}
         for index, (part, (results, entries, signed)) in enumerate(slices):
             if index:  # this process did the first slice, forked workers did the others
                 self.entries += entries
                 self.signed |= signed
                 for name in part if progress else ():
                     progress(name)  # type: ignore[misc]
-            found |= zip(part, results, strict=True)
-        return found
+            results_by_name |= zip(part, results, strict=True)
+        return results_by_name
 
 
 def _permissions(
@@ -354,10 +358,14 @@ def _early_expiry(
 
 
 def stated_enclave(policy: Policy, name: str) -> Enclave:
-    """Return a policy's rights for an enclave; raise `PolicyError` if it has none."""
+    """Return the rights that a policy states for an enclave.
+
+    Raises:
+        PolicyError: the policy does not have the enclave.
+    """
     enclave = policy.enclave(name)
     if enclave is None:
-        present = ", ".join(each.path for each in policy.enclaves)
+        present = ", ".join(enclave.path for enclave in policy.enclaves)
         raise PolicyError(
             f"unable to find enclave {name} in the policy '{policy.file}'",
             f"The policy has {present or 'no enclaves'}.",
@@ -380,7 +388,7 @@ def present_files(root: Path, name: str) -> set[str]:
     folder = enclave_path(root, name)
     try:
         names = os.listdir(folder)
-        return {each for each in names if os.path.exists(f"{folder}/{each}")}  # noqa: PTH110
+        return {file for file in names if os.path.exists(f"{folder}/{file}")}  # noqa: PTH110
     except FileNotFoundError:
         return set()
 

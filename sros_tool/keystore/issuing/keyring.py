@@ -1,4 +1,4 @@
-"""The private keys of the CAs: in the keystore, in another file, or on a PKCS #11 token.
+"""The private keys of the CAs: in the keystore, in another file, or on a PKCS#11 token.
 
 The library never prompts for a secret: it calls the secrets handler of its caller.
 """
@@ -43,7 +43,7 @@ def no_secrets(what: str) -> str:
     raise PkiError(
         f"{what} is needed",
         "The keyring has no secrets handler to ask for it.",
-        "Pass one, as in `Keyring(secrets=...)`.",
+        "Pass a handler, as in `Keyring(secrets=...)`.",
     )
 
 
@@ -54,8 +54,9 @@ class Keyring:
     ``places`` maps a role ("identity", "permissions") to the URI of its key, ``file:PATH`` or
     ``pkcs11:...``, as the user named it.  For a role without an entry, the keystore's settings name
     the place.
-    ``secrets`` returns passphrases and PINs.  With ``encrypt``, new key files get a passphrase,
-    which may be short only with ``short_passphrase``.
+
+    ``secrets`` returns passphrases and PINs.  With ``encrypt``, new key files get a passphrase;
+    only with ``short_passphrase`` may it have less than 12 characters.
     """
 
     secrets: Secrets = no_secrets
@@ -64,7 +65,7 @@ class Keyring:
     short_passphrase: bool = False
 
     def __post_init__(self) -> None:
-        """Raise `UsageError` for a place that is not a valid URI, before it is written anywhere."""
+        """Raise `UsageError` if a place is not a valid URI, before anything is written."""
         for place in self.places.values():
             refuse_pin(place)
             if is_token_uri(place):
@@ -90,7 +91,7 @@ class Keyring:
             path = key_path(root, place)
             if not path.exists():
                 raise KeystoreError(
-                    f"the key of the {role} CA is not at '{path}'",
+                    f"the key of the {role} CA is missing: '{path}'",
                     "It may be kept elsewhere on purpose.",
                     f"Put it back for this command, or set SROS_{role.upper()}_KEY to its place. "
                     "No new CA is created, because it would lock out every existing enclave.",
@@ -111,15 +112,16 @@ class Keyring:
         *,
         compared: bool = False,
     ) -> PrivateKey:
-        """Return the key for a new CA: the key already at its place, or a new key created there.
+        """Return the key for a new CA: the existing key at its place, or a new key created there.
 
-        ``file`` is the path in the keystore for a new key that has no other place.  A dry run opens
-        a token only if the key is ``compared`` with a certificate; otherwise any key will do.
+        ``file`` is the path in the keystore of a new key if nobody named another place.  A dry run
+        opens a token only if the key is ``compared`` with a certificate; otherwise it returns a
+        temporary key.
 
         Raises:
-            KeystoreError: the template alone names a key that exists, and no certificate that
-                the user chose is ``compared`` with it: whoever wrote the template could have
-                another CA of the user sign for the new keystore.
+            KeystoreError: only the template names the place of an existing key, and the key is not
+                ``compared`` with a certificate that the user chose: whoever wrote the template
+                could make another CA of the user sign for the new keystore.
         """
         place = self.places.get(role) or (
             template.identity_key if role == IDENTITY else template.permissions_key
@@ -150,8 +152,8 @@ class Keyring:
         """Raise `KeystoreError` unless the user chose the existing key for a new CA."""
         if not (compared or self._is_named(role)):
             raise KeystoreError(
-                f"the template names a key that exists, for the {role} CA: '{place}'",
-                "What the new keystore signs could then be used wherever a CA with that key is "
+                f"the template names an existing key for the {role} CA: '{place}'",
+                "Whatever the new keystore signs would be valid wherever a CA with that key is "
                 "trusted.",
                 f"If that is intended, name it yourself: --{role}-key {quote(place)}.",
             )
@@ -167,9 +169,13 @@ class Keyring:
     def _read(self, keystore: Keystore, path: Path, role: str) -> bytes:
         """Return the PEM of a CA key.
 
-        By its settings or a link, the keystore of another user could have a CA sign that only this
-        user can read.  So its key has to belong to the owner of the keystore, too, unless the user
-        named the place.
+        The settings or a link in another user's keystore could name a CA key that only this user
+        can read, to make it sign.  So the key has to belong to the owner of the keystore, too,
+        unless the user named the place.
+
+        Raises:
+            KeystoreError: the key file cannot be read, or belongs to another user than the
+                keystore.
         """
         what, root = f"{role} CA key", keystore.root
         owner = root.stat().st_uid if root.exists() else os.geteuid()
@@ -181,12 +187,12 @@ class Keyring:
             raise KeystoreError(
                 error.what,
                 error.why,
-                f"The keystore '{root}' of user {owner} names it. If that CA shall sign for it, "
+                f"The keystore '{root}' of user {owner} names this key. If the CA may sign for it, "
                 f"set SROS_{role.upper()}_KEY=file:{path}; otherwise find out who changed it.",
             ) from error
 
     def _is_named(self, role: str) -> bool:
-        """Return whether the user named the place, not a file that may come from others."""
+        """Return whether the key location came from the user rather than from keystore settings."""
         return bool(self.places.get(role))
 
     def _new_passphrase(self, role: str) -> str:
@@ -196,8 +202,8 @@ class Keyring:
             raise UsageError(
                 f"the passphrase of the new {role} CA key is too short",
                 f"It has {length} characters. Whoever copies the key can try passphrases without "
-                "limit, and short ones are found.",
-                f"Choose one of at least {_SHORTEST_PASSPHRASE} characters, or insist with "
+                "limit, and finds a short one.",
+                f"Choose at least {_SHORTEST_PASSPHRASE} characters, or allow a short one with "
                 "SROS_SHORT_PASSPHRASE=1 (in Python, short_passphrase=True).",
             )
         return passphrase
@@ -211,7 +217,7 @@ IN_KEYSTORE = Keyring()
 
 
 def check_places(keyring: Keyring, template: Template) -> None:
-    """Raise `KeystoreError` if a single CA is given different places for its key."""
+    """Raise `KeystoreError` if the roles of a single CA have different places for its key."""
     named = {role: keyring.places.get(role) for role in ROLES}
     if not template.separate_authorities and len({place or "" for place in named.values()}) > 1:
         raise KeystoreError(
@@ -241,7 +247,7 @@ def check_imported_keys(roles: Iterable[str], keyring: Keyring, template: Templa
 def _write_outside(path: Path, pem: bytes, transaction: Transaction) -> None:
     """Write a key file outside the keystore; remove it if the transaction fails.
 
-    It belongs to the owner of the keystore, who needs it, if the folder does, too.
+    The file belongs to the owner of the keystore, who needs it, if the folder belongs to that user.
     """
     root = transaction.root
     write_new_file(path, pem, for_user=root.stat().st_uid if root.exists() else None)

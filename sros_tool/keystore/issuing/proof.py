@@ -40,8 +40,8 @@ from sros_tool.policy.patterns import common_name, matches, overlap
 _ASKED = (Vendor.STANDARD, Vendor.FAST)
 """The vendors that must decide as the policy does.
 
-Fast DDS 2.9 decides on these documents as 2.14 does.  Cyclone DDS 0.10 is left out, because it
-denies a topic in both directions if one is denied.  No document can avoid that; a note reports it
+Fast DDS 2.9 decides on these documents as 2.14 does.  Cyclone DDS 0.10 is left out: a topic that is
+denied in one direction is denied in both there.  No document can avoid that; a note reports it
 (``portable.deny-blocks-topic``).
 """
 
@@ -53,13 +53,16 @@ _ACTION_TOPICS = ("feedback", "status")
 
 
 def _service(client: bool, part: str = "") -> tuple[tuple[str, str, str], ...]:
-    """Return the direction, prefix and suffix of both DDS topics of a service."""
+    """Return (direction, prefix, suffix) of both DDS topics of a service.
+
+    ``part`` stands between the name and the suffix, as in the services of an action.
+    """
     ask, answer = (_OUT, _IN) if client else (_IN, _OUT)
     return (ask, "rq", f"{part}Request"), (answer, "rr", f"{part}Reply")
 
 
 def _action(client: bool) -> tuple[tuple[str, str, str], ...]:
-    """Return the direction, prefix and suffix of all DDS topics of an action."""
+    """Return (direction, prefix, suffix) of all DDS topics of an action."""
     direction = _IN if client else _OUT
     services = (end for p in _ACTION_SERVICES for end in _service(client, f"/_action/{p}"))
     return (*services, *((direction, "rt", f"/_action/{topic}") for topic in _ACTION_TOPICS))
@@ -94,14 +97,18 @@ class ExpressionSets:
         )
 
     def says(self, stated: ExpressionSets) -> bool:
-        """Return whether these match the same names as ``stated``, of which they are a part."""
+        """Return whether these sets match the same names as ``stated``.
+
+        They have to be subsets of ``stated``, without only such names that a wildcard matches
+        anyway.
+        """
         return all(
             own <= theirs and _matched_anyway(theirs - own, own)
             for own, theirs in self.beside(stated)
         )
 
     def beside(self, other: ExpressionSets) -> Iterator[tuple[set[str], set[str]]]:
-        """Yield each of these sets with the one of ``other`` for the same side and direction."""
+        """Yield pairs of a set here and the set of ``other`` for the same side and direction."""
         for own, theirs in ((self.allowed, other.allowed), (self.denied, other.denied)):
             for verb in (_OUT, _IN):
                 yield own[verb], theirs[verb]
@@ -117,42 +124,46 @@ class ExpressionSets:
 class Disagreement:
     """A DDS topic on which policy and permissions differ.
 
-    ``meant`` is whether the policy allows it, ``outcome`` is the decision of ``vendor``.
+    ``allowed`` says whether the policy allows it; ``outcome`` is the decision of ``vendor``.
     """
 
     verb: str
     topic: str
-    meant: bool
+    allowed: bool
     vendor: Vendor
     outcome: Outcome
 
     def __str__(self) -> str:
         """Return text such as ``publish rt/x is allowed, but Fast DDS 2.14 decides: denied``."""
-        meant = "allowed" if self.meant else "denied"
+        stated = "allowed" if self.allowed else "denied"
         return (
-            f"{self.verb} {self.topic} is {meant}, but {self.vendor.title} decides: {self.outcome}"
+            f"{self.verb} {self.topic} is {stated}, but {self.vendor.title} decides: {self.outcome}"
         )
 
 
 def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None:
     """Raise `KeystoreError` unless ``permissions`` decide as ``policy`` does on all ``domains``."""
     stated = stated_expressions(policy)
-    wildcards = {each for each in stated.all() if is_expression(each)}
+    wildcards = {expression for expression in stated.all() if is_expression(expression)}
     signed = signed_expressions(permissions, domains)
     if signed and signed.says(stated) and all(map(matched_as_meant, wildcards)):
         return
-    found = differences(policy, permissions, domains)
-    if found:
+    disagreements = differences(policy, permissions, domains)
+    if disagreements:
         raise KeystoreError(
             f"the permissions of {policy.path} would not match the policy",
-            f"By the policy, {found[0]}"
-            + (f" (and {len(found) - 1} more differences)." if len(found) > 1 else "."),
+            f"By the policy, {disagreements[0]}"
+            + (
+                f" (and {len(disagreements) - 1} more differences)."
+                if len(disagreements) > 1
+                else "."
+            ),
             "Nothing was written. This is a defect of sros: please report it with the policy.",
         )
 
 
 def _matched_anyway(left_out: set[str], present: set[str]) -> bool:
-    """Return whether all of ``left_out`` are names that wildcards in ``present`` match."""
+    """Return whether wildcards in ``present`` match all of ``left_out``, which are plain names."""
     if not left_out:
         return True
     wildcards = list(filter(is_expression, present))
@@ -176,18 +187,18 @@ def matched_as_meant(expression: str) -> bool:
 
 def stated_expressions(policy: Enclave) -> ExpressionSets:
     """Return an enclave's rights in a policy as DDS expressions, with the ROS discovery topic."""
-    found = ExpressionSets.none()
+    expressions = ExpressionSets.none()
     for verb in (_OUT, _IN):
-        found.allowed[verb].add(ROS_DISCOVERY_TOPIC)
+        expressions.allowed[verb].add(ROS_DISCOVERY_TOPIC)
     for profile in policy.all_profiles():
         ns, node = profile.ns, profile.node
         for group in profile.groups:
             names = [expand(name, ns, node) for name in group.names]
             for right, qualifier in group.rights:
-                into = found.allowed if qualifier is ALLOW else found.denied
+                into = expressions.allowed if qualifier is ALLOW else expressions.denied
                 for verb, before, behind in _ENDPOINTS[right]:
                     into[verb].update([f"{before}{name}{behind}" for name in names])
-    return found
+    return expressions
 
 
 def signed_expressions(permissions: Permissions, domains: DomainSet) -> ExpressionSets | None:
@@ -197,19 +208,19 @@ def signed_expressions(permissions: Permissions, domains: DomainSet) -> Expressi
     """
     if len(permissions.grants) != 1 or permissions.grants[0].default_allow:
         return None
-    found = ExpressionSets.none()
+    expressions = ExpressionSets.none()
     allowing = False
     for rule in permissions.grants[0].rules:
         if (allowing and not rule.allow) or rule.domains != domains or rule.relay:
             return None
         allowing = rule.allow
-        into = found.allowed if allowing else found.denied
+        into = expressions.allowed if allowing else expressions.denied
         for verb, all_criteria in ((_OUT, rule.publish), (_IN, rule.subscribe)):
             for criteria in all_criteria:
                 if criteria.partitions or criteria.data_tags:
                     return None
                 into[verb].update(criteria.topics)
-    return found
+    return expressions
 
 
 # ── comparison by the decision engine ────────────────────────────────────────────────────
@@ -221,40 +232,41 @@ def differences(
     domains: DomainSet,
     vendors: Iterable[Vendor] = _ASKED,
 ) -> list[Disagreement]:
-    """Return the differences between the vendors' decisions and the policy.
+    """Return the topics on which a vendor decides otherwise than the policy.
 
-    They are compared for the `example_topics` of all expressions together, and of each expression
-    with wildcards alone, and for a topic of each expression that only one of both has.
+    The topics compared are the `example_topics` of all expressions together and of each wildcard
+    expression alone, and a topic of each expression that only the policy or only the permissions
+    have.
     """
     stated = stated_expressions(policy)
     expressions = {*stated.all(), *_topics(permissions)}
     topics = set(example_topics(expressions))
-    for each in filter(is_expression, expressions):
-        topics.update(example_topics([each]))
+    for expression in filter(is_expression, expressions):
+        topics.update(example_topics([expression]))
     signed = signed_expressions(permissions, domains)
     for pair in signed.beside(stated) if signed else ():
-        for one, other in (pair, pair[::-1]):
-            names = (common_name([each], sorted(other), absolute=False) for each in one - other)
+        for left, right in (pair, pair[::-1]):
+            names = (common_name([n], sorted(right), absolute=False) for n in left - right)
             topics.update(filter(None, names))
-    found = []
+    disagreements = []
     for vendor in vendors:
         for domain in _ends(domains):
             access = _access(vendor, permissions, domain)
             for topic in sorted(topics):
                 for verb in (_OUT, _IN):
-                    meant = stated.allow(verb, topic)
+                    allowed = stated.allow(verb, topic)
                     outcome = access.decide(AccessVerb(verb), topic).outcome
-                    if outcome.ok != meant:
-                        found.append(Disagreement(verb, topic, meant, vendor, outcome))
-    return found
+                    if outcome.ok != allowed:
+                        disagreements.append(Disagreement(verb, topic, allowed, vendor, outcome))
+    return disagreements
 
 
 def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
     """Return sorted example topics that distinguish the expressions.
 
-    They are: each expression without wildcards; for each expression with wildcards a topic that it
-    matches, one that no other expression matches, and one that it shares with each overlapping
-    expression; and for each ROS prefix a topic that no expression matches.
+    These are every expression without wildcards; for each expression with wildcards, a topic that
+    it matches, a topic that no other expression matches, and a topic that it shares with each
+    overlapping expression; and for each ROS prefix a topic that no expression matches.
     """
     known = sorted(set(expressions))
     wild = [each for each in known if is_expression(each)]
@@ -277,11 +289,13 @@ def _matched(expression: str) -> str | None:
     return common_name([expression], absolute=False) if is_expression(name) else name
 
 
-def _only(one: str, known: list[str]) -> str | None:
-    """Return a name that only the expression ``one`` matches, or None if no simple name does."""
+def _only(expression: str, known: list[str]) -> str | None:
+    """Return a name that only ``expression`` matches; None if no simple name is like that."""
     for letter in ("never_mentioned", "n", "0", ""):
-        name = _SET.sub(_member, one).replace("*", letter).replace("?", "n")
-        if matches(one, name) and not any(matches(each, name) for each in known if each != one):
+        name = _SET.sub(_member, expression).replace("*", letter).replace("?", "n")
+        if matches(expression, name) and not any(
+            matches(other, name) for other in known if other != expression
+        ):
             return name
     return None
 
@@ -292,13 +306,16 @@ def _member(found: re.Match[str]) -> str:
 
 
 def _ends(domains: DomainSet) -> tuple[int, ...]:
-    """Return the first and the last domain of each range."""
+    """Return the first and the last domain of each range in ``domains``, sorted."""
     ends = ((part.first, part.last) for part in domains.closed().ranges)
     return tuple(sorted({end for pair in ends for end in pair if end is not None}))
 
 
 def _access(vendor: Vendor, permissions: Permissions, domain: int) -> Access:
-    """Return the vendor's decisions for the subject of the first grant, during its validity."""
+    """Return an `Access` that decides as ``vendor``, for the subject of the first grant.
+
+    Its time is the middle of the grant's validity.
+    """
     grant = permissions.grants[0]
     window = grant.validity
     middle = window.not_before + (window.not_after - window.not_before) / 2
@@ -326,5 +343,5 @@ def _topics(permissions: Permissions) -> Iterator[str]:
 
 def _any_matches(expressions: set[str], topic: str) -> bool:
     return topic in expressions or any(
-        matches(each, topic) for each in expressions if is_expression(each)
+        matches(expression, topic) for expression in expressions if is_expression(expression)
     )

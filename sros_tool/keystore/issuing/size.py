@@ -41,14 +41,14 @@ from sros_tool.values import DryRun, FileChanges, Notes, shows
 from sros_tool.wording import first_few
 
 _SHOWN = 5
-"""The number of robots that a note names."""
+"""Largest number of robots that a note names."""
 _LINE = len("<topic></topic>\r\n")
 
 
 class SizeEstimator:
     """Estimator of the size of signed permissions, which signs them with a temporary key.
 
-    The error is below 100 bytes: the name of the CA and the signature vary in length.
+    The error is below 100 bytes: CA name and signature vary in length.
     """
 
     def __init__(self) -> None:
@@ -70,9 +70,9 @@ class SizeEstimator:
 
 
 def right_bytes(right: Right) -> int:
-    """Return the size in bytes of one right in a large permissions document.
+    """Return the size in bytes of a right in a large permissions document.
 
-    It has one line per DDS topic.  In a smaller document the lines are indented as well.
+    A right takes a line per DDS topic.  In a smaller document the lines are indented, too.
     """
     names = dds_names(right.right, right.name)
     return sum(_LINE + len(name) for name in (*names.publish, *names.subscribe))
@@ -88,11 +88,11 @@ class PermissionsBytes(NamedTuple):
     """Size of the signed permissions."""
 
     before: int
-    """Bytes before."""
+    """Size before the policy was minimized."""
     after: int
-    """Bytes after."""
+    """Size after the policy was minimized."""
     limit: int = MAX_SIGNED_BYTES
-    """Bytes that Fast DDS 2.9 no longer reads."""
+    """Size from which Fast DDS 2.9 refuses permissions."""
 
 
 @shows(spread=("use",))
@@ -100,20 +100,20 @@ class MinimizedEnclave(NamedTuple):
     """An enclave."""
 
     use: EnclaveUse
-    """Its rights, and those that were observed."""
+    """The enclave's rights, and the rights that were observed."""
     bytes: PermissionsBytes
     """Size of the signed permissions."""
     proposals: tuple[WildcardProposal, ...]
-    """Wildcards that would make permissions small enough."""
+    """Wildcards that would make the permissions small enough."""
 
 
 class PolicyMinimization(NamedTuple):
     """The rights of a policy that were observed in use."""
 
     policy: Path
-    """POLICY, as it was named."""
+    """POLICY, as given on the command line."""
     output: Path | None
-    """The file that was written, or null."""
+    """The file that was written; null if none was."""
     enclaves: Sequence[MinimizedEnclave]
     """The enclaves of the policy."""
     dry_run: DryRun
@@ -122,7 +122,7 @@ class PolicyMinimization(NamedTuple):
 
 
 class Minimization(NamedTuple):
-    """A policy without the rights that were not observed, and what of each enclave was."""
+    """A policy reduced to the observed rights, and the result for each enclave."""
 
     document: bytes
     enclaves: Sequence[MinimizedEnclave]
@@ -142,30 +142,30 @@ def minimized_policy(
     Args:
         file: the policy.
         observed: policies or permissions with the rights that were observed.
-        fleet: the robots that placeholders of the policies stand for.  What was observed of some
-            stays for all robots of the same enclave, and sizes are those of the longest path.
+        fleet: the robots that placeholders of the policies stand for.  A right observed on one
+            robot stays for all robots; sizes are computed for the robot with the longest path.
         strict: also remove unused rights that every node needs.
         output: where the policy is going to be written.
 
     Raises:
         PolicyError: a policy cannot be read, or would change when it is written.
     """
-    given = read_policy(file, placeholders=fleet is not None)
+    policy = read_policy(file, placeholders=fleet is not None)
     sources = [load_rights(path, fleet) for path in observed]
-    used = seen = frozenset(right for source in sources for right in source.rights)
+    used = observed_rights = frozenset(right for source in sources for right in source.rights)
     notes = [note for source in sources for note in source.notes]
-    robots = FleetPolicy(given, fleet) if fleet else None
+    robots = FleetPolicy(policy, fleet) if fleet else None
     if robots:
-        seen = with_placeholders(robots, used)
+        observed_rights = with_placeholders(robots, used)
         notes += _robot_notes(unobserved_robots(robots, used))
-    stated = absolute(given)
-    result = minimize(stated, seen, () if strict else _node_basics())
+    stated = absolute(policy)
+    result = minimize(stated, observed_rights, () if strict else _node_basics())
     if robots:
         check_narrowed(robots, result, used)
-    notes += _scope_notes(given, result, seen)
+    notes += _scope_notes(policy, result, observed_rights)
     narrowed = written(result.policy)
     document = checked_text(narrowed, output, "narrowed", placeholders=fleet is not None)
-    return Minimization(document, _measured(stated, result, seen, fleet), notes)
+    return Minimization(document, _measured(stated, result, observed_rights, fleet), notes)
 
 
 def _node_basics() -> Sequence[Group]:
@@ -178,41 +178,46 @@ def _node_basics() -> Sequence[Group]:
 def _robot_notes(unobserved: Mapping[str, Sequence[str]]) -> Iterator[Note]:
     for path, robots in unobserved.items():
         text = (
-            f"{path} was never observed for {first_few(robots, _SHOWN)}: what only these "
-            "use is removed, too."
+            f"{path} was never observed for {first_few(robots, _SHOWN)}: rights that only these "
+            "robots use are removed, too."
         )
         yield Note("minimize.robot-never-observed", text)
 
 
-def _scope_notes(given: Policy, result: MinimizedPolicy, seen: Set[Right]) -> Iterator[Note]:
+def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) -> Iterator[Note]:
     unseen = [use.enclave for use in result.uses if not use.observed_at_all]
     if unseen:
-        text = f"never observed, and therefore not changed: {', '.join(unseen)}."
+        text = f"enclaves never observed, and therefore not changed: {', '.join(unseen)}."
         yield Note("minimize.enclave-never-observed", text)
     unknown = sorted(
-        {right.enclave for right in seen} - {enclave.path for enclave in given.enclaves}
+        {right.enclave for right in observed} - {enclave.path for enclave in policy.enclaves}
     )
     if unknown:
-        text = f"observed, but not in the policy: {', '.join(unknown)}."
+        text = f"enclaves observed, but not in the policy: {', '.join(unknown)}."
         yield Note("minimize.enclave-not-in-policy", text)
 
 
 def _measured(
-    given: Policy, result: MinimizedPolicy, seen: Set[Right], fleet: Fleet | None
+    policy: Policy, result: MinimizedPolicy, observed: Set[Right], fleet: Fleet | None
 ) -> list[MinimizedEnclave]:
     """Return the enclaves of a minimized policy with their sizes."""
     estimator = SizeEstimator()
     measured = []
-    for before, after, use in zip(given.enclaves, result.policy.enclaves, result.uses, strict=True):
+    for before, after, use in zip(
+        policy.enclaves, result.policy.enclaves, result.uses, strict=True
+    ):
         sizes = PermissionsBytes(
-            *(estimator.signed_bytes(_longest(Policy((each,)), fleet)) for each in (before, after))
+            *(
+                estimator.signed_bytes(_longest(Policy((enclave,)), fleet))
+                for enclave in (before, after)
+            )
         )
         proposals: tuple[WildcardProposal, ...] = ()
         if sizes.after > MAX_SIGNED_BYTES - _MARGIN:
             proposals = propose_wildcards(
                 after.path,
                 policy_rights(result.policy),
-                policy_rights(given) | seen,
+                policy_rights(policy) | observed,
                 needed=sizes.after - MAX_SIGNED_BYTES + _MARGIN,
                 size=right_bytes,
             )
@@ -221,6 +226,6 @@ def _measured(
 
 
 def _longest(policy: Policy, fleet: Fleet | None) -> Enclave:
-    """Return the only enclave of a policy, or the one of the robot with the longest path."""
+    """Return the only enclave of a policy, expanded for the robot with the longest enclave path."""
     robots = FleetPolicy(written(policy), fleet) if fleet else None
     return robots[max(robots, key=len)] if robots else policy.enclaves[0]

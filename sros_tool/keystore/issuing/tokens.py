@@ -1,4 +1,4 @@
-"""Keys of enclaves on PKCS#11 tokens: their places, and what is to be known of them."""
+"""Keys of enclaves on PKCS#11 tokens: their places, checks of new keys, and notes on them."""
 
 from __future__ import annotations
 
@@ -28,32 +28,32 @@ from sros_tool.xml import read_bytes
 
 
 def token_places(uri: str, names: Sequence[str]) -> Mapping[str, TokenUri]:
-    """Return the place of the key of each enclave: ``uri``, with the name as label if it has none.
+    """Map enclaves to the places of their keys: ``uri``, with the enclave's name as default label.
 
     Raises:
-        UsageError: it is not a PKCS#11 URI, or gives several enclaves one key.
+        UsageError: ``uri`` is not a PKCS#11 URI, or names the same key for several enclaves.
     """
     if not is_token_uri(uri):
         raise UsageError(
-            "--key takes a key on a PKCS#11 token",
-            "Without it, the key is made in a file.",
-            "Write --key 'pkcs11:token=NAME;object=LABEL', or leave it out.",
+            "--key has to be the URI of a key on a PKCS#11 token",
+            "Without --key, the key is made in a file.",
+            "Write --key 'pkcs11:token=NAME;object=LABEL', or leave --key out.",
         )
     places = {name: parse_enclave_uri(uri, name) for name in names}
-    if len({each.object for each in places.values()}) < len(places):
+    if len({place.object for place in places.values()}) < len(places):
         raise UsageError(
             "one key is named for several enclaves",
             "Two enclaves with one key are one identity: each can act as the other.",
-            "Leave object= out, and the label of each key is the name of its enclave.",
+            "Leave object= out: then the label of each key is the name of its enclave.",
         )
     return places
 
 
 def place_in(path: Path) -> TokenUri:
-    """Return the place of the key that a ``key.p11`` names.
+    """Return the place on a token that the file ``key.p11`` at ``path`` names.
 
     Raises:
-        SrosError: it cannot be read, or names none.
+        SrosError: the file cannot be read, or names no key on a token.
     """
     try:
         return read_token_file(read_bytes(path, "place of the key"))
@@ -63,7 +63,7 @@ def place_in(path: Path) -> TokenUri:
 
 @dataclass(frozen=True, slots=True)
 class EnclaveTokens:
-    """The ``places`` of new keys on tokens, by enclave, and what they are compared with."""
+    """The ``places`` of new keys on tokens, by enclave, and the keys they must differ from."""
 
     places: Mapping[str, TokenUri]
     secrets: Secrets
@@ -72,10 +72,10 @@ class EnclaveTokens:
     dry_run: bool = False
 
     def key(self, name: str) -> TokenKey:
-        """Return the key at an enclave's place, made there if it is missing.
+        """Return the key at the enclave's place on the token; create it if it does not exist.
 
         Raises:
-            KeystoreError: it was revoked, or is the key of another enclave or of a CA.
+            KeystoreError: the key was revoked, or is the key of another enclave or of a CA.
             PkiError: the token cannot be used.
         """
         place = self.places[name]
@@ -83,8 +83,8 @@ class EnclaveTokens:
             return planned_key(place)
         key = make_enclave_key(place, self.secrets)
         public, remedy = key.public_key(), "Name another object of the token."
-        for each in (self.authorities.identity, self.authorities.permissions):
-            if each.certificate.public_key() == public:
+        for authority in (self.authorities.identity, self.authorities.permissions):
+            if authority.certificate.public_key() == public:
                 raise KeystoreError(
                     f"the key for enclave {name} is the key of a CA",
                     "Whoever has the robot could issue any identity, or sign any rights.",
@@ -95,21 +95,21 @@ class EnclaveTokens:
         return key
 
     def check_present(self, name: str, root: Path) -> None:
-        """Raise `KeystoreError` if an enclave that has a key has another than the chosen one."""
+        """Raise `KeystoreError` if the key of an existing enclave is not at its chosen place."""
         path = enclave_path(root, name) / KEY_URI_FILE
         if not path.exists() or read_bytes(path, "place of the key") != token_file(
             self.places[name]
         ):
             where = quote(str(root))
             raise KeystoreError(
-                f"enclave {name} of keystore '{root}' has another key already",
+                f"enclave {name} of keystore '{root}' already has another key",
                 "",
                 f"To replace it: `sros renew {where} {name} --key 'pkcs11:...' --revoke-old`.",
             )
 
 
 def token_notes(key: TokenKey) -> Iterator[Note]:
-    """Yield what can go wrong with a key on a token, and with the file of its PIN."""
+    """Yield notes on a token's key that may have been copied, and on the file with the PIN."""
     place = key.place
     if not key.never_left:
         yield Note(
@@ -121,6 +121,6 @@ def token_notes(key: TokenKey) -> Iterator[Note]:
 
 
 def pin_notes(place: TokenUri) -> Iterator[Note]:
-    """Yield why Fast DDS may not use the file that has the PIN of a token, or others may."""
+    """Yield notes on a PIN file that Fast DDS cannot use, or that other users can read."""
     for problem in filter(None, (pin_file_problem(place), pin_line_break(place))):
         yield Note("token.pin-file", f"{problem}.")

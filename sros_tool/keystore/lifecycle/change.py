@@ -1,8 +1,9 @@
-"""The frame of every change of a keystore, and the result that each of them returns.
+"""The frame of every change of a keystore, and the base class of the results.
 
-The order is the same for every verb: lock and recover, open the keystore once, note what was edited
-by hand, say what is to be, prove and sign it, stage it, keep Zenoh in step, write the ledger, ask
-the vendors, and put everything in place at once.  A verb says what is to be; the rest is here.
+The order is the same for every verb: lock and recover, open the keystore once, note files that were
+edited by hand, determine the new state, prove, sign and stage it, update Zenoh configurations,
+write the ledger, check that vendors accept the enclaves, and put everything in place at once.  A
+verb determines the new state; this module does the rest.
 """
 
 from __future__ import annotations
@@ -67,13 +68,13 @@ Result = TypeVar("Result", bound="Changed")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Changed:
-    """What a change did to a keystore; of a dry run, what it would do.
+    """The result of a change of a keystore; of a dry run, the result that it would have.
 
-    ``outcomes`` maps enclaves to what was done with them, such as ``created`` or ``renewed``.
-    ``rights`` has what enclaves gain and lose.  ``works_until`` is the latest expiry of what was
-    replaced, or None if nothing of it works any more.  ``revoked`` is the number of revoked
-    certificates.  ``restart`` are the enclaves whose processes have to be restarted, ``zenoh`` are
-    the configurations for Zenoh.  ``remarks`` are notes on open tasks.
+    ``outcomes`` maps enclaves to outcomes such as ``created`` or ``renewed``.  ``rights`` has the
+    rights that enclaves gain and lose.  ``works_until`` is the latest expiry of replaced files, or
+    None if no replaced file works any more.  ``revoked`` is the number of revoked certificates.
+    ``restart`` are the enclaves whose processes have to be restarted, ``zenoh`` are the Zenoh
+    configurations.  ``remarks`` are notes on open tasks.
     """
 
     root: Path
@@ -89,20 +90,20 @@ class Changed:
     notes: tuple[Note, ...] = ()
 
     def names(self, outcome: str) -> tuple[str, ...]:
-        """Return the enclaves with which this was done."""
+        """Return the names of the enclaves with this outcome."""
         return tuple(name for name, done in self.outcomes.items() if done == outcome)
 
 
 class KeystoreChange:
-    """A keystore that is being changed: a context, from the lock to the flip.
+    """A keystore that is being changed: a context manager, from the lock to the commit.
 
-    What is read of the keystore is read once, when it is first asked for.  A verb may set
-    ``template``, ``domains``, ``fleet`` and the CAs to what is to be; what it issues is signed and
-    recorded with those.  Without `finish`, nothing changes.
+    Every part of the keystore is read once, when it is first needed.  A verb may set ``template``,
+    ``domains``, ``fleet`` and the CAs to their new state, with which everything is signed and
+    recorded.  Without `finish`, nothing changes.
 
-    ``entries`` are for the ledger.  ``notes`` and ``remarks`` are for the result, and so are
-    ``revoked``, the number of revoked certificates, and ``restart``, the enclaves whose processes
-    have to be restarted.
+    ``entries`` are for the ledger.  ``notes``, ``remarks``, ``revoked`` (number of revoked
+    certificates) and ``restart`` (enclaves whose processes have to be restarted) are for the
+    result.
     """
 
     def __init__(
@@ -115,13 +116,13 @@ class KeystoreChange:
         dry_run: bool = False,
         fresh: bool = False,
     ) -> None:
-        """Take what every verb is given.
+        """Prepare the change, without reading or writing anything.
 
         Args:
             root: the keystore.
             now: the time of the change.
             keyring: opens the keys of the CAs.
-            allow_refusal: vendors on which nodes may stop.
+            allow_refusal: vendors whose nodes may stop to work.
             dry_run: change nothing.
             fresh: the keystore does not exist yet.
         """
@@ -167,12 +168,12 @@ class KeystoreChange:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The enclaves before the change, sorted."""
+        """Names of the enclaves before the change, sorted."""
         return self.transaction.enclaves
 
     @cached_property
     def template(self) -> Template:
-        """The settings."""
+        """The settings of the keystore; a verb may replace them."""
         return self.keystore.template
 
     @cached_property
@@ -191,7 +192,7 @@ class KeystoreChange:
         return Authorities(self.identity, self.permissions)
 
     def open_authorities(self) -> None:
-        """Open both CAs with the present settings, which say where their keys are."""
+        """Open both CAs now, with the key places in the present settings."""
         self.authorities  # noqa: B018 - read once
 
     def _authority(self, role: str) -> Authority:
@@ -209,7 +210,7 @@ class KeystoreChange:
 
     @cached_property
     def fleet(self) -> Fleet | None:
-        """The fleet of the keystore, which nobody edited by hand."""
+        """The fleet of the keystore, None without one; raises if its file was edited."""
         return checked_fleet(self.keystore)
 
     @cached_property
@@ -219,31 +220,31 @@ class KeystoreChange:
 
     @cached_property
     def known(self) -> KnownKeys:
-        """The keys that enclaves have or had."""
+        """The keys of present and revoked enclaves."""
         return KnownKeys(self.keystore)
 
     @cached_property
     def recorded(self) -> RecordedRights:
-        """The rights that the ledger has."""
+        """The rights of enclaves that the ledger records."""
         return RecordedRights(self.keystore)
 
     def begin_issuing(self, domain: int | None) -> None:
         """Open the CAs and the governance, and note edits by hand, before enclaves are issued.
 
         Raises:
-            KeystoreError: one of them cannot be used, or ``domain`` is given and not among those of
-                the governance.
+            KeystoreError: a CA or the governance cannot be used, or the governance is not for
+                ``domain``.
         """
         self.open_authorities()
         self.check_domain(domain)
         self.notes += self.edit_notes()
 
     def check_domain(self, domain: int | None) -> None:
-        """Raise `KeystoreError` if ``domain`` is given and not among those of the governance."""
+        """Raise `KeystoreError` if the governance is not for ``domain``; None is accepted."""
         check_domain(self.domains, domain, self.root)
 
     def write_fleet(self, fleet: Fleet, patterns: Collection[str]) -> Fleet:
-        """Stage ``fleet``, with more ``patterns`` of paths, as that of the keystore; return it."""
+        """Stage ``fleet``, with ``patterns`` added, as the keystore's fleet; return it."""
         fleet, entries = write_fleet(self.transaction, self.keystore, fleet, patterns, self.now)
         self.fleet = fleet
         self.entries += entries
@@ -254,10 +255,10 @@ class KeystoreChange:
         return edit_notes(self.keystore, self.governance)
 
     def unrevoked_key(self, name: str, certificate: x509.Certificate) -> PublicKey:
-        """Return the key of an enclave's ``certificate``, to certify it again.
+        """Return the public key of an enclave's ``certificate``, to certify it again.
 
         Raises:
-            KeystoreError: it was revoked.
+            KeystoreError: the key was revoked.
         """
         public: PublicKey = certificate.public_key()  # type: ignore[assignment]
         remedy = f"Give it another key with `sros renew {quote(str(self.root))} {name} --new-key`."
@@ -271,7 +272,7 @@ class KeystoreChange:
         )
 
     def writer(self, *, keys_on_token: bool = False) -> EnclaveWriter:
-        """Return a writer of enclaves with the settings and the CAs that are to be."""
+        """Return a writer of enclaves that uses the new settings and CAs."""
         return EnclaveWriter(
             self.transaction,
             self.template,
@@ -297,9 +298,9 @@ class KeystoreChange:
         )
 
     def revoke(self, replaced: Sequence[Superseded], *, names: Sequence[str] | None = None) -> None:
-        """Revoke all earlier certificates of enclaves whose certificates are ``replaced``.
+        """Revoke all earlier certificates of the enclaves whose certificates are ``replaced``.
 
-        The enclaves ``names`` (default: all) get the list, and have to be restarted.
+        The enclaves ``names`` (default: all) get the revocation list, and have to be restarted.
         """
         if not replaced:
             return
@@ -319,14 +320,14 @@ class KeystoreChange:
         stated: Mapping[str, Enclave | None] | None = None,
         created: Sequence[str] = (),
     ) -> None:
-        """Stage the configurations of Zenoh as they have to be, if there is a Zenoh network.
+        """Stage the Zenoh configurations that the change requires.
 
         Args:
             issued: the new permissions of enclaves.
             gone: the enclaves that are revoked.
-            replaced: those whose earlier certificates are.
-            stated: the policies of enclaves, by whose lines errors are told.
-            created: new enclaves, of which no process runs yet.
+            replaced: the enclaves whose earlier certificates are revoked.
+            stated: the policies of enclaves, whose lines errors name.
+            created: new enclaves, which have no running process yet.
         """
         if self.template.zenoh is None:
             return
@@ -354,9 +355,9 @@ class KeystoreChange:
     # ── the flip ───────────────────────────────────────────────────────────────────────────
 
     def record(self, signer: Authority | None = None) -> None:
-        """Write the ledger, signed by the identity CA or another ``signer``.
+        """Stage the ledger with the new entries, signed by the identity CA or ``signer``.
 
-        Before the first entry in a keystore of ros2/sros2 stands what is there already.
+        In a keystore of ros2/sros2, entries for its existing files come first.
         """
         if not self.entries:
             return
@@ -370,12 +371,12 @@ class KeystoreChange:
         )
 
     def finish(self, *, aim: str = "") -> None:
-        """Put everything in place, unless vendors would refuse enclaves that they accept today.
+        """Commit the change, unless vendors would refuse enclaves that they accept today.
 
-        ``aim`` is what the user wants, if it needs a revocation list, such as ``revoke``.
+        ``aim`` says for error messages why the change needs a revocation list, such as ``revoke``.
 
         Raises:
-            KeystoreError: nodes of a vendor would stop.
+            KeystoreError: nodes of a vendor would stop to work.
         """
         self.notes += refuse_stopping(
             self.transaction,
@@ -392,7 +393,7 @@ class KeystoreChange:
         return another_ca(self.keystore, aim)
 
     def result(self, kind: Callable[..., Result], **more: Any) -> Result:
-        """Return the result of the change, with ``more`` that the verb says of it."""
+        """Return the result, of class ``kind``, with the fields ``more`` of the verb."""
         shared: dict[str, Any] = {
             "root": self.root,
             "dry_run": self.dry_run,
@@ -408,27 +409,27 @@ class KeystoreChange:
 
 
 _ADOPTED = "taken over"
-"""The ``reason`` of ledger entries for what was there before the ledger."""
+"""The ``reason`` of ledger entries for files that existed before the ledger."""
 
 
 def _take_over(
     transaction: Transaction, keystore: Keystore, now: datetime, entries: Iterable[Entry]
 ) -> list[Entry]:
-    """Return ``entries``, after those of what ros2/sros2 left in a keystore; stage its settings.
+    """Return ``entries`` after entries for the files that ros2/sros2 made; stage the settings.
 
-    The first write of sros gives such a keystore settings, with the values that are in force, and a
-    ledger that begins with what is there.  Nothing shows whether something was taken away before:
-    what is recorded is taken on trust, and the entries and the message say so.
+    The first write of sros to a keystore of ros2/sros2 creates settings, with the values in force,
+    and a ledger that begins with the existing files.  Nothing shows whether files were removed
+    before: the recorded files are trusted as they are, and the entries and the message say so.
 
     Only certificates and permissions that the CAs of the keystore signed are recorded.  For a
-    keystore of sros, the entries are returned as they are.
+    keystore of sros, ``entries`` are returned as they are.
     """
     added = list(entries)
     if not keystore.is_of_ros2:
         return added
     before = list(_left_by_ros2(keystore, transaction.enclaves, now))
     transaction.adopt()
-    if not any(each.what == "settings" for each in added):
+    if not any(entry.what == "settings" for entry in added):
         before += _settings_of_ros2(transaction, keystore, now)
     return [*before, *added]
 

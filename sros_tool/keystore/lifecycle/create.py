@@ -53,8 +53,8 @@ class Creation(Changed):
     """The result of creating a keystore or enclaves.
 
     ``outcomes`` has enclaves that were created, changed (with new permissions), completed (with
-    missing files) and kept.  ``restart`` are the enclaves whose processes trust revoked
-    certificates, or have another governance or other rules for Zenoh.
+    missing files) and kept.  ``restart`` are the enclaves whose processes still trust revoked
+    certificates, or still have the old governance or old Zenoh rules.
     """
 
     template: Template
@@ -98,8 +98,8 @@ def create_keystore(
     keys the ``keyring`` opens.
 
     Raises:
-        KeystoreError: ``root`` holds a keystore or a part of one: enclaves of an older CA would
-            not work with a new one.
+        KeystoreError: ``root`` has a keystore or parts of one: enclaves of an older CA would not
+            work with a new CA.
     """
     if not dry_run:
         tidy(root)
@@ -133,8 +133,8 @@ def create_enclaves(
 
     An existing enclave keeps its key and its permissions, and gets its missing files.  ``domain``
     is the caller's ROS_DOMAIN_ID; the governance must name it.  ``key`` is the ``pkcs11:`` URI of
-    the key, which is made on the token if it is not there; without ``object`` in it, the label of
-    the key is the name of its enclave.
+    the key, which is created on the token if it does not exist; without ``object`` in the URI, the
+    label of the key is the name of its enclave.
     """
     return generate_artifacts(
         root,
@@ -160,11 +160,11 @@ def create_permission(
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Creation:
-    """Replace the permissions of existing enclaves with their rights in ``policy``: all or none.
+    """Replace the permissions of existing enclaves with their rights in ``policy``, all or none.
 
-    The replaced permissions work for whoever kept them, until they expire.  ``revoke_old`` ends
-    that: the enclaves get new certificates for the same keys, and all earlier ones are revoked.  On
-    the vendors in ``allow_refusal``, nodes may stop.
+    Whoever kept the replaced permissions can use them until they expire.  ``revoke_old`` prevents
+    that: the enclaves get new certificates for the same keys, and all earlier certificates are
+    revoked.  The nodes of the vendors in ``allow_refusal`` may stop to work.
     """
     for name in names:
         check_enclave_name(name)
@@ -176,7 +176,7 @@ def create_permission(
         for name in names:
             if name not in existing:
                 raise no_such_enclave(change.keystore, name, existing)
-        stated = {each.path: each for each in policy.enclaves}
+        stated = {enclave.path: enclave for enclave in policy.enclaves}
         wanted = {name: stated.get(name) or stated_enclave(policy, name) for name in names}
         _begin(change, domain, protections=stated_protections(wanted.values()))
         rights = write_enclaves(change, wanted, revoke_old=revoke_old)
@@ -202,13 +202,13 @@ def generate_artifacts(
     """Create the named enclaves and the enclaves of policies, with permissions, all or nothing.
 
     If a policy names an existing enclave, the enclave's permissions are replaced, and with
-    ``revoke_old`` its certificate, as by `create_permission`.  Without it, permissions are kept
-    that state the same and do not expire soon (`EnclaveWriter.would_only_date`).  The keystore
-    protects each name at least as the policies say.  If the keystore does not exist and ``create``
-    is given, it is created from that template.
+    ``revoke_old`` its certificate, as by `create_permission`.  Without ``revoke_old``, permissions
+    that state the same rights and do not expire soon are kept (`EnclaveWriter.would_only_date`).
+    The keystore protects each name at least as the policies demand.  If the keystore does not exist
+    and ``create`` is given, it is created from that template.
 
-    With policies for a fleet, which have to be for the same one, the keystore records it, and a
-    keystore that is created is for the domains of the robots.
+    Policies for a fleet have to be for the same fleet, which the keystore records; a new keystore
+    is for the domains of the robots.
 
     Raises:
         KeystoreError: a policy names a revoked enclave that ``enclaves`` does not name, or a robot
@@ -272,7 +272,7 @@ def creation(change: KeystoreChange, rights: tuple[ReplacedRights, ...]) -> Crea
 
 
 def _protecting(policies: Sequence[Policy | FleetPolicy]) -> Iterator[Enclave]:
-    """Yield the enclaves of the policies that say something about protection."""
+    """Yield the enclaves of the policies, of fleet policies only if they state protection."""
     for policy in policies:
         if not isinstance(policy, FleetPolicy):
             yield from policy.enclaves
@@ -281,12 +281,12 @@ def _protecting(policies: Sequence[Policy | FleetPolicy]) -> Iterator[Enclave]:
 
 
 def _domains_of(fleet: Fleet | None, domain: int | None) -> DomainSet:
-    """Return the domains of a new keystore: those of the robots, and ``domain`` or 0 for others."""
+    """Return the domains of a new keystore: the robots' domains, and ``domain`` or 0 for others."""
     robots = fleet.robots.values() if fleet else ()
     named = {robot.domain for robot in robots if robot.domain is not None}
     if not named or domain is not None or any(robot.domain is None for robot in robots):
         named.add(domain or 0)
-    return DomainSet.of(*((each, each) for each in named))
+    return DomainSet.of(*((number, number) for number in named))
 
 
 def _revoked_before(
@@ -303,9 +303,9 @@ def _revoked_before(
     if unasked := [name for name in again if name not in named]:
         raise KeystoreError(
             f"a policy names {', '.join(unasked)}, revoked in keystore '{root}'",
-            "Its policy would create it again, and `distribute_key --all` would export it.",
+            "The policy would create it again, and `distribute_key --all` would export it.",
             f"Remove it from the policy{' or its robot from the fleet file' if fleet else ''}; or, "
-            "to have it again with another key and the rights of the policy, name it, too: "
+            "to create it again with a new key and the rights of the policy, name it with -e: "
             f"`sros generate_artifacts -k {quote(str(root))} -e {' '.join(unasked)} -p POLICY_FILE"
             f"{' --fleet FLEET_FILE' if fleet else ''}`.",
         )
@@ -320,8 +320,8 @@ def refuse_other_template(root: Path, template: Template) -> None:
     if not (named or with_places(plain, present) == present):
         where = quote(str(root))
         raise UsageError(
-            f"keystore '{root}' exists already, with the template {present.name}",
-            f"The template {template.name} would change nothing in it.",
+            f"keystore '{root}' already exists, with the template {present.name}",
+            f"--template {template.name} would have no effect on it.",
             f"Leave --template out, or first run `sros update_keystore {where} --template "
             f"{quote(template.name)} --dry-run`, which shows what it changes, and then without "
             "--dry-run.",
@@ -329,7 +329,7 @@ def refuse_other_template(root: Path, template: Template) -> None:
 
 
 class _StatedEnclaves(Mapping[str, Enclave | None]):
-    """Enclaves with their rights in policies, or None: those of a fleet as they are asked for."""
+    """Map from enclaves to their rights in policies; fleet policies are expanded lazily."""
 
     def __init__(self, sources: Mapping[str, Mapping[str, Enclave] | None]) -> None:
         self._sources = sources
@@ -351,7 +351,11 @@ class _StatedEnclaves(Mapping[str, Enclave | None]):
 def _rights_by_enclave(
     names: Sequence[str], policies: Sequence[Policy | FleetPolicy]
 ) -> Mapping[str, Enclave | None]:
-    """Map enclaves to their rights in the policies, or None; raise if two policies differ."""
+    """Map enclaves to their rights in the policies, None for an enclave without a policy.
+
+    Raises:
+        PolicyError: two policies state different rights for an enclave.
+    """
     sources: dict[str, Mapping[str, Enclave] | None] = {
         check_enclave_name(name): None for name in names
     }
@@ -359,14 +363,14 @@ def _rights_by_enclave(
         stated: Mapping[str, Enclave] = (
             policy
             if isinstance(policy, FleetPolicy)
-            else {each.path: each for each in policy.enclaves}
+            else {enclave.path: enclave for enclave in policy.enclaves}
         )
         for name in stated:
             other = sources.get(name)
-            if other is not None and (one := other[name]) != (enclave := stated[name]):
+            if other is not None and (first := other[name]) != (second := stated[name]):
                 raise PolicyError(
                     f"the enclave {name} is in two policies that differ",
-                    f"It is at {one.source} and at {enclave.source}.",
+                    f"It is at {first.source} and at {second.source}.",
                     "Merge them into one policy, for example with `sros merge_policy`.",
                 )
             sources[name] = stated
@@ -387,12 +391,13 @@ def _begin(
     """Prepare an existing keystore for new enclaves and permissions.
 
     Args:
-        change: the keystore.
-        domain: has to be one of its governance, if it is given.
-        fleet: is staged as that of the keystore, if it is given.
+        change: the change of the keystore.
+        domain: the domain that the governance has to name; None for any.
+        fleet: the fleet to stage as the keystore's fleet; None for no change.
         patterns: the paths of enclaves in policies for the fleet.
-        stated: the enclaves that get the permissions of a policy, unless they have them.
-        protections: what policies demand; a governance that gives it is staged.
+        stated: the enclaves that get the permissions of a policy.
+        protections: the protection that policies demand; the governance is changed if it gives
+            less.
     """
     root = change.root
     change.begin_issuing(domain)
@@ -449,7 +454,7 @@ def _check_free(root: Path) -> None:
         if is_keystore(root):  # another process has just completed it
             raise _already_exists(root)
         raise KeystoreError(
-            f"'{root}' already holds parts of a keystore",
+            f"'{root}' already contains parts of a keystore",
             f"It has {', '.join(remains)}; with a new CA, every enclave that trusts the old CA "
             "would be locked out.",
             "Restore the missing files, or choose another path.",
@@ -457,7 +462,7 @@ def _check_free(root: Path) -> None:
 
 
 def _place_notes(root: Path) -> Iterator[Note]:
-    """Note that users other than this one and root can replace a new keystore."""
+    """Yield a note if users other than this user and root can replace a new keystore."""
     trusted = frozenset({0, os.geteuid()})
     replaceable = list(replaceable_on_the_way(root, trusted))
     if root.exists() and (why := other_writers(root.stat(), trusted)):
@@ -494,7 +499,7 @@ def _check_typo(root: Path) -> None:
     close = difflib.get_close_matches(root.name, siblings, n=3, cutoff=0.5)
     for name in close:
         if _without_digits(name) == _without_digits(root.name):
-            continue  # ks2 next to ks is meant
+            continue  # ks2 next to ks is no typo
         if is_keystore(root.absolute().parent / name):
             raise UsageError(
                 f"'{root}' does not exist, and '{name}' next to it is a keystore",

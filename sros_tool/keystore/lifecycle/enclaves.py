@@ -1,4 +1,4 @@
-"""The enclaves that a change creates or completes, and those whose permissions it replaces."""
+"""Creating and completing enclaves, and replacing their permissions, within a change."""
 
 from __future__ import annotations
 
@@ -72,18 +72,18 @@ def write_enclaves(
 ) -> tuple[ReplacedRights, ...]:
     """Create or complete enclaves, sign the permissions of their policies, and commit the change.
 
-    A keystore with a Zenoh network gets the enclave of its router, too.
+    In a keystore with a Zenoh network, the enclave of the router is created, too.
 
     Args:
-        change: the keystore.
-        wanted: the enclaves with their policies, or None.
-        revoke_old: replace and revoke the certificates of those that get other permissions, too.
-        keep_same: keep permissions that state the rights of a policy already.
-        places: where new keys on tokens are, by enclave; other new keys are in files.
+        change: the change of the keystore.
+        wanted: maps enclaves to their policies, or None.
+        revoke_old: also replace and revoke the certificates of enclaves that get other permissions.
+        keep_same: keep permissions that already state the rights of a policy.
+        places: maps enclaves to the places of new keys on tokens; other new keys are in files.
         progress: called with the name of each enclave that is done.
 
     Returns:
-        What enclaves gain and lose with their new permissions.
+        The rights that enclaves gain and lose with their new permissions.
     """
     network = change.template.zenoh
     if network and network.router not in change.names:
@@ -117,7 +117,7 @@ def write_enclaves(
 
 @dataclass(frozen=True, slots=True)
 class _Made:
-    """What was done to an enclave: ``superseded`` is its old certificate, if that is revoked."""
+    """The outcome for an enclave; ``superseded`` is its old certificate, if it gets revoked."""
 
     outcome: str
     notes: tuple[Note, ...]
@@ -126,7 +126,7 @@ class _Made:
 
 
 class _EnclaveMaker:
-    """Maker of single enclaves of one change."""
+    """Maker of enclaves, one at a time, within a change."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class _EnclaveMaker:
         self._keep_same = keep_same
 
     def make(self, name: str, policy: Enclave | None) -> _Made:
-        """Stage the missing files of an enclave, and permissions that state ``policy`` if given."""
+        """Stage the missing files of an enclave, and permissions for ``policy`` if not None."""
         change, root = self._change, self._root
         present = present_files(root, name)
         before = len(change.transaction.changes)
@@ -185,10 +185,11 @@ class _EnclaveMaker:
         return _Made("completed" if completed else "kept", notes)
 
     def _is_kept(self, certificate: x509.Certificate, rights: StatedRights) -> bool:
-        """Return whether the permissions of an enclave stay, because they state ``rights``.
+        """Return whether an enclave's permissions can stay, because they already state ``rights``.
 
         Raises:
-            KeystoreError: the key of the enclave was revoked, so nobody would accept them.
+            KeystoreError: the key of the enclave was revoked, so DDS would not accept the
+                permissions.
         """
         if not self._keep_same:
             return False
@@ -218,12 +219,12 @@ class _EnclaveMaker:
     ) -> NewIdentity | x509.Certificate:
         """Return the certificate of an enclave, or the subject and key for a new certificate.
 
-        If the enclave has signed permissions, the new certificate gets their subject; if they are
-        ``replaced`` in this step, it may have its own.
+        If the enclave has signed permissions, the new certificate gets their subject, unless they
+        are ``replaced`` in this step.
 
         Raises:
-            KeystoreError: the certificate is not usable, or a new one would fit permissions that
-                are not the latest ones.
+            KeystoreError: the certificate cannot be used, or the present permissions are not the
+                latest.
         """
         change, root = self._change, self._root
         folder = enclave_path(root, name)
@@ -250,13 +251,13 @@ class _EnclaveMaker:
             if path.name == KEY_FILE
             else open_enclave_key(place_in(path), self._tokens.secrets)
         ).public_key()
-        remedy = f"Move '{path}' away, and a new key is created."
+        remedy = f"Move '{path}' away: then a new key is created."
         change.known.refuse_revoked(public, f"enclave {name}", remedy)
         change.known.refuse_second(public, name, remedy)
         return NewIdentity(subject, public)
 
     def _subject_of_permissions(self, name: str, own: x509.Name) -> x509.Name:
-        """Return the subject of a grant in the permissions of an enclave, or its ``own`` one."""
+        """Return the subject in an enclave's signed permissions, or else ``own``."""
         path = enclave_path(self._root, name) / PERMISSIONS_FILE
         for subject in _permissions_subjects(path, self._change.permissions.certificate):
             if common_name_of(subject) == common_name_of(own):
@@ -266,7 +267,11 @@ class _EnclaveMaker:
         return own
 
     def _usable_certificate(self, name: str) -> x509.Certificate:
-        """Return the certificate of an enclave; raise `KeystoreError` if DDS would refuse it."""
+        """Return the certificate of an enclave, after checking its issuer and validity.
+
+        Raises:
+            KeystoreError: DDS would refuse the certificate.
+        """
         path = enclave_path(self._root, name) / CERTIFICATE_FILE
         certificate = self._change.keystore.certificate(path)
         authority = self._change.identity.certificate
@@ -290,14 +295,14 @@ class _EnclaveMaker:
 
 
 def _is_file(path: Path, content: bytes) -> bool:
-    """Return whether there is a file with this content."""
+    """Return whether the file at ``path`` exists and has this content."""
     with suppress(SrosError):
         return read_bytes(path, "permissions document") == content
     return False
 
 
 def _default_rights(template: Template, name: str) -> Enclave:
-    """Return the rights of a new enclave without a policy; the router of Zenoh only routes."""
+    """Return the rights of a new enclave without a policy; the basics for the router."""
     if template.zenoh and template.zenoh.router == name:
         template = replace(template, default_permissions=NODE_BASICS)
     return default_rights(template, name)

@@ -1,4 +1,4 @@
-"""A governance that changes: what to restart and to export again, and policies that change it."""
+"""Changes of a governance: writing it, policies that demand them, and notes on what to restart."""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ def write_governance(
 ) -> None:
     """Sign, stage and record the governance of a keystore that is made from settings.
 
-    Of the enclaves ``names``, those that have a copy in place of the link get the new document,
-    too.
+    Enclaves in ``names`` that have a copy of the document instead of a link get the new one, too.
     """
     document, what = render_governance(governance), "the governance document"
     check_meaning(parse_governance(document), governance, what)
@@ -51,13 +50,14 @@ def write_governance(
 
 
 def raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection]) -> None:
-    """Stage the governance and the settings of an existing keystore if policies demand more.
+    """Stage a governance and settings with more protection, if policies demand more.
 
-    ``stated`` is what policies say about the protection of names.
+    ``stated`` are the statements of policies about the protection of names.
 
     Raises:
         PolicyError: the statements contradict each other, or the settings.
-        KeystoreError: the files of the settings cannot state it, or were edited by hand.
+        KeystoreError: the keystore has no settings that can state it, or its files were edited by
+            hand.
     """
     root, template, governance = change.root, change.template, change.governance
     protection = with_stated(template.protection, stated)
@@ -67,7 +67,7 @@ def raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection])
     demand = f"{less[0].source} demands that {less[0]} has protect={less[0].word!r}"
     if not (root / SETTINGS).exists():
         raise KeystoreError(
-            f"{demand}, and keystore '{root}' has no settings that can say it",
+            f"{demand}, and keystore '{root}' has no settings to state that",
             f"A keystore of ros2/sros2 has no {SETTINGS}.",
             f"Give it settings first: `sros update_keystore {quote(str(root))} --template "
             "NAME|FILE --dry-run` shows what they would change.",
@@ -77,7 +77,7 @@ def raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection])
             f"{demand}, and files of keystore '{root}' were edited by hand: "
             f"{'; '.join(edits.clauses())}",
             "It is unclear which governance to start from.",
-            f"First carry it out or undo it: {edit_remedy(root)}",
+            f"First apply or undo the edit: {edit_remedy(root)}",
         )
     change.template = replace(template, protection=protection)
     after = governance_for(protection, governance.domains().closed())
@@ -88,7 +88,7 @@ def raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection])
     text = (
         f"The governance of the keystore changes, because policies demand it: "
         f"{first_few(demanded, _SHOWN)}. "
-        f"{'; '.join(dict.fromkeys(each.meaning for each in changes[:_SHOWN]))}."
+        f"{'; '.join(dict.fromkeys(change.meaning for change in changes[:_SHOWN]))}."
     )
     change.restart = change.names
     change.remarks += (
@@ -97,7 +97,7 @@ def raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection])
         exports_note(root, change.names),
         Note(
             "keystore.earlier-governance",
-            "The governance of before is still validly signed: whoever changes the files of a "
+            "The signature of the former governance stays valid: whoever changes the files of a "
             "robot can put it back there, until the CA that signed it is replaced (`sros "
             "rotate_ca --help`).",
         ),
@@ -108,23 +108,23 @@ def raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection])
 def refuse_less_protected(
     root: Path, governance: Governance, stated: Sequence[StatedProtection]
 ) -> None:
-    """Raise `KeystoreError` if a policy demands more than the governance of a keystore gives.
+    """Raise `KeystoreError` if a policy demands more protection than the governance gives.
 
-    For what signs a request, which changes no governance: all robots would have to get it.
+    For the signing of requests, which does not change the governance: all robots would need it.
     """
-    for each, level in less_protected(governance, stated):
-        kinds = "data=ENCRYPT" if each.level is Level.ENCRYPT else "metadata=SIGN"
+    for name, level in less_protected(governance, stated):
+        kinds = "data=ENCRYPT" if name.level is Level.ENCRYPT else "metadata=SIGN"
         raise KeystoreError(
-            f"{each.source} demands that {each} has protect={each.word!r}, and keystore '{root}' "
+            f"{name.source} demands that {name} has protect={name.word!r}, and keystore '{root}' "
             f"protects it with {level}",
             "Its governance has to change first, and with it the files of all enclaves.",
             f"Run `sros update_keystore {quote(str(root))} --rule "
-            f"{quote(f'{each} {kinds}')} --dry-run`, and then without --dry-run.",
+            f"{quote(f'{name} {kinds}')} --dry-run`, and then without --dry-run.",
         )
 
 
 def _zenoh_notes(template: Template) -> tuple[Note, ...]:
-    """Return a note on what protection means on Zenoh, if the keystore has files for it."""
+    """Return a note on protection by Zenoh, if the keystore has a Zenoh network."""
     if template.zenoh is None:
         return ()
     text = (
@@ -135,7 +135,7 @@ def _zenoh_notes(template: Template) -> tuple[Note, ...]:
 
 
 def restart_note(disturbed: Mismatch, *, revoked: bool = False) -> Note:
-    """Return which processes to restart in which order; the vendors agree (measured)."""
+    """Return a note on the processes to restart and their order; vendors agree (measured)."""
     return Note("keystore.restart", _restart_text(disturbed, revoked=revoked))
 
 
@@ -157,16 +157,16 @@ def _restart_text(disturbed: Mismatch, *, revoked: bool) -> str:
         )
     return (
         "All vendors: restart the processes one by one, at any time; processes before and after "
-        "the restart communicate. Until its restart, a process has what it had before."
+        "the restart communicate. Until its restart, a process keeps its former files."
     )
 
 
 def exports_note(root: Path, names: Sequence[str]) -> Note:
-    """Return that robots need new files, and how they get them."""
+    """Return a note that robots need new files, with the commands that deliver them."""
     shown = quote(str(root))
-    text = "Robots have the files of before: export them again (`sros distribute_key "
+    text = "Robots have the former files: export the new ones (`sros distribute_key "
     text += f"{shown} NAME TARGET --force`)"
-    remote = [each for each in names if key_on_robot(enclave_path(root, each))]
+    remote = [name for name in names if key_on_robot(enclave_path(root, name))]
     if remote:
         text += f"; for {', '.join(remote)}, answer the request again (`sros sign_request "
         text += f"{shown} REQUEST --renew`)"

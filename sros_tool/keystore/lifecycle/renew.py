@@ -56,22 +56,22 @@ def renew(
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Changed:
-    """Renew the named enclaves, and all that are due by ``expiring``; all or nothing.
+    """Renew the named enclaves, and the enclaves that are due by ``expiring``, all or nothing.
 
-    The new certificate is for the same key, or with ``new_key`` for a new key, or for the one on a
-    token that ``key`` names, as in `create_enclaves`; the signed rights do not change.  All files
-    are replaced at once.  A replaced certificate works for anyone who has its key until it expires
-    or is revoked; ``revoke_old`` revokes all earlier certificates of the renewed enclaves, and
-    gives them subjects that no earlier permissions fit.  On the vendors in ``allow_refusal``, nodes
-    may stop.
+    The new certificate is for the same key; with ``new_key``, for a new key; with ``key``, for the
+    key on a token, as in `create_enclaves`.  The signed rights do not change.  All files are
+    replaced at once.  Whoever has the key can use a replaced certificate until it expires or is
+    revoked; ``revoke_old`` revokes all earlier certificates of the renewed enclaves, and gives them
+    subjects that no earlier permissions fit.  The nodes of the vendors in ``allow_refusal`` may
+    stop to work.
 
     Raises:
-        KeystoreError: enclaves cannot be renewed, and the error names all of them; or vendors would
+        KeystoreError: enclaves cannot be renewed (the error names all of them), or vendors would
             refuse enclaves that they accept today.
     """
     if key and (expiring or new_key):
         raise UsageError(
-            "--key takes the names of its enclaves, and excludes --new-key",
+            "--key needs the names of enclaves, and excludes --new-key and --expiring",
             "It gives the named enclaves new keys on a token.",
             "Name the enclaves, and leave the other options out.",
         )
@@ -97,12 +97,14 @@ def renew(
             unique=change.template.unique_subject or revoke_old,
         )
         replaced = renewer.renew(thresholds, progress)
-        renewed = tuple(each.name for each in replaced)
+        renewed = tuple(certificate.name for certificate in replaced)
         change.notes += (*writer.notes, *renewer.notes) if replaced else ()
         left = writer.expiry - now
         if replaced and expiring and expiring.remaining and left <= expiring.remaining:
-            text = f"what is renewed now expires within {duration_text(expiring.remaining)} again, "
-            text += f"on {iso(writer.expiry)}, so that it is renewed each time: choose a shorter "
+            text = f"the new files expire within {duration_text(expiring.remaining)} again, "
+            text += (
+                f"on {iso(writer.expiry)}, so that they are renewed each time: choose a shorter "
+            )
             change.notes.append(Note("renew.due-again", f"{text}time, or a longer validity."))
         with suppress(SrosError):  # its governance is not what is renewed
             change.notes += change.edit_notes()
@@ -115,7 +117,7 @@ def renew(
             change.keep_zenoh(writer.signed, replaced=renewed if change.revoked else ())
         change.record()
         change.finish(aim="renew with --revoke-old" if revoke_old else "")
-    ends = [each.not_after for each in replaced if each.not_after >= now and not change.revoked]
+    ends = [old.not_after for old in replaced if old.not_after >= now and not change.revoked]
     return change.result(
         Changed,
         outcomes=dict.fromkeys(renewed, "renewed"),
@@ -124,7 +126,7 @@ def renew(
 
 
 class _Renewer:
-    """Renewer of single enclaves; ``notes`` are about their keys."""
+    """Renewer of enclaves, one at a time; ``notes`` are about their keys."""
 
     def __init__(
         self,
@@ -146,9 +148,9 @@ class _Renewer:
     def renew(
         self, thresholds: Mapping[str, Threshold | None], progress: Progress | None
     ) -> list[Superseded]:
-        """Renew enclaves that are due, and return the replaced certificates.
+        """Renew the enclaves that are due; return the replaced certificates.
 
-        Without a threshold, an enclave is always due.
+        ``thresholds`` maps enclaves to the limit from which they are due; None: always.
 
         Raises:
             KeystoreError: enclaves cannot be read; the error names all of them.
@@ -158,9 +160,9 @@ class _Renewer:
             return self._renew_if_due(name, thresholds[name])
 
         done = self._writer.for_each(list(thresholds), renew_one, progress).values()
-        unreadable = tuple(each for each in done if isinstance(each, UnreadableEnclave))
+        unreadable = tuple(result for result in done if isinstance(result, UnreadableEnclave))
         refuse_unreadable(unreadable, "renewed")
-        return [each for each in done if isinstance(each, Superseded)]
+        return [result for result in done if isinstance(result, Superseded)]
 
     def _renew_if_due(
         self, name: str, threshold: Threshold | None
@@ -176,7 +178,8 @@ class _Renewer:
         return Superseded.by(name, state.certificate, issued.certificate, now)
 
     def _issuance(self, state: Credentials) -> Issuance:
-        """Verify the files of an enclave, and return what to issue in their place."""
+        """Return the new certificate and permissions to issue, after verifying the present
+        files."""
         name = state.name
         rights = checked_rights(state, self._change.authorities, self._change.recorded)
         # Once earlier permissions were cut off by a unique subject, they stay cut off.
@@ -199,8 +202,8 @@ class _Renewer:
         if (folder / KEY_URI_FILE).exists():
             raise KeystoreError(
                 f"the key of enclave {name} is on a token",
-                f"A new one in a file would not be used: its {KEY_URI_FILE} names the one there.",
-                f"Make one on the token: `sros renew {quote(str(self._root))} {name} --key "
+                f"A new key in a file would have no effect: {KEY_URI_FILE} names the present key.",
+                f"Make a key on the token: `sros renew {quote(str(self._root))} {name} --key "
                 "'pkcs11:token=NAME;object=LABEL'`, with a label that the token does not have.",
             )
         self._refuse_key_on_robot(name)
@@ -219,12 +222,12 @@ class _Renewer:
 def checked_rights(
     state: Credentials, authorities: Authorities, recorded: RecordedRights
 ) -> SignedRights:
-    """Return the rights of an enclave, after verifying its files, to sign them again.
+    """Return the rights of an enclave, to sign them again, after verifying its files.
 
     Raises:
-        KeystoreError: the CAs of the keystore did not issue its certificate, or the permissions are
-            not the last ones that the ledger has for it.
-        PkiError: the permissions CA did not sign them.
+        KeystoreError: the CAs of the keystore did not issue the certificate, or the permissions are
+            not the last ones that the ledger records for the enclave.
+        PkiError: the permissions CA did not sign the permissions.
     """
     authority = authorities.identity.certificate
     if not issued_by(state.certificate, authority):

@@ -1,7 +1,7 @@
 """The rights that an enclave gains and loses when its permissions are replaced.
 
-DDS Security 1.1 cannot revoke permissions: replaced ones are valid until they expire, for whoever
-kept them with a certificate that they fit (ros2/sros2 issue 275).
+DDS Security 1.1 cannot revoke permissions: whoever kept replaced permissions, with a certificate
+that they fit, can use them until they expire (ros2/sros2 issue 275).
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class EarlierPermissions:
 
 @dataclass(frozen=True, slots=True)
 class ReplacedRights:
-    """What an enclave gains and loses with its new permissions.
+    """The rights that an enclave gains and loses with its new permissions.
 
-    Rights and denials are as their statement would read: a new denial is lost as ``ALLOW`` is.
+    A new denial counts as lost, a removed denial as gained.
     """
 
     enclave: str
@@ -50,15 +50,15 @@ class ReplacedRights:
     gained: tuple[Right, ...]
     """Rights that were added, and denials that were taken away."""
     works_until: datetime | None
-    """Until when the replaced permissions work, in UTC, for whoever kept them with the certificate
-    of that time; null if they no longer do."""
+    """When the replaced permissions expire, in UTC, for whoever kept them with their certificate;
+    null if they no longer work."""
     lost_domains: str = ""
-    """ROS domains for which it had permissions, such as 0,7, and has none any more."""
+    """ROS domains, such as 0,7, for which the enclave no longer has permissions."""
     gained_domains: str = ""
-    """ROS domains for which it had no permissions, and has them now."""
+    """ROS domains for which the enclave has permissions now, and had none before."""
 
     def revoked(self) -> ReplacedRights:
-        """Return the same rights, for a certificate that was revoked."""
+        """Return a copy for an enclave whose earlier certificate is revoked."""
         return replace(self, works_until=None)
 
     def loses(self) -> str:
@@ -78,7 +78,7 @@ def earlier_permissions(
 ) -> EarlierPermissions | None:
     """Return the present permissions of an enclave; None if DDS would refuse them.
 
-    ``authority`` is the permissions CA, ``certificate`` that of the enclave if it was read already.
+    ``authority`` is the permissions CA, ``certificate`` the enclave's, if it was read already.
     """
     with suppress(SrosError):
         certificate = certificate or keystore.certificate_of(name)
@@ -92,7 +92,7 @@ def earlier_permissions(
 def replaced_rights(
     name: str, earlier: EarlierPermissions, grant: Grant, now: datetime
 ) -> ReplacedRights:
-    """Return what changes when ``grant`` replaces the ``earlier`` permissions of an enclave."""
+    """Return the rights gained and lost when ``grant`` replaces ``earlier`` permissions."""
     difference = compare(grant_rights(name, earlier.grant), grant_rights(name, grant))
     lost: list[Right] = []
     gained: list[Right] = []
@@ -110,8 +110,8 @@ def replaced_rights(
         tuple(gained),
         end if end >= now else None,
         *(
-            str(DomainSet.of(*((each, each) for each in one if each not in other)))
-            for one, other in ((before, after), (after, before))
+            str(DomainSet.of(*((domain, domain) for domain in here if domain not in there)))
+            for here, there in ((before, after), (after, before))
         ),
     )
 
@@ -129,7 +129,7 @@ class Superseded:
     def by(
         cls, name: str, old: x509.Certificate, new: x509.Certificate, now: datetime
     ) -> Superseded:
-        """Return the record that ``new`` replaced ``old`` at ``now``."""
+        """Return the record that the certificate ``new`` replaced ``old`` at ``now``."""
         entry = certificate_entry(now, "certificate", old, name)
         key = key_digest(new.public_key())  # type: ignore[arg-type]
         return cls(name, entry, validity_of(old).not_after, key)
@@ -141,7 +141,7 @@ _RIGHTS_SHOWN = 6
 def rights_text(rights: Sequence[Right]) -> str:
     """Return lost or gained rights as text, such as ``publish topic /a, call action /b``.
 
-    A denial that was added is lost, and one that was taken away is gained.
+    An added or removed denial is marked with "(by a denial)".
     """
     described = [
         right.describe() + ("" if right.qualifier is ALLOW else " (by a denial)")
@@ -156,12 +156,12 @@ def _both_text(rights: Sequence[Right], domains: str) -> str:
 
 
 def lasting_text(root: Path, replaced: ReplacedRights) -> str:
-    """Return what still works of the lost rights and what ends it, as sentences; "" if nothing."""
+    """Return sentences on lost rights that still work, and how to end that; "" if none work."""
     if not (replaced.loses() and replaced.works_until):
         return ""
     command = f"`sros renew {quote(str(root))} {quote(replaced.enclave)} --revoke-old`"
     return (
-        f"{replaced.enclave}: what it lost works until {iso(replaced.works_until)} for whoever "
+        f"{replaced.enclave}: its lost rights work until {iso(replaced.works_until)} for whoever "
         "kept its earlier permissions and its key, and in its processes until they are restarted. "
-        f"To end it, run {command}, and restart all processes, those of this enclave first."
+        f"To end that, run {command}, and restart all processes, first those of this enclave."
     )

@@ -1,9 +1,9 @@
 """Signing of the revocation lists of a keystore, in the files that DDS reads.
 
 ``crl.pem`` in every enclave is the list of the issuing identity CA.  During a rotation there is a
-second identity CA; its list is in the file of the identity CAs.  Fast DDS 2.9.1 trusts both CAs and
-reads lists in that file, but reads only one list in ``crl.pem``; Cyclone DDS 0.10.2 trusts the
-issuing CA alone (all measured).
+second identity CA, whose list is in the file of the identity CAs.  Fast DDS 2.9.1 trusts both CAs
+and reads lists in that file, but reads only one list in ``crl.pem``; Cyclone DDS 0.10.2 trusts only
+the issuing CA (all measured).
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def sign_list(
     template: Template,
     now: datetime,
 ) -> SignedList:
-    """Sign a revocation list that expires with its CA at the latest."""
+    """Return a new signed revocation list, which expires with its CA at the latest."""
     validity = validity_of(authority.certificate)
     moment = now.replace(microsecond=0)
     begin = max(moment - BACKDATE, validity.not_before)
@@ -87,23 +87,23 @@ def sign_list(
 
 
 def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> list[Revoked]:
-    """Return the entries of the ``old`` list that the next list repeats.
+    """Return the entries of the ``old`` list that the next list has to repeat.
 
-    These are the certificates that had not expired when the old list was issued: RFC 5280, 3.3,
-    keeps an entry until it was on one list after the certificate's expiry.  ``expiries`` maps
-    serial numbers to expiries (ISO 8601, UTC); an entry without an expiry is always repeated.
+    These are the certificates that had not expired when the old list was issued: by RFC 5280, 3.3,
+    an entry stays until it was on a list after the certificate's expiry.  ``expiries`` maps serial
+    numbers to expiries (ISO 8601, UTC); an entry without an expiry is always repeated.
     """
     if old is None:
         return []
     # thisUpdate is up to BACKDATE before the signing, so some entries are kept a little longer.
     issued = iso(old.this_update)
-    return [each for each in old.revoked if expiries.get(each.serial, issued) >= issued]
+    return [entry for entry in old.revoked if expiries.get(entry.serial, issued) >= issued]
 
 
-def _put_away(keystore: Keystore, known: Container[str] = ()) -> Iterator[x509.Certificate]:
-    """Yield the certificates in ``revoked`` that a trusted identity CA issued.
+def _moved_away(keystore: Keystore, known: Container[str] = ()) -> Iterator[x509.Certificate]:
+    """Yield the certificates in the folder ``revoked`` that a trusted identity CA issued.
 
-    Those whose serial number in hexadecimal is in ``known`` are not read.
+    Certificates whose serial number (hexadecimal) is in ``known`` are not read.
     """
     file = keystore.identity_file
     trusted = keystore.certificates_of(file) if file else ()
@@ -118,9 +118,9 @@ def _put_away(keystore: Keystore, known: Container[str] = ()) -> Iterator[x509.C
 class RevocationListSigner:
     """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
-    ``present`` is the list before the change, or None if there is none, or if no trusted identity
-    CA signed it.  ``remarks`` are sentences about lists that could not be signed or used, and about
-    certificates that nobody may know of.
+    ``present`` is the list before the change; None if there is none, or no trusted identity CA
+    signed it.  ``remarks`` are notes on lists that could not be signed or used, and on certificates
+    that may be missing from the ledger.
     """
 
     def __init__(
@@ -151,31 +151,32 @@ class RevocationListSigner:
     ) -> list[Entry]:
         """Return the ledger entries for revoking all valid certificates of enclaves.
 
-        `sign` then remarks if the ledger may lack some of them.
+        `sign` then remarks if the ledger may lack some of these certificates.
 
         Args:
-            last: the present certificate of each of the enclaves.
+            last: maps the enclaves to their present certificates.
             reason: the reason, as RFC 5280 spells it.
-            keep: the digests of the keys of enclaves that are not revoked with their certificates.
+            keep: maps enclaves to the digests of keys that stay valid, though the certificates do
+                not.
         """
-        listed = {each.serial for each in self.present.revoked} if self.present else set()
+        listed = {entry.serial for entry in self.present.revoked} if self.present else set()
         revocations = []
         moment = iso(self._now)
         present = last
         if keep is not None:  # an expired certificate needs no revocation to be replaced
-            present = {name: each for name, each in last.items() if each.not_after >= moment}
+            present = {name: entry for name, entry in last.items() if entry.not_after >= moment}
         for name, valid in self._still_valid(last, present).items():
-            for serial, each in valid.items():
+            for serial, entry in valid.items():
                 if serial not in listed:
                     listed.add(serial)
-                    key = "" if keep and each.key == keep[name] else each.key
+                    key = "" if keep and entry.key == keep[name] else entry.key
                     revocations.append(
                         Entry(
                             iso(self._now),
                             "revocation",
-                            each.enclave,
-                            each.subject,
-                            each.serial,
+                            entry.enclave,
+                            entry.subject,
+                            entry.serial,
                             reason=reason,
                             key=key,
                         )
@@ -184,39 +185,45 @@ class RevocationListSigner:
         return revocations
 
     def superseded(self, replaced: Iterable[Superseded]) -> list[Entry]:
-        """Return the ledger entries for revoking all certificates that enclaves had before."""
-        by_name = {each.name: each for each in replaced}
+        """Return the ledger entries for revoking all earlier certificates of enclaves."""
+        by_name = {certificate.name: certificate for certificate in replaced}
         return self.revocations(
-            {name: each.old for name, each in by_name.items()},
+            {name: certificate.old for name, certificate in by_name.items()},
             SUPERSEDED,
-            keep={name: each.new_key for name, each in by_name.items()},
+            keep={name: certificate.new_key for name, certificate in by_name.items()},
         )
 
     def _still_valid(
         self, names: Iterable[str], present: Mapping[str, Entry]
     ) -> dict[str, dict[int, Entry]]:
-        """Map each of the enclaves to its certificates that have not expired, by serial number.
+        """Map each enclave to its certificates that have not expired, by serial number.
 
-        They are from the ledger, from the files in ``revoked`` (a list that was lost no longer has
-        those), and the ``present`` ones, which the ledger lacks if ros2/sros2 issued them.
+        The certificates are read from the ledger, from the folder ``revoked`` (a new list after a
+        lost one lacks them), and from ``present``, because the ledger lacks certificates that
+        ros2/sros2 issued.
         """
-        found: dict[str, dict[int, Entry]] = {name: {} for name in names}
+        certificates: dict[str, dict[int, Entry]] = {name: {} for name in names}
         moment = iso(self._now)
-        for each in self._keystore.ledger.entries:
-            expired = each.not_after and each.not_after < moment
-            if each.what == "certificate" and each.enclave in found and each.serial and not expired:
-                found[each.enclave][int(each.serial, 16)] = each
-        for certificate in _put_away(self._keystore):
+        for entry in self._keystore.ledger.entries:
+            expired = entry.not_after and entry.not_after < moment
+            if (
+                entry.what == "certificate"
+                and entry.enclave in certificates
+                and entry.serial
+                and not expired
+            ):
+                certificates[entry.enclave][int(entry.serial, 16)] = entry
+        for certificate in _moved_away(self._keystore):
             name = common_name_of(certificate.subject)
-            if name in found and validity_of(certificate).not_after >= self._now:
+            if name in certificates and validity_of(certificate).not_after >= self._now:
                 entry = certificate_entry(self._now, "certificate", certificate, name)
-                found[name][certificate.serial_number] = entry
-        for name, each in present.items():
-            found[name][int(each.serial, 16)] = each
-        return found
+                certificates[name][certificate.serial_number] = entry
+        for name, entry in present.items():
+            certificates[name][int(entry.serial, 16)] = entry
+        return certificates
 
     def _note_lack(self) -> None:
-        """Note if the ledger may lack earlier certificates of the enclaves that are revoked."""
+        """Add a remark if the ledger may lack earlier certificates of the revoked enclaves."""
         if not self._last:
             return
         ledger = self._keystore.ledger
@@ -225,35 +232,35 @@ class RevocationListSigner:
             why.append(
                 f"nothing shows whether a line was removed from its first {ledger.unchained}"
             )
-        recorded = {int(each.serial, 16) for each in ledger.entries if each.serial}
+        recorded = {int(entry.serial, 16) for entry in ledger.entries if entry.serial}
         lacking = (
-            name for name, each in self._last.items() if int(each.serial, 16) not in recorded
+            name for name, entry in self._last.items() if int(entry.serial, 16) not in recorded
         )
         if unknown := sorted(lacking):
             why.append(f"it does not have the present certificate of {', '.join(unknown)}")
         if why:
             text = (
                 f"The ledger of '{self._root}' may lack earlier certificates: {'; '.join(why)}. "
-                "Those that it lacks stay valid until they expire or their CA is replaced: see "
+                "Missing certificates stay valid until they expire or their CA is replaced: see "
                 "`sros rotate_ca`."
             )
             self.remarks.append(Note("ledger.may-lack-certificates", text))
 
     # ── the lists ──────────────────────────────────────────────────────────────────────────
 
-    def _authentic(self, found: RevocationList | None) -> RevocationList | None:
-        """Return a list if a trusted identity CA signed it; else None, with a remark.
+    def _authentic(self, crl: RevocationList | None) -> RevocationList | None:
+        """Return ``crl`` if a trusted identity CA signed it; else None, with a remark.
 
-        Whoever can write the file, but not sign, could have entries signed that revoke others, or
-        that keep a certificate from being revoked.
+        Whoever can write the file, but not sign, could otherwise have the CA sign entries that
+        revoke other enclaves, or that keep a certificate from being revoked.
         """
         file = self._keystore.identity_file
         own = (self._authority.certificate,)
         trusted = self._keystore.certificates_of(file) if file else own
-        if found is None or any(signed_by(found.list, each) for each in trusted):
-            return found
+        if crl is None or any(signed_by(crl.list, authority) for authority in trusted):
+            return crl
         text = (
-            "No identity CA of this keystore signed the revocation list that was there, so its "
+            "No identity CA of this keystore signed its present revocation list, so its "
             "entries do not count: find out who wrote it."
         )
         self.remarks.append(Note("crl.not-signed-here", text))
@@ -262,9 +269,9 @@ class RevocationListSigner:
     def sign(
         self, revocations: Sequence[Entry], names: Sequence[str], *, incomplete: bool
     ) -> tuple[datetime, list[Entry]]:
-        """Sign and stage the lists; return their first expiry and all ledger entries.
+        """Sign and stage the lists; return their first expiry (UTC) and the new ledger entries.
 
-        ``revocations`` are the entries of what is revoked; the enclaves ``names`` get the lists.
+        ``revocations`` are the entries of new revocations; the enclaves ``names`` get the lists.
         Each list has all serial numbers: the ledger does not say which of two CAs issued a
         certificate, and a serial number of the other CA does no harm.
 
@@ -273,23 +280,26 @@ class RevocationListSigner:
                 ``incomplete`` is not set.
         """
         date = self._now.replace(microsecond=0)
-        new_entries = [Revoked(int(each.serial, 16), date, each.reason) for each in revocations]
+        new_entries = [Revoked(int(entry.serial, 16), date, entry.reason) for entry in revocations]
         expiries = self._expiries()
         if lost := self._lost(expiries):
             new_entries = [*new_entries, *lost]
             text = (
-                f"The revocation list was not the last one that this keystore signed: {len(lost)} "
-                "revocations are in it again."
+                f"The revocation list was not the last list that this keystore signed: {len(lost)} "
+                "revocations were restored."
             )
             self.remarks.append(Note("crl.put-back", text))
         signed = self._sign(self._authority, self.present, new_entries, expiries, 0)
         self._transaction.write(CRL, signed.document)
-        found = [signed]
+        signed_lists = [signed]
         if second := self._sign_second(new_entries, names, expiries, incomplete=incomplete):
-            found.append(second)
+            signed_lists.append(second)
         _link_everywhere(self._transaction, names)
         self._note_lack()
-        return min(each.end for each in found), [*revocations, *(each.entry for each in found)]
+        return min(signed.end for signed in signed_lists), [
+            *revocations,
+            *(signed.entry for signed in signed_lists),
+        ]
 
     def _sign(
         self,
@@ -300,49 +310,49 @@ class RevocationListSigner:
         least: int,
     ) -> SignedList:
         kept = _carried_over(old, expiries)
-        listed = {each.serial for each in kept}
-        kept += [each for each in new_entries if each.serial not in listed]
+        listed = {entry.serial for entry in kept}
+        kept += [entry for entry in new_entries if entry.serial not in listed]
         # Without an earlier list that is authentic: above every number that was used, because each
         # list that is signed adds an entry to the ledger, and at most 2 to the number.
-        used = 2 * sum(each.what == "crl" for each in self._keystore.ledger.entries)
+        used = 2 * sum(entry.what == "crl" for entry in self._keystore.ledger.entries)
         number = max(old.number + 1 if old else used + 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
 
     def _lost(self, expiries: Mapping[int, str]) -> list[Revoked]:
-        """Return the revocations in the ledger, if the present list is older than the last one."""
+        """Return the revocations that the present list lacks, if it is older than the last list."""
         entries = self._keystore.ledger.entries
         count = max(
-            (i for i, each in enumerate(entries, 1) if each.what == "revocation"), default=0
+            (i for i, entry in enumerate(entries, 1) if entry.what == "revocation"), default=0
         )
         keystore = self._keystore
         present = keystore.read(CRL, "revocation list") if keystore.has(CRL) else b""
         sha256 = hashlib.sha256(present).hexdigest()
-        if any(each.what == "crl" and each.sha256 == sha256 for each in entries[count:]):
+        if any(entry.what == "crl" and entry.sha256 == sha256 for entry in entries[count:]):
             return []
-        listed = {each.serial for each in self.present.revoked} if self.present else set()
+        listed = {entry.serial for entry in self.present.revoked} if self.present else set()
         moment = iso(self._now)
         return [
             Revoked(serial, self._now.replace(microsecond=0), reason)
-            for each in entries[:count]
-            if each.what == "revocation" and each.serial
-            if (serial := int(each.serial, 16)) not in listed
+            for entry in entries[:count]
+            if entry.what == "revocation" and entry.serial
+            if (serial := int(entry.serial, 16)) not in listed
             if expiries.get(serial, moment) >= moment
-            for reason in (each.reason if each.reason in REASONS else "unspecified",)
+            for reason in (entry.reason if entry.reason in REASONS else "unspecified",)
         ]
 
     def _expiries(self) -> dict[int, str]:
-        """Map serial numbers to expiries, from the ledger and the files in ``revoked``.
+        """Map serial numbers to expiries (ISO 8601, UTC), from ledger and folder ``revoked``.
 
-        What is not certain has no expiry, and so stays on the list.
+        A certificate whose ledger entry is not certain has no expiry, and so stays on the list.
         """
         recorded = {
-            each.serial: each.not_after
-            for each in self._keystore.ledger.certain
-            if each.what == "certificate" and each.serial and each.not_after
+            entry.serial: entry.not_after
+            for entry in self._keystore.ledger.certain
+            if entry.what == "certificate" and entry.serial and entry.not_after
         }
         expiries = {int(serial, 16): not_after for serial, not_after in recorded.items()}
-        for found in _put_away(self._keystore, recorded):
-            expiries.setdefault(found.serial_number, iso(validity_of(found).not_after))
+        for certificate in _moved_away(self._keystore, recorded):
+            expiries.setdefault(certificate.serial_number, iso(validity_of(certificate).not_after))
         return expiries
 
     # ── the second CA during a rotation ────────────────────────────────────────────────────
@@ -357,17 +367,19 @@ class RevocationListSigner:
     ) -> SignedList | None:
         """Sign the list of the second identity CA, and stage it in the file of the identity CAs.
 
-        Return None if there is no second CA or its list cannot be signed.
+        Return None if there is no second CA, or its list cannot be signed.
         """
         rotation = read_rotation(self._keystore)
         file = self._keystore.identity_file
-        replaced = next((each for each in rotation.replacements if each.file == file), None)
+        replaced = next(
+            (candidate for candidate in rotation.replacements if candidate.file == file), None
+        )
         if not replaced or not file:
             return None
         coming = rotation.stage is RotationStage.DISTRIBUTE
         certificates = self._keystore.certificates_of(file)
-        wanted = replaced.new if coming else replaced.old
-        (other,) = [each for each in certificates if digest(each) == wanted]
+        sha256 = replaced.new if coming else replaced.old
+        (other,) = [candidate for candidate in certificates if digest(candidate) == sha256]
         if coming and crls_confusable(certificates[0], other):
             return None  # in this case all processes have to be restarted together anyway
         old = self._authentic(self._keystore.embedded_list(file))
@@ -411,7 +423,11 @@ class RevocationListSigner:
         *,
         incomplete: bool,
     ) -> None:
-        """Add a remark on the unsigned list of the old CA; raise if a revocation needs it."""
+        """Add a remark that the old CA's list was not signed.
+
+        Raises:
+            KeystoreError: there are new revocations, and ``incomplete`` is not set.
+        """
         name = authority_text(old_ca)
         if new_entries and not incomplete:
             raise KeystoreError(
@@ -435,7 +451,7 @@ class RevocationListSigner:
 
 
 def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
-    """Stage the link ``crl.pem`` to the revocation list for each enclave without it."""
+    """Stage the link ``crl.pem`` to the revocation list for each enclave that lacks the link."""
 
     def link(part: Sequence[str]) -> None:
         for name in part:
@@ -453,7 +469,10 @@ def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
 
 
 def another_ca(keystore: Keystore, aim: str) -> str:
-    """Return what to do where DDS refuses the lists of the identity CA, before the ``aim``."""
+    """Return the remedy, as a sentence, if DDS refuses the lists of the identity CA.
+
+    ``aim`` is the command to repeat afterwards, such as ``revoke``.
+    """
     file = keystore.identity_file
     words = ["sros rotate_ca", quote(str(keystore.root))]
     if read_rotation(keystore).stage is not RotationStage.NONE:
@@ -466,6 +485,6 @@ def another_ca(keystore: Keystore, aim: str) -> str:
     if not keystore.has(f"{PRIVATE}/{file}.key.pem"):
         words.append("--identity-key URI")
     return (
-        f"Replace the identity CA by one that may sign revocation lists: `{' '.join(words)} "
+        f"Replace the identity CA by a CA that may sign revocation lists: `{' '.join(words)} "
         f"--finish`, restart all processes, and {aim} then."
     )

@@ -1,4 +1,4 @@
-"""Revocation of enclaves: their certificates are put on the list, their files into ``revoked``."""
+"""Revocation of enclaves: certificates go on the list, files to the folder ``revoked``."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _PRIVATE = "key.pem"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Revocation(Changed):
-    """The result of a revocation, or of a list that was signed again.
+    """The result of a revocation, or of signing the revocation list again.
 
     ``next_update`` is the expiry of the revocation list, in UTC.  ``restart`` are the enclaves
     whose processes trust the revoked certificates until they are restarted.
@@ -63,17 +63,18 @@ def revoke(
 ) -> Revocation:
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
 
-    All certificates of an enclave that have not expired are revoked, if its folder, the ledger or
-    the folder ``revoked`` has them: an attacker with the key could use an earlier certificate, too.
-    If the ledger may lack some, a remark says so.  The other enclaves get
-    ``crl.pem``, a link to the list.  During a rotation of the identity CA, both CAs sign a list; if
-    the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts its
-    certificates until it is retired.  On the vendors in ``allow_refusal``, nodes may stop.
+    All certificates of an enclave that have not expired are revoked, as far as its folder, the
+    ledger or the folder ``revoked`` has them: an attacker with the key could use an earlier
+    certificate, too.  If the ledger may lack certificates, a remark says so.  The other enclaves
+    get ``crl.pem``, a link to the list.  During a rotation of the identity CA, both CAs sign a
+    list; if the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts its
+    certificates until that CA is retired.  The nodes of the vendors in ``allow_refusal`` may stop
+    to work.
 
     Raises:
         KeystoreError: an enclave does not exist, the identity CA did not issue its certificate, the
             key of a CA is missing, or vendors would refuse other enclaves with the list.
-        UsageError: ``reason`` is not one of `REASONS`.
+        UsageError: ``reason`` is not in `REASONS`.
     """
     if reason not in REASONS:
         raise UsageError(
@@ -113,7 +114,7 @@ def refresh_crl(
 ) -> Revocation:
     """Sign the revocation list again, so that it is valid for longer.
 
-    Its entries are kept, except certificates that had expired before the present list was signed.
+    Its entries are kept, except certificates that expired before the present list was signed.
     """
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
@@ -129,11 +130,11 @@ def refresh_crl(
 
 
 def _check_names(change: KeystoreChange, names: Sequence[str]) -> None:
-    """Raise an error if one of ``names`` is no enclave of the keystore."""
-    there = frozenset(change.names)
+    """Raise an error unless all ``names`` are enclaves of the keystore."""
+    existing = frozenset(change.names)
     for name in names:
         check_enclave_name(name)
-        if name not in there:
+        if name not in existing:
             raise no_such_enclave(change.keystore, name, change.names, may_create=False)
 
 
@@ -144,8 +145,8 @@ def _move_away(change: KeystoreChange, name: str) -> Entry:
     if not issued_by(certificate, change.identity.certificate):
         raise KeystoreError(
             f"the certificate of enclave {name} was not issued by the identity CA of this keystore",
-            "Only the CA that issued it can revoke it.",
-            "Revoke it in the keystore of that CA, or restore the right certificate.",
+            "Only the CA that issued a certificate can revoke it.",
+            "Revoke the enclave in the keystore of that CA, or restore the right certificate.",
         )
     target = f"{REVOKED}/{certificate.serial_number:x}"
     for file in _FILES:

@@ -2,7 +2,7 @@
 
 distribute: enclaves trust the new CA in addition to the old CA.  reissue: the new CA issues all
 certificates and signs all documents again.  retire: enclaves no longer trust the old CA.  Each
-stage is one transaction.
+stage is a transaction.
 """
 
 from __future__ import annotations
@@ -87,10 +87,10 @@ from sros_tool.validity import Span, Window, span_text, window
 from sros_tool.wording import first_few
 
 _SHOWN = 10
-"""The number of robots that an error names; it counts the others."""
+"""Largest number of robots that an error names."""
 _ENCLAVES_SHOWN = 5
 _ISSUED = {IDENTITY: ("certificate",), "permissions": ("permissions", "governance")}
-"""What the CA of each role issues, by the kinds of `fleet_status`."""
+"""The kinds of files that the CA of each role issues, as in `fleet_status`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +100,7 @@ class RotationStep(Changed):
     ``stage`` is the stage of the keystore afterwards.  ``files`` are the stems of the CA files that
     are replaced ("identity_ca", "permissions_ca" or "ca").  ``kept_elsewhere`` are the places of
     old keys outside of the keystore, which sros does not delete.  ``cut_off`` are robots that have
-    not confirmed the stage before.
+    not confirmed the stage before, and can no longer communicate with the others.
     """
 
     stage: RotationStage
@@ -127,12 +127,12 @@ def rotate_ca(
 ) -> RotationStep:
     """Rotate the CAs to the stage ``to`` (default: the next stage), or with ``finish`` to the end.
 
-    If the keystore is at the stage ``to`` already, nothing is changed.  ``roles`` ("identity",
-    "permissions"; default: both) and ``validity`` of the new CAs are only used when a rotation
+    If the keystore is already at the stage ``to``, nothing is changed.  ``roles`` ("identity",
+    "permissions"; default: both) and the ``validity`` of the new CAs are only used when a rotation
     begins.  ``keyring`` opens the present keys; ``new_keys`` names the places of new keys outside
-    of the keystore.  In a keystore with a fleet, a stage that cuts robots off, because they have
-    not confirmed the one before, needs ``allow_unconfirmed``.  On the vendors in ``allow_refusal``,
-    nodes may stop.
+    of the keystore.  In a keystore with a fleet, a stage that cuts off robots, because they have
+    not confirmed the stage before, needs ``allow_unconfirmed``.  The nodes of the vendors in
+    ``allow_refusal`` may stop to work.
 
     Raises:
         KeystoreError: a key is missing, an enclave cannot be moved to the new CA, robots would be
@@ -167,7 +167,7 @@ def rotate_ca(
 
 
 def _step(change: KeystoreChange, **more: Any) -> RotationStep:
-    """Return the result of a step, in which a CA issued all certificates again or none."""
+    """Return the result of a step, with all enclaves reissued, or all kept."""
     reissued = any(
         each.path.endswith(f"/{CERTIFICATE_FILE}") for each in change.transaction.changes
     )
@@ -176,14 +176,14 @@ def _step(change: KeystoreChange, **more: Any) -> RotationStep:
 
 
 def robots_cut_off(keystore: Keystore, rotation: Rotation, to: RotationStage) -> tuple[str, ...]:
-    """Return the names of the robots that the stage ``to`` would cut off from the others; sorted.
+    """Return the sorted names of the robots that the stage ``to`` would cut off from the others.
 
-    Those are the robots that have enclaves and have not confirmed the stage before: that they trust
-    the new CA, and then that they also have what it issued.  None is cut off without a fleet, or by
-    the first stage.
+    These are the robots with enclaves that have not confirmed the stage before: first that they
+    trust the new CA, then that they have the files it issued.  Without a fleet, or by the first
+    stage, no robot is cut off.
 
     Raises:
-        KeystoreError: the file of the fleet is not the one that sros wrote last.
+        KeystoreError: the fleet file is not the file that sros wrote last.
     """
     if to is RotationStage.DISTRIBUTE or checked_fleet(keystore) is None:
         return ()
@@ -204,7 +204,7 @@ def robots_cut_off(keystore: Keystore, rotation: Rotation, to: RotationStage) ->
 
 
 def _of_no_robot(keystore: Keystore, names: Iterable[str]) -> Iterator[Note]:
-    """Yield a note on enclaves that belong to no robot of a fleet, so that nobody confirms them."""
+    """Yield a note on enclaves without a robot in the fleet, whose state no confirmation shows."""
     fleet = load_fleet(keystore)
     without = [name for name in names if robot_of(fleet, name) is None] if fleet else []
     if without:
@@ -240,7 +240,7 @@ def _refuse_edited(keystore: Keystore) -> None:
 
 
 def _was_replaced(keystore: Keystore) -> bool:
-    """Return whether the ledger has a CA that another one replaced, perhaps of the same name."""
+    """Return whether the ledger records a CA that another CA replaced."""
     names = (keystore.certificates_of(f"{role}_ca") for role in ROLES)
     trusted = {subject_text(each.subject) for certificates in names for each in certificates}
     made = Counter(
@@ -254,7 +254,7 @@ def _was_replaced(keystore: Keystore) -> bool:
 def _target_stage(
     keystore: Keystore, rotation: Rotation, to: RotationStage | None
 ) -> RotationStage:
-    """Return the stage to go to; NONE if there is nothing to do.
+    """Return the stage to go to; NONE if the keystore is already there.
 
     Raises:
         UsageError: the stage ``to`` is over, or is not the next stage.
@@ -304,7 +304,7 @@ def renew_identity_ca(
     be renewed this way: DDS accepts its documents only with the certificate that they embed.
 
     Raises:
-        KeystoreError: the keystore has a single CA, a rotation is under way, or the CA is not
+        KeystoreError: the keystore has a single CA, a rotation is in progress, or the CA is not
             self-signed, or its key is weak or missing.
         UsageError: the new certificate would expire before the present one.
     """
@@ -379,9 +379,9 @@ class _Rotator:
     ) -> RotationStage:
         """Stage all changes up to ``stage``; return the stage of the keystore afterwards.
 
-        If revocations need a list of the new identity CA and it is missing, it is distributed, and
-        the stage stays DISTRIBUTE: where a list exists, Fast DDS 2.9.1 refuses every enclave of a
-        CA without a list (measured).
+        If revocations require a revocation list of the new identity CA, and enclaves lack it, only
+        the list is distributed, and the stage stays DISTRIBUTE: as soon as a list exists, Fast DDS
+        2.9.1 refuses every enclave of a CA without a list (measured).
         """
         if self._rotation.stage is RotationStage.REISSUE:
             self._retire()
@@ -426,10 +426,10 @@ class _Rotator:
         return successors
 
     def _note_earlier(self, old: x509.Certificate, new: x509.Certificate) -> None:
-        """Note that a new CA expires before the old one because the settings say so.
+        """Add a note if a new CA expires before the old CA because the settings say so.
 
         Raises:
-            UsageError: it does, and the keystore has no settings, so nobody chose it.
+            UsageError: it expires earlier, and the keystore has no settings, so nobody chose that.
         """
         if not (self._root / SETTINGS).exists():
             _check_later(old, new)
@@ -464,16 +464,18 @@ class _Rotator:
     def _lacks_crl(self, successors: list[_Successor]) -> bool:
         """Return whether the distributed identity CA needs a revocation list and has none.
 
-        This happens after the first revocation, if that was during the stage DISTRIBUTE.
+        This happens if the first revocation was during the stage DISTRIBUTE.
         """
         return (self._root / CRL).exists() and any(
             self._takes_crl(each) and not self._keystore.embedded_list(each.file)
             for each in successors
         )
 
-    def _takes_crl(self, each: _Successor) -> bool:
+    def _takes_crl(self, successor: _Successor) -> bool:
         """Return whether a new CA's revocation list can be distributed with the CA."""
-        return IDENTITY in each.roles and not crls_confusable(each.old[0], each.new.certificate)
+        return IDENTITY in successor.roles and not crls_confusable(
+            successor.old[0], successor.new.certificate
+        )
 
     def _reissue(
         self, successors: list[_Successor], stage: RotationStage, progress: Progress | None
@@ -546,7 +548,7 @@ class _Rotator:
             change.notes += change.known.shared_notes(change.names)
 
     def _sign_governance(self, permissions: _Successor) -> None:
-        """Sign the governance of the keystore and its copies in enclaves again, unchanged."""
+        """Stage the governance, unchanged but signed by the new CA, with its copies in enclaves."""
         copies = [
             f"{enclave_folder(each)}/{GOVERNANCE_FILE}"
             for each in self._change.names
@@ -586,27 +588,27 @@ class _Rotator:
     def _keep_certificate(self, old: x509.Certificate) -> None:
         self._transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
 
-    def _install_key(self, each: _Successor) -> str:
-        """Stage the move of the old key to ``retired`` and of the new key to the place of the old.
+    def _install_key(self, successor: _Successor) -> str:
+        """Stage the move of the old key to ``retired``, and of the new key to the old key's place.
 
         Return the place of the old key if it is outside of the keystore, else "".
         """
         transaction, root = self._transaction, self._root
         old_key = ""
-        place = f"{PRIVATE}/{each.file}.key.pem"
+        place = f"{PRIVATE}/{successor.file}.key.pem"
         if (root / place).is_file():
             if not self._delete:
                 key = transaction.read(place)
-                transaction.write(retired_key(each.old[0]), key, private=True)
+                transaction.write(retired_key(successor.old[0]), key, private=True)
         else:
-            old_key = self._change.keyring.place(each.roles[0], self._template)
+            old_key = self._change.keyring.place(successor.roles[0], self._template)
             self.kept_elsewhere.append(old_key)
-        if each.key == f"{PRIVATE}/next_{each.file}.key.pem":
-            transaction.write(place, transaction.read(each.key), private=True)
-            transaction.remove(each.key)
-        elif each.key != place and (root / place).is_file():
+        if successor.key == f"{PRIVATE}/next_{successor.file}.key.pem":
+            transaction.write(place, transaction.read(successor.key), private=True)
+            transaction.remove(successor.key)
+        elif successor.key != place and (root / place).is_file():
             transaction.remove(place)
-            for role in each.roles:
+            for role in successor.roles:
                 if (root / ca_key(role)).is_symlink():
                     transaction.remove(ca_key(role))
         return old_key
@@ -641,8 +643,8 @@ def _issuance(
     """Return the `Issuance` of the new CAs for an enclave; None if it has no certificate yet.
 
     Raises:
-        KeystoreError: the old CA did not issue its certificate or sign its permissions, or its key
-            was revoked.
+        KeystoreError: the old CA did not issue the certificate or sign the permissions, or the
+            enclave's key was revoked.
     """
     root = change.root
     folder = enclave_path(root, name)
@@ -701,7 +703,7 @@ class _Successor:
     key: str
 
     def replacement(self) -> Replacement:
-        """Return the entry of this CA in the file of the rotation."""
+        """Return the record of this CA for the rotation file."""
         return Replacement(self.file, digest(self.old[0]), digest(self.new.certificate), self.key)
 
 
@@ -715,8 +717,8 @@ def _make_successors(
 ) -> list[_Successor]:
     """Create new CAs for ``roles`` (empty: for both roles), and stage their keys.
 
-    New keys in the keystore get names next to the present keys if ``next_to``; otherwise they
-    replace them.
+    With ``next_to``, new keys in the keystore get file names next to the present keys; otherwise
+    they replace the present keys.
     """
     template = change.template
     files = change.keystore.authority_files

@@ -1,6 +1,6 @@
 """The state of a CA rotation: its stage, the replaced CAs, and the number of enclaves of each CA.
 
-This module only reads; `stages` makes the changes.
+This module only reads; `sros_tool.keystore.lifecycle.rotate` makes the changes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from sros_tool.validity import Window, iso
 from sros_tool.values import Words, as_plain, parse_json, shows
 
 _SOON = timedelta(days=90)
-"""The remaining validity at which a remark advises to replace a CA."""
+"""Remaining validity from which a remark advises to replace a CA."""
 
 
 class RotationStage(StrEnum):
@@ -70,7 +70,7 @@ class Replacement:
     old_key: str = ""
 
     def old_key_place(self, certificate: x509.Certificate) -> str:
-        """Return the place of the key of the old CA, ``certificate``, after the stage REISSUE."""
+        """Return the place of the old CA's key from REISSUE on; ``certificate`` is that CA's."""
         return self.old_key or retired_key(certificate)
 
 
@@ -98,13 +98,13 @@ class AuthorityStatus:
     roles: tuple[Annotated[str, Words(ROLES)], ...]
     """What the CA signs."""
     state: Annotated[str, Words(("issuing", "next", "old"))]
-    """Whether it issues now, will issue next, or issued before."""
+    """Whether the CA issues now (``issuing``), will issue next, or issued before (``old``)."""
     subject: str
-    """Its subject."""
+    """Subject of the CA."""
     serial: str
-    """Serial number of its certificate, in hexadecimal."""
+    """Serial number of the CA's certificate, in hexadecimal."""
     sha256: str
-    """SHA-256 of its certificate, which tells it from another one of that name."""
+    """SHA-256 of the CA's certificate (DER), in hexadecimal; two CAs can have the same subject."""
     validity: Window
     enclaves: int
     """Number of enclaves with a certificate or permissions of this CA."""
@@ -127,10 +127,10 @@ def retired_key(certificate: x509.Certificate) -> str:
 
 
 def read_rotation(keystore: Keystore) -> Rotation:
-    """Return the rotation that is under way, or an empty `Rotation`.
+    """Return the rotation in progress; an empty `Rotation` if there is none.
 
     Raises:
-        KeystoreError: the file of the rotation is damaged, or does not fit the CA certificates.
+        KeystoreError: the rotation file is damaged, or does not fit the CA certificates.
     """
     path = keystore.root / ROTATION
     if not path.exists():
@@ -154,14 +154,18 @@ def read_rotation(keystore: Keystore) -> Rotation:
 
 
 def _replacement(read: dict[str, str]) -> Replacement:
-    """Return the replacement in its JSON form; raise ValueError or TypeError if it is none."""
+    """Return the replacement that the JSON object ``read`` describes.
+
+    Raises:
+        ValueError, TypeError: ``read`` does not describe a replacement.
+    """
     if not all(isinstance(each, str) for each in read.values()) or "/" in read.get("file", ""):
         raise ValueError
     return Replacement(**read)
 
 
 def render_rotation(rotation: Rotation) -> bytes:
-    """Return the file of a rotation, as JSON that `read_rotation` reads."""
+    """Return the content of the rotation file: JSON, which `read_rotation` reads."""
     content = {
         "stage": rotation.stage.value,
         "replacements": as_plain(rotation.replacements),
@@ -207,7 +211,11 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
 def _count(
     keystore: Keystore, role: str, authorities: tuple[x509.Certificate, ...]
 ) -> Counter[int]:
-    """Count the enclaves of each CA, by index: for identity CAs by certificate, else by signer."""
+    """Count the enclaves of each CA, by its index in ``authorities``.
+
+    An enclave belongs to the identity CA that issued its certificate, and to the permissions CA
+    that signed its permissions.
+    """
     counts: Counter[int] = Counter()
     for name in keystore.names:
         try:
@@ -258,7 +266,7 @@ EXPORT_FIRST = "Where they run from an export, export the enclaves again first."
 
 
 def _restart_remarks(keystore: Keystore, rotation: Rotation) -> list[str]:
-    """Return remarks on the processes to restart at the stage DISTRIBUTE or REISSUE, by vendor."""
+    """Return remarks, by vendor, on the processes to restart at the stage DISTRIBUTE or REISSUE."""
     files = [each.file for each in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
         return [
@@ -307,7 +315,7 @@ def _has_identifier(certificate: x509.Certificate) -> bool:
 
 
 def _fast_dds_hindrance(keystore: Keystore, files: Sequence[str]) -> str:
-    """Return why Fast DDS cannot trust the old and the new CA at once, as a sentence, or "".
+    """Return a sentence on why Fast DDS cannot trust the old and the new CA at once; "" if it can.
 
     Fast DDS 2.9.1 (measured) distinguishes two CAs of the same name by their key identifiers, and
     refuses a peer whose permissions CA has another name or key algorithm.

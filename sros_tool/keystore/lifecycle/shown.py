@@ -1,6 +1,6 @@
-"""What ``--json`` prints of changes of a keystore: creation, renewal, revocation, update, rotation.
+"""The values that ``--json`` prints for changes of a keystore.
 
-`shown` turns the result of a change into what is printed of it.
+`shown` makes them from the result of a change: creation, renewal, revocation, update, rotation.
 """
 
 from __future__ import annotations
@@ -56,9 +56,10 @@ Form = TypeVar("Form", bound=tuple[Any, ...])
 
 
 def shown(result: Changed, form: type[Form], **more: Any) -> Form:
-    """Return what ``--json`` prints of a change: the keys of ``form``, from the result or ``more``.
+    """Return the value of class ``form`` that ``--json`` prints for the result of a change.
 
-    ``notes`` among ``more`` are added to those of the result.
+    Its fields are from ``more``, or else from the result.  ``notes`` in ``more`` are added to the
+    notes of the result.
     """
     root = result.root
     known: dict[str, Callable[[], Any]] = {
@@ -80,7 +81,7 @@ def shown(result: Changed, form: type[Form], **more: Any) -> Form:
 
 
 def enclave_results(result: Changed) -> list[EnclaveResult[str]]:
-    """Return what was done with enclaves; those that a dry run would write are not there yet."""
+    """Return the outcomes of enclaves; in a dry run, new enclaves have no certificate yet."""
     keystore = Keystore(result.root)
     return [
         enclave_result(keystore, name, done, written=not result.dry_run or done == "kept")
@@ -99,7 +100,7 @@ class _EnclaveCreation(NamedTuple, Generic[Outcome]):
     new_keystore: bool
     """Whether the keystore was created, too."""
     enclaves: Sequence[EnclaveResult[Outcome]]
-    """The enclaves that were named, by what was done."""
+    """The enclaves of the command, with their outcomes."""
     rights: Rights
     restart: Restart
     restart_zenoh: RestartZenoh
@@ -150,7 +151,7 @@ class NewKeystore(NamedTuple):
     domains: str
     """The ROS domains of the keystore, such as ``0`` or ``10-19``."""
     authorities: Sequence[KeystoreAuthority]
-    """Its CAs; one of both roles with ``--ca-layout single``."""
+    """CAs of the keystore; a single CA with both roles with ``--ca-layout single``."""
     changes: FileChanges
     notes: Notes
 
@@ -158,7 +159,7 @@ class NewKeystore(NamedTuple):
 def shown_keystore(
     result: Creation, imported: Mapping[str, bytes], notes: Sequence[Note]
 ) -> NewKeystore:
-    """Return what is printed of a new keystore; ``imported`` are certificates of CAs by role."""
+    """Return the value for a new keystore; ``imported`` maps roles to existing CAs (PEM)."""
     authorities = []
     separate = result.template.separate_authorities
     for roles in [(role,) for role in ROLES] if separate else [ROLES]:
@@ -187,24 +188,24 @@ class NetworkSettings(NamedTuple):
     router: str
     """The enclave of the router."""
     endpoints: Sequence[str]
-    """Where sessions connect to the router."""
+    """Endpoints at which sessions connect to the router, as HOST:PORT."""
     listen: Sequence[str]
-    """Where the router listens."""
+    """Endpoints on which the router listens, as HOST:PORT."""
     mode: Annotated[str, Words(("client", "peer"))]
     """Whether sessions also connect to each other (``peer``), or only to the router."""
     domains: Sequence[int]
-    """The ROS domains."""
+    """The ROS domains of the network."""
 
 
 class ZenohFileState(NamedTuple):
-    """A configuration."""
+    """A Zenoh configuration file."""
 
     enclave: str
     """The enclave."""
     path: Path
-    """The file; the signed document is next to it."""
+    """Path of the file; the signed document is next to it."""
     current: bool
-    """Whether it was there before with the same content and a valid signature."""
+    """Whether the file already had this content and a valid signature."""
 
 
 class KeystoreZenoh(NamedTuple):
@@ -215,9 +216,9 @@ class KeystoreZenoh(NamedTuple):
     network: NetworkSettings | None
     """The network, as the keystore's settings have it afterwards; null after ``--off``."""
     files: Sequence[ZenohFileState]
-    """The file of the router, and one for each other enclave with rights."""
+    """The file of the router, and a file for each other enclave with rights."""
     created: Sequence[str]
-    """Enclaves that were created: that of the router, if it did not exist."""
+    """Enclaves that were created: the router's enclave, if it did not exist."""
     restart: Sequence[str]
     """The enclaves whose processes have to be restarted, because their rules changed."""
     changes: FileChanges
@@ -228,7 +229,7 @@ class KeystoreZenoh(NamedTuple):
 def shown_zenoh(
     result: Creation, network: ZenohNetwork | None, changed: Collection[str]
 ) -> KeystoreZenoh:
-    """Return what is printed of the files of Zenoh; ``changed`` are the paths of new ones."""
+    """Return the value for a keystore's Zenoh files; ``changed`` are paths of new files."""
     settings = None
     if network:
         settings = NetworkSettings(
@@ -298,29 +299,29 @@ class TemplateChange(NamedTuple):
     """The name of the template."""
 
     before: str
-    """The one before."""
+    """Name of the template before the update."""
     after: str
-    """The one after all stages."""
+    """Name of the template after all stages."""
 
 
 class UpdatedKeystore(NamedTuple):
-    """What changed in the keystore."""
+    """The changes of the keystore."""
 
     keystore: NamedKeystore
     dry_run: DryRun
     needs_allow_looser: bool
-    """Whether something becomes possible that was not, which ``--allow-looser`` has to allow."""
+    """Whether the update allows more than before, which needs ``--allow-looser``."""
     template: TemplateChange
     """The name of the template."""
     done: Sequence[UpdateStage]
-    """The stages that were carried out; empty if nothing was left to do."""
+    """Stages that were carried out; empty if nothing was left to do."""
     left: Sequence[UpdateStage]
-    """The stages that are left."""
+    """Stages that are left to do."""
     settings: Sequence[SettingChange]
     """The settings that change."""
     rights: Rights
     looser: Sequence[str]
-    """Everything that becomes possible, settings and rights."""
+    """Clauses on everything that the update allows and that was not allowed before."""
     enclaves: Sequence[
         EnclaveResult[
             Annotated[
@@ -330,7 +331,7 @@ class UpdatedKeystore(NamedTuple):
             ]
         ]
     ]
-    """The enclaves that were issued something."""
+    """Enclaves that got a certificate or permissions."""
     replaced_work_until: datetime | None
     """Last expiry of the replaced certificates with their permissions, in UTC; null if none was
     replaced or all were revoked."""
@@ -349,9 +350,9 @@ class RevokedCertificate(NamedTuple):
     """A revoked certificate."""
 
     serial: str
-    """Its serial number, in hexadecimal."""
+    """Serial number, in hexadecimal."""
     enclave: str | None
-    """Its enclave, as the ledger has it; null if the ledger does not have it."""
+    """Enclave of the certificate; null if the ledger does not record it."""
     date: datetime
     """When it was revoked, in UTC."""
     reason: str
@@ -362,13 +363,13 @@ class OtherList(NamedTuple):
     """A revocation list of another CA."""
 
     issuer: str
-    """The CA that signed it."""
+    """Subject of the CA that signed the list."""
     number: int
-    """Its number."""
+    """Number of the list."""
     this_update: datetime
-    """Begin of its validity, in UTC."""
+    """Start of the validity, in UTC."""
     next_update: datetime
-    """End of its validity, in UTC."""
+    """Expiry, in UTC."""
     revoked: Sequence[str]
     """Serial numbers of the revoked certificates, in hexadecimal."""
 
@@ -379,13 +380,13 @@ class KeystoreLists(NamedTuple):
     keystore: NamedKeystore
     dry_run: DryRun
     number: int | None
-    """Number of the list; null if nothing was ever revoked."""
+    """Number of the list; null if the keystore has no list, because nothing was revoked."""
     this_update: datetime | None
-    """Begin of its validity, in UTC; null as above."""
+    """Start of the list's validity, in UTC; null if there is no list."""
     next_update: datetime | None
-    """End of its validity, in UTC; null as above."""
+    """Expiry of the list, in UTC; null if there is no list."""
     expires_soon: bool
-    """Whether it expires within 30 days: the exit status is 1."""
+    """Whether the list expires within 30 days: the exit status is 1."""
     revoked: Sequence[RevokedCertificate]
     """The revoked certificates."""
     other_lists: Sequence[OtherList]
@@ -406,7 +407,7 @@ def shown_lists(
     expires_soon: bool,
     dry_run: bool,
 ) -> KeystoreLists:
-    """Return what is printed of revocation lists; ``enclaves`` names them by serial number."""
+    """Return the value for revocation lists; ``enclaves`` maps serial numbers to enclaves."""
     first = lists[0] if lists else None
     return KeystoreLists(
         root,
@@ -447,18 +448,18 @@ class RotationState(NamedTuple):
     next: RotationStage
     """The next stage."""
     enclaves: int
-    """Number of enclaves."""
+    """Number of enclaves in the keystore."""
     authorities: Sequence[AuthorityStatus]
     """The CAs that processes trust."""
     unconfirmed: Sequence[str] | None
     """The robots of the fleet that have not confirmed the stage; empty without a rotation or a
     fleet, null if the file of the fleet was edited."""
     remarks: Sequence[str]
-    """What to do next."""
+    """Next steps, as sentences."""
 
 
 def shown_status(status: RotationStatus, unconfirmed: Sequence[str] | None) -> RotationState:
-    """Return what is printed of a rotation; ``unconfirmed`` are robots, None if it is unknown."""
+    """Return the value for the state of a rotation; ``unconfirmed`` is None if it is not known."""
     return RotationState(
         status.rotation.stage,
         status.rotation.next_stage(),
@@ -470,14 +471,14 @@ def shown_status(status: RotationStatus, unconfirmed: Sequence[str] | None) -> R
 
 
 class RotationChange(NamedTuple):
-    """What was done."""
+    """The result of a rotation step."""
 
     keystore: NamedKeystore
     dry_run: DryRun
     stage: RotationStage
     """The stage that was reached."""
     authorities: Sequence[Annotated[str, Words(("identity_ca", "permissions_ca", "ca"))]]
-    """The CAs that are replaced: names of files in public/."""
+    """The CAs that are replaced: stems of their file names in public/."""
     enclaves: Sequence[
         EnclaveResult[
             Annotated[
@@ -488,13 +489,13 @@ class RotationChange(NamedTuple):
             ]
         ]
     ]
-    """All enclaves."""
+    """All enclaves of the keystore, with their outcomes."""
     old_keys_elsewhere: Sequence[str]
     """Places of old CA keys outside of the keystore, which sros does not delete."""
     cut_off: Sequence[str]
-    """The robots of the fleet that have not confirmed the stage before, and so cannot talk to the
-    others until they get its files (``--allow-unconfirmed``)."""
+    """The robots of the fleet that have not confirmed the stage before, and so cannot communicate
+    with the others until they get its files (``--allow-unconfirmed``)."""
     remarks: Sequence[str]
-    """What to do next; empty in a dry run."""
+    """Next steps, as sentences; empty in a dry run."""
     changes: FileChanges
     notes: Notes

@@ -1,10 +1,10 @@
-"""Change of an existing keystore: its governance, its settings, and what follows from them.
+"""Update of an existing keystore: settings, governance, and the files that follow from them.
 
-Two stages, because a running robot survives one of them without a pause.  credentials: enclaves get
-certificates and permissions as the new settings state them; processes with old and new ones
-communicate.  governance: the signed governance and the domains; most differences of governance
-keep a process with the old one from communicating with a process with the new one.  Each stage is
-one transaction, and no state is kept: what the keystore does not have yet is what is left to do.
+There are two stages, so that a running robot passes the first without a pause.  credentials:
+enclaves get certificates and permissions as the new settings state them; processes with old and new
+files communicate.  governance: the signed governance and the domains change; with most differences,
+processes with the old governance cannot communicate with processes with the new one.  Each stage is
+a transaction, and no state is kept: the stages that would still change something are left.
 """
 
 from __future__ import annotations
@@ -113,9 +113,9 @@ class UpdateStage(StrEnum):
 class KeystoreUpdate(Changed):
     """The result of an update.
 
-    ``before`` and ``after`` are the names of the templates.  ``done`` are the stages that it
-    carries out, ``left`` those that remain.  ``outcomes`` has the enclaves that are renewed, with a
-    new certificate and permissions, and signed, with new permissions only.
+    ``before`` and ``after`` are the names of the templates.  ``done`` are the stages that this
+    update carries out, ``left`` the stages that remain.  ``outcomes`` has the enclaves that are
+    renewed (new certificate and permissions) and signed (only new permissions).
     """
 
     before: str
@@ -126,7 +126,7 @@ class KeystoreUpdate(Changed):
 
     @property
     def looser(self) -> tuple[str, ...]:
-        """Everything that becomes possible, settings and rights, as clauses."""
+        """Clauses on everything that the update allows and that was not allowed before."""
         gained = [
             f"{each.enclave} gains {rights_text(each.gained)}"
             for each in self.rights
@@ -142,8 +142,8 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
     """Return the settings and domains that the edited files of a keystore state.
 
     Raises:
-        KeystoreError: nothing was edited, both files state another protection, or the governance
-            cannot be stated in settings.
+        KeystoreError: nothing was edited, both files were edited to different protection, or
+            settings cannot state the governance.
     """
     edits = present.edits
     if not edits:
@@ -192,7 +192,11 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
 
 
 def _checked_target(root: Path, present: PresentSettings, target: Template) -> Template:
-    """Return ``target`` with the places of the present CA keys; raise if it cannot be reached."""
+    """Return ``target`` with the places of the present CA keys.
+
+    Raises:
+        UsageError: the keystore cannot be changed to ``target``.
+    """
     for name in ("identity_key", "permissions_key"):
         wanted, place = getattr(target, name), getattr(present.settings, name)
         if wanted and wanted != place:
@@ -240,7 +244,7 @@ def update_keystore(
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> KeystoreUpdate:
-    """Change a keystore to the settings ``target`` and to ``domains`` (None: as they are).
+    """Change a keystore to the settings ``target`` and to ``domains`` (None: unchanged).
 
     Args:
         root: the keystore.
@@ -248,23 +252,23 @@ def update_keystore(
         domains: its new domains.
         now: the time from which validities count.
         next_stage: do only the first stage that is left.
-        allow_looser: accept that something becomes possible that was not.
+        allow_looser: accept settings that allow more than before.
         revoke_old: issue all certificates again, with subjects that no earlier permissions fit, and
-            revoke all earlier ones.
-        allow_refusal: vendors on which nodes may stop.
-        replace_edits: accept that ``target`` replaces what somebody edited by hand in the settings
-            or the governance, as ``target`` has those edits, or undoes them.
+            revoke all earlier certificates.
+        allow_refusal: vendors whose nodes may stop to work.
+        replace_edits: accept that ``target`` replaces edits by hand in the settings or the
+            governance, because it contains or undoes them.
         seen: the settings that ``target`` was made from.
         keyring: opens the keys of the CAs.
         dry_run: report the changes without making them.
         progress: called with the name of each enclave that is done.
 
     Raises:
-        UsageError: something would become looser without ``allow_looser``, or ``target`` cannot be
-            reached from here.
+        UsageError: more would be allowed without ``allow_looser``, or the keystore cannot be
+            changed to ``target``.
         KeystoreError: an enclave cannot be issued again, files were edited by hand, the settings
-            are no longer those that were ``seen``, or vendors would refuse enclaves that they
-            accept today.
+            are no longer the ``seen`` settings, or vendors would refuse enclaves that they accept
+            today.
     """
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
@@ -315,18 +319,18 @@ def update_keystore(
 
 @dataclass(frozen=True, slots=True)
 class _Goal:
-    """The settings and the domains that a keystore shall have."""
+    """The settings and the domains that an update leads to."""
 
     settings: Template
     domains: DomainSet
 
     def governance(self) -> Governance:
-        """Return the governance that follows from them."""
+        """Return the governance that follows from the settings and domains."""
         return governance_for(self.settings.protection, self.domains)
 
 
 def _first_step(present: PresentSettings, goal: _Goal) -> _Goal:
-    """Return the goal after the stage CREDENTIALS: protection, domains and name stay."""
+    """Return the goal of the stage CREDENTIALS, which keeps protection, domains and name."""
     settings = replace(
         goal.settings,
         protection=present.settings.protection,
@@ -337,7 +341,7 @@ def _first_step(present: PresentSettings, goal: _Goal) -> _Goal:
 
 
 def _signed_payloads(before: DomainProtection, after: DomainProtection) -> list[Note]:
-    """Return a note if payloads become signed only, with which Fast DDS loses messages."""
+    """Return a note if payloads become signed but not encrypted: then Fast DDS loses messages."""
     old, new = (
         {
             name
@@ -375,7 +379,7 @@ def _pending(present: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
 
 @dataclass(frozen=True, slots=True)
 class _Reissued:
-    """An enclave after its update; ``old`` is the record of its replaced certificate, if any."""
+    """An enclave after its update; ``old`` records its replaced certificate, if there is one."""
 
     name: str
     rights: ReplacedRights
@@ -384,9 +388,9 @@ class _Reissued:
 
 @dataclass(frozen=True, slots=True)
 class _KeptOpen:
-    """An enclave that may do everything, and still may when enclaves without a policy may not.
+    """An enclave that keeps the right to everything, though enclaves without a policy lose it.
 
-    ``reissued`` has what was issued for it, or None.
+    ``reissued`` has its new files, or None.
     """
 
     name: str
@@ -428,7 +432,7 @@ class _Updater:
         left: tuple[UpdateStage, ...],
         progress: Progress | None,
     ) -> Callable[[], KeystoreUpdate]:
-        """Stage the changes of the stages ``done``; return what gives the result."""
+        """Stage the changes of the stages ``done``; return a function that makes the result."""
         change, before, after = self._change, self._present.settings, self._goal.settings
         if after.zenoh and after.zenoh != before.zenoh:
             check_network(after.zenoh)
@@ -541,7 +545,7 @@ class _Updater:
         return _Reissued(name, replaced_rights(name, present, grant, change.now), old)
 
     def _expires_otherwise(self, name: str) -> bool:
-        """Return whether an enclave becomes short-lived, or is no longer."""
+        """Return whether the update makes an enclave short-lived, or ends that."""
         before, after = self._present.settings, self._goal.settings
         return before.longest_validity(name) != after.longest_validity(name)
 
@@ -557,7 +561,7 @@ class _Updater:
         return NewIdentity(enclave_subject(name, unique=unique), public)
 
     def _has_default_rights(self, state: Credentials, earlier: SignedRights) -> bool:
-        """Return whether an enclave has the rights of no policy, and these change."""
+        """Return whether an enclave has the default rights, and the update changes these."""
         before, after = self._present.settings, self._goal.settings
         if before.default_permissions == after.default_permissions:
             return False
@@ -596,7 +600,7 @@ class _Updater:
     # ── authorities ────────────────────────────────────────────────────────────────────────
 
     def _part_authorities(self) -> None:
-        """Stage a file of its own for each CA, if one file has both; DDS loads the same bytes."""
+        """Stage a separate file for each CA, if one file has both; DDS loads the same bytes."""
         settings, files = self._goal.settings, self._change.keystore.authority_files
         if not settings.separate_authorities or len(files) > 1:
             return
@@ -654,9 +658,9 @@ class _Updater:
         return []
 
     def _rotation(self, role: str) -> str:
-        """Return the command that begins to replace CAs, or goes on with it, as a clause.
+        """Return the command, as a clause, that begins or continues the replacement of CAs.
 
-        ``role`` is the option for one of them, or "".
+        ``role`` is the option that selects a CA, or "".
         """
         command = f"sros rotate_ca {quote(str(self._root))}"
         if read_rotation(self._change.keystore).stage is RotationStage.NONE:
@@ -670,14 +674,14 @@ class _Updater:
 def trust_records(
     root: Path, *, now: datetime, keyring: Keyring = IN_KEYSTORE, dry_run: bool = False
 ) -> KeystoreUpdate:
-    """Record the permissions of enclaves again that version 0.1 of sros recorded without a chain.
+    """Record permissions again that sros 0.1 recorded without a chain of ledger lines.
 
-    Only permissions are recorded that are the last ones of their enclave in the ledger, and that
-    the permissions CA signed.  Where others are there, nothing is written.
+    Only permissions are recorded that the permissions CA signed, and that are the last ones of
+    their enclave in the ledger.  If any enclave has other permissions, nothing is written.
 
     Raises:
-        KeystoreError: the ledger is damaged, or no enclave needs it, or permissions are not the
-            last ones that the ledger has.
+        KeystoreError: the ledger is damaged, no enclave needs this, or an enclave has permissions
+            other than the last ones in the ledger.
     """
     with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
         ledger = change.ledger
@@ -731,10 +735,10 @@ def set_zenoh(
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Creation:
-    """Give a keystore a Zenoh network, or None: its settings, and the files of all enclaves.
+    """Set or remove (None) the Zenoh network of a keystore: its settings, and all enclaves' files.
 
-    The enclave of the router is created if it does not exist.  Files that are as they should be,
-    with a valid signature, stay as they are.
+    The enclave of the router is created if it does not exist.  Files that already have the right
+    content and a valid signature stay as they are.
 
     Raises:
         KeystoreError: files of the keystore were edited by hand, or it has no settings.
@@ -779,7 +783,7 @@ def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
 
 
 def _check_router(change: KeystoreChange, router: str) -> None:
-    """Raise `UsageError` if the enclave of the router has permissions that a policy gave it."""
+    """Raise `UsageError` if a policy gave the enclave of the router its permissions."""
     path = enclave_path(change.root, router) / PERMISSIONS_FILE
     if not path.exists():
         return

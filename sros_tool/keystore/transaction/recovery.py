@@ -1,4 +1,4 @@
-"""Locks and recovery of a keystore: a committed transaction is completed, another one undone.
+"""Locks and recovery of a keystore: a committed transaction is completed, any other is undone.
 
 Every transaction ends with a recovery: after the commit, plain files replace the links into the
 stage, and new folders move to their places.  Each step can be repeated and skips finished work, so
@@ -39,10 +39,10 @@ _PAUSE = 0.02
 
 
 class KeystoreLock:
-    """The lock on a keystore: a locked file in it, which is there only while it is locked.
+    """The lock on a keystore: a locked file in the keystore, which exists only while it is locked.
 
-    Only the owner of the keystore (and root) can open the file, so nobody else can hold the lock:
-    a lock on the folder itself could be taken by everybody who may read the folder.
+    Only the owner of the keystore (and root) can open the file, so no other user can hold the lock:
+    anybody who may read the folder could lock the folder itself.
     """
 
     def __init__(self, folder: Folder) -> None:
@@ -55,10 +55,10 @@ class KeystoreLock:
         return self._handle >= 0
 
     def acquire(self, wait: float | None = None) -> Self:
-        """Lock the keystore; wait for it for ``wait`` seconds (default: 60).
+        """Lock the keystore, waiting up to ``wait`` seconds (default: 60) for another process.
 
-        Whoever calls it calls `release` also if it raises: a signal may come just after the file
-        was made.
+        The caller has to call `release` even if this raises: a signal may arrive just after the
+        file was made.
 
         Raises:
             KeystoreError: another process held the lock for ``wait`` seconds.
@@ -76,7 +76,7 @@ class KeystoreLock:
         return self
 
     def _try(self) -> bool:
-        """Return whether the lock could be taken now."""
+        """Try to take the lock; return whether this succeeded."""
         try:
             with _signals_held_back():
                 handle = self._folder.open_private(LOCK)
@@ -110,7 +110,7 @@ class KeystoreLock:
         )
 
     def _is_there(self, handle: int) -> bool:
-        """Return whether the locked file is still in the folder: who unlocks it removes it."""
+        """Return whether the locked file is still in the folder; unlocking removes it."""
         there = self._folder.state(LOCK)
         return there is not None and os.path.samestat(there, os.fstat(handle))
 
@@ -126,7 +126,7 @@ class KeystoreLock:
 
 
 def lock_new(folder: Folder) -> bool:
-    """Lock a folder that only this user can open; return whether no other process has locked it.
+    """Lock a folder that only this user can open; return False if another process has locked it.
 
     The lock lasts until the folder is closed.
     """
@@ -143,7 +143,7 @@ def _locked(handle: int) -> bool:
 
 @contextlib.contextmanager
 def _signals_held_back() -> Iterator[None]:
-    """Let no signal end the work between making a file and noting that it was made."""
+    """Delay signals, so that none interrupts between making and recording a file."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
@@ -155,7 +155,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def tidy(root: Path) -> None:
-    """Remove what an interrupted process left in the keystore: its transaction, and its lock.
+    """Remove the transaction and the lock that an interrupted process left in the keystore.
 
     The transaction is completed if it was committed, and otherwise undone.
 
@@ -189,7 +189,7 @@ def recover(folder: Folder) -> None:
 
 
 def complete(folder: Folder, moves: Sequence[Move]) -> None:
-    """Put everything that was committed in its place, and remove the stage."""
+    """Move all committed files to their places, and remove the stage."""
     _replace_links(folder, moves)
     if folder.is_folder(f"{STAGE}/{ADDED}"):
         _move_into_place(folder, f"{STAGE}/{ADDED}", "")
@@ -252,7 +252,11 @@ def _leads_into_stage(folder: Folder, path: str) -> bool:
 
 
 def _make_folders(folder: Folder, paths: Iterable[str]) -> None:
-    """Make the missing folders; raise `KeystoreError` if one is not a real folder."""
+    """Make the missing folders among ``paths``.
+
+    Raises:
+        KeystoreError: a path exists and is not a real folder.
+    """
     there = {""}
 
     def make(path: str) -> None:
@@ -270,8 +274,8 @@ def _make_folders(folder: Folder, paths: Iterable[str]) -> None:
 def _move_into_place(folder: Folder, source: str, target: str) -> None:
     """Move everything in the folder ``source`` to the same paths below the folder ``target``.
 
-    CA keys come after their certificates, and enclaves last: a folder without them does not count
-    as a keystore yet.
+    CA keys move after their certificates, and enclaves last: a folder without enclaves does not
+    count as a keystore yet.
     """
     for name in sorted(folder.names(source), key=lambda each: (each == ENCLAVES, each == PRIVATE)):
         old, new = f"{source}/{name}", f"{target}/{name}".lstrip("/")

@@ -31,9 +31,9 @@ _VERSION = 2
 
 
 class Move(NamedTuple):
-    """The change of one path in an existing folder of the keystore.
+    """The change of a path in an existing folder of the keystore.
 
-    ``before`` and ``after`` say what is at the path: None for nothing, "" for a file, and the
+    ``before`` and ``after`` are the content of the path: None for nothing, "" for a file, and the
     target of a symbolic link.
     """
 
@@ -48,10 +48,10 @@ ADOPT = "adopt"
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One file or link that a transaction changes.
+    """A file or link that a transaction changes.
 
     ``action`` is "create", "replace" or "remove", or `CLOSE` for a private key or a folder of keys
-    that other users cannot open any more, or `ADOPT` for a keystore of ros2/sros2 that gets its
+    that other users could open before, or `ADOPT` for a keystore of ros2/sros2 that gets its
     settings and ledger; ``path`` is relative to the keystore.
     """
 
@@ -60,7 +60,7 @@ class Change:
 
 
 class ChangeRun(NamedTuple):
-    """The same action on several files of one folder, which is "" or ends with "/"."""
+    """The same action on several files of a folder; ``folder`` is "" or ends with "/"."""
 
     action: str
     folder: str
@@ -70,12 +70,12 @@ class ChangeRun(NamedTuple):
 class Changes(Sequence[Change]):
     """The changes of a transaction, in order.
 
-    Changes in a row that are alike but for the names of their files are kept together: most folders
-    of a large keystore get the same files, whose names are in the memory once.
+    Consecutive changes of the same kind are stored together: most folders of a large keystore get
+    the same files, whose names are in memory only once.
     """
 
     def __init__(self) -> None:
-        """Begin without a change."""
+        """Create an empty list of changes."""
         self._runs: list[ChangeRun] = []
         self._ends: list[int] = []  # how many changes there are up to the end of each run
         self._names: dict[tuple[str, ...], tuple[str, ...]] = {}
@@ -142,8 +142,7 @@ class Changes(Sequence[Change]):
 class Staged:
     """The changes that a forked worker staged, sent to the process that commits.
 
-    ``kept`` are the new files, None for those beyond its limit, and the targets of links of a dry
-    run.
+    ``kept`` has the new files and link targets of a dry run; None for files beyond its limit.
     """
 
     changes: tuple[ChangeRun, ...]
@@ -152,12 +151,12 @@ class Staged:
 
 
 def staged_name(path: str) -> str:
-    """Return the name in the stage for a path; it is short, so that a link fits into an inode."""
+    """Return the name of a path's file in the stage; short, so that a link fits in an inode."""
     return hashlib.blake2b(os.fsencode(path), digest_size=8).hexdigest()
 
 
 def stage_link_target(path: str) -> str:
-    """Return the target of the link that is at ``path`` during the commit."""
+    """Return the target of the link that replaces ``path`` during the commit."""
     return "../" * path.count("/") + f"{STAGE}/{LIVE}/{staged_name(path)}"
 
 
@@ -207,7 +206,7 @@ def _move(path: str, before: str | None, after: str | None) -> Move:
 
 
 def _stays_inside(path: str, target: str) -> bool:
-    """Return whether a link at ``path`` with the text ``target`` stays in the keystore."""
+    """Return whether a link at ``path`` to ``target`` leads to a place inside the keystore."""
     whole = os.path.normpath(f"{os.path.dirname(path)}/{target}")
     return not target.startswith("/") and not whole.startswith("..")
 
@@ -221,12 +220,12 @@ _STAGED_NAME = re.compile(r"[0-9a-f]{16}")
 def _check_stage(folder: Folder) -> str | None:
     """Return the target of the link ``live``: BEFORE, AFTER, or None if nothing was changed yet.
 
-    A stage may have been made up, by somebody who can write to the keystore or who packed it into
-    an archive, to have the next verb of another user move files.  It is only accepted if sros, run
-    by this user or by the owner of the keystore, can have made all of it.
+    Whoever can write to the keystore, or packed it into an archive, could forge a stage, to have
+    the next verb of another user move files.  A stage is only accepted if sros, run by this user or
+    by the owner of the keystore, can have made all of it.
 
     Raises:
-        KeystoreError: somebody else made the stage, or it is not of this version's format.
+        KeystoreError: another user made the stage, or it has the format of another version.
     """
     if not folder.is_folder(STAGE):
         return None
@@ -255,7 +254,7 @@ def _check_stage(folder: Folder) -> str | None:
 
 
 def check_interrupted(folder: Folder) -> tuple[str | None, tuple[Move, ...]]:
-    """Return what a stage holds: the target of ``live``, and the moves to complete or to undo.
+    """Return the target of ``live`` in a stage, and the moves to complete or to undo.
 
     Raises:
         KeystoreError: as `_check_stage` and `_read_manifest`.
@@ -265,7 +264,7 @@ def check_interrupted(folder: Folder) -> tuple[str | None, tuple[Move, ...]]:
 
 
 def _check_added(folder: Folder, path: str) -> None:
-    """Raise `KeystoreError` unless every file below an added folder is one of a keystore."""
+    """Raise `KeystoreError` unless all files below an added folder can belong to a keystore."""
     whole = f"{STAGE}/{ADDED}/{path}".rstrip("/")
     if stat.S_ISDIR(folder.mode(whole)):
         _check_owner(folder, whole)

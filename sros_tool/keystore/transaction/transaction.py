@@ -63,15 +63,16 @@ _LOG = logging.getLogger(__name__)
 _KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
 _MOST_LINKS = 8
 _MOST_KEPT = 32 << 20
-"""Bytes of new files that a process keeps in a dry run, so that they can be looked at."""
+"""Bytes of new files that a dry run keeps in memory, for `Transaction.content_after`."""
 
 
 class Transaction:
-    """An atomic change of many files of a keystore, which is locked meanwhile.
+    """An atomic change of many files of a keystore, which is locked during the change.
 
     Use it as a context manager; without `commit` nothing changes.  With ``fresh``, the keystore may
     be new; otherwise it must exist.  With ``dry_run`` nothing is written, and ``changes`` lists the
-    changes that would be made.  ``enclaves`` are the names of those before the change, sorted.
+    changes that would be made.  ``enclaves`` are the sorted names of the enclaves before the
+    change.
     """
 
     def __init__(self, root: Path, *, fresh: bool = False, dry_run: bool = False) -> None:
@@ -97,28 +98,28 @@ class Transaction:
 
     @property
     def _in(self) -> Folder:
-        """The keystore's folder; of a new keystore, the folder next to its path."""
+        """The folder to write in: the keystore's, or for a new keystore a sibling folder."""
         if self._folder is None:
             self._folder = Folder(self.root, for_owner=True)
         return self._folder
 
     @property
     def _added(self) -> str:
-        """The folder, in `_in`, of what is in a new folder; with a "/" at its end."""
+        """The folder in `_in` for the files of new folders; ends with "/"."""
         return "" if self._new_root else f"{STAGE}/{ADDED}/"
 
     def on_failure(self, undo: Callable[[], None]) -> None:
-        """Have ``undo`` called if the transaction ends without a commit."""
+        """Register ``undo``, which is called if the transaction ends without a commit."""
         self._undo.append(undo)
 
     # ── begin and end ──────────────────────────────────────────────────────────────────────
 
     def __enter__(self) -> Self:
-        """Begin the transaction.
+        """Begin the transaction, and lock the keystore.
 
         Raises:
-            KeystoreError: this user cannot read all enclaves, the keystore is busy, or a new one
-                would belong to a stranger.
+            KeystoreError: this user cannot read all enclaves, the keystore is busy, or a new
+                keystore would belong to another user.
         """
         try:
             if self._fresh and not self._new_root:
@@ -153,7 +154,7 @@ class Transaction:
         _LOG.info("began a transaction in the keystore '%s'", self.root)
 
     def _refuse_folder_of_stranger(self) -> None:
-        """Refuse, as root, a folder that anybody may have made to be given the keys in it."""
+        """Refuse, as root, to write keys into a folder that another user may have prepared."""
         above = Path(os.path.realpath(self.root)).parent.stat()
         owner = self._in.owner[0]
         if os.geteuid() == 0 and above.st_mode & stat.S_IWOTH and owner not in (0, above.st_uid):
@@ -202,7 +203,7 @@ class Transaction:
                     folder.close()
 
     def _remove_stale_siblings(self, parent: Folder) -> None:
-        """Remove what processes of this user left that were killed as they made this keystore."""
+        """Remove what killed processes of this user left while they created this keystore."""
         for name in parent.names():
             if not name.startswith(self._sibling_prefix):
                 continue
@@ -228,7 +229,7 @@ class Transaction:
             self._kept_bytes += len(data) if fits else 0
 
     def write_parts(self, path: str, parts: Iterable[bytes], *, private: bool = False) -> None:
-        """Stage a file as `write` does, part by part; a dry run takes no part."""
+        """Stage a file as `write` does, from parts; a dry run does not read the parts."""
         staged = self._prepare(path, "")
         if staged is None:
             return
@@ -239,15 +240,15 @@ class Transaction:
             raise
 
     def read(self, path: str) -> bytes:
-        """Return the content of a file of the keystore, to be moved or copied in it.
+        """Return the content of a file, to move or copy it within the keystore.
 
         Raises:
-            KeystoreError: a link leads out of the keystore: the copy would be its owner's.
+            KeystoreError: a link leads out of the keystore: the copy would belong to its owner.
         """
         return self._in.read_inside(path)
 
     def place_after(self, path: str) -> str:
-        """Return where the content of ``path`` will be, through links, for `content_after`."""
+        """Return the path that ``path`` will lead to through links, for `content_after`."""
         for _ in range(_MOST_LINKS):
             target = self.target_after(path)
             if target is None:
@@ -258,10 +259,10 @@ class Transaction:
         return path
 
     def content_after(self, place: str) -> bytes | None:
-        """Return the content that a file, not a link, will have.
+        """Return the content that a file (not a link) will have after the transaction.
 
-        It is None if there will be no such file, or if it cannot be read, or if this dry run made
-        too many files to keep this one.
+        Return None if the file will not exist or cannot be read, or if this dry run makes too many
+        files to keep it in memory.
         """
         if not self.is_staged(place):
             return _content(self.root / place)
@@ -271,14 +272,14 @@ class Transaction:
         return _content(Path(self._stage_place(place)))
 
     def not_kept(self) -> list[str]:
-        """Return the new files of which `content_after` cannot tell: a dry run keeps up to a limit.
+        """Return the new files that `content_after` does not know, because of a dry run's limit.
 
         Private files are not among them.
         """
         return sorted(path for path, kept in self._kept.items() if kept is None)
 
     def target_after(self, path: str) -> str | None:
-        """Return the target of the link that will be at ``path``; None if it will be no link."""
+        """Return the target of the link at ``path`` after the transaction; None: no link."""
         if not self.is_staged(path):
             return _link_target(f"{self.root}/{path}")
         if self.dry_run:
@@ -293,7 +294,7 @@ class Transaction:
         return f"{self._in.path}/{staged}"
 
     def changed_folders(self) -> dict[str, set[str]]:
-        """Map each folder ("" is the keystore) to the names of the files in it that change."""
+        """Map folders ("" is the keystore) to the names of their files that change."""
         found: dict[str, set[str]] = {}
         for run in self.changes.since(0):
             found.setdefault(run.folder.removesuffix("/"), set()).update(run.names)
@@ -348,7 +349,7 @@ class Transaction:
         return name in self._staged.get(folder, ())
 
     def _at(self, path: str) -> str | None:
-        """Return the present state of a path, as in `Move.before`."""
+        """Return the present content of a path, as in `Move.before`."""
         state = self._in.state(path)
         if state is None:
             return None
@@ -359,7 +360,7 @@ class Transaction:
         return self._in.link_target(path) or "" if stat.S_ISLNK(state.st_mode) else ""
 
     def _prepare_folder(self, path: str, *, wanted: bool = True) -> bool:
-        """Return whether a folder exists in the keystore; if not and ``wanted``, stage it."""
+        """Return whether a folder exists in the keystore; if not, stage it if ``wanted``."""
         if path in self._folders:
             return self._folders[path]
         exists = not self._new_root
@@ -422,7 +423,7 @@ class Transaction:
         return [(part, result) for part, (result, _) in slices]
 
     def adopt(self) -> None:
-        """Note among the changes that the keystore gets its first settings and ledger."""
+        """Add a change that says that the keystore gets its first settings and ledger."""
         self.changes.add(ADOPT, "")
 
     # ── commit ─────────────────────────────────────────────────────────────────────────────
@@ -430,8 +431,8 @@ class Transaction:
     def commit(self) -> None:
         """Put all staged changes in place atomically, and flush them to disk.
 
-        Private keys and folders of keys that other users could open are closed to them:
-        ros2/sros2 leaves them as open as the umask lets them be.
+        Private keys and folders of keys that other users could open are closed to them: ros2/sros2
+        leaves their mode to the umask.
 
         Raises:
             KeystoreError: another process has created the keystore meanwhile.
@@ -463,7 +464,7 @@ class Transaction:
                     self.changes.add(CLOSE, path)
 
     def _open_keys(self) -> list[str]:
-        """Return the paths that other users can open, except those that this change writes."""
+        """Return the keys that other users can open, except files that this transaction writes."""
         if self._new_root:
             return []
         return [path for path in _open_keys(self.root) if not self.is_staged(path)]
@@ -614,5 +615,5 @@ class _Bridge:
 
 
 def _kept(move: Move) -> str:
-    """Return where the old content of a path is during the change."""
+    """Return the path of the old content during the commit."""
     return f"{STAGE}/{BEFORE}/{staged_name(move.path)}"
