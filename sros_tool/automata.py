@@ -470,7 +470,7 @@ class NameSet:
     __slots__ = ("_node",)
 
     def __init__(self, exact: Iterable[str] = (), automata: Iterable[Automaton] = ()) -> None:
-        """Hold the names of ``exact``, and all that one of the ``automata`` accepts."""
+        """Create the set of the ``exact`` names and of all names that an automaton accepts."""
         self._node: _Node = _Some(frozenset(exact), frozenset(automata))
 
     @classmethod

@@ -72,22 +72,22 @@ def _way(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
         if part == "..":
             here = here.parent
             continue
-        each = here / part
+        entry = here / part
         try:
-            state = each.lstat()
+            state = entry.lstat()
         except OSError:
             return
         if stat.S_ISLNK(state.st_mode):
             links += 1
             if links > _MOST_LINKS:
                 return
-            yield each, state
-            target = each.readlink()
+            yield entry, state
+            target = entry.readlink()
             here = Path("/") if target.is_absolute() else here
             rest += reversed(target.parts[1:] if target.is_absolute() else target.parts)
         elif rest:
-            yield each, state
-            here = each
+            yield entry, state
+            here = entry
 
 
 @lru_cache

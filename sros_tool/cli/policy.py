@@ -751,7 +751,7 @@ def access_summary(growth: Growth) -> str:
         text = "1 enclave can influence another one"
         parts.append((text if pairs == 1 else f"{pairs} pairs of enclaves can influence") + " now")
     if growth.added and growth.reach_unknown:
-        parts.append(f"whom that lets enclaves influence is not known: {growth.reach_unknown}")
+        parts.append(f"it is unknown whom enclaves can influence now: {growth.reach_unknown}")
     return "; ".join(parts) + gone + basis
 
 

@@ -145,7 +145,7 @@ def _upwards(name: str) -> Iterator[str]:
 
 
 def _folders(fleet: Fleet) -> Mapping[str, frozenset[str]]:
-    """Map the folders of robots to their names, usually one.
+    """Map enclave folders of robots, such as ``/r3``, to the names of the robots (usually one).
 
     They are the paths of the fleet down to the part with the first placeholder.
     """

@@ -491,7 +491,7 @@ _HOST = re.compile(r"(?!.*(?:\.-|-\.))\w(?:[\w-]*\w)?(?:\.[\w-]*\w)+", re.ASCII)
 
 
 def _name_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
-    """Yield the names in a chain that a CA above them does not allow."""
+    """Yield faults of names that violate the name constraints of a CA in the chain."""
     for place, certificate in enumerate(chain):
         if place and is_self_issued(certificate):
             continue

@@ -415,7 +415,7 @@ def parse_token_uri(uri: str) -> TokenUri:
 
 
 def parse_enclave_uri(uri: str, name: str) -> TokenUri:
-    """Parse the URI of an enclave's key; without ``object``, it is ``name``, the enclave.
+    """Parse the URI of an enclave's key; ``object`` defaults to the enclave's name, ``name``.
 
     Only what sros uses and Fast DDS reads is accepted, so that both find the same key.
 

@@ -100,9 +100,9 @@ class DocumentReader(Enum):
     STANDARD = auto()
     """The schema of the standard."""
     FAST = auto()
-    """TinyXML-2 and Fast DDS."""
+    """TinyXML-2, as Fast DDS uses it."""
     CYCLONE = auto()
-    """Cyclone DDS' own."""
+    """The XML parser of Cyclone DDS."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
