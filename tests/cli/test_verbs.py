@@ -399,7 +399,7 @@ def test_a_document_without_the_signature_that_was_asked_for_is_a_no(
     for path in (keystore, authority, keystore / "enclaves/a", keystore / "enclaves/a/key.pem"):
         assert sros("inspect", path).status == 0 or path.is_dir()
         ignored = sros("inspect", path, "--ca", authority)
-        assert ignored.status == 2 and "--ca verifies a signed document" in ignored.err
+        assert ignored.status == 2 and "--ca applies only to signed documents" in ignored.err
 
 
 def test_create_permission_replaces_and_says_so(keystore: Path, tmp_path: Path) -> None:
