@@ -1,4 +1,4 @@
-"""What a comparison of two sides takes for granted, and what it leaves out on purpose.
+"""The assumptions of a comparison of two sides, and the parts that it leaves out on purpose.
 
 A policy says neither which governance it is signed with, nor, but for robots of a fleet, for which
 domains.  Permissions do not say the first.
@@ -21,7 +21,7 @@ from sros_tool.zenoh.configuration import Mode
 
 
 def completed(side: AccessSource, other: AccessSource) -> AccessSource:
-    """Return a side of which domains and access control are certain, to compare it with another.
+    """Return a side with its domains and access control filled in, to compare it with another.
 
     Enclaves of robots are for the domain of their robot.  Without a governance of its own, a side
     has access control of everything, in the domains of the other side and in its own ones.
@@ -67,7 +67,7 @@ def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permi
 
 
 def domains_of_robots(side: AccessSource, other: AccessSource) -> dict[str, int]:
-    """Map the enclaves of a policy that are of a robot with a domain of its own to that domain."""
+    """Map the enclaves of robots that have a domain in the fleet to this ROS domain."""
     robots = side.fleet or other.fleet
     if side.kind != "policy" or robots is None:
         return {}
@@ -90,7 +90,7 @@ def _for_domain(permissions: Permissions, domain: int) -> Permissions:
 
 
 def _granted(side: AccessSource) -> DomainSet:
-    """Return the domains for which permissions have rules; none for a policy, which is for any."""
+    """Return the domains for which permissions have rules; empty for a policy, which fits any."""
     if side.kind == "policy":
         return DomainSet(())
     return DomainSet(
@@ -135,7 +135,7 @@ def _controlling(governance: Governance | None, more: DomainSet) -> Governance |
 
 
 def assumptions(base: AccessSource, head: AccessSource) -> tuple[str, ...]:
-    """Return what is assumed of sides that do not say everything, as clauses."""
+    """Return the assumptions about sides that do not state everything, as clauses."""
     return tuple(_assumed(base, head))
 
 
@@ -164,7 +164,7 @@ def _assumed(base: AccessSource, head: AccessSource) -> Iterator[str]:
 
 
 def left_out(base: AccessSource, head: AccessSource) -> tuple[str, ...]:
-    """Return what is not compared on purpose, in words."""
+    """Return the parts that are not compared on purpose, in words."""
     return tuple(_left_out(base, head))
 
 

@@ -64,7 +64,7 @@ class CommitFiles:
     refused: list[SrosError] = field(default_factory=list)
 
     def entry(self, path: str) -> TreeEntry | None:
-        """Return what is at a path of the commit; None if nothing is."""
+        """Return the tree entry at a path of the commit; None if the path does not exist."""
         return self.repository.find(self.commit, path)
 
     def file(self, path: str) -> Path | None:
@@ -157,7 +157,7 @@ class CommitFiles:
         return top
 
     def differing(self, work_tree: Path) -> list[str]:
-        """Return the files of this snapshot that a work tree has otherwise, or not at all."""
+        """Return the files of this snapshot that differ in a work tree, or are missing there."""
         paths = []
         with Folder(work_tree) as folder:
             for path in self.files:
@@ -233,7 +233,7 @@ _EBCDIC = b"\x4c\x6f\xa7\x94"
 _ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
 _READABLE = (b"utf-8", b"utf8", b"utf-16", b"us-ascii", b"ascii", b"iso-8859-", b"windows-125")
 _BEFORE = b"\xef\xbb\xbf\xfe\xff \t\r\n"
-"""Bytes of byte order marks and white space, which can stand before the first element."""
+"""Byte order marks and white space, which may precede the first XML element."""
 _BEGIN = 4096
 _NAMES = frozenset(kind.removesuffix("s") for kind in RIGHTS)
 _WITH_PARTS = ("policy", "enclaves", "enclave", "profiles", "profile", *RIGHTS)
@@ -261,7 +261,7 @@ def may_be_policy(content: bytes) -> bool:
 
 
 def _is_part(root: etree._Element) -> bool:
-    """Return whether a document has what policies include, however it is written."""
+    """Return whether an XML document has elements that policies can include."""
     below = list(root.iter(etree.Element))
     only_names = below[0] if root.tag in _NAMES else below[1:]
     return (
@@ -296,7 +296,7 @@ def is_whole_policy(content: bytes) -> bool:
 
 
 def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) -> dict[str, bool]:
-    """Map the files that policies use with all that is in them, to whether with the root element.
+    """Map the files that policies use completely to whether their root element is used, too.
 
     Args:
         policies: the paths of the policies.
@@ -315,13 +315,13 @@ def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) 
 
 
 def includes_files(content: bytes) -> bool:
-    """Return whether a file may be XML, which can include others."""
+    """Return whether a file may be XML, so that it can include other files."""
     begin = content[:_BEGIN].replace(b"\0", b"").lstrip(_BEFORE)
     return not begin or begin.startswith((b"<", _EBCDIC))
 
 
 def users_of(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str]:
-    """Return those of some files that include some of the parts, or one that does."""
+    """Return the files that include some of the parts, directly or through other files."""
     includes = {
         path: {target for target, _ in _includes(path, data)} for path, data in files.items()
     }
@@ -332,7 +332,7 @@ def users_of(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str]:
 
 
 def _includes(path: str, content: bytes | None) -> Iterator[tuple[str, str]]:
-    """Yield file and xpointer of the includes of a file that count."""
+    """Yield file and xpointer of the includes in a file, without unused fallbacks."""
     try:
         root = parse(content, "the file", instructions=True) if content is not None else None
     except DocumentError:

@@ -1,4 +1,4 @@
-"""Decide requirements in a world, for all names, with a witness for each that does not hold.
+"""Decide requirements in a world, for all names, with a witness for each broken requirement.
 
 To do something is to write one of its DDS topics: whoever may write the requests of a service can
 have them executed, even if it may not read the replies.  To subscribe is to read.  Only what an
@@ -60,7 +60,7 @@ class Use:
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """Why a requirement does not hold: the shortest list of uses that it forbids, or lacks.
+    """The reason that a requirement does not hold: a shortest list of forbidden or missing uses.
 
     For influence it is a chain: each use that writes is followed by the one that reads it.
     ``others`` are further enclaves that break the requirement, each on its own.
@@ -71,12 +71,12 @@ class Witness:
 
     @property
     def enclaves(self) -> tuple[str, ...]:
-        """The enclaves of the uses, in their order, each once."""
+        """The enclaves of the uses, in order, without duplicates."""
         return tuple(dict.fromkeys(use.enclave for use in self.uses))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the uses, in their order, each once."""
+        """The names of the uses, in order, without duplicates."""
         return tuple(dict.fromkeys(use.name for use in self.uses))
 
 
@@ -97,7 +97,7 @@ class Verdict:
 
 
 class Worlds:
-    """Worlds in which requirements are decided; those that give the same have one decision.
+    """Worlds in which requirements are decided; worlds with equal access share a decision.
 
     The engine of each world confirms the witness.
     """
@@ -112,7 +112,11 @@ class Worlds:
     def decide(
         self, requirement: Requirement, limit: SearchLimit
     ) -> Iterator[tuple[World, Verdict]]:
-        """Yield each world with its decision; raises what `decide` raises."""
+        """Yield each world with its decision.
+
+        Raises:
+            DocumentError: as `decide`.
+        """
         known: dict[World, Verdict] = {}
         for world, first in self._first_alike.items():
             if first is world:
@@ -184,7 +188,7 @@ class _Part:
 
     @property
     def longer(self) -> int:
-        """By how many bytes the topic is longer than the name."""
+        """Number of bytes by which the topic is longer than the name."""
         return len(self.begin) + len(self.end)
 
     def topics(self, name: str) -> Topics:
@@ -204,7 +208,7 @@ def _parts_of(right: str) -> tuple[_Part, ...]:
 
 @lru_cache(maxsize=16)
 def _doing(right: str) -> tuple[_Part, ...]:
-    """Return the DDS topics of which each one lets an enclave do what a right is for."""
+    """Return the DDS topics of a right of which a single one is enough to act."""
     return tuple(each for each in _parts_of(right) if each.writes or right == "subscribe")
 
 
@@ -217,7 +221,7 @@ def _each(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
 
 
 def _match(patterns: Sequence[str], enclave: str) -> bool:
-    """Return whether a list of enclaves has an enclave: by a pattern, and excepted by none."""
+    """Return whether a pattern of the list matches an enclave and no exception does."""
     return any(
         fnmatchcase(enclave, pattern) for pattern in patterns if pattern[0] != EXCEPT
     ) and not any(fnmatchcase(enclave, pattern[1:]) for pattern in patterns if pattern[0] == EXCEPT)
@@ -228,7 +232,7 @@ def _use(enclave: str, right: str, part: _Part, topics: Topics, topic: str) -> U
 
 
 def _better(use: Use) -> tuple[int, str, str]:
-    """Return the sort key of witnesses with one use: short names first."""
+    """Return a sort key for uses: short names first."""
     return len(use.name), use.name, use.enclave
 
 
@@ -243,7 +247,7 @@ def _not_alone(requirement: Only | Nobody, world: World, limit: SearchLimit) -> 
 def _first_uses(
     rights: RightNames, world: World, limit: SearchLimit, without: Sequence[str] = ()
 ) -> dict[str, Use]:
-    """Map the enclaves that have one of some rights to the shortest use, except ``without``."""
+    """Map each enclave that has one of the rights to its shortest use, except ``without``."""
     uses: dict[str, Use] = {}
     for right, part, topics in _each(rights):
         for met in world.side(part.writes).meeting(topics, limit):
@@ -263,7 +267,7 @@ def _first_of(uses: Collection[Use]) -> Witness | None:
 
 
 def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
-    """Return the shortest name that an enclave lacks a right to; all of its topics count."""
+    """Return a witness with the shortest name for which an enclave lacks a topic of a right."""
     enclave = requirement.enclave
     lacking = []
     for right, names in requirement.rights:
@@ -286,7 +290,7 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
 
 
 def _own(world: World, enclave: str, writes: bool) -> NameSet:
-    """Return what an enclave may write, or read, by its own permissions."""
+    """Return the topics that an enclave may write, or read, by its own permissions."""
     access = world.own.get(enclave)
     if access is None:
         return NameSet()
@@ -294,7 +298,7 @@ def _own(world: World, enclave: str, writes: bool) -> NameSet:
 
 
 def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a name that too many enclaves may use, with as many of them as it needs.
+    """Return a witness with a name that too many enclaves may use, and enough of them.
 
     Whoever may write one topic of an action can do a part of what the right to it is for, and
     counts as one who has it.
@@ -340,7 +344,7 @@ def _shared_by(
     expression: str,
     limit: SearchLimit,
 ) -> str | None:
-    """Return a name among those of an expression that at least ``count`` holders may use, or None.
+    """Return a name of an expression that at least ``count`` holders may use, or None.
 
     A name that some enclave states is better than one that only wildcards match.
     """
@@ -377,7 +381,7 @@ def _shared_by(
 
 
 def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness | None:
-    """Return the shortest name that a wildcard gives an enclave beyond the names it may."""
+    """Return a witness with the shortest name that a wildcard allows beyond the requirement."""
     enclaves = [each for each in world.enclaves if _match(requirement.enclaves, each)]
     uses: dict[str, Use] = {}
     for right, names in requirement.rights:
@@ -402,7 +406,7 @@ _READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
 
 
 def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Witness | None:
-    """Return the shortest name of which an enclave may do more than it should."""
+    """Return a witness with the shortest name to which an enclave has a further right."""
     enclaves = [each for each in world.enclaves if _match(requirement.enclaves, each)]
     uses: dict[str, Use] = {}
     for writes, ordinary in ((True, _WRITTEN_BY_EVERY_NODE), (False, _READ_BY_EVERY_NODE)):
@@ -423,7 +427,7 @@ def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Wit
 
 
 def _both(requirement: NotBoth, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a use of each side by one enclave, the shortest ones."""
+    """Return a witness: an enclave with the shortest use of each of the two sets of rights."""
     sides = [
         _first_uses(rights, world, limit) for rights in (requirement.first, requirement.second)
     ]
@@ -458,7 +462,7 @@ def _assumed(requirement: Requirement, world: World, limit: SearchLimit) -> str:
 
 
 def _of_kinds(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
-    """Yield the topics of names of topics, services and actions, each once."""
+    """Yield the DDS topics of names of topics, services and actions, without duplicates."""
     return iter(
         dict.fromkeys(
             part.topics(name)
@@ -485,7 +489,7 @@ def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness 
 
 
 def _uses(hop: TopicHop) -> Iterator[Use]:
-    """Yield the use that writes and the use that reads."""
+    """Yield the two uses of a hop: the source writes the topic, the target reads it."""
     for enclave, writes in ((hop.source, True), (hop.target, False)):
         right, name = right_to_use(hop.topic, writes=writes)
         yield Use(enclave, right, name, hop.topic, writes)
@@ -495,7 +499,7 @@ def _uses(hop: TopicHop) -> Iterator[Use]:
 
 
 def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterator[str]:
-    """Yield the names and enclaves of a requirement that nothing has."""
+    """Yield names and enclaves in a requirement that do not occur in the world."""
     patterns: tuple[str, ...] = ()
     match requirement:
         case Only():
@@ -532,7 +536,7 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
 
 
 def _always(requirement: Requirement, world: World) -> str:
-    """Return why no rights of the enclaves that there are can break a requirement, or "".
+    """Return why a requirement cannot fail with the present enclaves, as a clause, or "".
 
     A list of all enclaves by their names is no such reason: it names those that may come.
     """
@@ -562,7 +566,7 @@ def _named(right: str, name: str) -> str:
 
 
 def _anybody(world: World, parts: Iterable[_Part], name: str, limit: SearchLimit) -> bool:
-    """Return whether some enclave may use a topic of the name."""
+    """Return whether any enclave may use a DDS topic of the name."""
     for part in parts:
         met = world.side(part.writes).meeting(part.topics(name), limit)
         if any(each.stated for each in met) or any(
@@ -582,7 +586,7 @@ _IGNORED = NameSet.union(
         *(f"rq/{name.lstrip('/')}{SERVICE_ENDS['rq']}" for name in QUESTIONS),
     )
 )
-"""Topics that are no hops."""
+"""Topics that do not count as a flow of information."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -638,7 +642,7 @@ def _shortest_chain(
 
 
 def influencers(world: World, limit: SearchLimit) -> dict[str, set[str]]:
-    """Map each enclave that others influence directly to these."""
+    """Map each enclave to the enclaves that influence it directly."""
     sources: dict[str, set[str]] = {}
     flow = _Flow(world, limit)
     for enclave in world.enclaves:
@@ -652,7 +656,7 @@ def influencers(world: World, limit: SearchLimit) -> dict[str, set[str]]:
 
 
 class _Flow:
-    """The hops of a world; what is shared by wildcards is searched once for each pair."""
+    """The hops of a world; topics shared by wildcards are searched once for each pair."""
 
     def __init__(self, world: World, limit: SearchLimit) -> None:
         self._world = world
@@ -664,7 +668,7 @@ class _Flow:
         is_unused: Callable[[str], bool],
         is_new: Callable[[str], bool],
     ) -> Iterator[tuple[str, str]]:
-        """Yield topic and reader for the hops from an enclave to those that are new.
+        """Yield topic and reader for the hops from an enclave to readers for which ``is_new``.
 
         Exact topics come first, each only if it is unused.
         """

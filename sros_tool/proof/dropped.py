@@ -1,4 +1,4 @@
-"""What a file of requirements demands no longer, compared with the file as it was before.
+"""Find requirements that a new version of a requirements file drops or weakens.
 
 Whoever changes a policy can change its requirements, too.  A requirement is kept if some
 requirements of the new file demand at least as much, under whatever name and in whatever order.
@@ -35,10 +35,10 @@ from sros_tool.values import shows
 @shows("change", "demand", "name", "why", "file", "line", "now")
 @dataclass(frozen=True, slots=True)
 class DroppedRequirement:
-    """A requirement of the earlier file that the new one does not demand, or not all of it.
+    """A requirement of the earlier file that the new file drops or weakens.
 
     ``requirement`` has its place in the earlier file; ``kept`` are the requirements of the new file
-    that are about some of the same, as far as they can be told.
+    about some of the same names or enclaves.
     """
 
     requirement: Requirement
@@ -51,22 +51,22 @@ class DroppedRequirement:
 
     @property
     def demand(self) -> str:
-        """What the requirement demanded."""
+        """The demand of the requirement, as a clause."""
         return demand(self.requirement)
 
     @property
     def name(self) -> str:
-        """The own name of the requirement, or ""."""
+        """The name that the file gives the requirement, or ""."""
         return self.requirement.name
 
     @property
     def why(self) -> str:
-        """The reason that the requirement gave, or ""."""
+        """The ``why`` of the requirement, or ""."""
         return self.requirement.why
 
     @property
     def file(self) -> str:
-        """The earlier file."""
+        """Path of the earlier file."""
         return self.requirement.source.file
 
     @property
@@ -76,13 +76,13 @@ class DroppedRequirement:
 
     @property
     def now(self) -> tuple[str, ...]:
-        """What the new file demands in its place."""
+        """The demands of the new file about some of the same names, as clauses."""
         return tuple(demand(each) for each in self.kept)
 
     def text(self) -> str:
-        """Return what is left of the requirement, as a clause."""
+        """Return a clause with the part of the requirement that the new file still demands."""
         if not self.kept:
-            return "nothing demands it any more"
+            return "the new file has no such requirement"
         return f"only this is left of it: {'; '.join(self.now)}"
 
 
@@ -123,7 +123,7 @@ def dropped_findings(
 
 
 def _parts(requirement: Requirement) -> Iterator[Requirement]:
-    """Yield requirements about one name each that together demand the same."""
+    """Split a requirement into requirements about a single name that together demand the same."""
     match requirement:
         case Widest(rights=rights, enclaves=enclaves):
             for each in rights:
@@ -157,13 +157,13 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
 
 
 def _one_by_one(enclaves: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield lists of one enclave or pattern each, with what the whole list excepts."""
+    """Split a list into lists with one enclave or pattern, each with all exceptions of the list."""
     excepted = tuple(enclave for enclave in enclaves if enclave.startswith(EXCEPT))
     yield from ((enclave, *excepted) for enclave in enclaves if not enclave.startswith(EXCEPT))
 
 
 def _single_rights(rights: RightNames) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield rights to one name each."""
+    """Yield pairs of a right and a single name."""
     yield from ((right, (name,)) for right, names in rights for name in names)
 
 

@@ -1,4 +1,4 @@
-"""Findings of requirements, by the lines of a policy and by worlds; requirements to propose."""
+"""Findings about requirements, with policy lines and worlds; and proposals for requirements."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Step:
 
     @property
     def source(self) -> Source | None:
-        """The file and line of the right, if it has any."""
+        """File and line of the right, or None."""
         return self.place.source if self.place else None
 
     def does(self) -> str:
@@ -84,7 +84,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """A requirement that does not hold, the steps of its witness, and the worlds where it does not.
+    """A broken requirement, the steps of its witness, and the worlds in which it does not hold.
 
     ``worlds`` is empty if it holds in none of those that were decided.  ``missing`` is an enclave
     of the witness that does not exist, or "".  ``idle`` says that it is no process that could start
@@ -101,7 +101,7 @@ class Violation:
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """All decisions: what does not hold, and why requirements, or parts of them, cannot fail.
+    """All decisions: broken requirements, and why (parts of) requirements cannot fail.
 
     ``assumed`` are those that hold only with the protection of the default template, which nobody
     has chosen, each with a name of which the policy does not say it.
@@ -113,7 +113,7 @@ class Decided:
 
 
 _MOST_STEPS = 8_000_000
-"""Most steps to search for names that wildcards have in common: some twenty seconds."""
+"""Highest number of search steps for names that wildcards share: about twenty seconds."""
 
 
 def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
@@ -147,14 +147,14 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
 
 
 def _step(use: Use, world: World, system: System) -> Step:
-    """Return a use with the right that states it, perhaps that of another enclave."""
+    """Return a use with the right that allows it, which may belong to another enclave."""
     lender = world.lender(use.enclave, use.writes, use.topic)
     stating = replace(use, enclave=lender) if lender else use
     return Step(use, system.places.find(stating), lender)
 
 
 def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
-    """Yield why a requirement, or a part of it, cannot fail in any world."""
+    """Yield clauses that say why a requirement, or a part of it, cannot fail in any world."""
     first, *others = verdicts
     empty = [each for each in first.empty if all(each in other.empty for other in others)]
     if empty:
@@ -178,7 +178,7 @@ def requirement_findings(requirements: Sequence[Requirement], system: System) ->
 
 
 def decided_findings(decided: Decided, system: System) -> list[Finding]:
-    """Return the findings of decisions, those of what does not hold first and in their order."""
+    """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violated(violation) for violation in decided.violations]
     findings += [_vacuous(requirement, why) for requirement, why in decided.vacuous]
     findings += [_assumed(*each) for each in decided.assumed]
@@ -200,7 +200,7 @@ def _text(violation: Violation) -> str:
 
 
 def _subject(violation: Violation) -> str:
-    """Return the enclave, or the name that the finding is about."""
+    """Return the subject of the finding: an enclave or a name."""
     use = violation.steps[0].use
     return use.name if isinstance(violation.requirement, AtMost | Protected) else use.enclave
 
@@ -230,7 +230,7 @@ def _titled(requirement: Requirement) -> str:
 
 
 def _fact(violation: Violation) -> str:
-    """Return what breaks the requirement, as a clause without the subject of the finding."""
+    """Return a clause that says what breaks the requirement, without the finding's subject."""
     steps = violation.steps
     match violation.requirement:
         case Apart():
@@ -260,7 +260,7 @@ def _chain(steps: Sequence[Step]) -> str:
 
 
 def _together(steps: Sequence[Step]) -> str:
-    """Return text such as ``/a and /b may publish /x``, or for each what it may do."""
+    """Return text such as ``/a and /b may publish /x``; different uses are listed one by one."""
     if len({step.does() for step in steps}) > 1:
         return _listed([step.text() for step in steps])
     return f"{_listed([step.use.enclave for step in steps])} may {steps[0].does()}"
@@ -291,7 +291,7 @@ def _assumed(requirement: Requirement, name: str) -> Finding:
 
 
 def assumption_text(name: str) -> str:
-    """Return of which name a policy does not say the protection, and what is assumed."""
+    """Return a clause on a name whose protection the policy does not state, but is assumed."""
     assumed = f"that of the template {DEFAULT_TEMPLATE} is assumed"
     return f"the policy does not say how {name} is protected, and {assumed}"
 
@@ -301,15 +301,15 @@ def assumption_text(name: str) -> str:
 _NOWHERE = Source("", 0)
 _OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
 _FEW = 3
-"""A name that so many enclaves may use is worth an upper limit."""
+"""Highest number of enclaves with a right to a name for which a limit is proposed."""
 _MOST = 1000
-"""Most candidates, so that a human can read what is left of them."""
+"""Highest number of candidates, so that a person can read the proposals."""
 _WIDE_LIST = 50
-"""Most names that are joined into one requirement."""
+"""Highest number of names that are joined into one requirement."""
 
 
 def suggest(rights: Iterable[Right], worlds: Sequence[World]) -> tuple[Requirement, ...]:
-    """Return requirements that hold in all worlds for ``rights``, which are those that are allowed.
+    """Propose requirements that hold in all worlds; ``rights`` are the allowed rights.
 
     Raises:
         DocumentError: one cannot be decided with so many wildcards.
@@ -326,7 +326,7 @@ def suggest(rights: Iterable[Right], worlds: Sequence[World]) -> tuple[Requireme
 
 
 def _joined(one: Requirement, other: Requirement) -> Requirement | None:
-    """Return one requirement for two of a kind, if they demand the same of different names."""
+    """Join two requirements of a kind that demand the same of different names, or return None."""
     match one, other:
         case (
             Nobody(rights=(("request", some),)),
@@ -372,7 +372,7 @@ def _candidates(stated: _Stated, worlds: Sequence[World]) -> Iterator[Requiremen
 
 
 def _alone(stated: _Stated, right: str) -> Iterator[Only]:
-    """Yield for each enclave the names that it alone has a right to, and others listen to."""
+    """Yield a requirement for each enclave that alone has a right to names that others receive."""
     other = OTHER_SIDE[right]
     names: dict[str, list[str]] = defaultdict(list)
     for name in stated.names(right):
@@ -384,14 +384,14 @@ def _alone(stated: _Stated, right: str) -> Iterator[Only]:
 
 
 def _unused_services(stated: _Stated) -> Iterator[Nobody]:
-    """Yield the last parts of services that change something, such as ``*/set_parameters``."""
+    """Yield requirements against calls of unused services that change a node's state."""
     last = {name.rpartition("/")[2] for name in stated.names("reply") if name.count("/") > 1}
     for each in sorted(last.difference(READING_SERVICES)):
         yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{each}",)),))
 
 
 def _limits(stated: _Stated) -> Iterator[AtMost]:
-    """Yield the names that few enclaves publish, by how many they are."""
+    """Yield limits for names that only few enclaves publish."""
     names: dict[int, list[str]] = defaultdict(list)
     for name in stated.names("publish"):
         if name not in _OF_EVERY_NODE and ("subscribe", name) in stated.users:
@@ -402,7 +402,7 @@ def _limits(stated: _Stated) -> Iterator[AtMost]:
 
 
 def _gates(world: World) -> Iterator[Apart]:
-    """Yield the enclaves that all others can influence only through one of them."""
+    """Yield requirements that enclaves can be influenced only through one gate enclave."""
     for target, sources in sorted(influencers(world, SearchLimit()).items()):
         if len(sources) == 1:
             yield Apart(source=_NOWHERE, sources=("*",), targets=(target,), through=tuple(sources))
@@ -417,7 +417,7 @@ _HEAD = """\
 
 
 def render_requirements(requirements: Iterable[Requirement], of: str) -> str:
-    """Return requirements as TOML, each with what it demands as a comment; ``of`` is in the head.
+    """Return requirements as TOML with their demands as comments; ``of`` names the source on top.
 
     `sros_tool.proof.requirements.parse_requirements` returns equal ones but for their places.
     """

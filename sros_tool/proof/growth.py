@@ -1,4 +1,4 @@
-"""What one side of a comparison lets enclaves do that the other one does not, for all names.
+"""Find access that HEAD grants and BASE does not, and the reverse, for all names.
 
 Each vendor's rules are compared as sets of topics, and each name that is reported was confirmed by
 the decision of that vendor on this name.  Nothing is reported only if no name at all is added.
@@ -56,34 +56,34 @@ _JOIN = "join"
 )
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """Something that enclaves may do on one side only.
+    """An access that enclaves have on one side of the comparison only.
 
-    ``name`` is an example, and so are ``domains``.
+    ``name`` and ``domains`` are examples.
     """
 
     enclaves: tuple[str, ...]
-    """The enclaves."""
+    """The enclaves that have the access."""
     action: Annotated[str, Words((*KIND_OF, "write", "read", "join"))]
-    """What they may do; ``write`` and ``read`` are for a DDS topic that no right states."""
+    """The operation; ``write`` and ``read`` are for a DDS topic that no right states."""
     right: Right | None
-    """The right that gives it; of another enclave if a vendor takes that one's permissions for
-    those of ``enclaves``, too; null if none is stated."""
+    """The right that gives the access, or null if no right states it; it belongs to another enclave
+    if a vendor accepts the permissions of that enclave for ``enclaves``, too."""
     name: str
-    """A name for which it is so; empty for ``join``."""
+    """Example of a ROS name with the access; empty for ``join``."""
     topic: str
-    """The DDS topic of that name; empty for ``join``."""
+    """DDS topic of the example name; empty for ``join``."""
     source: Source | None
     denied: Right | None
     denied_at: Source | None
-    """Where that is stated."""
+    """File and line of the denial on the other side, or null."""
     worlds: tuple[str, ...]
-    """The vendors, or Zenoh, that decide so."""
+    """The DDS vendors, or Zenoh, that allow the access."""
     domains: tuple[int, ...]
-    """Domains in which it is so: one of each kind."""
+    """Example ROS domains with the access: one for each group of domains with the same rules."""
 
     @property
     def place(self) -> Source | None:
-        """Where the right is stated; null if it is not in a policy."""
+        """File and line of the right; null if the right is not in a policy."""
         return self.source
 
     @property
@@ -94,7 +94,7 @@ class Gain:
 
 @dataclass(frozen=True, slots=True)
 class NewReach:
-    """An enclave that another one can influence on one side only, by a shortest path."""
+    """An enclave that another enclave can influence on one side only, with a shortest path."""
 
     source: str
     """The enclave that influences."""
@@ -105,23 +105,23 @@ class NewReach:
 
 
 class LostProtection(NamedTuple):
-    """A protection that is less."""
+    """A protection that is weaker in HEAD."""
 
     key: str
-    """What is protected."""
+    """Name of the protected setting, topic or certificate."""
     before: str
     """The protection in BASE."""
     after: str
     """The protection in HEAD."""
     meaning: str
-    """What that means."""
+    """Consequence of the weaker protection."""
 
 
 class GainedProtection(NamedTuple):
-    """A protection that is more."""
+    """A protection that is stronger in HEAD."""
 
     key: str
-    """What is protected."""
+    """Name of the protected setting, topic or certificate."""
     before: str
     """The protection in BASE."""
     after: str
@@ -134,32 +134,32 @@ class GainedProtection(NamedTuple):
 )
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """What HEAD adds to BASE, and what it removes; true if it adds anything or protects less.
+    """Access and protection that HEAD adds and removes; true if it adds access or protects less.
 
-    ``reach_unknown`` says why ``reach`` was not followed, if so.
+    ``reach_unknown`` says why ``reach`` is not known, or is "".
     """
 
     added: tuple[Gain, ...]
-    """What HEAD lets enclaves do, and BASE does not."""
+    """Access that HEAD grants and BASE does not."""
     removed: tuple[Gain, ...]
-    """What BASE lets enclaves do, and HEAD does not."""
+    """Access that BASE grants and HEAD does not."""
     reach: tuple[NewReach, ...]
     """Enclaves that others can influence in HEAD, and not in BASE; at most 10,000 pairs."""
     reach_unknown: str
     lost: tuple[SettingChange, ...]
-    """The protection that is less; `SettingChange` says what it was and what it is."""
+    """The settings that protect less in HEAD."""
     gained: tuple[SettingChange, ...]
-    """The protection that is more, as the change that would undo it."""
+    """The settings that protect more in HEAD, as changes from HEAD back to BASE."""
     worlds: tuple[str, ...]
-    """The vendors, and Zenoh if a side has rules of it, for which it was decided."""
+    """The compared DDS vendors, and Zenoh if a side has rules of Zenoh."""
     domains: tuple[int, ...]
-    """The ROS domains for which it was decided: of those with the same rules on both sides one."""
+    """The compared ROS domains: one for each group of domains with the same rules."""
     assumed: tuple[str, ...]
-    """What is taken for granted of a side that does not say everything, such as a policy."""
+    """Assumptions about a side that does not state everything, such as a policy."""
     left_out: tuple[str, ...]
-    """What is not compared on purpose."""
+    """Parts that are not compared on purpose."""
     not_compared: tuple[str, ...]
-    """What could not be compared; if nothing is new, that is an error, with exit status 2."""
+    """Parts that could not be compared; if nothing is new, this is an error with exit status 2."""
 
     @property
     def new_access(self) -> bool:
@@ -168,19 +168,19 @@ class Growth:
 
     @property
     def reach_known(self) -> bool:
-        """Whether ``reach`` was looked for: not if a side is only for some enclaves, or there are
-        too many ways between them.
+        """Whether ``reach`` is known: not if a side has only some enclaves, or there are too many
+        hops between enclaves.
         """
         return not self.reach_unknown
 
     @property
     def less_protection(self) -> list[LostProtection]:
-        """What is protected less in HEAD."""
+        """The protections that are weaker in HEAD."""
         return [LostProtection(it.key, it.before, it.after, it.meaning) for it in self.lost]
 
     @property
     def more_protection(self) -> list[GainedProtection]:
-        """What is protected more in HEAD."""
+        """The protections that are stronger in HEAD."""
         return [GainedProtection(it.key, it.after, it.before) for it in self.gained]
 
     def __bool__(self) -> bool:
@@ -188,27 +188,27 @@ class Growth:
 
 
 class ComparedSide(NamedTuple):
-    """A side."""
+    """A side of the comparison."""
 
     path: str
-    """It, as it was named."""
+    """Path or revision of the side, as named on the command line."""
     kind: SourceKind
-    """What it is."""
+    """Kind of the side, such as policy or keystore."""
     enclaves: Sequence[str] | None
-    """The enclaves that it is for; null for all."""
+    """The enclaves of the side, if it has only some; null for all."""
     notes: Sequence[Note]
-    """Notes on it."""
+    """Notes on the side."""
 
     @staticmethod
     def of(source: AccessSource) -> ComparedSide:
-        """Return what is printed of a source."""
+        """Return a source in the form that ``--json`` prints."""
         enclaves = None if source.scope is None else sorted(source.scope)
         return ComparedSide(source.shown, source.kind, enclaves, source.notes)
 
 
 @shows(spread=("growth",))
 class NewAccess(NamedTuple):
-    """What B (HEAD) adds to A (BASE)."""
+    """The access that B (HEAD) adds to A (BASE)."""
 
     base: ComparedSide
     """The side BASE."""
@@ -218,7 +218,7 @@ class NewAccess(NamedTuple):
 
 
 def compare_access(base: AccessSource, head: AccessSource) -> Growth:
-    """Return what ``head`` gives that ``base`` does not, and the reverse.
+    """Compare the access of two sides, in both directions.
 
     A policy counts as signed with access control of everything.  As BASE, it means encryption of
     all that it demands no other protection of, and a keystore that protects less has lost it; as
@@ -267,7 +267,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
 
 
 def _not_compared(base: AccessSource, head: AccessSource) -> Iterator[str]:
-    """Yield what of HEAD cannot be compared."""
+    """Yield clauses on the parts of HEAD that cannot be compared."""
     if found := contradiction(head):
         yield f"the protection of HEAD: {found}"
     yield from unknown_settings(base.zenoh_files, head.zenoh_files)
@@ -298,7 +298,7 @@ def _fits(vendor: Vendor, side: AccessSource, name: str, subject: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Access:
-    """What an enclave may do in one world and domain: sets of topics, and decisions to confirm."""
+    """Access of an enclave in one world and domain: sets of topics, and decisions to confirm."""
 
     topics: Mapping[AccessVerb, NameSet]
     decide: Callable[[AccessVerb, str], bool]
@@ -309,7 +309,7 @@ _NO_ACCESS = _Access(dict.fromkeys(_VERBS, NameSet()), lambda verb, topic: False
 
 
 _AccessOf = Callable[[AccessSource, str, int], _Access]
-"""The access of an enclave of a side in a domain."""
+"""A function that returns the access of an enclave of a side in a domain."""
 _Lenders = Callable[[AccessSource, str], tuple[str, ...]]
 """The other enclaves of a side whose permissions fit the certificate of an enclave as well."""
 
@@ -390,7 +390,7 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
     def access_by(
         side: AccessSource, governance: Governance, name: str, subject: str, at: int
     ) -> Access:
-        """Return what the permissions of an enclave give to a certificate.
+        """Return the access that an enclave's permissions give to a certificate.
 
         Those that do not fit it count as if they did: `_not_compared` says so.
         """
@@ -519,7 +519,7 @@ def _gains(
     scope: Collection[str] | None,
     limit: SearchLimit,
 ) -> Iterator[Gain]:
-    """Yield what ``new`` gives that ``old`` does not: the same in several worlds once."""
+    """Yield the access that ``new`` gives and ``old`` does not, joined over the worlds."""
     gains: dict[tuple[object, ...], tuple[Gain, set[str], set[int]]] = {}
     for gain in _each_gain(old, new, worlds, scope, limit):
         key = gain.enclaves[0], gain.action, gain.right, gain.name or gain.topic
@@ -602,7 +602,7 @@ def _without_name(grant: Grant) -> Grant:
 
 
 class _Denials:
-    """What an enclave is denied to write, or to read: ``names`` has all of it."""
+    """The topics that an enclave is denied to write, or to read; ``names`` is the set of all."""
 
     def __init__(self, rights: Sequence[Right], verb: AccessVerb, style: Style) -> None:
         pairs = [(right, text) for right in rights for text in getattr(right.topics, verb)]
@@ -617,7 +617,7 @@ class _Denials:
 
 
 class _Stated:
-    """The rights that two sides state, to say which one gives what ``new`` adds."""
+    """The rights that two sides state, to find the right that gives an added access."""
 
     def __init__(self, old: AccessSource, new: AccessSource) -> None:
         self._old, self._new = old, new
@@ -733,7 +733,7 @@ class _Stated:
 
 
 _Sources = dict[str, dict[Right, Source]]
-"""By enclave: where its rights are stated, of those enclaves that were asked for."""
+"""Cache: for each enclave, the file and line that states each right."""
 
 
 def _source(known: _Sources, side: AccessSource, right: Right | None) -> Source | None:
@@ -758,13 +758,13 @@ def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit)
 
 
 _Edges = Mapping[str, Mapping[str, Hop]]
-"""By source and target: a hop from one enclave to another."""
+"""Map (source, target) to a hop from one enclave to another."""
 _MOST_REACH = 10_000
 _MOST_HOPS = 200_000
 
 
 def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach]:
-    """Yield whom enclaves can influence after and not before, over new hops; none if unknown."""
+    """Yield pairs of enclaves with an influence that is new in ``after``; none if unknown."""
     if before is None or after is None:
         return
     changed = {

@@ -1,4 +1,4 @@
-"""What one side of a comparison protects less than the other one: messages, trust, statements.
+"""Find weaker protection of one side of a comparison: messages, trust, and protect= values.
 
 A side without a governance of its own, such as a policy, means a strict one: a keystore with a
 looser one protects less.  A policy never lowers what a keystore protects.
@@ -35,7 +35,7 @@ from sros_tool.translate import governance_for, protected_topics
 
 @lru_cache(maxsize=1)
 def strict_protection() -> DomainProtection:
-    """Return the protection that is meant where nothing is said: that of the template production.
+    """Return the protection of a side without a governance: that of the template production.
 
     Whole messages need only be signed, as in the template development: what is in them is encrypted
     without it.
@@ -67,7 +67,7 @@ def _demanded_governance(stated: Sequence[StatedProtection], domains: DomainSet)
 
 
 def _of_payloads(governance: Governance) -> Governance:
-    """Return a governance with the protection of payloads that they have by all layers together."""
+    """Return a governance in which the data kind is the strongest protection of any layer."""
 
     def strongest(domain: DomainRule, topic: TopicRule) -> TopicRule:
         kinds = (
@@ -106,7 +106,7 @@ def contradiction(side: AccessSource) -> str:
 def less_protection(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield what is protected less in ``new`` than in ``old``."""
+    """Yield the settings whose protection is weaker in ``new`` than in ``old``."""
     if "zenoh" in (old.kind, new.kind):
         pass  # only what Zenoh permits is compared
     elif old.governance and new.governance:
@@ -143,7 +143,7 @@ def less_protection(
 def _looser_later(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield what the settings of a keystore, and its fleet, give to later enclaves only in new."""
+    """Yield settings and robots of ``new`` that protect enclaves less if they are created later."""
     if old.later is None or new.later is None:
         return
     domains = DomainSet.of((0, 0))
@@ -170,7 +170,7 @@ def _looser_later(
 
 
 def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
-    """Yield the certificates whose name is not that of their enclave, or of their key before."""
+    """Yield the enclaves whose certificate names another enclave, or whose key belonged to one."""
     names = {each.key: each.name for each in old.certified.values()}
     for enclave, new_one in new.certified.items():
         before = names.get(new_one.key, enclave)
@@ -184,7 +184,7 @@ def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[Setti
 
 
 def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
-    """Yield the certificates that enclaves refuse in ``old``, and not in ``new``."""
+    """Yield the certificates that enclaves refuse in ``old`` but accept in ``new``."""
     if old.trusts is None or new.trusts is None:
         return
     all_revoked = frozenset(entry for trust in old.trusts.values() for entry in trust.revoked)
@@ -253,7 +253,7 @@ def _looser_topics(
 
 
 def _by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, NameSet]]:
-    """Return each protection of topics, as a rule without its expression, and all its topics."""
+    """Group topics by protection: pairs of a rule without expression and all its topics."""
     rules = [
         (names_of(style, (topic_rule.topic_expression,)), replace(topic_rule, topic_expression="*"))
         for topic_rule in rule.topic_access_rules
@@ -267,7 +267,7 @@ def _by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, Name
 def _no_longer_stated(
     old: Iterable[StatedProtection], new: Iterable[StatedProtection], limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield the names whose protection one policy demands, and the other one less or not."""
+    """Yield the names whose protection ``new`` demands less than ``old``, or not at all."""
     later = tuple(new)
     for each in old:
         enough = [

@@ -1,4 +1,4 @@
-"""The review of a change: what HEAD has, and what it adds to BASE, both read from commits.
+"""Review a change in git: findings in HEAD, and access that HEAD adds to BASE.
 
 Nobody whose change is reviewed steers the review: both sides are what two commits have, not what
 lies in a checkout (`sros_tool.proof.repository`, `sros_tool.proof.commit_files`), and what was not
@@ -58,7 +58,7 @@ _MOST_ENTRIES = 200_000
 _MOST_CHANGED = 20_000
 _MOST_BYTES = 1024 * 1024 * 1024
 _MOST_OUTSIDE = 32 * 1024 * 1024
-"""Bytes of the largest changed file of which it is looked whether it is a policy.
+"""Size in bytes of the largest changed file that is searched for a policy.
 
 No policy is larger.
 """
@@ -68,7 +68,7 @@ _OK, _FOUND, _UNDECIDED = 0, 1, 2
 
 @dataclass(frozen=True, slots=True)
 class ReviewRequest:
-    """What is reviewed: paths are from the top of the repository.
+    """The request for a review; paths are relative to the top of the repository.
 
     ``base`` is the commit with the access of before, or "" to compare with nothing; ``head`` the
     one that is reviewed.  With ``allow_new_access``, more access is shown, and does not fail.
@@ -92,7 +92,7 @@ class ReviewRequest:
 
 @dataclass(frozen=True, slots=True)
 class AccessChange:
-    """What HEAD gives that BASE does not."""
+    """The access that HEAD gives and BASE does not."""
 
     before: AccessSource
     after: AccessSource
@@ -214,16 +214,16 @@ _STEPS = (
 
 
 class StepResult(NamedTuple):
-    """A step."""
+    """The result of one step of a review."""
 
     step: Annotated[str, Words(_STEPS)]
-    """What it decides; ``requirements-before`` are those of the base that the change drops."""
+    """Name of the step; ``requirements-before`` finds requirements that the change drops."""
     subject: str | None
-    """The paths that it is about; null for the whole commit."""
+    """The paths that the step is about; null for the whole commit."""
     status: int
-    """Its exit status, as above."""
+    """Exit status of the step: 0, 1 or 2, as for the review."""
     result: str
-    """What it found, or why it could not be decided, in a sentence."""
+    """A sentence with the result, or why the step could not be decided."""
 
 
 class ReviewResult(NamedTuple):
@@ -240,7 +240,7 @@ class ReviewResult(NamedTuple):
     findings: Sequence[Finding]
     """The findings on the commit that was reviewed."""
     left_out: Sequence[str]
-    """What the review did not look at, as clauses."""
+    """Parts that the review did not look at, as clauses."""
 
 
 def review(request: ReviewRequest, folder: Path) -> Review:
@@ -279,7 +279,7 @@ class _Review:
 
     @property
     def _new_access(self) -> int:
-        """The status of what gives more access."""
+        """Exit status of a step that finds more access."""
         return _OK if self.request.allow_new_access else _FOUND
 
     def all(self) -> Iterator[ReviewStep]:
@@ -341,7 +341,7 @@ class _Review:
         *,
         if_any: bool = True,
     ) -> Iterator[ReviewStep]:
-        """Yield a step with what a function decides, or with the reason why it could not."""
+        """Yield a step with the result of ``decide``, or with the error that it raises."""
         if not if_any:
             return
         try:
@@ -425,7 +425,7 @@ class _Review:
     def _places(
         self, base: tuple[list[Path], Fleet | None], head: tuple[list[Path], Fleet]
     ) -> tuple[int, Content] | None:
-        """Return whose keys are delivered to another place, or in another way, than before."""
+        """Return the step result on robots whose keys go to another place, or in another way."""
         lines: list[tuple[str, str]] = []
         robots = base[1].robots if base[1] else {}
         for name, new in head[1].robots.items():
@@ -447,7 +447,7 @@ class _Review:
         return (self._new_access, Facts(tuple(lines))) if lines else None
 
     def _others(self, reviewed: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content] | None:
-        """Return what changes and is not reviewed of policies, and what became of others."""
+        """Return the step result on changed policy files that are not reviewed, or were renamed."""
         assert self.base
         lines: list[tuple[str, str]] = []
         status = _OK
@@ -604,7 +604,7 @@ class _Review:
         return sorted(path for path, digits in small.items() if digits in of_policies)
 
     def left_out(self) -> Iterator[str]:
-        """Yield what the review does not say, as clauses."""
+        """Yield clauses on the parts that the review leaves out."""
         asked = self.request
         if not asked.policies:
             yield "no policy is named"
@@ -772,7 +772,7 @@ def _decisive_first(where: str) -> tuple[bool, str]:
 
 
 def _place(robot: Robot) -> str:
-    """Return where a robot gets its keys."""
+    """Return text on the place where a robot gets its keys."""
     return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
 
 

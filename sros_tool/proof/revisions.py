@@ -36,7 +36,7 @@ class Revision:
 
     @property
     def place(self) -> Path:
-        """A path for the policy reader, which exists nowhere."""
+        """A path for the policy reader that does not exist on disk."""
         return _NOWHERE / self.path
 
     def policies(self) -> tuple[Revision, ...]:
@@ -92,18 +92,18 @@ class Revision:
         return self.repository.content(entry.id)
 
     def shown(self, text: str) -> str:
-        """Return a text with the places of this revision as a user would name them."""
+        """Return a text with the paths of this revision as ``git:REVISION:PATH``."""
         return text.replace(f"{_NOWHERE}/", f"{PREFIX}{self.name}:").replace(
             str(_NOWHERE), f"{PREFIX}{self.name}:"
         )
 
     def source(self, source: Source) -> Source:
-        """Return a source of this revision as a user would name it."""
+        """Return a source with its path as ``git:REVISION:PATH``."""
         return Source(self.shown(source.file), source.line)
 
 
 def find_revision(text: str) -> Revision:
-    """Return what ``git:REVISION:PATH`` names, in the repository of the working directory.
+    """Return the revision of ``git:REVISION:PATH`` in the repository of the working directory.
 
     As for git, ``PATH`` is relative to the top of the repository, or to the working directory if it
     begins with ``./`` or ``../``.

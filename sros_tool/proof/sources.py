@@ -1,4 +1,4 @@
-"""What two sides of a comparison give: policies, keystores, permissions, Zenoh rules, revisions."""
+"""Read the access of a side to compare: policy, keystore, permissions, Zenoh file or revision."""
 
 from __future__ import annotations
 
@@ -70,16 +70,16 @@ UNCERTAIN = {
     "rights.zenoh-no-name",
     "rights.zenoh-strangers",
 }
-"""Notes on what a comparison of rights leaves out: then it cannot say that nothing is added."""
+"""Notes of which one means that rights are unknown, so that new access cannot be excluded."""
 
 
 KEYSTORE_ITSELF = "the keystore"
-"""What has the CA and the revocation list of enclaves that a keystore gets later."""
+"""Name that stands for the keystore's own CA and revocation list, for later enclaves."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """The identity CAs that an enclave trusts, and the certificates of these that it refuses.
+    """The identity CAs that an enclave trusts, and the certificates of these CAs that it refuses.
 
     A CA is the SHA-256 of its public key; ``revoked`` are pairs of a CA and a serial number.
     """
@@ -90,7 +90,7 @@ class Trust:
 
 @dataclass(frozen=True, slots=True)
 class CertifiedEnclave:
-    """What a certificate says: its subject, the common name in it, and a digest of the key."""
+    """Subject, common name and key digest of an enclave's certificate."""
 
     subject: str
     name: str
@@ -99,7 +99,7 @@ class CertifiedEnclave:
 
 @dataclass(frozen=True, slots=True)
 class AccessSource:
-    """What a file, a folder or a revision gives.
+    """The access that a file, a folder or a revision gives to enclaves.
 
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh"; ``shown`` is its name.
     ``permissions`` are what DDS would load for each enclave, or would if it were signed; ``rights``
@@ -134,14 +134,14 @@ class AccessSource:
     revision: Revision | None = None
 
     def subject_of(self, enclave: str) -> str:
-        """Return the subject in an enclave's certificate; without one that of its grant, or ""."""
+        """Return the subject of an enclave's certificate, or else of its grant, or ""."""
         if certified := self.certified.get(enclave):
             return certified.subject
         known = self.permissions.get(enclave)
         return next((grant.subject for grant in known.grants), "") if known else ""
 
     def sources_of(self, enclave: str) -> dict[Right, Source]:
-        """Return the file and line that states each right of an enclave, if it is of a policy."""
+        """Map the rights of an enclave to their file and line; empty without a policy."""
         sources: dict[Right, Source] = {}
         stated = self.enclaves.get(enclave)
         for placed in placed_rights(stated) if stated else ():
@@ -149,7 +149,7 @@ class AccessSource:
         return sources
 
     def shown_source(self, source: Source) -> Source:
-        """Return a source of this side as a user would name it."""
+        """Return a source of this side in the form that users write."""
         return self.revision.source(source) if self.revision else source
 
 
@@ -158,7 +158,7 @@ ALL_DOMAINS = DomainSet.of((0, MAX_DOMAIN))
 
 
 def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
-    """Return what ``path`` gives: a path as for `load_rights`, a folder of policies, a revision.
+    """Read the access that ``path`` gives; also a folder of policies or ``git:REVISION:PATH``.
 
     Raises:
         SrosError: it cannot be read, DDS would refuse a part of it, or a part of it has a meaning
@@ -256,7 +256,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
 
 
 def _certified(folders: Mapping[str, Path]) -> dict[str, CertifiedEnclave]:
-    """Map the enclaves that have a certificate to what it says."""
+    """Map the enclaves that have a certificate to its subject, name and key."""
     certified = {}
     for name, folder in folders.items():
         if (file := folder / CERTIFICATE_FILE).exists():
@@ -318,7 +318,7 @@ _NEVER = "9999"
 
 
 def _expiries(root: Path) -> dict[int, str]:
-    """Return when certificates expire, by serial number, as the ledger of a keystore has it."""
+    """Map serial numbers to the expiry of certificates, from the keystore's ledger."""
     if not (root / CRL).exists():
         return {}
     expiries: dict[int, str] = {}
@@ -332,7 +332,7 @@ def _expiries(root: Path) -> dict[int, str]:
 def _trusts(
     files: Mapping[str, tuple[Path, Path]], expiries: Mapping[int, str]
 ) -> dict[str, Trust]:
-    """Return whom enclaves trust by their identity CA and revocation list, if they have a CA.
+    """Map enclaves to their trust, by identity CA and revocation list; skip enclaves without CA.
 
     Certificates that had expired when a list was signed do not count: lists may leave them out.
 
@@ -389,12 +389,12 @@ def _governance(file: Path) -> Governance:
 
 
 AT = datetime(2026, 1, 1, tzinfo=UTC)
-"""The moment for which all permissions are compared, as if they were valid then."""
+"""The moment for which permissions are compared; all permissions count as valid."""
 _VALID = window(AT - timedelta(days=2), timedelta(days=9))
 
 
 def _without_dates(permissions: Permissions) -> Permissions:
-    """Return permissions that are valid at `AT`: what they give is compared, not until when."""
+    """Return permissions that are valid at `AT`, as validity is not compared."""
     begin, end = iso(_VALID.not_before), iso(_VALID.not_after)
     return Permissions(
         tuple(replace(grant, not_before=begin, not_after=end) for grant in permissions.grants)
@@ -453,7 +453,7 @@ def _of_policies(shown: str, policies: list[_Read]) -> AccessSource:
 
 
 def load_policies(files: Iterable[Path], shown: str, fleet: Fleet | None = None) -> AccessSource:
-    """Return what the policies of one robot, or of one fleet, give together.
+    """Return the access that the policies of one robot, or of one fleet, give together.
 
     Raises:
         SrosError: one cannot be read, or two have the same enclave.

@@ -1,4 +1,4 @@
-"""The worlds of a policy or a keystore: what its enclaves may do with each vendor, and on Zenoh."""
+"""The worlds of a policy or keystore: the access of its enclaves on each vendor and on Zenoh."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ from sros_tool.validity import window
 from sros_tool.zenoh.access import AccessControl, Enforcement
 
 _ZENOH = "zenoh"
-"""The world that is no vendor of DDS."""
+"""Name of the world of Zenoh."""
 WORLDS = (*(each.value for each in MEASURED), _ZENOH)
 """The worlds that are decided: the measured vendors, and Zenoh."""
 _PLANNED = timedelta(days=365)
@@ -258,7 +258,7 @@ _RANK = {Level.NONE: 0, Level.SIGN: 1, Level.ENCRYPT: 2}
 
 
 def _weak(access: Iterable[Access]) -> dict[Level, NameSet]:
-    """Map levels to the topics that are protected less, by the governance of some enclave."""
+    """Map levels to the topics that the governance of some enclave protects less."""
     different = dict.fromkeys(each.protection() for each in access)
     return {
         level: NameSet.union(
@@ -415,7 +415,7 @@ _MOST_MOMENTS = 10
 
 
 def _later(name: str, grants: Iterable[Grant], at: datetime) -> tuple[datetime, ...]:
-    """Return a moment in the validity of each grant of an enclave that is not valid yet.
+    """Return a moment inside the validity of each grant that becomes valid later.
 
     Raises:
         KeystoreError: there are too many moments to decide for all.
@@ -439,7 +439,7 @@ def _later(name: str, grants: Iterable[Grant], at: datetime) -> tuple[datetime, 
 def _zenoh_worlds(
     keystore: Keystore, domain: int | None, stated: Mapping[str, TopicAccess]
 ) -> Iterator[World]:
-    """Yield the worlds of Zenoh as others enforce it: a session obeys itself only if it wants to.
+    """Yield the worlds of Zenoh; only rules that other processes enforce on a session count.
 
     Raises:
         KeystoreError: there are no configurations of Zenoh, or it is not certain what they enforce.
@@ -486,7 +486,7 @@ def _enforced(
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A right as it is stated somewhere; without a line, in the permissions of an enclave."""
+    """A right and the place that states it; without a line, the permissions of an enclave."""
 
     right: Right
     source: Source
@@ -496,7 +496,7 @@ class Places:
     """Where rights are stated, to find the one that lets an enclave use a topic."""
 
     def __init__(self, stated: Mapping[str, Iterable[Place]]) -> None:
-        """Take the rights of each enclave."""
+        """Create an index of rights by enclave."""
         self._stated = stated
         self._by_enclave: dict[str, list[tuple[bool, str, Place]]] = {}
 
@@ -506,7 +506,7 @@ class Places:
         return cls({enclave.path: _Lazy(enclave) for enclave in policy.enclaves})
 
     def find(self, use: Use) -> Place | None:
-        """Return the right that states a use: one without wildcards if there is one."""
+        """Return the right that allows a use, preferably without wildcards, or None."""
         topics = self._by_enclave.get(use.enclave)
         if topics is None:
             places = self._stated.get(use.enclave, ())
@@ -525,7 +525,7 @@ class Places:
 
 
 class _Lazy:
-    """The rights that an enclave of a policy is allowed, each time they are asked for."""
+    """The allowed rights of a policy's enclave, computed again on each iteration."""
 
     def __init__(self, enclave: Enclave) -> None:
         self._enclave = enclave

@@ -32,15 +32,15 @@ from sros_tool.zenoh.access import Enforcement, Flow, Message, Remote
 from sros_tool.zenoh.key_expressions import names_of as names_of_keys
 
 LONGEST = 255
-"""Longest name of a topic in bytes: the limit of DDS in ROS 2 (rmw, validate_full_topic_name.h)."""
+"""Length in bytes of the longest DDS topic name in ROS 2 (rmw, validate_full_topic_name.h)."""
 _LAST = "\U0010ffff"
 _OF_A_STEP = 4
-"""Comparisons of the ends of wildcards that take as long as a step of a search."""
+"""Number of comparisons of wildcard prefixes and suffixes that count as one search step."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicAccess:
-    """The DDS topics that an enclave may write, and those that it may read."""
+    """The DDS topics that an enclave may write, and the DDS topics that it may read."""
 
     writes: NameSet
     reads: NameSet
@@ -60,7 +60,7 @@ class Topics:
         return f"{self.begin}{self.name}{self.end}"
 
     def ros_name(self, topic: str) -> str:
-        """Return the ROS name in one of the topics."""
+        """Return the ROS name of a DDS topic."""
         return topic[len(self.begin) : len(topic) - len(self.end)]
 
     def every(self) -> NameSet:
@@ -106,7 +106,7 @@ ROS_TOPICS = NameSet.union(
 
 @dataclass(frozen=True, slots=True)
 class Meeting:
-    """What an enclave may use of some topics: ``stated`` ones, and perhaps others by wildcards."""
+    """The topics that an enclave may use: ``stated`` topics, and perhaps others by wildcards."""
 
     enclave: str
     names: NameSet
@@ -120,7 +120,7 @@ def shortest(names: Iterable[str]) -> str | None:
 
 
 class Side:
-    """What all enclaves may write, or what they may read."""
+    """An index of the topics that all enclaves may write, or that they may read."""
 
     def __init__(self, of: Mapping[str, NameSet]) -> None:
         self.of = of
@@ -220,7 +220,7 @@ class Side:
 
 
 def _starting(ordered: list[str], begin: str) -> range:
-    """Return the places of the texts of a sorted list that start with ``begin``."""
+    """Return the indexes of the texts in a sorted list that start with ``begin``."""
     return range(bisect_left(ordered, begin), bisect_left(ordered, begin + _LAST))
 
 
@@ -229,7 +229,7 @@ Confirm = Callable[[str, bool, str], bool]
 
 
 class World:
-    """What all enclaves may write and read in one world.
+    """The topics that all enclaves may write and read with one vendor, or on Zenoh.
 
     ``title`` names it, ``longest`` is the length in bytes of the longest topic that is used in it.
     """
@@ -248,7 +248,7 @@ class World:
         lenders: Mapping[str, Sequence[str]] = MappingProxyType({}),
         longest: int = LONGEST,
     ) -> None:
-        """Take the access that each enclave has by its own permissions.
+        """Create a world from the access of each enclave by its own permissions.
 
         ``confirm`` decides on one topic without these sets, and ``stated`` has the topics that the
         rights of an enclave name without wildcards.
@@ -296,7 +296,7 @@ class World:
         return next((each for each in others if self.confirm_own(each, writes, topic)), "")
 
     def gives_as(self, other: World) -> bool:
-        """Return whether all decisions are those of ``other``: both have equal sets."""
+        """Return whether another world has equal sets, so that all decisions are equal."""
         return (
             (self.longest, self.needed, self.idle) == (other.longest, other.needed, other.idle)
             and self.stated == other.stated
@@ -314,7 +314,7 @@ class World:
         return Side({enclave: self._access[enclave].reads for enclave in self.enclaves})
 
     def side(self, writes: bool) -> Side:
-        """Return what enclaves may write, or what they may read."""
+        """Return the index of writers, or of readers."""
         return self._writers if writes else self._readers
 
     def example(self, names: NameSet, topics: Topics, limit: SearchLimit) -> str | None:
@@ -343,7 +343,7 @@ class World:
         )
 
     def any_example(self, names: NameSet, limit: SearchLimit) -> str | None:
-        """Return a topic of a set, if possible one that is stated, or that nodes can have."""
+        """Return a topic of a set, preferably a stated topic or one that nodes can have."""
         sets = (names, *(names & each for each in _VALID))
         stated = (next(each.stated(), None) for each in sets)
         examples = (each.example(limit, longest=self.longest) for each in (*sets[1:], names))
