@@ -87,8 +87,8 @@ class Entry:
     settings: str = ""
     """The settings of the keystore, as TOML."""
     nodes: str = ""
-    """Nodes that the policy of permissions names, and that these do not show: namespace and name of
-    each."""
+    """Namespaces and names of nodes that the policy of permissions names and the permissions
+    lack."""
     previous: str = ""
     """SHA-256 of the line before."""
 

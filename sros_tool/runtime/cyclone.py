@@ -416,7 +416,7 @@ def _load_from_folder(folder: Path) -> tuple[Any, Path]:
     if not files:
         raise UnavailableError(
             f"cannot find Cyclone DDS in {folder}",
-            "The folder holds no libddsc.so.0*, neither directly nor under lib or usr/lib.",
+            "The folder has no libddsc.so.0*, neither directly nor under lib or usr/lib.",
             f"Correct or unset {FOLDER_VARIABLE}. {INSTALL_ADVICE}",
         )
     path = files[0]

@@ -474,7 +474,7 @@ def render_secret(enclave: str, files: Mapping[str, bytes]) -> str:
     if size > MAX_SECRET:
         raise KeystoreError(
             f"the files of enclave {enclave} have {size} bytes, and a Secret holds {MAX_SECRET}",
-            "Kubernetes refuses a larger one.",
+            "Kubernetes refuses a larger Secret.",
             "Give the enclave fewer rights, or bring its files to the node of the cluster: `sros "
             "distribute_key`.",
         )

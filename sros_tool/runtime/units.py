@@ -117,7 +117,7 @@ def _check_user(name: str) -> str:
         UsageError: it is not a valid user name.
     """
     if not _USER.match(name):
-        raise UsageError(f"{name!r} is not the name of a user", "", "Name one such as ros.")
+        raise UsageError(f"{name!r} is not the name of a user", "", "Name a user such as ros.")
     return name
 
 

@@ -221,7 +221,7 @@ def _would_cut_off(root: Path, rotation: Rotation, robots: Sequence[str]) -> Key
     return KeystoreError(
         f"not every robot has confirmed {stage}: {first_few(robots, _SHOWN)}",
         "The next step would cut them off from the others.",
-        f"Bring them the present files and confirm them; see `sros fleet status "
+        f"Deliver the present files and confirm them; see `sros fleet status "
         f"{quote(str(root))}`. --allow-unconfirmed goes on without them.",
     )
 
@@ -234,7 +234,7 @@ def _refuse_edited(keystore: Keystore) -> None:
     if edits := found_edits(keystore, governance):
         raise KeystoreError(
             f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
-            "The new CA would sign the governance as it was before.",
+            "The new CA would sign the governance without these edits.",
             f"First carry it out or undo it: {edit_remedy(root)}",
         )
 
@@ -274,7 +274,7 @@ def _target_stage(
     ahead = order.index(to) - order.index(rotation.stage)
     if ahead > 1:
         raise UsageError(
-            f"the stage {to} is not the next one",
+            f"the stage {to} is not the next stage",
             f"The next stage is {rotation.next_stage()}; after it, restart the processes.",
             f"Run `sros rotate_ca {quote(str(root))} --next`, or `--finish` to do all stages at "
             "once.",

@@ -285,7 +285,7 @@ def update_keystore(
             raise KeystoreError(
                 f"files of keystore '{root}' were edited by hand: "
                 f"{'; '.join(present.edits.clauses())}",
-                "The update would undo it.",
+                "The update would undo the edit.",
                 f"First carry it out or undo it: {edit_remedy(root)}",
             )
         goal = _Goal(
@@ -311,7 +311,7 @@ def update_keystore(
             raise UsageError(
                 f"the update would make keystore '{root}' looser: {'; '.join(looser)}",
                 "Nothing was changed.",
-                "If that is meant, add --allow-looser.",
+                "If that is intended, add --allow-looser.",
             )
         change.finish(aim="update with --revoke-old" if revoke_old else "")
     return update()
@@ -777,7 +777,7 @@ def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
         edits = found_edits(change.keystore, change.governance)
         raise KeystoreError(
             f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
-            "Writing the settings would undo it, or carry it out unseen.",
+            "Writing the settings would undo the edit, or apply it unnoticed.",
             f"First carry it out or undo it: {edit_remedy(root)}",
         )
 
