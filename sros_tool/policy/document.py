@@ -89,7 +89,7 @@ class IncludedFile:
 
 
 class MissingFileError(DocumentError):
-    """There is no such file where policies are read from."""
+    """The file does not exist in the place from which policies are read."""
 
 
 PolicyFiles = Callable[[Path], bytes]
@@ -257,7 +257,7 @@ class Includer:
     def _selected(
         self, roots: Iterator[tuple[etree._Element, IncludedFile]], pointer: str, where: str
     ) -> list[tuple[etree._Element, IncludedFile]]:
-        """Return what an xpointer selects in a document after its includes were replaced."""
+        """Return the elements that an xpointer selects in a document with its includes replaced."""
         path = pointer.removeprefix("xpointer(").removesuffix(")")
         steps = list(_STEP.finditer(path[:_MAX_LENGTH]))
         if f"xpointer({''.join(step[0] for step in steps)})" != pointer or not steps:
@@ -994,7 +994,7 @@ _WORDS = {level: word for word, level in PROTECT.items()}
 
 
 def instruction_text(protect: Level | None) -> str:
-    """Return what stands behind a name with this protection, or "" for None."""
+    """Return the text that marks a name with this protection, or "" for None."""
     return f'<?{_INSTRUCTION} protect="{_WORDS[protect]}"?>' if protect else ""
 
 
@@ -1070,7 +1070,7 @@ def _write_profile(
 
 _MOST_FILES = 10_000
 _LOOKED_AT = 256 * 1024
-"""Bytes of a file with another name of which it is looked whether it is a policy."""
+"""Size in bytes of the largest file with another name that is searched for a policy."""
 
 
 def policy_files(folder: Path) -> Iterator[Path]:

@@ -55,7 +55,7 @@ class WideRule(NamedTuple):
     rule: Right
     """The wildcard."""
     used: tuple[Right, ...]
-    """Observed rights that it gives."""
+    """Observed rights that the wildcard gives."""
     replacement: tuple[Right, ...]
     """Rights that replace it, without those that other rules of the enclave allow by exact name."""
 
@@ -81,11 +81,11 @@ class EnclaveUse:
     not_allowed: tuple[Right, ...]
     """Rights that were observed, and that the policy does not give."""
     allowed: int
-    """Number of pairs of a right and a name that it has."""
+    """Number of pairs of a right and a name that the policy has."""
     observed: int
-    """Number of those that were observed."""
+    """Number of these pairs that were observed."""
     remaining: int
-    """Number of those that it keeps."""
+    """Number of these pairs that the policy keeps."""
 
     @property
     def ratio(self) -> float | None:
@@ -423,11 +423,11 @@ class WildcardProposal(NamedTuple):
     rule: Right
     """The wildcard."""
     replaces: tuple[Right, ...]
-    """Rights that it replaces."""
+    """Rights that the wildcard replaces."""
     adds: tuple[Right, ...]
-    """Known names of other enclaves that it newly allows."""
+    """Known names of other enclaves that the wildcard newly allows."""
     saves: int
-    """Bytes that it saves."""
+    """Number of bytes that the wildcard saves."""
 
 
 def propose_wildcards(
