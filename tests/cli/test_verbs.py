@@ -26,9 +26,10 @@ from sros_tool.pki.keys import generate_key
 from sros_tool.runtime.environment import REFUSING, render_refusal
 from sros_tool.runtime.variables import DOMAIN
 from sros_tool.validity import Window
-from tests.support.children import finish, python, run, wait_for
+from tests.support.children import finish, run, wait_for
 from tests.support.harness import (
     check_whole,
+    forked,
     policy_text,
     publish,
     remains,
@@ -587,9 +588,8 @@ def test_completion_of_words(words: str, wanted: str, keystore: Path) -> None:
         "COMP_WORDS": line,
         "COMP_CWORD": str(len(line.split()) - 1),
     }
-    script = "from sros_tool.cli import main; main()"
-    ended = python("-c", script, env=environment)
-    assert ended.stdout.replace("plain,", "").split() == wanted.split(), ended
+    ended = forked(env=environment)
+    assert ended.out.replace("plain,", "").split() == wanted.split(), ended
 
 
 # ── env and run ────────────────────────────────────────────────────────────────────────────
@@ -628,11 +628,11 @@ def test_no_process_starts_with_a_key_that_others_can_read(mode: int, keystore: 
     assert sros("env", keystore, "/a").out == render_refusal("sh")
     accepted = sros("env", keystore, "/a", "--accept-readable-key", "--json").ok()
     assert json.loads(accepted.out)["variables"] == variables(keystore)
-    run([*PROGRAM, "run", keystore, "/a", "--accept-readable-key", "--", "touch", marker])
+    forked("run", keystore, "/a", "--accept-readable-key", "--", "touch", marker).ok()
     marker.unlink()
     mend, replace = re.findall("`(.+?)`", refused.err)
     run(["sh", "-c", mend])
-    run([*PROGRAM, "run", keystore, "/a", "--", "touch", marker])
+    forked("run", keystore, "/a", "--", "touch", marker).ok()
     assert marker.exists()
     sros(*shlex.split(replace)[1:]).ok()
 
@@ -648,10 +648,10 @@ def test_no_process_starts_with_files_that_others_can_replace(place: str, keysto
     assert (refused.status, marker.exists()) == (2, False)
     assert f"'{folder}': its mode is {before | 0o022:04o}, so everybody can write" in refused.err
     assert sros("env", keystore, "/a").out == render_refusal("sh")
-    run([*PROGRAM, "run", "--accept-readable-key", *command])
+    forked("run", "--accept-readable-key", *command).ok()
     marker.unlink()
     run(["sh", "-c", re.findall("`(chmod .+?)`", refused.err)[0]])
-    run([*PROGRAM, "run", *command])
+    forked("run", *command).ok()
     assert marker.exists()
 
 
@@ -785,9 +785,8 @@ def test_run_hands_everything_on(
 ) -> None:
     (tmp_path / "here").write_text("#!/bin/sh\necho here\n")
     (tmp_path / "here").chmod(0o755)
-    command = [*PROGRAM, "run", str(keystore), "/a", *words]
-    ended = run(command, cwd=tmp_path, status=status)
-    assert ended.stdout == out, ended.stderr
+    ended = forked("run", keystore, "/a", *words, cwd=tmp_path)
+    assert (ended.status, ended.out) == (status, out), ended
 
 
 def test_a_reader_that_goes_away_is_no_trouble(keystore: Path) -> None:

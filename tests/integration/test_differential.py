@@ -39,7 +39,7 @@ from tests.support.children import LONG
 
 pytestmark = pytest.mark.dds
 
-COUNT = int(os.environ.get("SROS_DIFFERENTIAL", "2000" if LONG else "30"))
+COUNT = int(os.environ.get("SROS_DIFFERENTIAL", "2000" if LONG else "15"))
 SEED = int(os.environ.get("SROS_DIFFERENTIAL_SEED", "1"))
 FASTS = (Vendor.FAST, Vendor.FAST_2_9)
 Draw = Callable[[int, int, datetime], list[Case]]

@@ -323,7 +323,7 @@ def is_of_every_node(name: str, *, managed: bool) -> bool:
 @pytest.mark.parametrize(
     "system",
     [
-        *WITH_MOST,
+        *some([*WITH_MOST], 1),
         *(pytest.param(each, marks=ONLY_LONG) for each in SYSTEMS if each not in WITH_MOST),
     ],
 )

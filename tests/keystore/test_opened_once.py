@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import os
 import re
 import shutil
 from collections import Counter
@@ -70,7 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("words", QUESTIONS.values(), ids=QUESTIONS)
 def test_a_question_opens_each_file_once(words: tuple[str, ...], folder: Path) -> None:
     def ask() -> None:
-        ended = forked(*words, first=lambda: os.chdir(folder))
+        ended = forked(*words, cwd=folder)
         assert ended.status in (0, 1), ended
 
     opened = count_opens(folder / "ks", ask)
@@ -91,7 +90,7 @@ def changed(folder: Path, tmp_path: Path) -> Path:
 @pytest.mark.parametrize("words", CHANGES.values(), ids=CHANGES)
 def test_a_change_opens_each_file_once(words: tuple[str, ...], changed: Path) -> None:
     def change() -> None:
-        forked(*words, first=lambda: os.chdir(changed)).ok()
+        forked(*words, cwd=changed).ok()
 
     opened = count_opens(changed / "ks", change)
     assert opened["ledger.jsonl"] == 1

@@ -78,10 +78,13 @@ def sros(
 def forked(
     *arguments: object,
     env: Mapping[str, str] | None = None,
+    cwd: Path | None = None,
     first: Callable[[], object] | None = None,
     together: bool = False,
 ) -> Ended:
-    """Run the program in a forked process, which calls ``first`` before it.
+    """Run the program in a forked process in ``cwd``, which calls ``first`` before it.
+
+    The command of ``sros run`` then takes the place of that process.
 
     Nothing is imported again, so this is faster than a new process.  If ``together``, ``out`` has
     both outputs in their order.
@@ -90,7 +93,7 @@ def forked(
     child = os.fork()
     if child == 0:
         words = [str(argument) for argument in arguments]
-        _become_program(words, env, first, out[1], out[1] if together else err[1])
+        _become_program(words, env, cwd, first, out[1], out[1] if together else err[1])
     os.close(out[1])
     os.close(err[1])
     said: list[str] = []
@@ -105,6 +108,7 @@ def forked(
 def _become_program(
     words: list[str],
     env: Mapping[str, str] | None,
+    cwd: Path | None,
     first: Callable[[], object] | None,
     out: int,
     err: int,
@@ -118,6 +122,8 @@ def _become_program(
         if env is not None:
             os.environ.clear()
             os.environ.update(env)
+        if cwd:
+            os.chdir(cwd)
         if first:
             first()
         sys.argv = ["sros", *words]
