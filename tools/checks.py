@@ -45,12 +45,13 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     these arguments.
     """
     started = time.monotonic()
-    if read_record().ros_around:
-        # ROS 2 installs pytest plugins that are made for other versions of pytest.
-        env = {**env, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": _PLUGINS}
     if LONG in arguments:
         arguments = [each for each in arguments if each != LONG]
         env = {**env, "SROS_LONG": "1"}
+    if read_record().ros_around or not arguments:
+        # ROS 2 installs pytest plugins that are made for other versions of pytest, and colcon some
+        # that look at each test and that only arguments make use of.
+        env = {**env, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": _PLUGINS}
     if not with_tests:
         return _conclude(_run_together(LINT, "mypy", env), Counter(), started)
     if arguments:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -71,9 +72,16 @@ def make(folder: Path, template: str = "development") -> Path:
     return root
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The keystore of `make`; only to be copied."""
+    return make(tmp_path_factory.mktemp("made"))
+
+
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
-    return make(tmp_path)
+def root(made: Path, tmp_path: Path) -> Path:
+    shutil.copy(made.with_name("policy.xml"), tmp_path)
+    return Path(shutil.copytree(made, tmp_path / "ks", symlinks=True))
 
 
 def change(root: Path, *values: tuple[str, str], **options: object) -> KeystoreUpdate:
