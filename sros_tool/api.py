@@ -9,7 +9,7 @@ exception.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
 from os import PathLike, fspath
 from pathlib import Path
@@ -373,7 +373,7 @@ def explain_access(
     own = stated.enclave(enclave) if stated else None
     signed = signed_enclave(opened, enclave, asking.at)
     assert signed
-    asked = AskedEnclave(replace(signed, keystore=opened, policy=own), stated)
+    asked = AskedEnclave(signed._replace(keystore=opened, policy=own), stated)
     context = asking.context(signed.joined_domains)
     evaluator = Evaluator(Vendor(vendor), asked.enclave, context)
     question, _ = meant(evaluator, asked, question, kind)

@@ -10,6 +10,7 @@ import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
+from typing import NamedTuple
 
 from sros_tool.errors import UsageError
 
@@ -65,8 +66,7 @@ class Window:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Lifespan:
+class Lifespan(NamedTuple):
     """A chosen validity with a fixed start, a fixed end, or both.
 
     Without ``start`` it begins at the creation.  Exactly one of ``end`` and ``length`` is given;

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.values import shows
@@ -56,8 +56,7 @@ NOTE, WARNING, ERROR = Severity.NOTE, Severity.WARNING, Severity.ERROR
 
 
 @shows("id", "severity", "title", "why", "source", "remedy", "vendors", null_if_empty=("vendors",))
-@dataclass(frozen=True, slots=True)
-class FindingKind:
+class FindingKind(NamedTuple):
     """A kind of finding.
 
     ``id`` is stable and has the form ``family.name``.  ``title`` is a clause; ``why``, ``source``
@@ -102,8 +101,7 @@ class FindingKind:
         return Finding(self, subject, text, file, line or None, remedy, accepted, related)
 
 
-@dataclass(frozen=True, slots=True)
-class RelatedPlace:
+class RelatedPlace(NamedTuple):
     """Another place in a file that a finding is about."""
 
     text: str
@@ -118,8 +116,7 @@ class RelatedPlace:
         return f"{self.file}:{self.line}" if self.line else self.file
 
 
-@dataclass(frozen=True, slots=True)
-class Cause:
+class Cause(NamedTuple):
     """The common cause of several findings of one severity, and the remedy for all of them.
 
     ``title`` is a clause, ``text`` and ``remedy`` are sentences.  ``number`` counts the findings
@@ -139,8 +136,7 @@ class Cause:
     "related",
     null_if_empty=("file", "accepted"),
 )
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(NamedTuple):
     """A finding of ``sros check``.
 
     ``own_remedy`` replaces the remedy of the kind unless it is empty.  An accepted finding counts

@@ -297,7 +297,7 @@ def _misspelt(each: _Statement, other: str, meant: Sequence[_Statement]) -> Find
         RelatedPlace(f"{one.right.enclave} may {one.right.describe()}", *_place(one.source))
         for one in meant[:_NAMES_SHOWN]
     )
-    return replace(each.found(MISSPELT, text), related=places)
+    return each.found(MISSPELT, text)._replace(related=places)
 
 
 def _place(source: Source) -> tuple[str, int | None]:
@@ -454,7 +454,7 @@ def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
             by_file[each.finding.file].append(each)
     causes = {file: _no_common_part(found) for file, found in by_file.items() if len(found) > 1}
     for one in lacking:
-        yield replace(one.finding, cause=causes.get(one.finding.file) if one.has_include else None)
+        yield one.finding._replace(cause=causes.get(one.finding.file) if one.has_include else None)
     for said in checked.statements:
         if said.written in _GLOBAL and said.profile.ns != "/" and said.right.kind == "topics":
             text = f"{said.written} becomes {said.name} in namespace {said.profile.ns}"
@@ -678,7 +678,7 @@ def _at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
     """Return the finding with the place of the first denial of its enclave."""
     denials = (s for s in checked.statements if s.right.enclave == found.subject and not s.allows)
     source = next(denials).source
-    return replace(found, file=source.file, line=source.line)
+    return found._replace(file=source.file, line=source.line)
 
 
 def outside_findings(

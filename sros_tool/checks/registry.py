@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib import import_module
@@ -99,7 +99,7 @@ class FindingFilter:
         """Return the findings to show, worst first, and the accepted findings that are hidden."""
         wanted = [each for each in findings if self.wants(each.kind)]
         if self.strict:
-            wanted = [replace(each, accepted="") for each in wanted]
+            wanted = [each._replace(accepted="") for each in wanted]
         shown = [each for each in wanted if self._shows(each)]
         shown.sort(key=lambda each: (-each.severity.weight, each.file, each.line or 0))
         hidden = [each for each in wanted if not self._shows(each)]
@@ -107,8 +107,7 @@ class FindingFilter:
         return ChosenFindings(tuple(shown), tuple(accepted), len(hidden) - len(accepted))
 
 
-@dataclass(frozen=True, slots=True)
-class ChosenFindings:
+class ChosenFindings(NamedTuple):
     """The shown findings, the accepted ones that are not shown, and the number of hidden ones."""
 
     shown: tuple[Finding, ...]

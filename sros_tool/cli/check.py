@@ -507,8 +507,8 @@ def _findings_here(
 
 def _shown(finding: Finding) -> Finding:
     """Return the finding; files below the working directory get relative paths."""
-    related = tuple(replace(place, file=_relative(place.file)) for place in finding.related)
-    return replace(finding, file=_relative(finding.file), related=related)
+    related = tuple(place._replace(file=_relative(place.file)) for place in finding.related)
+    return finding._replace(file=_relative(finding.file), related=related)
 
 
 def _relative(file: str) -> str:

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, field, fields
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 from lxml import etree
 
@@ -37,8 +37,7 @@ _DATA_KINDS = (ProtectionKind.NONE, ProtectionKind.SIGN, ProtectionKind.ENCRYPT)
 Value = bool | ProtectionKind
 
 
-@dataclass(frozen=True, slots=True)
-class Attribute:
+class Attribute(NamedTuple):
     """One attribute of domain rules or topic rules, from the metadata of its field below.
 
     All code that reads, writes, describes or compares rules iterates over `attributes`, in the
@@ -155,8 +154,7 @@ def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, 
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Governance:
+class Governance(NamedTuple):
     """A governance document; the first domain rule that names a domain decides."""
 
     domain_access_rules: tuple[DomainRule, ...]

@@ -7,9 +7,9 @@ omg_shared_ca_permissions of 20170901).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import combinations
+from typing import NamedTuple
 
 from lxml import etree
 
@@ -38,8 +38,7 @@ TOPIC_LINE_BYTES = len("            <topic></topic>\r\n")
 """Size in bytes that a topic adds to a signed document, without its name, if it is indented."""
 
 
-@dataclass(frozen=True, slots=True)
-class Criteria:
+class Criteria(NamedTuple):
     """The topics of a rule; no partitions means the default partition."""
 
     topics: tuple[str, ...]
@@ -47,8 +46,7 @@ class Criteria:
     data_tags: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Rule:
+class Rule(NamedTuple):
     """An allow or deny rule for some domains."""
 
     allow: bool
@@ -58,8 +56,7 @@ class Rule:
     relay: tuple[Criteria, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Grant:
+class Grant(NamedTuple):
     """The rights and the validity of one subject; dates are kept as written in the document."""
 
     name: str
@@ -93,8 +90,7 @@ class Grant:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Permissions:
+class Permissions(NamedTuple):
     """A permissions document."""
 
     grants: tuple[Grant, ...]

@@ -292,7 +292,7 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
             faulty[name] = reason
         elif grant := state.grant:
             rules = tuple(rule for rule in grant.rules if domain in rule.domains.closed())
-            rights[name] = replace(grant, rules=rules)
+            rights[name] = grant._replace(rules=rules)
             governances[name] = state.governance
             if newest or serials:
                 revocations = _content(enclave_path(keystore.root, name) / CRL_FILE)

@@ -160,7 +160,7 @@ class KeystoreCopy:
             )
         rules = list(grant.rules)
         rules[place] = _with_topics(rules[place], publish, subscribe)
-        grants = (replace(grant, rules=tuple(rules)), *permissions.grants[1:])
+        grants = (grant._replace(rules=tuple(rules)), *permissions.grants[1:])
         return render_permissions(Permissions(grants))
 
     def sign(self, document: bytes, root: Path | None = None) -> bytes:
@@ -215,8 +215,7 @@ def name_of(forgery: Forge | Undefended) -> str:
 
 
 def _with_topics(rule: Rule, publish: Sequence[str], subscribe: Sequence[str]) -> Rule:
-    return replace(
-        rule,
+    return rule._replace(
         publish=_widened(rule.publish, publish),
         subscribe=_widened(rule.subscribe, subscribe),
     )
@@ -228,7 +227,7 @@ def _widened(criteria: tuple[Criteria, ...], topics: Sequence[str]) -> tuple[Cri
     if not criteria:
         return (Criteria(tuple(topics)),)
     first = criteria[0]
-    return (replace(first, topics=(*first.topics, *topics)), *criteria[1:])
+    return (first._replace(topics=(*first.topics, *topics)), *criteria[1:])
 
 
 def _weak_governance(copy: KeystoreCopy) -> bytes:
@@ -390,7 +389,7 @@ def permissions_for_another_domain(copy: KeystoreCopy) -> None:
 def _only_elsewhere(document: bytes, domain: int) -> tuple[Grant, ...]:
     elsewhere = DomainSet.of((0, 0) if domain else (1, 1))
     return tuple(
-        replace(grant, rules=tuple(replace(rule, domains=elsewhere) for rule in grant.rules))
+        grant._replace(rules=tuple(rule._replace(domains=elsewhere) for rule in grant.rules))
         for grant in parse_permissions(document).grants
     )
 

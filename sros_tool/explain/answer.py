@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Annotated, NamedTuple
@@ -175,8 +174,7 @@ class DecidedPart(NamedTuple):
     *("until_file", "problems", "parts", "remedy", "change", "commands"),
     null_if_empty=("denied_by", "wildcard", "policy_sha256", "until_file", "remedy"),
 )
-@dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(NamedTuple):
     """The decision of a DDS vendor on a question.
 
     ``decision`` determines the outcome; ``part`` is the endpoint decided on, or None for

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -147,7 +146,7 @@ def open_to_ask(
         own = policy.enclave(enclave.name)
         if own is None and not is_enclave(Path(enclave.name)):
             raise _not_in_policy(policy, enclave.name, policy_file)
-    enclave = replace(enclave, keystore=keystore, policy=own, policy_file=policy_file)
+    enclave = enclave._replace(keystore=keystore, policy=own, policy_file=policy_file)
     return AskedEnclave(enclave, policy)
 
 

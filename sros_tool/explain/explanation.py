@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 
@@ -68,8 +67,7 @@ def explain(evaluator: Evaluator, question: Question) -> Answer:
     keystore = enclave.keystore
     known = keystore is not None and keystore.has(LEDGER)
     recorded = recorded_policy(keystore, enclave.signed) if keystore and known else ""
-    answer = replace(
-        answer,
+    answer = answer._replace(
         lines=deciding_lines(enclave.policy, answer) if enclave.policy else (),
         provenance=_provenance(enclave, recorded),
         policy_sha256=recorded,
@@ -80,7 +78,7 @@ def explain(evaluator: Evaluator, question: Question) -> Answer:
         return changed
     faulty = (problem.file for problem in answer.problems if problem.fault.id == answer.reason)
     text = remedy(answer.reason, str(enclave.root or ""), enclave.name, next(faulty, ""))
-    return replace(answer, remedy=text)
+    return answer._replace(remedy=text)
 
 
 def _provenance(enclave: LoadedEnclave, recorded: str) -> Provenance | None:
@@ -121,9 +119,9 @@ def _changed(evaluator: Evaluator, answer: Answer) -> Answer | None:
     if change is None:
         return None
     if change.add or change.lift:
-        return replace(answer, change=change)
+        return answer._replace(change=change)
     # The present policy allows it.
-    return replace(answer, sign=True) if answer.provenance is Provenance.CHANGED else None
+    return answer._replace(sign=True) if answer.provenance is Provenance.CHANGED else None
 
 
 # ── remedies ───────────────────────────────────────────────────────────────────────────────

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -167,7 +166,7 @@ def _begin(path: Parts) -> Parts:
             break
         if inside and isinstance(part, Placeholder) and part.value == "namespace":
             break
-        begin.append(part if isinstance(part, str) else replace(part, group=""))
+        begin.append(part if isinstance(part, str) else part._replace(group=""))
         inside = inside or isinstance(part, Placeholder)
     return tuple(part for part in begin if part != "")
 

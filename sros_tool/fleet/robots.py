@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from ipaddress import ip_address
 from types import MappingProxyType
+from typing import NamedTuple
 
 from sros_tool.errors import DocumentError
 
@@ -31,8 +32,7 @@ _HOST = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?\.?", re.ASCII)
 _USER = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?", re.ASCII)
 
 
-@dataclass(frozen=True, slots=True)
-class Robot:
+class Robot(NamedTuple):
     """A robot: its ROS namespace, and how it is reached.
 
     ``domain`` is its ROS_DOMAIN_ID, or None for every domain of the keystore.  ``address`` is a

@@ -8,11 +8,10 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note
@@ -127,8 +126,7 @@ def enclaves_of_robot(root: Path, fleet: Fleet, robot: Robot) -> tuple[str, ...]
     return tuple(name for name in enclaves_of(fleet, robot) if has_enclave(root, name))
 
 
-@dataclass(frozen=True, slots=True)
-class EnclaveDomains:
+class EnclaveDomains(NamedTuple):
     """The ROS domains of enclaves: the domain of the robot, or else the keystore's domains."""
 
     keystore: DomainSet

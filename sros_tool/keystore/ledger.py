@@ -23,7 +23,6 @@ from array import array
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
 from datetime import datetime
 from functools import lru_cache
 from itertools import chain
@@ -50,8 +49,7 @@ SAME_KEY = "same key"
 """The ``reason`` of a CA certificate that has the same key as the CA's certificate before."""
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(NamedTuple):
     """A line of the ledger: a certificate or document that was issued, or a revocation.
 
     Times are ISO 8601 in UTC; what does not apply is an empty string.
@@ -93,8 +91,7 @@ class Entry:
     """SHA-256 of the line before."""
 
 
-@dataclass(frozen=True, slots=True)
-class Ledger:
+class Ledger(NamedTuple):
     """The readable entries of a ledger, oldest first, and its faults.
 
     ``gaps`` are clauses about lines that are missing, changed or unreadable; faults from before the
@@ -127,8 +124,7 @@ _MOST_BYTES = 4 * 1024**3
 _MOST_LINES = 8_000_000
 _LONGEST_LINE = 4 * 1024**2
 _BLOCK = 1024**2
-_FIELDS = tuple(field.name for field in fields(Entry))
-_TEXTS = tuple(field.name for field in fields(Entry) if field.type == "str")
+_TEXTS = tuple(name for name in Entry._fields if name != "number")
 _SERIAL = re.compile(r"[0-9a-f]{1,40}")
 _MOST_BITS = 159
 """Largest length of a serial number, in bits (RFC 5280, 4.1.2.2)."""
@@ -146,7 +142,7 @@ _WRITTEN = re.compile(
         f'{"," if index else ""}"{name}":{_VALUES.get(name, _TEXT)}'
         if name in ("time", "what")
         else f'(?:,"{name}":{_VALUES.get(name, _TEXT)})?'
-        for index, name in enumerate(_FIELDS)
+        for index, name in enumerate(Entry._fields)
     )
     + r"\}"
 )
@@ -701,7 +697,7 @@ class _Links:
 
 def _line(entry: Entry, previous: str) -> bytes:
     """Return an entry as a line of compact JSON; ``previous`` is the digest of the line before."""
-    filled = ((name, getattr(entry, name)) for name in _FIELDS[:-1])
+    filled = ((name, getattr(entry, name)) for name in Entry._fields[:-1])
     parts = [
         f'"{name}":{_quoted(value) if isinstance(value, str) else value}'
         for name, value in filled

@@ -7,10 +7,10 @@ the faults that all vendors refuse; they are not checked here again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
 from itertools import dropwhile
+from typing import NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, rsa
@@ -159,8 +159,7 @@ def _is_specific(problem: Problem, state: OpenedEnclave) -> bool:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Trust:
+class _Trust(NamedTuple):
     """The CA files of a keystore, as a vendor reads them.
 
     ``authorities`` and ``signers`` are the certificates of the identity CA's and the permissions

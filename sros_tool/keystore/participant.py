@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 from cryptography import x509
 
@@ -68,8 +69,7 @@ _PLANNED = timedelta(days=365)
 """The assumed validity of permissions for a policy that is not signed yet."""
 
 
-@dataclass(frozen=True, slots=True)
-class LoadedEnclave:
+class LoadedEnclave(NamedTuple):
     """An enclave as DDS loads it.
 
     ``governance`` and ``permissions`` are the XML in the signed documents; ``signed`` is the signed
@@ -243,8 +243,7 @@ def _governed_as(
     return GovernedDomain(vendor, governance, domain)
 
 
-@dataclass(frozen=True, slots=True)
-class JoinContext:
+class JoinContext(NamedTuple):
     """The ROS domain and the time of joining; ``zone`` is the time zone of the host."""
 
     domain: int
@@ -252,8 +251,7 @@ class JoinContext:
     zone: tzinfo = UTC
 
 
-@dataclass(frozen=True, slots=True)
-class RefusalCause:
+class RefusalCause(NamedTuple):
     """A reason why no node of a vendor can run in an enclave, or peers refuse the node.
 
     ``reason`` is the id of a fault or of a decision; ``text`` is a clause with the name of the
@@ -349,11 +347,11 @@ class VendorParticipant:
             text = f"{self.vendor.title}: {first}."
             late = Decision(Outcome.PEER_DENIES, first.fault.id, text)
         if isinstance(governed, Refusal):
-            return replace(governed.decision(), reason=Fault.GOVERNANCE_MALFORMED.id)
+            return governed.decision()._replace(reason=Fault.GOVERNANCE_MALFORMED.id)
         self.governance = governed.governance
         permissions = enclave.portable or read_permissions_as(self.vendor, enclave.permissions)
         if isinstance(permissions, Refusal):
-            return replace(permissions.decision(), reason=Fault.PERMISSIONS_MALFORMED.id)
+            return permissions.decision()._replace(reason=Fault.PERMISSIONS_MALFORMED.id)
         self.permissions = permissions
         access = Access(governed, permissions, enclave.subject, at=context.at, zone=context.zone)
         if late is None:
@@ -363,8 +361,7 @@ class VendorParticipant:
         return joined if joined.outcome in (Outcome.REFUSED, Outcome.CRASHES) else late
 
 
-@dataclass(frozen=True, slots=True)
-class EvaluatedEnclave:
+class EvaluatedEnclave(NamedTuple):
     """An enclave as given vendors load it, and their participants in it."""
 
     state: OpenedEnclave
@@ -474,7 +471,7 @@ def _with_acceptance(
         text += f", refused by {refusing}"
     if state.certificate and _signers(state, problem.file) == {state.certificate}:
         text = f"the enclave gave itself these rights: {text}"
-    return replace(problem, text=text, fault=Fault.SIGNER_NO_CA)
+    return problem._replace(text=text, fault=Fault.SIGNER_NO_CA)
 
 
 def _signers(state: OpenedEnclave, file: str) -> set[x509.Certificate | None]:

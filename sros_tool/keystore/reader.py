@@ -17,7 +17,7 @@ from datetime import datetime
 from functools import cached_property, lru_cache, wraps
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Concatenate, Generic, ParamSpec, TypeVar, overload
+from typing import TYPE_CHECKING, Concatenate, Generic, NamedTuple, ParamSpec, TypeVar, overload
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import rsa
@@ -79,13 +79,13 @@ from sros_tool.pki.crl import (
 )
 from sros_tool.pki.keys import is_key_for_pss, load_any_key
 from sros_tool.pki.pem import XML, kind_of
-from sros_tool.pki.token import TokenUri, read_token_file
 from sros_tool.validity import Window, iso
 from sros_tool.values import shows
 from sros_tool.xml import MAX_BYTES, read_bytes, read_file
 
 if TYPE_CHECKING:
     from sros_tool.keystore.template import Template
+    from sros_tool.pki.token import TokenUri
 
 _Parsed = TypeVar("_Parsed")
 
@@ -520,8 +520,7 @@ class Keystore:
 _OF_ENCLAVES = ("enclave", "identity", "grant", "certificate")
 
 
-@dataclass(frozen=True, slots=True)
-class _Failure:
+class _Failure(NamedTuple):
     """Why a part of a keystore cannot be read."""
 
     error: SrosError | OSError
@@ -562,8 +561,7 @@ def read_certificate(path: Path) -> x509.Certificate:
 # ── signed permissions ─────────────────────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True, slots=True)
-class SignedGrant:
+class SignedGrant(NamedTuple):
     """A signed permissions document, not verified yet, and its grant to a subject.
 
     ``digest`` is the SHA-256 of the whole file, in hexadecimal.  ``grant`` is the first grant to
@@ -592,8 +590,7 @@ def _read_signed_grant(path: Path, subject: str, files: FilesReadOnce | None = N
 
 
 @shows("file", "text", "code")
-@dataclass(frozen=True, slots=True)
-class Problem:
+class Problem(NamedTuple):
     """A fault in a file of an enclave."""
 
     file: str
@@ -701,8 +698,7 @@ class OpenedEnclave:
         return min(moments)
 
 
-@dataclass(frozen=True, slots=True)
-class EnclaveIdentity:
+class EnclaveIdentity(NamedTuple):
     """The certificate of an enclave, and the problems of it, of its key and of its identity CA.
 
     The key may be missing in a keystore if it was generated on the robot and stays there.
@@ -887,6 +883,8 @@ class _EnclaveFiles:
             self._add(KEY_URI_FILE, text, Fault.KEY_TWICE)
         if not data:  # it was reported already
             return None
+        from sros_tool.pki.token import read_token_file
+
         try:
             return read_token_file(data)
         except PkiError as error:

@@ -476,8 +476,7 @@ def policy_difference(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class SignedRights:
+class SignedRights(NamedTuple):
     """The rights in signed permissions.
 
     ``policy`` is the SHA-256 of the policy that they were made from; "" if the ledger lacks it.

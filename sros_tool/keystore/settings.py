@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
@@ -79,8 +79,7 @@ class HandEdits:
         return tuple(dict.fromkeys(clause for clause in clauses if clause))
 
 
-@dataclass(frozen=True, slots=True)
-class PresentSettings:
+class PresentSettings(NamedTuple):
     """The settings in force in a keystore, and edits by hand.
 
     ``settings`` are the settings as sros wrote them last, with the protection of the signed

@@ -11,7 +11,7 @@ import hashlib
 import os
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from enum import Enum, StrEnum
 from pathlib import Path
@@ -725,7 +725,7 @@ def _recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
     """
     source = Source(f"the permissions of {enclave}", 0)
     rules = tuple(each for each in grant.rules if domain in each.domains.closed())
-    rights = grant_rights(enclave, replace(grant, rules=rules))
+    rights = grant_rights(enclave, grant._replace(rules=rules))
     raw = {each for each in rights if not each.name.startswith("/")}
     rights -= raw
     if {each.right for each in raw if each.name == "*" and each.qualifier is ALLOW} == {

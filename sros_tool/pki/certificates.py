@@ -7,7 +7,6 @@ import re
 import secrets
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import Enum
 from functools import cache, lru_cache
@@ -729,8 +728,7 @@ _MAX_BYTES = 64 * 1024
 _DIGESTS = (hashes.SHA256, hashes.SHA384, hashes.SHA512)
 
 
-@dataclass(frozen=True, slots=True)
-class SigningRequest:
+class SigningRequest(NamedTuple):
     """A verified certificate signing request; ``name`` is the common name of its subject."""
 
     name: str

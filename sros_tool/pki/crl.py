@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum
 from functools import lru_cache
@@ -55,8 +54,7 @@ SUPERSEDED = x509.ReasonFlags.superseded.value
 """The reason for a certificate that was renewed: its key may still be in use."""
 
 
-@dataclass(frozen=True, slots=True)
-class Revoked:
+class Revoked(NamedTuple):
     """An entry of a revocation list; ``reason`` is one of `REASONS`."""
 
     serial: int
@@ -64,8 +62,7 @@ class Revoked:
     reason: str = "unspecified"
 
 
-@dataclass(frozen=True, slots=True)
-class RevocationList:
+class RevocationList(NamedTuple):
     """A parsed revocation list; its signature is not verified yet.
 
     ``revoked`` lacks entries with the reason removeFromCRL: they revoke nothing.

@@ -16,7 +16,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -175,8 +175,7 @@ class Signature:
         return True
 
 
-@dataclass(frozen=True, slots=True)
-class SignedDocument:
+class SignedDocument(NamedTuple):
     """A parsed ``.p7s``; do not trust its content before `verify`.
 
     ``content`` is the signed part, with CRLF line ends and the MIME header; ``document`` is the

@@ -7,10 +7,9 @@ import os
 import secrets as random
 import stat
 from collections.abc import Callable, Sequence, Set
-from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote as shell_quote
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote, unquote
 
 from cryptography.exceptions import InvalidSignature
@@ -235,7 +234,7 @@ def _usable_uri(uri: str, *, named: bool) -> TokenUri:
 
 def _usable(parsed: TokenUri, *, named: bool) -> TokenUri:
     """Return the URI with its module filled in; raise if tokens cannot be used here."""
-    parsed = replace(parsed, module=_module_of(parsed, named=named))
+    parsed = parsed._replace(module=_module_of(parsed, named=named))
     if importlib.util.find_spec("pkcs11") is None:
         raise UnavailableError(
             "keys on PKCS#11 tokens need the Python package python-pkcs11",
@@ -352,8 +351,7 @@ _MOST_BYTES = 2000
 _LONGEST_TOKEN, _LONGEST_OBJECT = 32, 128  # bytes; CK_TOKEN_INFO of PKCS#11, and enough
 
 
-@dataclass(frozen=True, slots=True)
-class TokenUri:
+class TokenUri(NamedTuple):
     """The parts of a ``pkcs11:`` URI that sros uses.
 
     ``object`` is the label of the key, ``module`` the path of the PKCS#11 library, or "", and

@@ -76,8 +76,7 @@ _MAX_BYTES = 32 * 1024 * 1024
 _MAX_LENGTH = 1000  # characters of a href or an xpointer
 
 
-@dataclass(frozen=True, slots=True)
-class IncludedFile:
+class IncludedFile(NamedTuple):
     """A document, and the includes that lead to it, each with file and xpointer.
 
     ``linked`` says that the last include names the file by a symbolic link.
@@ -756,8 +755,7 @@ def _absolute(profile: Profile) -> tuple[Profile, ...]:
 # ── earlier formats ────────────────────────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True, slots=True)
-class ConvertedPolicy:
+class ConvertedPolicy(NamedTuple):
     """A policy of an earlier format with the same rights, as `Policy`.
 
     ``left_out`` are the profiles that no enclave can stand for, with the reason; without them the

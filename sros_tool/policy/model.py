@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.names import expand
 from sros_tool.values import Words, shows
@@ -37,8 +37,7 @@ ALLOW = Qualifier.ALLOW
 DENY = Qualifier.DENY
 
 
-@dataclass(frozen=True, slots=True)
-class Source:
+class Source(NamedTuple):
     """The file and line (from 1) that something was read from; without a line it is 0."""
 
     file: str
@@ -87,8 +86,7 @@ class Profile:
     source: Source = field(default=_NOWHERE, compare=False)
 
 
-@dataclass(frozen=True, slots=True)
-class Profiles:
+class Profiles(NamedTuple):
     """A set of profiles with its free ``type`` and its ``metadata`` (XML text, or "")."""
 
     profiles: tuple[Profile, ...]
@@ -115,7 +113,7 @@ class Enclave:
     def with_profiles(self, change: Callable[[Profile], Profile]) -> Enclave:
         """Return the enclave with every profile replaced by what ``change`` returns for it."""
         blocks = (
-            replace(block, profiles=tuple(map(change, block.profiles))) for block in self.profiles
+            block._replace(profiles=tuple(map(change, block.profiles))) for block in self.profiles
         )
         return replace(self, profiles=tuple(blocks))
 

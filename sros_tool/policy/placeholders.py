@@ -10,8 +10,8 @@ in the same part of the name, because ``/r1*`` would match the names of a robot 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _KIND = re.compile(r"(robot|namespace)(s?)(?::([A-Za-z_][A-Za-z0-9_]{0,63}))?", re.ASCII)
@@ -19,8 +19,7 @@ _WILDCARDS = frozenset("*?[]!")
 _SAMPLES = {"robot": "r", "namespace": "/r"}
 
 
-@dataclass(frozen=True, slots=True)
-class Placeholder:
+class Placeholder(NamedTuple):
     """A placeholder: ``value`` is robot or namespace; ``group`` is "" for the whole fleet."""
 
     value: str
@@ -107,7 +106,7 @@ def check_path(path: Parts) -> None:
     """
     found = placeholders_of(path)
     if plural := next((part for part in found if part.plural), None):
-        one = replace(plural, plural=False)
+        one = plural._replace(plural=False)
         raise ValueError(f"{plural} is all robots, and a path is of one enclave: write {one}.")
     if len({part.group for part in found}) > 1:
         raise ValueError("Its placeholders are of different groups.")
@@ -130,7 +129,7 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
             if not several:
                 raise ValueError(f"{placeholder} is a name for each robot, and here is only one.")
         elif not owner:
-            instead = f" For a name for each robot write {replace(placeholder, plural=True)}."
+            instead = f" For a name for each robot write {placeholder._replace(plural=True)}."
             raise ValueError(
                 f"{placeholder} is one robot, and the path of the enclave does not say which one."
                 f"{instead if several else ''}"

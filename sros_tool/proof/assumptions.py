@@ -61,7 +61,7 @@ def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permi
             subject = f"CN={name},OU={sha256(name.encode()).hexdigest()}"
         grants = permissions.grants
         if subject:
-            grants = tuple(replace(grant, subject=subject) for grant in grants)
+            grants = tuple(grant._replace(subject=subject) for grant in grants)
         found[name] = Permissions(grants)
     return found
 
@@ -83,7 +83,7 @@ def _for_domain(permissions: Permissions, domain: int) -> Permissions:
     only = DomainSet.of((domain, domain))
     return Permissions(
         tuple(
-            replace(grant, rules=tuple(replace(rule, domains=only) for rule in grant.rules))
+            grant._replace(rules=tuple(rule._replace(domains=only) for rule in grant.rules))
             for grant in permissions.grants
         )
     )

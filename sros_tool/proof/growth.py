@@ -499,7 +499,7 @@ def _of_rights(side: AccessSource, robots: Mapping[str, int]) -> Callable[[str, 
 
 def _in_domain(grant: Grant, domain: int) -> Grant:
     rules = (rule for rule in grant.rules if domain in rule.domains.closed())
-    return replace(grant, rules=tuple(rules))
+    return grant._replace(rules=tuple(rules))
 
 
 def _by_enclave(rights: Iterable[Right]) -> dict[str, list[Right]]:
@@ -598,7 +598,7 @@ def _same_grants(one: Permissions | None, other: Permissions | None) -> bool:
 
 
 def _without_name(grant: Grant) -> Grant:
-    return replace(grant, name="")
+    return grant._replace(name="")
 
 
 class _Denials:

@@ -194,11 +194,10 @@ class Review:
     def shown_finding(self, finding: Finding) -> Finding:
         """Return a finding with the paths of files as the repository has them."""
         related = tuple(
-            replace(each, text=self.shown(each.text), file=self.shown(each.file))
+            each._replace(text=self.shown(each.text), file=self.shown(each.file))
             for each in finding.related
         )
-        return replace(
-            finding,
+        return finding._replace(
             subject=self.shown(finding.subject),
             text=self.shown(finding.text),
             file=self.shown(finding.file),

@@ -397,7 +397,7 @@ def _without_dates(permissions: Permissions) -> Permissions:
     """Return permissions that are valid at `AT`, as validity is not compared."""
     begin, end = iso(_VALID.not_before), iso(_VALID.not_after)
     return Permissions(
-        tuple(replace(grant, not_before=begin, not_after=end) for grant in permissions.grants)
+        tuple(grant._replace(not_before=begin, not_after=end) for grant in permissions.grants)
     )
 
 

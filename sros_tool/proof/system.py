@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, tzinfo
 from itertools import product
 from pathlib import Path
@@ -331,7 +331,7 @@ def _keystore_system(
     )
     loaded = {name: load_enclave_of(keystore, name, at=at) for name in names}
     if public:
-        loaded = {name: replace(each, key_elsewhere=True) for name, each in loaded.items()}
+        loaded = {name: each._replace(key_elsewhere=True) for name, each in loaded.items()}
     for name, each in loaded.items():
         if not each.permissions and (file := enclave_path(root, name) / PERMISSIONS_FILE).exists():
             raise KeystoreError(
@@ -408,7 +408,7 @@ def _keystore_system(
 def _possible(enclave: LoadedEnclave, grants: Sequence[Grant], governance: bytes) -> LoadedEnclave:
     """Return an enclave with its permissions, and with nothing that keeps it from starting."""
     subject = enclave.subject or next((grant.subject for grant in grants), "")
-    return replace(enclave, subject=subject, governance=governance, state=None)
+    return enclave._replace(subject=subject, governance=governance, state=None)
 
 
 _MOST_MOMENTS = 10

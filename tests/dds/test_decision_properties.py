@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
@@ -72,7 +71,7 @@ def test_an_allow_rule_at_the_end_takes_no_right_away(
         subscribe=() if publish else criteria,
     )
     more = Permissions(
-        tuple(replace(each, rules=(*each.rules, rule)) for each in permissions.grants)
+        tuple(each._replace(rules=(*each.rules, rule)) for each in permissions.grants)
     )
     governed = GovernedDomain(vendor, governance, case.domain)
     for question in case.questions:

@@ -7,7 +7,6 @@ twin with a change of the policy after which it is allowed, and nothing else is.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -60,7 +59,7 @@ def enclaves() -> Iterator[tuple[Path, Enclave]]:
 
 
 def planned(enclave: Enclave) -> LoadedEnclave:
-    return replace(plan_enclave(enclave, GOVERNANCE, at=NOW), policy=enclave)
+    return plan_enclave(enclave, GOVERNANCE, at=NOW)._replace(policy=enclave)
 
 
 def question(right: str, name: str) -> Question:

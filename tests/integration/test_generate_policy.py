@@ -497,8 +497,7 @@ def without(policy: Policy, path: str, name: str) -> Policy:
             else replace(
                 each,
                 profiles=tuple(
-                    replace(
-                        block,
+                    block._replace(
                         profiles=tuple(replace(p, groups=poorer(p.groups)) for p in block.profiles),
                     )
                     for block in each.profiles

@@ -214,7 +214,7 @@ def without(enclave: Enclave, right: str, name: str) -> Enclave:
     return replace(
         enclave,
         profiles=tuple(
-            replace(block, profiles=tuple(poorer(each, right, name) for each in block.profiles))
+            block._replace(profiles=tuple(poorer(each, right, name) for each in block.profiles))
             for block in enclave.profiles
         ),
     )

@@ -224,7 +224,7 @@ def test_history_as_text_and_json(tmp_path: Path) -> None:
     document = json.loads(sros("inspect", root, "--history", "--json").ok().out)
     assert set(document) == {"version", "kind", "path", "entries", "unexplained", "gaps"}
     assert len(document["entries"]) == 10
-    assert {*document["entries"][3]} == {*Entry.__slots__, "status", "path"}
+    assert {*document["entries"][3]} == {*Entry._fields, "status", "path"}
     assert {entry["status"] for entry in document["entries"]} <= set(HistoryStatus)
     assert document["unexplained"] == []
 

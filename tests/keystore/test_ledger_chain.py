@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -270,7 +269,7 @@ def test_a_line_in_another_form_is_read_as_ever(root: Path) -> None:
     spaced = [json.dumps(json.loads(line)).encode() for line in lines_of(root)]
     put(root, [re.sub(rb', "previous": "[0-9a-f]+"', b"", line) for line in spaced])
     (root / LEDGER_HEAD).unlink()
-    assert [replace(each, previous="") for each in before] == list(Keystore(root).ledger.entries)
+    assert [each._replace(previous="") for each in before] == list(Keystore(root).ledger.entries)
     put(root, [*lines_of(root)[:4], b'{"time":"x","what":"certificate","serial":"000"}'])
     assert len(Keystore(root).ledger.entries) == 4
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from unittest.mock import patch
@@ -111,8 +110,8 @@ def test_only_what_a_wildcard_matches_is_left_out(
     enclave = of_text(f"{SHORT}{more}</topics>", tmp_path)
     (full,) = permissions_of(enclave).grants[0].rules
     topics = (*signed.split(), ROS_DISCOVERY_TOPIC)
-    rule = replace(full, publish=(Criteria(topics),))
-    made = only_grant(permissions_of(enclave), lambda grant: replace(grant, rules=(rule,)))
+    rule = full._replace(publish=(Criteria(topics),))
+    made = only_grant(permissions_of(enclave), lambda grant: grant._replace(rules=(rule,)))
     with nullcontext() if same else pytest.raises(KeystoreError, match="would not match"):
         prove(enclave, made, DOMAINS)
 
@@ -151,35 +150,35 @@ def only_grant(made: Permissions, change: Callable[[Grant], Grant]) -> Permissio
 
 
 def rules(change: Callable[[tuple[Rule, ...]], tuple[Rule, ...]]) -> Callable[[Grant], Grant]:
-    return lambda grant: replace(grant, rules=change(grant.rules))
+    return lambda grant: grant._replace(rules=change(grant.rules))
 
 
 def topics(rule: Rule, side: str, change: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Rule:
     (criteria,) = getattr(rule, side)
-    return replace(rule, **{side: (Criteria(change(criteria.topics)),)})  # type: ignore[arg-type]
+    return rule._replace(**{side: (Criteria(change(criteria.topics)),)})  # type: ignore[arg-type]
 
 
 WRONG: dict[str, Callable[[Grant], Grant]] = {
     "denials behind permissions": rules(lambda r: r[::-1]),
     "denials lost": rules(lambda r: r[1:]),
-    "permissions lost": rules(lambda r: (r[0], replace(r[1], publish=()))),
+    "permissions lost": rules(lambda r: (r[0], r[1]._replace(publish=()))),
     "a topic more": rules(lambda r: (r[0], topics(r[1], "publish", lambda t: (*t, "rt/more")))),
     "a wildcard more": rules(lambda r: (r[0], topics(r[1], "publish", lambda t: (*t, "rt/*")))),
     "a topic less": rules(lambda r: (r[0], topics(r[1], "publish", lambda t: t[1:]))),
     "directions swapped": rules(
-        lambda r: (r[0], replace(r[1], publish=r[1].subscribe, subscribe=r[1].publish))
+        lambda r: (r[0], r[1]._replace(publish=r[1].subscribe, subscribe=r[1].publish))
     ),
-    "allowed turned into denied": rules(lambda r: (r[0], replace(r[1], allow=False))),
+    "allowed turned into denied": rules(lambda r: (r[0], r[1]._replace(allow=False))),
     "half a service": rules(
         lambda r: (
             r[0],
             topics(r[1], "subscribe", lambda t: tuple(x for x in t if x != "rr/addReply")),
         )
     ),
-    "a domain less": rules(lambda r: tuple(replace(x, domains=DomainSet.parse("0")) for x in r)),
-    "default ALLOW": lambda grant: replace(grant, default_allow=True),
+    "a domain less": rules(lambda r: tuple(x._replace(domains=DomainSet.parse("0")) for x in r)),
+    "default ALLOW": lambda grant: grant._replace(default_allow=True),
     "in a partition": rules(
-        lambda r: (r[0], replace(r[1], publish=(replace(r[1].publish[0], partitions=("p",)),)))
+        lambda r: (r[0], r[1]._replace(publish=(r[1].publish[0]._replace(partitions=("p",)),)))
     ),
 }
 
@@ -223,9 +222,9 @@ def test_equivalent_permissions_of_another_form_are_accepted(tmp_path: Path) -> 
     def split(all_rules: tuple[Rule, ...]) -> tuple[Rule, ...]:
         (rule,) = all_rules
         (criteria,) = rule.publish
-        one = replace(rule, publish=(Criteria(criteria.topics[:1]),))
-        deny_nothing = replace(rule, allow=False, publish=(Criteria(("rt/nobody",)),), subscribe=())
-        return (one, deny_nothing, replace(rule, publish=(Criteria(criteria.topics[1:]),)))
+        one = rule._replace(publish=(Criteria(criteria.topics[:1]),))
+        deny_nothing = rule._replace(allow=False, publish=(Criteria(("rt/nobody",)),), subscribe=())
+        return (one, deny_nothing, rule._replace(publish=(Criteria(criteria.topics[1:]),)))
 
     changed = only_grant(made, rules(split))
     assert signed_expressions(changed, DOMAINS) is None
@@ -275,13 +274,13 @@ def test_permissions_that_fail_the_proof_are_not_written(
     def forgetful(enclave: Enclave, **rest: object) -> Permissions:
         made = permissions_for(enclave, **rest)  # type: ignore[arg-type]
         kept = tuple(rule for rule in made.grants[0].rules if rule.allow)
-        return Permissions((replace(made.grants[0], rules=kept),))
+        return Permissions((made.grants[0]._replace(rules=kept),))
 
     def greedy(enclave: Enclave, **rest: object) -> Permissions:
         made = permissions_for(enclave, **rest)  # type: ignore[arg-type]
         all_rules = made.grants[0].rules
         wide = topics(all_rules[-1], "publish", lambda t: (*t, "rt/*"))
-        return Permissions((replace(made.grants[0], rules=(*all_rules[:-1], wide)),))
+        return Permissions((made.grants[0]._replace(rules=(*all_rules[:-1], wide)),))
 
     for wrong in (forgetful, greedy):
         monkeypatch.setattr(writer_of_enclaves, "permissions_for", wrong)

@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -295,7 +294,7 @@ def an_entry_that_undoes_another(keystore: Path) -> None:
     authority = load_certificate((keystore / "public/identity_ca.cert.pem").read_bytes(), "")
     key = load_key((keystore / "private/identity_ca.key.pem").read_bytes(), "")
     found = load_crl((keystore / "enclaves/mux/crl.pem").read_bytes(), "")
-    entries = [replace(each, reason="removeFromCRL") for each in found.revoked] + [*found.revoked]
+    entries = [each._replace(reason="removeFromCRL") for each in found.revoked] + [*found.revoked]
     begin, end = found.this_update, found.next_update
     text = sign_crl(authority, key, entries, number=99, this_update=begin, next_update=end)
     lists(keystore, text, b"")

@@ -159,8 +159,7 @@ def test_access_is_open_where_it_is_for_any_topic_behind_a_name() -> None:
     assert other.read_control and other.write_control
     # A topic is open if it is in any domain, as an enclave may join there.
     closed = governance_for(DomainProtection(), DomainSet.of((1, 1)))
-    both = replace(
-        governance,
+    both = governance._replace(
         domain_access_rules=(*closed.domain_access_rules, *governance.domain_access_rules),
     )
     assert not protection_of(both, "topics", "/open/x").write_control

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
@@ -369,7 +368,7 @@ def _denied_before_everything(grant: Grant) -> list[str]:
     """Return the topics that a grant denies before its rule that allows all topics."""
     denied: dict[str, None] = {}
     for index, rule in enumerate(grant.rules):
-        if allows_everything(replace(grant, rules=grant.rules[: index + 1], default_allow=False)):
+        if allows_everything(grant._replace(rules=grant.rules[: index + 1], default_allow=False)):
             return [*denied]
         for criteria in () if rule.allow else (*rule.publish, *rule.subscribe):
             denied.update(dict.fromkeys(criteria.topics))

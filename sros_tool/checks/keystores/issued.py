@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from cryptography.hazmat.primitives import hashes, serialization
 
@@ -150,8 +149,7 @@ _AUTHORITY_FILES = (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 """The CA files of an enclave, which define the peers that it trusts."""
 
 
-@dataclass(frozen=True, slots=True)
-class EnclaveSummary:
+class EnclaveSummary(NamedTuple):
     """Digests and names of an enclave, to compare enclaves that several processes checked."""
 
     name: str

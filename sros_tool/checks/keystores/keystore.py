@@ -234,7 +234,7 @@ def _at_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
     real = Path(os.path.realpath(finding.file))
     if not Path(finding.file).is_symlink() or not real.is_relative_to(real_root):
         return finding
-    return replace(finding, file=str(root / real.relative_to(real_root)))
+    return finding._replace(file=str(root / real.relative_to(real_root)))
 
 
 def _with_names(finding: Finding, root: Path) -> Finding:
@@ -242,14 +242,14 @@ def _with_names(finding: Finding, root: Path) -> Finding:
     remedy = re.sub(r"\bROOT\b", lambda _: quote(str(root)), finding.remedy)
     if finding.subject.startswith("/") and "," not in finding.subject:
         remedy = re.sub(r"\bNAME\b", lambda _: quote(finding.subject), remedy)
-    return finding if remedy == finding.remedy else replace(finding, own_remedy=remedy)
+    return finding if remedy == finding.remedy else finding._replace(own_remedy=remedy)
 
 
 def _one_of(group: list[Finding]) -> Finding:
     subjects = list(dict.fromkeys(each.subject for each in group))
     if len(subjects) == 1:
         return group[0]
-    return replace(group[0], subject=first_few(subjects, _NAMES_SHOWN))
+    return group[0]._replace(subject=first_few(subjects, _NAMES_SHOWN))
 
 
 # ── one cause for what ros2/sros2 made ────────────────────────────────────────────────────
@@ -321,7 +321,7 @@ def _with(
     if len(together) < 2:
         return list(findings)
     cause = Cause(title, text, remedy, len(together), str(root))
-    return [replace(each, cause=cause) if id(each) in together else each for each in findings]
+    return [each._replace(cause=cause) if id(each) in together else each for each in findings]
 
 
 def _kinds(findings: Sequence[Finding]) -> str:

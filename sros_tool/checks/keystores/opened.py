@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from cryptography import x509
 
@@ -48,8 +48,7 @@ def _shipped(name: str) -> Template | None:
     return _load_shipped(name) if name in template_names() else None
 
 
-@dataclass(frozen=True, slots=True)
-class UnreadablePart:
+class UnreadablePart(NamedTuple):
     """A file that exists but cannot be read; ``path`` is relative to the root."""
 
     path: str

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from sros_tool.checks.keystores.documents import PARTITIONS, UNREACHABLE
 from sros_tool.checks.keystores.enclaves import fault_remedy, grant_of
@@ -129,8 +129,7 @@ def asked_vendors(vendor: str) -> tuple[Vendor, ...]:
     return tuple(each for each in MEASURED if vendor in ("", each.value))
 
 
-@dataclass(frozen=True, slots=True)
-class EnclaveEvaluation:
+class EnclaveEvaluation(NamedTuple):
     """The decisions of DDS vendors on an enclave.
 
     ``enclave`` is the loaded enclave with its faults for these vendors; ``by_domain`` maps a ROS
@@ -371,8 +370,7 @@ _TYPES = "get_type_description"
 _SOME_NODE = "/sros_nobody_has_this"
 
 
-@dataclass(frozen=True, slots=True)
-class _Denial:
+class _Denial(NamedTuple):
     """The endpoints that an ordinary node needs and that a vendor denies.
 
     ``text`` is a clause; ``by`` names the deciding deny rule as findings do, and ``partition`` is
@@ -547,6 +545,6 @@ def with_causes(findings: Sequence[Finding]) -> list[Finding]:
         if len(group) > 1
     }
     return [
-        replace(each, cause=causes.get(each.text)) if each.kind is NO_NODE else each
+        each._replace(cause=causes.get(each.text)) if each.kind is NO_NODE else each
         for each in findings
     ]

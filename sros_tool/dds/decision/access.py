@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from enum import Enum, auto
 from functools import cache, cached_property, lru_cache
@@ -394,8 +393,7 @@ def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bo
             return f"no rule allows {asked}{peers}"
 
 
-@dataclass(frozen=True, slots=True)
-class _Joining:
+class _Joining(NamedTuple):
     """The outcome of joining, its reason for programs, and a clause for messages."""
 
     outcome: Outcome
@@ -592,8 +590,7 @@ class Access:
         traits = self._traits
         rules, otherwise = _rules_for(traits, grant, self._governed.domain)
         joining = _decide_join(traits, self._governed, grant, rules, otherwise)
-        self._join = replace(
-            self._answer(joining.outcome, joining.reason, joining.text),
+        self._join = self._answer(joining.outcome, joining.reason, joining.text)._replace(
             hits_peers=joining.hits_peers,
         )
         self._rules, self._otherwise = rules, otherwise
@@ -638,8 +635,7 @@ class Access:
         longest = traits.longest_topic_name
         if decision.outcome.ok and longest is not None and len(topic.encode()) > longest:
             text = f"no peer matches a topic whose name has more than {longest} bytes"
-            return replace(
-                decision,
+            return decision._replace(
                 outcome=Outcome.PEER_DENIES,
                 reason="long-name",
                 text=f"{traits.title}: {text}.",
@@ -662,7 +658,7 @@ class Access:
         if not (writes if verb is AccessVerb.PUBLISH else reads):
             text = f"the governance does not control {asked}"
             if join.hits_peers:
-                return replace(join, topic_rule=rule)
+                return join._replace(topic_rule=rule)
             if join.outcome is Outcome.PEER_DENIES:
                 if not self._in_the_open(rule):
                     return self._peers_refuse(rule)
@@ -672,7 +668,7 @@ class Access:
         if not verdict.allowed:
             return self._verdict(verdict, asked, rule)
         if join.hits_peers:
-            return replace(join, topic_rule=rule)
+            return join._replace(topic_rule=rule)
         if join.outcome is Outcome.PEER_DENIES:
             return self._peers_refuse(rule)
         if self._peers is not self._own:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from sros_tool.dds.governance import TopicRule
 from sros_tool.values import shows
@@ -46,8 +45,7 @@ ReasonWord = Annotated[str, "Why, as a stable word such as `no-rule`."]
 
 
 @shows("outcome", "reason", "expression")
-@dataclass(frozen=True, slots=True)
-class Decision:
+class Decision(NamedTuple):
     """An outcome and what decided it.
 
     ``reason`` is a stable word for programs (one of `_REASONS`), ``text`` a sentence for people.
@@ -99,8 +97,7 @@ _REASONS = {
 """Every reason and its meaning."""
 
 
-@dataclass(frozen=True, slots=True)
-class Refusal:
+class Refusal(NamedTuple):
     """The reason why a vendor does not accept a document; ``outcome`` is REFUSED or CRASHES."""
 
     reason: str

@@ -329,7 +329,7 @@ def _permissions(
     """Return permissions with ``rights`` for a subject (RFC 4514 text) and a validity."""
     if isinstance(rights, SignedRights):
         begin, end = iso(validity.not_before), iso(validity.not_after)
-        grant = replace(rights.grant, subject=subject, not_before=begin, not_after=end)
+        grant = rights.grant._replace(subject=subject, not_before=begin, not_after=end)
         return Permissions((grant,))
     permissions = permissions_for(
         rights.enclave, subject=subject, validity=validity, domains=rights.domains

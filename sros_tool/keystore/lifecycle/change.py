@@ -9,7 +9,7 @@ verb determines the new state; this module does the rest.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -440,7 +440,7 @@ def _left_by_ros2(keystore: Keystore, names: Iterable[str], now: datetime) -> It
         yield certificate_entry(now, "ca", authority, reason=_ADOPTED)
     with suppress(SrosError):  # a missing one is reported by the verb
         message = keystore.read(GOVERNANCE_P7S, "governance document")
-        yield replace(document_entry(now, "governance", message), reason=_ADOPTED)
+        yield document_entry(now, "governance", message)._replace(reason=_ADOPTED)
     for name in names:
         state = keystore.enclave(name, now=now)
         files = {problem.file for problem in state.problems_at_home}
@@ -449,7 +449,7 @@ def _left_by_ros2(keystore: Keystore, names: Iterable[str], now: datetime) -> It
         message = state.files.get(PERMISSIONS_FILE, b"")
         if message and state.permissions_document and PERMISSIONS_FILE not in files:
             entry = document_entry(now, "permissions", message, enclave=name)
-            yield replace(entry, reason=_ADOPTED)
+            yield entry._replace(reason=_ADOPTED)
 
 
 def _settings_of_ros2(

@@ -534,7 +534,7 @@ class _Updater:
             enclave = default_rights(self._goal.settings, name)
             rights = StatedRights(enclave, self._after.of(name))
         else:
-            rights = replace(earlier, grant=self._on_domains(name, earlier.grant))
+            rights = earlier._replace(grant=self._on_domains(name, earlier.grant))
         identity = self._new_identity(state) if certificate else state.certificate
         issued = self._writer.write(Issuance(name, identity, rights))
         (grant,) = issued.permissions.grants
@@ -594,8 +594,8 @@ class _Updater:
                 f"State them with `sros create_permission {quote(str(self._root))} {name} "
                 "POLICY_FILE`.",
             )
-        rules = tuple(replace(each, domains=after) for each in grant.rules)
-        return replace(grant, rules=rules)
+        rules = tuple(each._replace(domains=after) for each in grant.rules)
+        return grant._replace(rules=rules)
 
     # ── authorities ────────────────────────────────────────────────────────────────────────
 
@@ -702,7 +702,7 @@ def trust_records(
             message = state.files.get(PERMISSIONS_FILE, b"")
             if state.grant and hashlib.sha256(message).hexdigest() == last[name].sha256:
                 entries.append(
-                    replace(last[name], time=iso(now), reason="taken on trust", previous="")
+                    last[name]._replace(time=iso(now), reason="taken on trust", previous="")
                 )
             else:
                 others.append(name)
