@@ -41,6 +41,7 @@ from sros_tool.runtime.rmw import RMW, package_version
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.document import (
+    ENDINGS,
     ConfigurationDocument,
     UnreadConfigurationError,
     parse_configuration,
@@ -325,7 +326,7 @@ NO_SESSION_FILE = FindingKind(
 FILE_NOT_FOUND = FindingKind(
     "runtime.zenoh-file-not-found",
     ERROR,
-    "a variable of rmw_zenoh names no file that can be read",
+    "a variable of rmw_zenoh names no file that Zenoh can read",
     "No node, or with ZENOH_ROUTER_CONFIG_URI no router, starts.",
     _SOURCE,
     f"Correct the path. {OWN_CONFIGURATION}",
@@ -334,8 +335,8 @@ UNREAD = FindingKind(
     "runtime.zenoh-unread",
     WARNING,
     "a configuration of Zenoh that sros cannot read",
-    "Zenoh reads more than sros: YAML, lists in place of objects, pipes, more than 16 MiB. Whether "
-    "the configuration enforces anything is not known.",
+    "Zenoh reads more than sros: YAML, TOML, lists in place of objects, pipes, more than 16 MiB. "
+    "Whether the configuration enforces anything is not known.",
     _SOURCE,
     f"Write it as JSON5 objects into a file. {OWN_CONFIGURATION}",
 )
@@ -405,6 +406,10 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
         yield NO_SESSION_FILE.found(SESSION_URI, f"{SESSION_URI} is not set")
     overrides = tuple(override_pairs(environment.get(OVERRIDE, "")))
     for name, path in _named_files(environment):
+        if path.suffix not in ENDINGS:
+            text = f"'{path}': the ending of its name is none of {', '.join(ENDINGS)}"
+            yield FILE_NOT_FOUND.found(name, text, str(path))
+            continue
         try:
             data = read_bytes(path, "Zenoh configuration")
         except SrosError as error:

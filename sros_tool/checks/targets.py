@@ -53,10 +53,10 @@ class Circumstances:
 def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     """Return the findings at a path: a policy, a keystore, an enclave, or a folder of policies.
 
-    A file ``*.json5`` or ``*.json`` is a configuration of Zenoh.  Raises `DocumentError` for any
-    other path.
+    A file ``*.json5``, ``*.json`` or ``*.yaml`` is a configuration of Zenoh.  Raises
+    `DocumentError` for any other path.
     """
-    if path.suffix in (".json5", ".json") and not path.is_dir():
+    if path.suffix in (".json5", ".json", ".yaml", ".yml") and not path.is_dir():
         from sros_tool.checks.zenoh import configuration_findings
 
         return list(configuration_findings(path))

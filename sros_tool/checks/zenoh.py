@@ -19,6 +19,7 @@ from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import (
     ENCRYPTED,
     ConfigurationDocument,
+    UnreadConfigurationError,
     parse_configuration,
 )
 from sros_tool.zenoh.key_expressions import includes, intersects, widest
@@ -33,6 +34,15 @@ MALFORMED = FindingKind(
     "No session opens with it, and no router starts.",
     "Zenoh 1.10.2 (commons/zenoh-config), measured.",
     "Correct the file.",
+)
+UNREAD = FindingKind(
+    "zenoh.unread",
+    WARNING,
+    "a configuration that Zenoh may accept, and sros does not read",
+    "Zenoh also reads YAML, TOML, and lists in place of objects, whose meaning depends on its "
+    "version. Whether the configuration enforces anything is not known.",
+    "Zenoh 1.10.2 (commons/zenoh-config), measured.",
+    "Write it as JSON5 objects into a file whose name ends with .json5.",
 )
 UNKNOWN_SETTING = FindingKind(
     "zenoh.unknown-setting",
@@ -228,6 +238,9 @@ def configuration_findings(path: Path) -> Iterator[Finding]:
     data = read_bytes(path, "Zenoh configuration")
     try:
         document = parse_configuration(data, str(path))
+    except UnreadConfigurationError as error:
+        yield UNREAD.found(str(path), f"{error.what}. {error.why}", str(path))
+        return
     except DocumentError as error:
         yield MALFORMED.found(str(path), str(error), str(path))
         return

@@ -63,7 +63,7 @@ from sros_tool.xml import parse, read_bytes
 from sros_tool.zenoh.configuration import Configuration, Mode, ZenohNetwork, parse_rendered
 from sros_tool.zenoh.document import parse_configuration
 
-_JSON = (".json5", ".json")
+_OF_ZENOH = (".json5", ".json", ".yaml", ".yml")
 
 NamedPath = Annotated[Path, "PATH, as given on the command line."]
 Problems = Annotated[Sequence[str], "Problems that keep a process from running in the enclave."]
@@ -545,7 +545,7 @@ def _file(
         return _configuration(path, signed.text, signature, now)
     if data.lstrip()[:1] == b"<":
         return _document(path, data, _NOT_SIGNED, now)
-    if path.suffix in _JSON or data.lstrip()[:1] == b"{":
+    if path.suffix in _OF_ZENOH or data.lstrip()[:1] == b"{":
         return _configuration(
             path, data, _signature_next_to(path, data, now, authority, files), now
         )
@@ -821,7 +821,9 @@ def _configuration(
     Raises:
         DocumentError: Zenoh would not accept the configuration.
     """
-    read = parse_configuration(document, "its content")
+    # A signed document is JSON5 whatever the file with it is called.
+    yaml = path.suffix in (".yaml", ".yml")
+    read = parse_configuration(document, f"its content{path.suffix if yaml else ''}")
     own: Configuration | None = None
     with suppress(SrosError):
         own = parse_rendered(document, "its content")

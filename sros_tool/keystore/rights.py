@@ -123,7 +123,7 @@ def load_rights(
             f"It has no enclaves folder, and no {PERMISSIONS_FILE}.",
         )
     data = read_bytes(path, "file")
-    if is_zenoh(data):
+    if is_zenoh(data, path):
         from sros_tool.zenoh.document import parse_configuration
 
         return _zenoh_rights(path, parse_configuration(data, str(path), lines=False))
@@ -198,9 +198,11 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
     )
 
 
-def is_zenoh(data: bytes) -> bool:
-    """Return whether ``data`` looks like a Zenoh configuration: JSON5 with access control."""
-    return data.lstrip()[:1] in (b"{", b"/") and b"access_control" in data
+def is_zenoh(data: bytes, path: Path) -> bool:
+    """Return whether a file is a Zenoh configuration, by its name or its access control."""
+    return path.suffix in (".json5", ".yaml", ".yml") or (
+        data.lstrip()[:1] in (b"{", b"/") and b"access_control" in data
+    )
 
 
 def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:

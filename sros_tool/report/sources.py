@@ -332,7 +332,7 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
         DocumentError: ``path`` is none of these.
     """
     data = read_bytes(path, "file") if path.is_file() else b""
-    if data.lstrip()[:1] == b"{" and not is_zenoh(data):
+    if data.lstrip()[:1] == b"{" and not is_zenoh(data, path):
         return _observation(path)
     opened = Keystore(path) if path.is_dir() and is_keystore(path) else None
     read = load_rights(opened or path, fleet)

@@ -1,4 +1,6 @@
-"""Reading the configuration of a Zenoh process, whoever wrote it: JSON5 or JSON.
+"""Reading the configuration of a Zenoh process, whoever wrote it: JSON5, or YAML that is JSON.
+
+Zenoh chooses the language by the ending of the file's name, and reads no file of another ending.
 
 Only what security depends on becomes values; `ConfigurationDocument.unknown` names the rest that no
 version up to 1.10 has.  What Zenoh does not accept is an error, as a process with it does not open.
@@ -10,6 +12,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from math import prod
@@ -26,7 +29,7 @@ from sros_tool.zenoh.access import (
     Message,
 )
 from sros_tool.zenoh.configuration import Mode
-from sros_tool.zenoh.json5 import MOST_BYTES, Json5Error, Json5Object, parse_json5
+from sros_tool.zenoh.json5 import MOST_BYTES, Json5Error, Json5Object, parse_json, parse_json5
 from sros_tool.zenoh.key_expressions import expression_problem
 
 _E = TypeVar("_E", bound=StrEnum)
@@ -59,6 +62,12 @@ ENCRYPTED = frozenset({"tls", "quic"})
 _LINK_PROTOCOLS = frozenset(
     {"tcp", "udp", "tls", "quic", "serial", "unixpipe", "unixsock-stream", "vsock", "ws"}
 )
+_AS_YAML = (".yaml", ".yml")
+_AS_TOML = (".toml",)
+ENDINGS = (".json5", ".json", *_AS_YAML, *_AS_TOML)
+"""The endings of the names of files that Zenoh reads (1.10.2, measured)."""
+_OTHER_IN_YAML = re.compile(r"\\u|[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
+"""What means another thing in YAML than in JSON, or nothing."""
 _MOST_MEANT = 1_000_000
 _MOST_PARTS = 10
 _ZID = re.compile(r"[1-9a-f][0-9a-f]{0,31}", re.ASCII)
@@ -174,7 +183,8 @@ def parse_configuration(
 
     Raises:
         UnreadConfigurationError: Zenoh may read it, and sros does not: the file has more than
-            16 MiB, is YAML, or has lists in place of objects.
+            16 MiB, is TOML or YAML that is not JSON, too, or has lists in place of objects, whose
+            meaning depends on the version.
         DocumentError: the file is not JSON5, or Zenoh would not accept it.
     """
     root = _root(data, name, lines=lines)
@@ -211,7 +221,8 @@ def _root(data: bytes, name: str, *, lines: bool) -> _Section:
             f"It has more than {MOST_BYTES // 1024**2} MiB.",
         )
     try:
-        value = parse_json5(data.decode(), lines=lines)
+        text = data.decode()
+        value = _of_yaml(text, name) if _has_ending(name) else parse_json5(text, lines=lines)
     except UnicodeDecodeError as error:
         raise _not_json5(name)(
             f"the Zenoh configuration '{name}' is not UTF-8",
@@ -222,16 +233,46 @@ def _root(data: bytes, name: str, *, lines: bool) -> _Section:
             f"the Zenoh configuration '{name}' is not JSON5",
             f"Line {error.line}: {error.problem}.",
         ) from error
+    if isinstance(value, list):
+        raise UnreadConfigurationError(
+            f"the Zenoh configuration '{name}' is a list, which sros does not read",
+            "What it means to Zenoh depends on the version.",
+            "Write it as an object with settings.",
+        )
     if not isinstance(value, Json5Object):
-        raise _no_object(value)(
+        raise DocumentError(
             f"'{name}' is not a Zenoh configuration", "It is not an object with settings."
         )
     return _Section(name, "", value)
 
 
+def _has_ending(name: str, endings: tuple[str, ...] = (*_AS_YAML, *_AS_TOML)) -> bool:
+    return name.endswith(endings)
+
+
+def _of_yaml(text: str, name: str) -> object:
+    """Return the value of YAML that is JSON, too, where both mean the same.
+
+    Raises:
+        UnreadConfigurationError: it is not, or it is TOML.
+    """
+    value: object = None
+    if not _has_ending(name, _AS_TOML) and not _OTHER_IN_YAML.search(text):
+        with suppress(Json5Error):
+            value = parse_json(text)
+    if value is None:
+        language = "TOML" if _has_ending(name, _AS_TOML) else "YAML"
+        raise UnreadConfigurationError(
+            f"the Zenoh configuration '{name}' is in a language that sros does not read",
+            f"Zenoh reads it as {language}, by the ending of its name.",
+            "Write it as JSON5 into a file whose name ends with .json5.",
+        )
+    return value
+
+
 def _not_json5(name: str) -> type[DocumentError]:
     """Return the kind of error for what is not JSON5: Zenoh chooses YAML by the file's name."""
-    return UnreadConfigurationError if name.endswith((".yaml", ".yml")) else DocumentError
+    return UnreadConfigurationError if _has_ending(name) else DocumentError
 
 
 def _no_object(value: object) -> type[DocumentError]:

@@ -45,7 +45,8 @@ _TOKEN = re.compile(
     r"""
       (?P<space>(?:[\s\ufeff]+|//[^\n\r\u2028\u2029]*|/\*.*?\*/)+)
     | (?P<mark>[{}\[\]:,])
-    | (?P<text>"(?:[^"\\\n\r]|\\(?:\r\n|.))*"|'(?:[^'\\\n\r]|\\(?:\r\n|.))*')
+    | (?P<text>"(?:[^"\\\n\r\u2028\u2029]|\\(?:\r\n|.))*"
+                |'(?:[^'\\\n\r\u2028\u2029]|\\(?:\r\n|.))*')
     | (?P<number>[+-]?(?:Infinity|NaN|0[xX][0-9a-fA-F]+
                        |(?:(?:0|[1-9][0-9]*)(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)
                  (?![\w$.]))
@@ -53,6 +54,8 @@ _TOKEN = re.compile(
     """,
     re.VERBOSE | re.DOTALL,
 )
+_NOT_IN_JSON5 = re.compile(r"\\u|[\u2028\u2029]")
+"""What JSON may have in a text: half a character by an escape, and ends of lines."""
 _LINE = re.compile(r"\r\n|[\n\r\u2028\u2029]")
 _ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|x([0-9a-fA-F]{2})|(\r\n|.))", re.DOTALL)
 _ESCAPED = {"b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t", "v": "\v", "0": "\0"}
@@ -76,13 +79,25 @@ def parse_json5(text: str, *, lines: bool = True) -> Any:
         Json5Error: the text is not JSON5, is too large, has more than 100 levels, or an object that
             names a member twice.
     """
-    # JSON may state half a character by an escape.
-    if not lines and "\\u" not in text:
-        with suppress(ValueError, RecursionError):  # then the reader of JSON5 says what is wrong
-            value = json.loads(text, object_pairs_hook=_without_lines)
-            if not _is_deep(value):
-                return value
+    if not lines and not _NOT_IN_JSON5.search(text):
+        with suppress(Json5Error):  # then the reader of JSON5 says what is wrong
+            return parse_json(text)
     return _Reader(text, _MOST_TOKENS if lines else _MOST_WITHOUT_LINES).whole()
+
+
+def parse_json(text: str) -> Any:
+    """Return the value of a JSON text; each object is a `Json5Object` of the first line.
+
+    Raises:
+        Json5Error: it is not JSON, or has more than 100 levels.
+    """
+    try:
+        value = json.loads(text, object_pairs_hook=_without_lines)
+    except (ValueError, RecursionError):
+        raise Json5Error("it is not JSON", 1) from None
+    if _is_deep(value):
+        raise Json5Error(f"more than {_MOST_DEPTH} levels", 1)
+    return value
 
 
 def _without_lines(members: list[tuple[str, Any]]) -> Json5Object:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from sros_tool.checks.registry import FindingFilter
 from sros_tool.checks.runtime import RuntimeState
 from sros_tool.runtime.processes import Process, ProcessTable, RunningProcesses
 from sros_tool.zenoh.json5 import MOST_BYTES
+from tests.checks import zenoh_cases
 from tests.checks.bench import DAY, Bench
 from tests.checks.runtime_cases import (
     CASES,
@@ -143,7 +145,8 @@ def test_a_session_file_that_changed_since_the_start(sound_one: RuntimeState, be
         ("sequence.json5", '["client"]'),
         ("sequences.json5", "{mode: 'client', transport: [[]]}"),
         ("large.json5", f"{{}}{' ' * MOST_BYTES}"),
-        ("pipe", None),
+        ("open.toml", 'mode = "client"\n'),
+        ("pipe.json5", None),
     ],
 )
 def test_what_zenoh_reads_and_sros_does_not_is_not_called_malformed(
@@ -159,6 +162,15 @@ def test_what_zenoh_reads_and_sros_does_not_is_not_called_malformed(
     state = change(sound_one, bench)
     ids_found = ids(replace(state, running=RunningProcesses()))
     assert ids_found == {"runtime.zenoh-unread"}
+
+
+def test_zenoh_reads_no_file_of_another_ending(
+    sound_one: RuntimeState, bench: Bench, tmp_path: Path
+) -> None:
+    for name in ("session.json", "session.conf", "session", ".json5", "session.JSON5"):
+        (tmp_path / name).write_text(json.dumps(zenoh_cases.sound()))
+        found = ids(on_zenoh(**{SESSION: str(tmp_path / name)})(sound_one, bench))
+        assert ("runtime.zenoh-file-not-found" in found) is (name != "session.json")
 
 
 @pytest.mark.parametrize(

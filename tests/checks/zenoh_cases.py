@@ -81,6 +81,7 @@ TLS = "transport.link.tls"
 
 CASES: dict[str, Change] = {
     "zenoh.malformed": having("mode", "Client"),
+    "zenoh.unread": having("listen", [["tls/localhost:0"]]),
     "zenoh.unknown-setting": having("acces_control", {}),
     "zenoh.router-without-rules": all_of(
         having("mode", "router"), having("access_control.enabled", False)

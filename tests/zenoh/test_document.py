@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import json
+import random
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from sros_tool.errors import DocumentError
 from sros_tool.zenoh.access import Flow, Message
 from sros_tool.zenoh.configuration import Mode
-from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
+from sros_tool.zenoh.document import (
+    ConfigurationDocument,
+    UnreadConfigurationError,
+    parse_configuration,
+)
+from tests.support.children import LONG
 
 RULE = {"id": "r", "permission": "allow", "messages": ["put"], "key_exprs": ["a"]}
 SUBJECT = {"id": "s", "cert_common_names": ["/talker"]}
@@ -183,7 +192,7 @@ def test_a_short_file_that_means_too_much() -> None:
 
 def test_settings_by_their_order_are_not_read() -> None:
     """Zenoh accepts a list, too; nobody writes that, and its meaning depends on the version."""
-    with pytest.raises(DocumentError, match="is not an object with settings"):
+    with pytest.raises(UnreadConfigurationError, match="is a list, which sros does not read"):
         read("[]")
 
 
@@ -192,3 +201,127 @@ def test_a_file_that_is_too_large_or_no_text(tmp_path: Path) -> None:
         parse_configuration(b" " * (16 * 1024**2 + 1), "file")
     with pytest.raises(DocumentError, match="is not UTF-8"):
         parse_configuration(b"{}\xff", "file")
+
+
+# ── documents as people write them ─────────────────────────────────────────────────────────
+
+PLACES = ((), ("access_control",), ("transport",), ("transport", "link", "tls"), ("listen",))
+"""Objects that may be written as lists of their values."""
+
+
+def drawn_document(draw: random.Random) -> dict[str, Any]:
+    """Settings of which each is often there, and sometimes wrong."""
+
+    def some(value: Any, *others: Any) -> Any:
+        return draw.choice([value] * 4 + list(others))
+
+    name = some("/talker", "/a\\b", "/é", "/a\u2028b", "/y/n")
+    rule = {**RULE, "key_exprs": [some("0/chatter/**", "0/$*::$*/*", "0/a//b")]}
+    subject = {"id": "s", "cert_common_names": [name]}
+    settings: dict[str, Any] = {
+        "mode": some("client", "peer", "router", "yes", None),
+        "listen": {"endpoints": some(["tls/localhost:7447"], {"router": ["tls/a:1"]}, "tls/a:1")},
+        "transport": {"link": {"tls": {"enable_mtls": some(True, False, "yes", None)}}},
+        "adminspace": {"enabled": some(False, "no", 1)},
+        "metadata": {"n": some(1, 1.5, "0x1f"), "of": some("a#b", "a: b", "")},
+        "access_control": {
+            "enabled": some(True, False, "on"),
+            "default_permission": some("deny", "allow", "Deny"),
+            "rules": [rule],
+            "subjects": [subject],
+            "policies": [POLICY],
+        },
+    }
+    for key in draw.sample(sorted(settings), draw.randint(0, 3)):
+        del settings[key]
+    if draw.random() < 0.15:
+        *parents, last = draw.choice(PLACES[1:])
+        inner: Any = settings
+        for each in parents:
+            inner = inner.get(each, {})
+        if last in inner:
+            inner[last] = list(inner[last].values())
+    return settings
+
+
+def in_json5(value: Any, draw: random.Random) -> str:
+    """A value in JSON5, in one of its many forms."""
+    space = draw.choice(["", " ", "\n", "\t", "/* x */", "// y\n"])
+    comma = draw.choice(["", ","])
+    if isinstance(value, dict):
+        names = (each if draw.random() < 0.5 else f"'{each}'" for each in value)
+        inner = (
+            f"{space}{name}:{in_json5(each, draw)}"
+            for name, each in zip(names, value.values(), strict=True)
+        )
+        return f"{{{','.join(inner)}{comma if value else ''}}}{space}"
+    if isinstance(value, list):
+        return f"[{','.join(in_json5(e, draw) for e in value)}{comma if value else ''}]"
+    if isinstance(value, str) and draw.random() < 0.5:
+        letters = (draw.choice([e, f"\\x{ord(e):02x}"]) if ord(e) < 128 else e for e in value)
+        return "'" + "".join(rf"\{e}" if e == "\\" else e for e in letters) + "'"
+    return json.dumps(value, ensure_ascii=draw.random() < 0.5)
+
+
+def in_yaml(value: Any, draw: random.Random) -> str:
+    return str(yaml.safe_dump(value, default_flow_style=draw.choice([True, False, None])))
+
+
+def drawn_file(draw: random.Random) -> tuple[str, str]:
+    """The ending of a file's name, and a text that its language may have."""
+    document: Any = drawn_document(draw)
+    if draw.random() < 0.05:
+        document = [None, None, document.get("mode")]
+    if draw.random() < 0.1:
+        return ".toml", draw.choice(['mode = "client"\n', json.dumps(document)])
+    ending = draw.choice([".json5", ".json5", ".json", ".yaml", ".yaml", ".yml"])
+    if (ending in (".yaml", ".yml")) is (draw.random() < 0.85):
+        forms: list[Callable[[Any, random.Random], str]] = [in_yaml, lambda e, _: json.dumps(e)]
+        forms += [lambda e, _: json.dumps(e, ensure_ascii=False, indent="\t")]
+    else:
+        forms = [in_json5]
+    begin = draw.choice(["", "", "", "\ufeff", "\n", "---\n", "# x\n", "// x\n"])
+    return ending, begin + draw.choice(forms)(document, draw)
+
+
+def test_files_are_read_as_zenoh_reads_them_or_called_unread(tmp_path: Path) -> None:
+    """Whatever Zenoh accepts has its meaning, or sros says that it does not read it."""
+    zenoh = pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
+    looked_at = ("mode", "listen/endpoints", "transport/link/tls", "access_control")
+
+    def theirs(path: Path) -> dict[str, Any] | None:
+        try:
+            config = zenoh.Config.from_file(str(path))
+        except zenoh.ZError:
+            return None
+        return {each: json.loads(config.get_json(each)) for each in looked_at}
+
+    draw = random.Random(20261)
+    outcomes: Counter[str] = Counter()
+    for _ in range(20_000 if LONG else 600):
+        ending, text = drawn_file(draw)
+        path = tmp_path / f"file{ending}"
+        path.write_bytes(text.encode())
+        meant = theirs(path)
+        try:
+            found = parse_configuration(path.read_bytes(), str(path))
+        except UnreadConfigurationError:
+            outcomes["unread" if meant else "unread and refused"] += 1
+            continue
+        except DocumentError as error:
+            opened = meant and meant["access_control"]["enabled"]  # refused when a session opens
+            assert meant is None or opened, (text, str(error))
+            outcomes["refused"] += 1
+            continue
+        outcomes["read"] += 1
+        assert meant is not None, text
+        control = meant["access_control"]
+        assert found.mode.value == (meant["mode"] or "peer"), text
+        assert found.tls.mutual is bool(meant["transport/link/tls"]["enable_mtls"]), text
+        assert found.access.enabled is control["enabled"], text
+        assert found.access.allows_by_default is (control["default_permission"] == "allow"), text
+        names = [each["cert_common_names"] for each in control["subjects"] or ()]
+        assert [list(e.cert_common_names or ()) for e in found.access.subjects] == names, text
+        keys = [each["key_exprs"] for each in control["rules"] or ()]
+        assert [list(each.key_expressions) for each in found.access.rules] == keys, text
+    assert min(outcomes[each] for each in ("read", "refused", "unread")) > 50, outcomes
