@@ -14,6 +14,7 @@ from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource
 from sros_tool.keystore.selection import likely_names, no_such_enclave
+from sros_tool.policy.model import ALLOW
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, Reach, unguarded
 from sros_tool.values import shows
 
@@ -194,8 +195,12 @@ def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) ->
     of_keystore = source.kind == "keystore"
     names = enclave_names(source.path) if of_keystore or source.kind == "zenoh" else ()
     without, questions = ((), ()) if infrastructure else (OF_EVERY_NODE, QUESTIONS)
+    rights = source.rights
+    if enclave == source.router:
+        # It may say and hear what passes through it: the other end of everybody's rights.
+        rights |= {right.opposite(enclave) for right in rights if right.qualifier is ALLOW}
     network = Network(
-        source.rights,
+        rights,
         without=without,
         questions=questions,
         unguarded=unguarded(Keystore(source.path).governance) if of_keystore else (),

@@ -231,7 +231,7 @@ class WhoOnZenoh(NamedTuple):
     domain: int
     """The ROS domain."""
     enclaves: Sequence[ZenohEnclaveOutcome]
-    """All enclaves but the router's."""
+    """All enclaves; the router's may do what passes through it."""
 
 
 class ZenohEvaluator:
@@ -303,8 +303,7 @@ class ZenohEvaluator:
         if own.process is None:
             return answer
         if own.process.mode is Mode.ROUTER:
-            text = "it is the router's enclave, which passes on what others say and says nothing"
-            return replace(answer, outcome=_Outcome.DROPPED, text=text)
+            return self._of_router(answer, own.process, brief=brief)
         if self.router.process is None:
             text = f"no link to the router {self.router.enclave}: {self.router.problem}"
             return replace(answer, text=text)
@@ -313,11 +312,7 @@ class ZenohEvaluator:
             text += f"{ROUTER_FILE} listens at {_listed(self.router.endpoints)}"
             return replace(answer, text=text)
         wanted = self._rights(enclave, question)
-        checks = tuple(
-            check
-            for other in self._enforcers(own.process, self.router.process, brief=brief)
-            for check in self._decided(own.process, other, wanted)
-        )
+        checks = self._deciding(own.process, self.router.process, wanted, brief=brief)
         answer = replace(answer, checks=checks)
         assert answer.deciding
         by = answer.deciding.enforcer
@@ -345,11 +340,15 @@ class ZenohEvaluator:
                 return None
             domains = self.keystore.domains
             authority = self.keystore.ca_certificate(PERMISSIONS)
-            drifts, _ = zenoh_drift(self.keystore, network, domains, authority, self._at)
+            ours = {answer.enclave, self.router.enclave}
+            deciding = ours | {check.enforcer for check in answer.checks}
+            if answer.mode is not Mode.CLIENT:
+                deciding |= self._other_ends(answer)
+            drifts, _ = zenoh_drift(
+                self.keystore, network, domains, authority, self._at, only=deciding
+            )
         except SrosError:
             return None
-        ours = {answer.enclave, self.router.enclave}
-        deciding = ours | {check.enforcer for check in answer.checks}
         return tuple(
             sorted(
                 signed_path(drift.path) if drift.kind is Drift.UNSIGNED else drift.path
@@ -359,6 +358,18 @@ class ZenohEvaluator:
                 and not (drift.kind is Drift.UNSIGNED and drift.enclave in ours)
             )
         )
+
+    def _other_ends(self, answer: ZenohAnswer) -> set[str]:
+        """Return the enclaves with which a peer may communicate about the question by its file."""
+        own = self._file(answer.enclave, self._file_of(answer.enclave)).process
+        wanted = self._rights(answer.enclave, answer.question)
+        if own is None or not wanted:
+            return set()
+        return {
+            name
+            for name in self.names
+            if all(e.arrives for e in self._direct(own, _unrestricted(name, Mode.PEER), wanted))
+        }
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
@@ -415,19 +426,73 @@ class ZenohEvaluator:
 
     # ── decisions ──────────────────────────────────────────────────────────────────────────
 
-    def _enforcers(
-        self, own: ZenohProcess, router: ZenohProcess, *, brief: bool
-    ) -> tuple[ZenohProcess, ...]:
-        """Return the processes that decide on an enclave's rights."""
-        if brief or own.mode is not Mode.PEER:
-            return (router,)
-        files = (
-            self._file(name, SESSION_FILE)
-            for name in self.names
-            if name not in (own.name, self.router.enclave)
+    def _of_router(self, answer: ZenohAnswer, own: ZenohProcess, *, brief: bool) -> ZenohAnswer:
+        """Return the answer for the router's key: its process may do what passes through it.
+
+        Every session that may hear what is asked for believes it, and beside the router a second
+        process with its key.
+        """
+        wanted = self._rights(answer.enclave, answer.question)
+        believing: list[Reached] = []
+        for name in self.names if wanted else ():
+            if name == own.name:
+                continue
+            # The router's rules state the same rights, and are at hand.
+            deliveries = self._direct(own, _unrestricted(name, Mode.CLIENT), wanted)
+            other = self._file(name, SESSION_FILE) if not brief else None
+            if other and other.process and all(each.arrives for each in deliveries):
+                lawless = _unrestricted(own.name, Mode.ROUTER)
+                deliveries = self._direct(lawless, other.process, wanted)
+            if all(each.arrives for each in deliveries):
+                believing.append(Reached(name, deliveries, other.problem if other else ""))
+                if brief:
+                    break
+        if not believing:
+            text = "it passes on what others say, and no session lets it do that"
+            return replace(answer, outcome=_Outcome.DROPPED, text=text)
+        checks = tuple(
+            check
+            for delivery in believing[0].deliveries
+            for check in (*delivery.checks, *delivery.replies)
+            if check.enforcer != own.name
         )
-        peers = (file.process for file in files if file.process)
-        return tuple(peer for peer in peers if peer.mode is Mode.PEER) or (router,)
+        text = "sessions believe whoever has the router's key about what passes through the router"
+        return replace(
+            answer,
+            outcome=_Outcome.ALLOWED,
+            text=text,
+            checks=checks if not brief else (),
+            reached=tuple(believing) if not brief else (),
+        )
+
+    def _direct(
+        self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right]
+    ) -> tuple[Delivery, ...]:
+        return tuple(self._delivery((own, other), right) for right in wanted)
+
+    def _deciding(
+        self, own: ZenohProcess, router: ZenohProcess, wanted: Sequence[Right], *, brief: bool
+    ) -> tuple[Check, ...]:
+        """Return the checks that decide on an enclave's rights: on the link with the router.
+
+        The sessions of peers state the rights that both ends have.  So where the router denies
+        something, it is looked for a peer whose file allows it all the same.
+        """
+        checks = tuple(self._decided(own, router, wanted))
+        if own.mode is not Mode.PEER or brief or all(each.allowed for each in checks):
+            return checks
+        for name in self.names:
+            if name in (own.name, self.router.enclave):
+                continue
+            # What the session itself lets through comes first: it needs no other file.
+            alone = self._decided(own, _unrestricted(name, Mode.PEER), wanted)
+            if all(each.allowed for each in alone):
+                other = self._file(name, SESSION_FILE).process
+                if other and other.mode is Mode.PEER:
+                    direct = tuple(self._decided(own, other, wanted))
+                    if all(each.allowed for each in direct):
+                        return direct
+        return checks
 
     def _rights(self, enclave: str, question: Question) -> tuple[Right, ...]:
         """Return the rights to topics and services that the question asks for; none for joining."""
@@ -436,15 +501,10 @@ class ZenohEvaluator:
     def _decided(
         self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right]
     ) -> Iterator[Check]:
-        """Yield the checks by which a process decides on rights of another one, or on joining.
-
-        With the router, the session itself decides too; of peers, each on the rights of the other.
-        """
-        deliveries = [self._delivery((own, other), right) for right in wanted]
+        """Yield the checks by which both ends of a link decide on rights, or on joining."""
+        deliveries = self._direct(own, other, wanted)
         for delivery in deliveries or self._graph(own, other):
-            for each in (*delivery.checks, *delivery.replies):
-                if other.mode is not Mode.PEER or each.enforcer == other.name:
-                    yield each
+            yield from (*delivery.checks, *delivery.replies)
 
     def _delivery(self, way: Route, right: Right, key: str = "") -> Delivery:
         """Return the delivery for a right of the first process of a way, on its key or another."""
@@ -559,8 +619,16 @@ def _closed(enclave: str, file: str, problem: str) -> ZenohFile:
 # ── all enclaves ───────────────────────────────────────────────────────────────────────────
 
 
+_ROUTERS_KEY = Note(
+    "explain.zenoh-router",
+    "whoever has the router's key may say and hear what passes through the router, whatever its "
+    "permissions say: that is how it passes things on. In peer mode every session also believes a "
+    "second process with that key, beside the router. Keep it from all other processes.",
+)
+
+
 class ZenohOfKeystore:
-    """Zenoh, asked about the enclaves of a keystore; all but the router's without ``names``."""
+    """Zenoh, asked about the enclaves of a keystore: all without ``names``, also the router's."""
 
     def __init__(
         self,
@@ -573,8 +641,7 @@ class ZenohOfKeystore:
         self._why = why
         context = asking.context(keystore.domains)
         self._evaluator = ZenohEvaluator(keystore, at=context.at, domain=context.domain)
-        chosen = names or self._evaluator.names
-        self._names = [name for name in chosen if name != self._evaluator.router.enclave]
+        self._names = names or self._evaluator.names
 
     @property
     def title(self) -> str:
@@ -601,7 +668,9 @@ class ZenohOfKeystore:
         return WhoOnZenoh(str(question), "zenoh", self._why, self._evaluator.domain, shown)
 
     def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
-        """Yield a note if peers were asked by the file of the router."""
+        """Yield a note on the router's key, and one if peers were asked by the router's file."""
+        if any(outcome.of_router and outcome.allowed for outcome in outcomes):
+            yield _ROUTERS_KEY
         if any(outcome.mode is Mode.PEER for outcome in outcomes):
             text = (
                 "peers decide by their own files, and this is by that of the router, which has the "
@@ -675,7 +744,7 @@ class ZenohExplanation(NamedTuple):
     def written(self) -> str:
         """What to do if the files of Zenoh do not say what the permissions say, or ""."""
         if self.answer.of_router:
-            return "Give the node an enclave of its own."
+            return "" if self.allowed else "Give the node an enclave of its own."
         if self.allowed is self.permitted and not self.out_of_date:
             return ""
         text = "Look at the files"
@@ -726,7 +795,10 @@ def explain_on_zenoh(
 
 
 def _notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) -> Iterator[Note]:
-    if answer.allowed is not stated.allowed and not stated.problems:
+    if answer.of_router:
+        if answer.allowed:
+            yield _ROUTERS_KEY
+    elif answer.allowed is not stated.allowed and not stated.problems:
         does, other = ("allow", "Zenoh drops") if stated.allowed else ("deny", "Zenoh lets through")
         text = f"the signed permissions {does} it and {other} it: the two are not in step."
         yield Note("explain.zenoh-differs", text)

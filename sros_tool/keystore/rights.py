@@ -44,7 +44,7 @@ from sros_tool.policy.model import (
     StatedProtection,
     stated_protections,
 )
-from sros_tool.policy.rights import Right, RightsDifference, compare, policy_rights
+from sros_tool.policy.rights import Right, RightsDifference, Rules, compare, policy_rights
 from sros_tool.translate import grant_rights
 from sros_tool.values import Words, shows
 from sros_tool.xml import parse, read_bytes
@@ -183,11 +183,17 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
                 name not in routers and document.mode is not Mode.CLIENT
             ):
                 sources.append(_zenoh_rights(file, document))
+    # Peers state the rights that both ends of a link have: parts of those that the router states.
+    of_router = next(source.rights for source in sources if source.path.name == ROUTER_FILE)
+    stated = Rules(of_router)
+    rights = (right for source in sources for right in source.rights)
     return RightsSource(
         root,
         "zenoh",
         frozenset(
-            item for source in sources for item in source.rights if item.enclave not in routers
+            right
+            for right in rights
+            if right.enclave not in routers and (right in of_router or not stated.cover(right))
         ),
         None,
         True,

@@ -51,7 +51,15 @@ from sros_tool.translate_zenoh.rights import (
     remote_of,
     remote_rights,
 )
-from sros_tool.zenoh.access import AccessControl, Flow, Message, RemoteRights, joined
+from sros_tool.zenoh.access import (
+    AccessControl,
+    Flow,
+    Message,
+    RemoteRights,
+    RightsBetween,
+    is_within,
+    joined,
+)
 from sros_tool.zenoh.configuration import (
     Configuration,
     Mode,
@@ -61,7 +69,7 @@ from sros_tool.zenoh.configuration import (
     render_configuration,
     render_rights,
 )
-from sros_tool.zenoh.key_expressions import KeyExpressions
+from sros_tool.zenoh.key_expressions import KeyExpressions, TooManyExpressions
 
 
 class ZenohFault(Enum):
@@ -202,10 +210,10 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
         own = remote_of(name, stated, nodes)
     except SrosError as error:
         return f"Zenoh cannot state the permissions of the enclave: {error.what}"
-    # The router may do what the enclave lets it, and another process of the enclave the same.
+    # The router may do what the enclave lets it, and other processes nothing else.
     mirrored = joined(each.mirrored() for each in own.rules)
-    if not any(remote.rules == mirrored for remote in control.remotes) or any(
-        remote.common_name == name and remote != own for remote in control.remotes
+    if not any(remote.rules == mirrored for remote in control.remotes) or not all(
+        is_within(remote, own) for remote in control.remotes
     ):
         return f"it does not state the rights of {PERMISSIONS_FILE}"
     return ""
@@ -318,15 +326,18 @@ def zenoh_drift(
     domains: DomainSet,
     authority: x509.Certificate,
     now: datetime | None,
+    *,
+    only: Collection[str] = (),
 ) -> tuple[tuple[Drifted, ...], Mapping[str, str]]:
     """Return the configurations that are not as they shall be, and who gets none with the reason.
 
-    Without ``now``, permissions that have expired count, too.
+    Without ``now``, permissions that have expired count, too.  ``only`` are the enclaves that are
+    looked at, all if there are none.
 
     Raises:
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
     """
-    wanted = zenoh_documents(keystore, network, domains, authority, now)
+    wanted = zenoh_documents(keystore, network, domains, authority, now, only=only)
     return drifted(keystore, wanted, authority), wanted.left_out
 
 
@@ -339,11 +350,13 @@ def zenoh_documents(
     change: ZenohChange = NO_CHANGE,
     *,
     existing: tuple[str, ...] | None = None,
+    only: Collection[str] = (),
 ) -> ZenohDocuments:
     """Return the configurations that the enclaves of a keystore need; arguments as `keep_zenoh`.
 
     Without ``now``, permissions that have expired count, too.  ``existing`` are the enclaves of
-    the keystore, which are looked for if they are not given.
+    the keystore, which are looked for if they are not given.  ``only`` are the enclaves whose
+    configurations are made, and that count as existing; all if there are none.
     """
     root = keystore.root
     of_network = _domains(network, domains, root)
@@ -364,7 +377,7 @@ def zenoh_documents(
             "Give the node an enclave of its own.",
         )
     names.remove(network.router)
-    reader = _RightsReader(keystore, authority, of_network, network.router, now, change)
+    reader = _RightsReader(keystore, authority, of_network, network, now, change)
     read: dict[str, _RulesOfEnclave | str] = {}
     for _, each in map_slices(names, reader.read):
         read |= each
@@ -376,21 +389,55 @@ def zenoh_documents(
     remotes = {name: each.remote for name, each in rules.items()}
     files = {of_router: render_configuration(Mode.ROUTER, listening, (), remotes.values())}
     direct = network.mode is Mode.PEER
-    if direct and len(files[of_router]) * len(remotes) > _MOST_BYTES:
+    listen = (_ANY_PORT_HERE,) if direct else ()
+    between = RightsBetween(each.rights for each in rules.values() if each.rights)
+
+    def sessions(some: Sequence[str]) -> dict[str, bytes]:
+        return {
+            _session_path(name): render_configuration(
+                network.mode,
+                listen,
+                endpoints,
+                _peers(name, rules[name].router, between) if direct else (rules[name].router,),
+            )
+            for name in some
+        }
+
+    size = 0
+    chosen = [name for name in rules if not only or name in only]
+    for _, part in map_slices(chosen, sessions):
+        size += sum(map(len, part.values()))
+        files |= part
+    if direct and size > _MOST_BYTES:
         raise UsageError(
-            f"the files of {len(remotes)} enclaves would be larger than {_MOST_BYTES >> 20} MB",
-            "In peer mode each has the rights of all enclaves.",
+            f"the files of {len(rules)} enclaves would be larger than {_MOST_BYTES >> 20} MB",
+            "In peer mode each has the rights of all enclaves that it may communicate with.",
             f"Take client mode: `sros zenoh {quote(str(root))} --mode client`.",
         )
-
-    listen = (_ANY_PORT_HERE,) if direct else ()
-    for name, own in rules.items():
-        known = {**(remotes if direct else {}), network.router: own.router}
-        in_order = [known[one] for one in sorted(known)] if direct else known.values()
-        session = render_configuration(network.mode, listen, endpoints, in_order)
-        files[_session_path(name)] = session
-    enclaves = {of_router: network.router, **{_session_path(name): name for name in rules}}
+    enclaves = {of_router: network.router, **{_session_path(name): name for name in chosen}}
+    if only:
+        existing = tuple(name for name in existing if name in only)
     return ZenohDocuments(files, enclaves, left_out, existing, reader.ledger)
+
+
+def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[RenderedRights]:
+    """Return what a session of an enclave allows to the router and to all other sessions, in order.
+
+    Raises:
+        PolicyError: what both may do takes too many key expressions.
+    """
+    try:
+        # Zenoh takes no policy without rules.
+        found = [render_rights(each) for each in between.of_all(name) if each.rules]
+    except TooManyExpressions:
+        raise PolicyError(
+            f"what {name} and another enclave may send each other cannot be said to Zenoh",
+            "In peer mode each session has the rights that both ends have, and with the wildcards "
+            "of these that takes too many key expressions.",
+            "Use fewer wildcards, or client mode: `sros zenoh --mode client`.",
+        ) from None
+    found.append(router)
+    return sorted(found, key=lambda each: each.name)
 
 
 def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int, ...]:
@@ -417,10 +464,14 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
 
 
 class _RulesOfEnclave(NamedTuple):
-    """What other processes allow to an enclave, and what the enclave allows to the router."""
+    """What other processes allow to an enclave, and what the enclave allows to the router.
+
+    ``rights`` are the former as a value, if processes connect to each other.
+    """
 
     remote: RenderedRights
     router: RenderedRights
+    rights: RemoteRights | None
 
 
 class _RightsReader:
@@ -435,14 +486,14 @@ class _RightsReader:
         keystore: Keystore,
         authority: x509.Certificate,
         domains: Sequence[int],
-        router: str,
+        network: ZenohNetwork,
         now: datetime | None,
         change: ZenohChange,
     ) -> None:
         self._keystore = keystore
         self._authority = authority
         self._domains = domains
-        self._router = router
+        self._network = network
         self._now = now
         self._change = change
         self.ledger = keystore.ledger
@@ -486,12 +537,16 @@ class _RightsReader:
         remotes = {name: self._remote(name, each) for name, each in stated.items()}
         for name, remote in remotes.items():
             _prove(name, remote, stated[name])
-        routers = {name: as_router(self._router, each) for name, each in remotes.items()}
+        routers = {name: as_router(self._network.router, each) for name, each in remotes.items()}
         rendered = {name: render_rights(each) for name, each in remotes.items()}
         return {
             name: left_out[name]
             if name in left_out
-            else _RulesOfEnclave(rendered[name], render_rights(routers[name]))
+            else _RulesOfEnclave(
+                rendered[name],
+                render_rights(routers[name]),
+                remotes[name] if self._network.mode is Mode.PEER else None,
+            )
             for name in names
         }
 

@@ -16,6 +16,7 @@ from sros_tool.names import ACTION_PARTS, GOAL, DdsNames, dds_names, expand
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
+    OTHER_SIDE,
     RIGHTS,
     Enclave,
     Group,
@@ -68,6 +69,10 @@ class Right(NamedTuple):
             return dds_names(self.right, self.name)
         writes = self.right == "publish"
         return DdsNames((self.name,) if writes else (), () if writes else (self.name,))
+
+    def opposite(self, enclave: str) -> Right:
+        """Return the right at the other end, for an enclave: publish for subscribe, and so on."""
+        return self._replace(enclave=enclave, right=OTHER_SIDE[self.right])
 
     def __str__(self) -> str:
         """Return text such as ``/talker ALLOW publish topic /chatter``."""

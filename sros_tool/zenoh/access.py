@@ -10,15 +10,16 @@ with the wheel 1.10.2.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from functools import cached_property, lru_cache
-from itertools import product
+from itertools import count, product
 from typing import NamedTuple, Protocol
 
 from sros_tool.automata import NameSet
-from sros_tool.zenoh.key_expressions import KeyExpressions, includes, names_of
+from sros_tool.zenoh.key_expressions import KeyExpressions, Keys, includes, keys_of, names_of
 
 
 class Message(StrEnum):
@@ -123,8 +124,8 @@ class AccessControl:
             stated = any(each.rules for each in self.remotes)
             return AccessDecision(False, (), (), _NO_SUBJECT if stated else _NO_RULE_AT_ALL)
         applying = [
-            (rule.allows, rule_id(own.common_name, number))
-            for number, rule in enumerate(own.rules)
+            (rule.allows, name)
+            for name, rule in self._with_ids(own)
             if rule.flow is flow
             and message in rule.messages
             and _include(rule.key_expressions, key)
@@ -138,8 +139,16 @@ class AccessControl:
 
     def key_expressions_of(self, rule: str) -> tuple[str, ...]:
         """Return the key expressions of a rule of `decide`, by its id."""
-        name, _, number = rule.rpartition("#")
-        return self._by_name[name].rules[int(number)].key_expressions
+        ids = ((id_, of) for remote in self.remotes for id_, of in self._with_ids(remote))
+        return next(of.key_expressions for id_, of in ids if id_ == rule)
+
+    def _with_ids(self, remote: RemoteRights) -> Iterator[tuple[str, AccessRule]]:
+        return zip(self._ids[remote.common_name], remote.rules, strict=True)
+
+    @cached_property
+    def _ids(self) -> Mapping[str, list[str]]:
+        names = [each.common_name for each in self.remotes]
+        return dict(zip(names, rule_ids([each.rules for each in self.remotes], names), strict=True))
 
     @cached_property
     def _by_name(self) -> Mapping[str, RemoteRights]:
@@ -152,9 +161,20 @@ class AccessControl:
                     yield rule
 
 
-def rule_id(common_name: str, number: int) -> str:
-    """Return the id that a rule of a remote process has in a file, by its place among them."""
-    return f"{common_name}#{number}"
+def rule_ids(
+    rules: Sequence[Sequence[Hashable]], names: Sequence[str], *, once: bool = True
+) -> list[list[str]]:
+    """Return the ids that the rules of remote processes, by their common names, have in a file.
+
+    A rule that several have is there once, with an id of its own; before, it had one for each.
+    """
+    uses = Counter(rule for of in rules for rule in of if once)
+    number = count()
+    shared = {rule: f"several#{next(number)}" for rule, times in uses.items() if times > 1}
+    return [
+        [shared.get(rule) or f"{name}#{at}" for at, rule in enumerate(of)]
+        for name, of in zip(names, rules, strict=True)
+    ]
 
 
 _NO_RULE = "no rule allows it, and the default is DENY"
@@ -210,6 +230,88 @@ def in_order(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     """Return rules of different directions and messages in the order of `joined`."""
     return tuple(
         sorted(rules, key=lambda each: (*_place(each.flow, each.messages), not each.allows))
+    )
+
+
+class RightsBetween:
+    """What processes of two enclaves may send each other directly: what both may by their rights.
+
+    So a process that obeys its own rules never sends or gets more than its rights, whatever the
+    other one does.
+    """
+
+    def __init__(self, rights: Iterable[RemoteRights]) -> None:
+        """Take the rights of all enclaves, whose processes connect to each other."""
+        self._rules = {
+            each.common_name: [_RuleOfPeer.of(rule) for rule in each.rules] for each in rights
+        }
+
+    def of_all(self, own: str) -> Iterator[RemoteRights]:
+        """Yield what a process of the enclave ``own`` allows to processes of all enclaves.
+
+        Raises:
+            TooManyExpressions: that takes too many key expressions.
+        """
+        mine = [_RuleOfPeer.of(each.rule.mirrored()) for each in self._rules[own]]
+        denied = [each for each in mine if not each.rule.allows]
+        meeting: dict[_Place, list[tuple[tuple[Message, ...], Keys]]] = {}
+        for remote, theirs in self._rules.items():
+            found: dict[_Place, tuple[str, ...]] = {}
+            for place, _, keys in theirs:
+                if place not in meeting:
+                    meeting[place] = [
+                        (messages, each.keys)
+                        for each in mine
+                        if (messages := _shared(place, each.place))
+                    ]
+                for messages, others in meeting[place]:
+                    if both := keys.common(others):
+                        same = (place[0], messages, True)
+                        found[same] = _sorted(found.get(same, ()), both)
+            for place, rule, _ in (*(each for each in theirs if not each.rule.allows), *denied):
+                found[place] = _sorted(found.get(place, ()), rule.key_expressions)
+            rules = (
+                AccessRule(flow, messages, keys, allows)
+                for (flow, messages, allows), keys in found.items()
+            )
+            yield RemoteRights(remote, in_order(rules))
+
+
+_Place = tuple[Flow, tuple[Message, ...], bool]
+"""Direction and messages of a rule, and whether it allows them."""
+
+
+class _RuleOfPeer(NamedTuple):
+    place: _Place
+    rule: AccessRule
+    keys: Keys
+
+    @classmethod
+    def of(cls, rule: AccessRule) -> _RuleOfPeer:
+        place = (rule.flow, rule.messages, rule.allows)
+        return cls(place, rule, keys_of(frozenset(rule.key_expressions)))
+
+
+def _shared(one: _Place, other: _Place) -> tuple[Message, ...]:
+    """Return the messages that two rules allow in the same direction."""
+    if one[0] is not other[0] or not (one[2] and other[2]):
+        return ()
+    return tuple(each for each in one[1] if each in other[1])
+
+
+def _sorted(some: tuple[str, ...], others: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(sorted({*some, *others})) if some else others
+
+
+def is_within(remote: RemoteRights, own: RemoteRights) -> bool:
+    """Return whether a process whose rights are ``own`` lets a remote one do no more than that."""
+    mine = AccessControl((own,))
+    return all(
+        mine.allows(own.common_name, rule.flow.opposite(), message, key)
+        for rule in remote.rules
+        if rule.allows
+        for message in rule.messages
+        for key in rule.key_expressions
     )
 
 

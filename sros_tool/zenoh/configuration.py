@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum
 from functools import lru_cache
 from json.encoder import encode_basestring_ascii
@@ -24,7 +24,7 @@ from sros_tool.zenoh.access import (
     Flow,
     Message,
     RemoteRights,
-    rule_id,
+    rule_ids,
 )
 
 
@@ -66,28 +66,32 @@ _MICROSECONDS_UNTIL_CLOSED = 60_000_000
 
 
 class SettingsEdition(Enum):
-    """Which settings a file has that have nothing to do with security."""
+    """Which settings a file has that have nothing to do with security, and how it lists rules."""
 
     FEW = "few"
     """The few that the files had at first: sessions ended where rmw_zenoh waits for the router."""
     OF_RMW_ZENOH = "of rmw_zenoh"
     """All those of rmw_zenoh (0.1.9, 0.2.10, 0.6.7, 0.10.5, which have the same) that differ from
     Zenoh's own, and a session waits for its router."""
+    RULES_ONCE = "rules once"
+    """The same settings; a rule that several enclaves have is there once."""
 
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
     """The configuration of one Zenoh process: where it listens and connects, and what it enforces.
 
-    Endpoints have the form ``tls/HOST:PORT``.
+    Endpoints have the form ``tls/HOST:PORT``.  ``settings`` is the edition of the file that it was
+    read from.
     """
 
     mode: Mode
     listen: tuple[str, ...]
     connect: tuple[str, ...]
     access_control: AccessControl
+    settings: SettingsEdition = field(default=SettingsEdition.RULES_ONCE, compare=False)
 
-    def render(self, settings: SettingsEdition = SettingsEdition.OF_RMW_ZENOH) -> bytes:
+    def render(self, settings: SettingsEdition = SettingsEdition.RULES_ONCE) -> bytes:
         """Return the file: JSON, the same for equal configurations.
 
         TLS has no files yet: a session that is not told where its key is does not open.
@@ -97,11 +101,10 @@ class Configuration:
 
 
 class RenderedRights(NamedTuple):
-    """The lines of a remote enclave's rules, of its subject and of its policy."""
+    """The rules of a remote enclave as a file has them, without their ids."""
 
-    rules: str
-    subject: str
-    policy: str
+    name: str
+    rules: tuple[str, ...]
 
 
 def render_configuration(
@@ -109,17 +112,34 @@ def render_configuration(
     listen: tuple[str, ...],
     connect: tuple[str, ...],
     rights: Iterable[RenderedRights],
-    settings: SettingsEdition = SettingsEdition.OF_RMW_ZENOH,
+    settings: SettingsEdition = SettingsEdition.RULES_ONCE,
 ) -> bytes:
     """Return what `Configuration.render` does, from the rendered rights of all remote enclaves."""
-    every = [*rights]
-    lists = []
-    for number, name in enumerate(("rules", "subjects", "policies")):
-        lines = ",\n".join(each[number] for each in every if each[number])
-        lists.append(f'  "{name}": [\n{lines}\n  ]' if lines else f'  "{name}": [\n  ]')
+    control = _control([*rights], once=settings is SettingsEdition.RULES_ONCE)
+    return f"{_rest(mode, listen, connect, settings)}{_CONTROL}{control}".encode()
+
+
+_CONTROL = ',\n "access_control": {\n'
+
+
+def _control(every: Sequence[RenderedRights], *, once: bool) -> str:
+    """Return the access control of a file; a rule that several enclaves have once, or for each."""
+    rules: dict[str, str] = {}
+    lines: dict[str, list[str]] = {"rules": [], "subjects": [], "policies": []}
+    names = [each.name for each in every]
+    every_ids = rule_ids([each.rules for each in every], names, once=once)
+    for each, ids in zip(every, every_ids, strict=True):
+        rules.update(zip(ids, each.rules, strict=True))
+        own = _list([each.name])
+        lines["subjects"].append(f'   {{"id": {own[1:-1]}, "cert_common_names": {own}}}')
+        lines["policies"].append(f'   {{"rules": {_list(ids)}, "subjects": {own}}}')
+    lines["rules"] = [f'   {{"id": {_list([name])[1:-1]}, {rule}' for name, rule in rules.items()]
+    lists = [
+        f'  "{name}": [\n{text}\n  ]' if (text := ",\n".join(of)) else f'  "{name}": [\n  ]'
+        for name, of in lines.items()
+    ]
     control = ",\n".join(('  "enabled": true', '  "default_permission": "deny"', *lists))
-    rest = _rest(mode, listen, connect, settings)
-    return f'{rest},\n "access_control": {{\n{control}\n }}\n}}\n'.encode()
+    return f"{control}\n }}\n}}\n"
 
 
 @lru_cache
@@ -159,7 +179,7 @@ def _rest(
         },
         "adminspace": {"enabled": False},
     }
-    if settings is SettingsEdition.OF_RMW_ZENOH:
+    if settings is not SettingsEdition.FEW:
         _add_settings_of_rmw_zenoh(document, mode)
     return json.dumps(document, indent=1).removesuffix("\n}")
 
@@ -193,24 +213,16 @@ _PERMISSIONS = {True: "allow", False: "deny"}
 
 
 def render_rights(remote: RemoteRights) -> RenderedRights:
-    """Return the lines of a remote enclave, as each file of a network in peer mode has them."""
-    name = remote.common_name
-    ids = [rule_id(name, number) for number in range(len(remote.rules))]
-    rules = (
-        f'   {{"id": {_list([each])[1:-1]}, "permission": "{_PERMISSIONS[rule.allows]}", '
-        f'"flows": ["{rule.flow}"], '
+    """Return the rules of a remote enclave as the files have them."""
+    rules = [
+        f'"permission": "{_PERMISSIONS[rule.allows]}", "flows": ["{rule.flow}"], '
         f'"messages": {_known(rule.messages)}, "key_exprs": {_known(rule.key_expressions)}}}'
-        for each, rule in zip(ids, remote.rules, strict=True)
-    )
-    own = _list([name])
-    return RenderedRights(
-        ",\n".join(rules),
-        f'   {{"id": {own[1:-1]}, "cert_common_names": {own}}}',
-        f'   {{"rules": {_list(ids)}, "subjects": {own}}}',
-    )
+        for rule in remote.rules
+    ]
+    return RenderedRights(remote.common_name, tuple(rules))
 
 
-@lru_cache(maxsize=64)  # several rules have the same
+@lru_cache(maxsize=4096)  # several rules have the same, and in peer mode many files
 def _known(texts: tuple[str, ...]) -> str:
     return _list(texts)
 
@@ -235,7 +247,6 @@ def parse_rendered(data: bytes, name: str) -> Configuration:
     return configuration
 
 
-_CONTROL = ',\n "access_control": {\n'
 _SECTIONS = re.compile(
     r'  "enabled": true,\n  "default_permission": "deny",\n'
     r'  "rules": \[(.*)\n  \],\n  "subjects": \[(.*)\n  \],\n  "policies": \[(.*)\n  \]\n }\n}\n',
@@ -250,8 +261,8 @@ class RenderedReader:
     """
 
     def __init__(self) -> None:
-        self._beginnings: dict[str, tuple[Mode, tuple[str, ...], tuple[str, ...]]] = {}
-        self._policies: dict[str, tuple[str, int]] = {}
+        self._beginnings: dict[str, Configuration] = {}
+        self._policies: dict[str, tuple[str, list[str]]] = {}
         self._remotes: dict[RenderedRights, RemoteRights] = {}
 
     def read(self, data: bytes) -> Configuration | None:
@@ -261,42 +272,50 @@ class RenderedReader:
             sections = _SECTIONS.fullmatch(control)
             if not mark or not sections:
                 return None
-            mode, listen, connect = self._beginning(beginning)
-            return Configuration(mode, listen, connect, AccessControl(self._of_all(sections)))
+            found, rights = self._beginning(beginning), self._of_all(sections)
+            settings = found.settings
+            if settings is not SettingsEdition.FEW and _control(rights, once=True) == control:
+                settings = SettingsEdition.RULES_ONCE
+            elif _control(rights, once=False) != control:
+                return None
+            remotes = tuple(map(self._remote, rights))
+            return replace(found, access_control=AccessControl(remotes), settings=settings)
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):
             return None
 
-    def _beginning(self, text: str) -> tuple[Mode, tuple[str, ...], tuple[str, ...]]:
+    def _beginning(self, text: str) -> Configuration:
         """Return the mode, and where a process listens and connects; raise if others wrote it."""
         if text not in self._beginnings:
             document = json.loads(f"{text}\n}}")
             mode = Mode(document["mode"])
             listen, connect = (tuple(document[key]["endpoints"]) for key in ("listen", "connect"))
-            if all(_rest(mode, listen, connect, edition) != text for edition in SettingsEdition):
-                raise ValueError("another beginning")
-            self._beginnings[text] = mode, listen, connect
+            edition = next(e for e in SettingsEdition if _rest(mode, listen, connect, e) == text)
+            self._beginnings[text] = Configuration(
+                mode, listen, connect, AccessControl(()), edition
+            )
         return self._beginnings[text]
 
-    def _of_all(self, sections: re.Match[str]) -> tuple[RemoteRights, ...]:
-        rules, subjects, policies = (_lines(section) for section in sections.groups())
-        remotes, begin = [], 0
-        for subject, policy in zip(subjects, policies, strict=True):
-            name, count = self._policy(policy)
-            of_remote = RenderedRights(",\n".join(rules[begin : begin + count]), subject, policy)
-            begin += count
-            remotes.append(self._remote(name, of_remote))
-        if begin != len(rules) or len({remote.common_name for remote in remotes}) != len(remotes):
-            raise ValueError("rules without a subject, or a subject twice")
-        return tuple(remotes)
+    def _of_all(self, sections: re.Match[str]) -> list[RenderedRights]:
+        rules, _, policies = (_lines(section) for section in sections.groups())
+        by_id = {}
+        for line in rules:
+            begin, mark, rest = line.partition(', "permission": ')
+            by_id[json.loads(begin.removeprefix('   {"id": '))] = f"{mark[2:]}{rest}"
+        rights = []
+        for name, ids in map(self._policy, policies):
+            rights.append(RenderedRights(name, tuple([by_id[each] for each in ids])))
+        if len({each.name for each in rights}) != len(rights):
+            raise ValueError("a subject twice")
+        return rights
 
-    def _policy(self, line: str) -> tuple[str, int]:
-        """Return the remote enclave of a policy, and its number of rules."""
+    def _policy(self, line: str) -> tuple[str, list[str]]:
+        """Return the remote enclave of a policy, and the ids of its rules."""
         if line not in self._policies:
             policy = json.loads(line)
-            self._policies[line] = policy["subjects"][0], len(policy["rules"])
+            self._policies[line] = policy["subjects"][0], policy["rules"]
         return self._policies[line]
 
-    def _remote(self, name: str, rendered: RenderedRights) -> RemoteRights:
+    def _remote(self, rendered: RenderedRights) -> RemoteRights:
         if rendered not in self._remotes:
             rules = tuple(
                 AccessRule(
@@ -305,9 +324,9 @@ class RenderedReader:
                     tuple(rule["key_exprs"]),
                     rule["permission"] == _PERMISSIONS[True],
                 )
-                for rule in json.loads(f"[{rendered.rules}]")
+                for rule in (json.loads(f"{{{rule}") for rule in rendered.rules)
             )
-            remote = RemoteRights(name, rules)
+            remote = RemoteRights(rendered.name, rules)
             if render_rights(remote) != rendered:
                 raise ValueError("not as it is rendered")
             self._remotes[rendered] = remote

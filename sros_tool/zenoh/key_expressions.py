@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import count
 
 from sros_tool.automata import Automaton, Letters, NameSet
@@ -237,6 +237,187 @@ def _sequences_intersect(
         reached = following
     return len(other) in reached
 
+
+# ── what two expressions have in common ────────────────────────────────────────────────────
+
+_MOST_COMMON = 4096
+"""Most key expressions for what two others have in common."""
+
+
+class TooManyExpressions(Exception):  # noqa: N818 - the caller makes an error of it
+    """What two expressions have in common takes too many others."""
+
+
+def common(one: str, other: str) -> list[str]:
+    """Return expressions that together include the keys that both include, and no others.
+
+    Raises:
+        TooManyExpressions: there are too many.
+    """
+    if includes(one, other):
+        return [other]
+    if includes(other, one):
+        return [one]
+    if not intersects(one, other):
+        return []
+    found = _common(one.split("/"), other.split("/"), ANY_CHUNKS, _common_chunks)
+    return KeyExpressions(canonical(each) for each in found).needed()
+
+
+_ANY_LETTERS = "\0"
+"""In place of ``$*``, as it is no character of a key."""
+
+
+@lru_cache(maxsize=_MANY)
+def _common_chunks(one: str, other: str) -> tuple[str, ...]:
+    if one == other:
+        return (one,)
+    if ANY_CHUNKS in (one, other):
+        chunk = other if one == ANY_CHUNKS else one
+        return () if chunk.startswith("@") else (chunk,)
+    if not _chunks_intersect(one, other):
+        return ()
+    if _ANY_CHUNK in (one, other):
+        return (other if one == _ANY_CHUNK else one,)
+    left, right = (each.replace(ANY_PART, _ANY_LETTERS) for each in (one, other))
+    found = {
+        "".join(each).replace(_ANY_LETTERS, ANY_PART)
+        for each in _common(left, right, _ANY_LETTERS, _common_letters)
+    }
+    return tuple(sorted(found))
+
+
+def _common_letters(one: str, other: str) -> tuple[str, ...]:
+    if _ANY_LETTERS in (one, other):
+        return (other if one == _ANY_LETTERS else one,)
+    return (one,) if one == other else ()
+
+
+def _common(
+    one: Sequence[str],
+    other: Sequence[str],
+    many: str,
+    meet: Callable[[str, str], tuple[str, ...]],
+) -> set[tuple[str, ...]]:
+    """Return the sequences for all that is both, where ``many`` is any number of members.
+
+    ``meet`` returns what two members have in common; of ``many`` and another one, that it allows.
+    """
+
+    @cache
+    def following(at: int, there: int) -> frozenset[tuple[str, ...]]:
+        left, right = one[at : at + 1], other[there : there + 1]
+        if not left and not right:
+            return frozenset({()})
+        found: set[tuple[str, ...]] = set()
+        first, second = (each[0] if each else "" for each in (left, right))
+        if first == many == second:
+            # One of them stands for no more than the other, which goes on.
+            for rest in following(at + 1, there) | following(at, there + 1):
+                found.add(rest if rest[:1] == (many,) else (many, *rest))
+        elif many in (first, second):
+            found |= following(at + 1, there) if first == many else following(at, there + 1)
+            if left and right:
+                more = following(at, there + 1) if first == many else following(at + 1, there)
+                found |= {(each, *rest) for each in meet(first, second) for rest in more}
+        elif left and right:
+            more = following(at + 1, there + 1)
+            found |= {(each, *rest) for each in meet(first, second) for rest in more}
+        if len(found) > _MOST_COMMON:
+            raise TooManyExpressions
+        return frozenset(found)
+
+    return set(following(0, 0))
+
+
+class Keys:
+    """The keys of a rule: what ``expressions`` include, with a fast search for what others share.
+
+    ``plain`` are those of one name: with wildcards only for the type and its hash, and for the
+    history below.
+    """
+
+    def __init__(self, expressions: frozenset[str]) -> None:
+        """Take the expressions; `keys_of` does it once for the same ones."""
+        self.plain = frozenset(each for each in expressions if "*" not in _PLAIN_ENDS.sub("", each))
+        self.wide = _searched(expressions - self.plain)
+
+    def common(self, other: Keys) -> tuple[str, ...]:
+        """Return expressions that together include the keys of both, and no others, sorted.
+
+        Raises:
+            TooManyExpressions: there are too many.
+        """
+        found = self.plain & other.plain
+        if other.wide.all and self.plain:
+            found |= _plain_in(self.plain, other.wide)
+        if self.wide.all and other.plain:
+            found |= _plain_in(other.plain, self.wide)
+        if self.wide.all and other.wide.all:
+            wide = _common_of_wide(self.wide, other.wide)
+            if not found:
+                return wide
+            found |= {*wide}
+        return tuple(sorted(found))
+
+
+@lru_cache(maxsize=_MANY)
+def keys_of(expressions: frozenset[str]) -> Keys:
+    """Return the keys that expressions include: the same value for the same ones."""
+    return Keys(expressions)
+
+
+@lru_cache(maxsize=_MANY)
+def _searched(expressions: frozenset[str]) -> KeyExpressions:
+    return KeyExpressions(expressions)
+
+
+_PLAIN_ENDS = re.compile(r"/\$\*::\$\*/\*(?:/\*\*)?(?:/@adv/\*\*)?\Z")
+
+
+@lru_cache(maxsize=_MANY)
+def _plain_in(plain: frozenset[str], wide: KeyExpressions) -> frozenset[str]:
+    found: set[str] = set()
+    for key in plain:
+        found.update([key] if wide.include(key) else _common_with_all(key, wide))
+    return frozenset(found)
+
+
+@lru_cache(maxsize=_MANY)
+def _common_of_wide(one: KeyExpressions, other: KeyExpressions) -> tuple[str, ...]:
+    if one.all == other.all:
+        return tuple(sorted(one.all))
+    found = {each for each in one.all if other.include(each)}
+    left = [each for each in one.all if each not in found]
+    if not left:
+        return tuple(sorted(found))
+    for each in other.all:
+        if one.include(each):
+            found.add(each)
+        else:
+            # Of the others, those that are included as they are have been found.
+            found.update(*(common(each, wide) for wide in left if intersects(each, wide)))
+    if len(found) > _MOST_COMMON:
+        raise TooManyExpressions
+    return tuple(KeyExpressions(found).needed())
+
+
+@lru_cache(maxsize=_MANY)
+def _common_with_all(key: str, wide: KeyExpressions) -> tuple[str, ...]:
+    begin = _fixed_begin(key)
+    return tuple(
+        shared
+        for each in wide.all
+        if _may_meet(begin, _fixed_begin(each))
+        for shared in common(key, each)
+    )
+
+
+def _may_meet(one: str, other: str) -> bool:
+    return one.startswith(other) or other.startswith(one)
+
+
+# ── the keys as sets of names ──────────────────────────────────────────────────────────────
 
 _SLASH = Letters.of("/")
 _IN_CHUNK = ~_SLASH

@@ -106,8 +106,7 @@ def test_what_is_denied_is_dropped_without_an_error(made: Path, mode: str, words
     assert found["change"], found
     for link in found["links"]:
         enforcers = {each["enforcer"] for each in link["checks"] if not each["allowed"]}
-        # In client mode also the session itself, in peer mode the other session alone.
-        assert enforcers == set(link["enclaves"][:2] if mode == "client" else link["enclaves"][1:])
+        assert enforcers == set(link["enclaves"]), "the session itself and the router"
 
 
 def test_each_link_is_shown_with_who_enforces_it_by_which_rule(made: Path) -> None:
@@ -142,12 +141,10 @@ def test_what_a_wildcard_reaches(made: Path, mode: str) -> None:
 def test_who_may(made: Path, mode: str) -> None:
     found = zenoh(made / mode, "--who", "subscribe", "/chatter")
     able = {each["enclave"]: each["wildcard"] for each in found["enclaves"] if each["allowed"]}
-    assert able == {"/listener": None, "/recorder": "0/*/**/$*::$*/*/**"}
+    wide = "0/*/**/$*::$*/*/**"
+    assert able == {"/listener": None, "/recorder": wide, "/router": None}
     shown = explain(made / mode, "--who", "subscribe", "/chatter", "--vendor", "zenoh").ok()
-    assert (
-        "/recorder  by the wildcard 0/*/**/$*::$*/*/**\n"
-        "2 of 6 enclaves may subscribe topic /chatter\n" in shown.out
-    )
+    assert f"/recorder  by the wildcard {wide}\n/router\n3 of 7 enclaves may" in shown.out
     assert explain(made / mode, "--who", "call", "/nope", "--vendor", "zenoh").status == 1
 
 
@@ -241,12 +238,24 @@ def test_a_peer_whose_file_is_not_signed_is_named(made: Path, tmp_path: Path) ->
 def test_a_peer_with_other_rules_is_named(made: Path, tmp_path: Path) -> None:
     """Each peer decides by its own file: one that differs drops what the others let through."""
     changed = Path(shutil.copytree(made / "peer", tmp_path / "ks", symlinks=True))
-    file = changed / "enclaves/client/session.json5"
+    file = changed / "enclaves/listener/session.json5"
     file.write_text(file.read_text().replace("0/chatter/", "0/other/"))
     found = zenoh(changed, "/talker", "publish", "/chatter")
-    assert found["outcome"] == "dropped"
-    assert [each["enclaves"][1] for each in found["links"] if not each["passes"]] == ["/client"]
-    assert found["out_of_date"] == ["enclaves/client/session.json5"]
+    assert [each["enclave"] for each in found["reached"]] == ["/recorder"]
+    assert found["out_of_date"] == ["enclaves/listener/session.json5"]
+
+
+def test_peers_that_let_through_what_the_router_denies_are_named(
+    made: Path, tmp_path: Path
+) -> None:
+    changed = Path(shutil.copytree(made / "peer", tmp_path / "ks", symlinks=True))
+    for name in ("talker", "listener"):
+        file = changed / f"enclaves/{name}/session.json5"
+        file.write_text(file.read_text().replace("0/chatter/", "0/other/"))
+    found = zenoh(changed, "/talker", "publish", "/other")
+    assert (found["outcome"], found["permitted"]) == ("allowed", False)
+    assert [each["enclaves"] for each in found["links"]] == [["/talker", "/listener"]]
+    assert zenoh(changed, "/wide", "publish", "/other")["outcome"] == "dropped"
 
 
 def test_a_file_that_zenoh_does_not_accept(keystore: Path) -> None:
@@ -271,9 +280,25 @@ def test_an_expired_certificate_gets_no_link(made: Path) -> None:
     assert "expired" in found["text"]
 
 
-def test_the_router_says_nothing(made: Path) -> None:
-    found = zenoh(made / "client", "/router", "publish", "/chatter")
-    assert (found["outcome"], found["change"]) == ("dropped", None)
+@pytest.mark.parametrize("mode", MODES)
+def test_the_routers_key_may_do_what_passes_through_it(made: Path, mode: str) -> None:
+    keystore = made / mode
+    found = zenoh(keystore, "/router", "publish", "/chatter")
+    assert (found["outcome"], found["change"]) == ("allowed", None)
+    assert [each["enclave"] for each in found["reached"]] == ["/listener", "/recorder"]
+    assert zenoh(keystore, "/router", "call", "/nope")["outcome"] == "dropped"
+    shown = explain(keystore, "/router", "publish", "/chatter", "--vendor", "zenoh").ok()
+    assert "put 0/chatter/type/hash: entering /listener by rule " in shown.out
+    assert "note [explain.zenoh-router]" in shown.err
+    assert "zenoh-differs" not in shown.err
+    who = explain(keystore, "publish", "/chatter", "--who", "--vendor", "zenoh").ok()
+    assert who.out == "/router\n/talker\n2 of 7 enclaves may publish topic /chatter\n"
+    assert "note [explain.zenoh-router]" in who.err
+    reach = json.loads(
+        explain("--reach", "/router", keystore, "--vendor", "zenoh", "--json").ok().out
+    )
+    assert "/listener" in [each["enclave"] for each in reach["influences"]]
+    assert "/talker" in [each["enclave"] for each in reach["learns_from"]]
 
 
 def test_a_keystore_without_these_files(tmp_path: Path) -> None:

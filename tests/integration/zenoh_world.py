@@ -34,8 +34,8 @@ WITHIN = 60.0
 """Seconds within which what is allowed has to happen; usually it takes parts of one."""
 PAUSE = 0.5
 
-ITS_OWN = {"other", "wildcard", "wildcards", "thief", "forged image"}
-"""What a session says to itself: no rule stands in between."""
+ITS_OWN = {"other", "wildcard", "wildcards", "thief", "forged image", "strayed", "twin"}
+"""What a session says to itself: no rule stands in between; and what its enclave may hear."""
 FALSE_TOKENS = (
     ("/talker", "spoofed"),
     ("/other", "talker"),
@@ -217,6 +217,8 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
         kept: list[Any] = [
             listener.declare_subscriber(key("/chatter"), lambda each: heard.add(text(each))),
             listener.declare_subscriber(key("/secret"), lambda each: heard.add(text(each))),
+            listener.declare_subscriber(key("/elsewhere"), lambda each: heard.add(text(each))),
+            other.declare_subscriber(key("/elsewhere"), lambda each: overheard.add(text(each))),
             other.declare_subscriber(key("/chatter"), lambda each: overheard.add(text(each))),
             other.declare_subscriber("0/**", lambda each: overheard.add(text(each))),
             # What /other may hear below /chatter is no buffer of /chatter.
@@ -260,6 +262,9 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             other.put(f"0/*/{TYPE}", "wildcard")
             other.put("0/**", "wildcards")
             talker.put(key("/secret"), "talker")
+            # Processes that obey, and another one that may do it and does not obey.
+            talker.put(key("/elsewhere"), "astray")
+            other.put(key("/elsewhere"), "strayed")
             for name in (key("/add"), "0/**"):
                 asked = other.get(name, payload="other", target=zenoh.QueryTarget.ALL, timeout=5.0)
                 overheard.update(text(each.ok) for each in asked if each.ok is not None)
@@ -268,8 +273,8 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             attack()
             time.sleep(0.1)
         if not rules:  # what succeeds may take its time on a busy machine
-            attacks = {"other", "wildcard", "wildcards", "talker", "forged image"}
-            until(lambda: heard >= attacks and "server" in overheard, attack)
+            attacks = {"other", "wildcard", "wildcards", "talker", "forged image", "strayed"}
+            until(lambda: heard >= attacks and {"server", "astray"} <= overheard, attack)
         until(lambda: "chatter" in heard, lambda: talker.put(key("/chatter"), "chatter"))
         for each in BUFFERS:
             buffer = f"{key('/chatter')}/{each}"

@@ -8,9 +8,12 @@ import pytest
 
 from sros_tool.zenoh.key_expressions import (
     canonical,
+    common,
     expression_problem,
     includes,
     intersects,
+    keys_of,
+    names_of,
 )
 from tests.support.children import LONG
 
@@ -80,6 +83,22 @@ def test_zenoh_itself_says_the_same() -> None:
         met += told
     assert included > count // 20
     assert included + count // 20 < met < count // 2
+
+
+def test_what_two_expressions_have_in_common() -> None:
+    draw, met, several = random.Random(32), 0, 0
+    for _ in range(20_000 if LONG else 1_000):
+        one, other = drawn_expression(draw), drawn_expression(draw)
+        found = common(one, other)
+        assert not any(expression_problem(each) for each in found)
+        assert all(includes(one, each) and includes(other, each) for each in found), (one, other)
+        assert bool(found) is intersects(one, other), (one, other)
+        both = names_of([one]) & names_of([other])
+        assert (both - names_of(found)).example() is None, (one, other, found)
+        assert set(found) == set(keys_of(frozenset([one])).common(keys_of(frozenset([other]))))
+        met += bool(found)
+        several += len(found) > 1
+    assert met > 200 and several > 20
 
 
 @pytest.mark.parametrize(
