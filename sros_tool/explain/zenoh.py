@@ -43,7 +43,7 @@ from sros_tool.translate_zenoh.graph import example_token
 from sros_tool.translate_zenoh.rights import ANY_TYPE, untyped
 from sros_tool.values import shows
 from sros_tool.zenoh.access import Enforcement, Flow, Message, MessageFilter
-from sros_tool.zenoh.configuration import Mode, RenderedReader
+from sros_tool.zenoh.configuration import Mode, RenderedReader, SettingsEdition
 from sros_tool.zenoh.delivery import (
     Check,
     Delivery,
@@ -401,7 +401,8 @@ class ZenohEvaluator:
     def _configuration(self, path: Path) -> tuple[Mode, MessageFilter, tuple[ZenohEndpoint, ...]]:
         """Return the mode of a process, what it enforces, and where it connects or listens."""
         data = self.keystore.read(path, "Zenoh configuration")
-        if own := self._rendered.read(data):
+        own = self._rendered.read(data)
+        if own and own.settings is SettingsEdition.RULES_ONCE:  # rules have the ids of the file
             texts = own.listen if own.mode is Mode.ROUTER else own.connect
             return own.mode, own.access_control, tuple(map(ZenohEndpoint, texts))
         document = parse_configuration(data, str(path), lines=False)

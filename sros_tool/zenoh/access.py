@@ -19,7 +19,7 @@ from itertools import count, product
 from typing import NamedTuple, Protocol
 
 from sros_tool.automata import NameSet
-from sros_tool.zenoh.key_expressions import KeyExpressions, Keys, includes, keys_of, names_of
+from sros_tool.zenoh.key_expressions import KeyExpressions, RuleKeys, includes, keys_of, names_of
 
 
 class Message(StrEnum):
@@ -254,7 +254,7 @@ class RightsBetween:
         """
         mine = [_RuleOfPeer.of(each.rule.mirrored()) for each in self._rules[own]]
         denied = [each for each in mine if not each.rule.allows]
-        meeting: dict[_Place, list[tuple[tuple[Message, ...], Keys]]] = {}
+        meeting: dict[_Place, list[tuple[tuple[Message, ...], RuleKeys]]] = {}
         for remote, theirs in self._rules.items():
             found: dict[_Place, tuple[str, ...]] = {}
             for place, _, keys in theirs:
@@ -284,7 +284,7 @@ _Place = tuple[Flow, tuple[Message, ...], bool]
 class _RuleOfPeer(NamedTuple):
     place: _Place
     rule: AccessRule
-    keys: Keys
+    keys: RuleKeys
 
     @classmethod
     def of(cls, rule: AccessRule) -> _RuleOfPeer:

@@ -289,9 +289,9 @@ class RenderedReader:
             document = json.loads(f"{text}\n}}")
             mode = Mode(document["mode"])
             listen, connect = (tuple(document[key]["endpoints"]) for key in ("listen", "connect"))
-            edition = next(e for e in SettingsEdition if _rest(mode, listen, connect, e) == text)
+            editions = [e for e in SettingsEdition if _rest(mode, listen, connect, e) == text]
             self._beginnings[text] = Configuration(
-                mode, listen, connect, AccessControl(()), edition
+                mode, listen, connect, AccessControl(()), editions[0]
             )
         return self._beginnings[text]
 

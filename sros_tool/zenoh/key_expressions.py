@@ -330,7 +330,7 @@ def _common(
     return set(following(0, 0))
 
 
-class Keys:
+class RuleKeys:
     """The keys of a rule: what ``expressions`` include, with a fast search for what others share.
 
     ``plain`` are those of one name: with wildcards only for the type and its hash, and for the
@@ -342,7 +342,7 @@ class Keys:
         self.plain = frozenset(each for each in expressions if "*" not in _PLAIN_ENDS.sub("", each))
         self.wide = _searched(expressions - self.plain)
 
-    def common(self, other: Keys) -> tuple[str, ...]:
+    def common(self, other: RuleKeys) -> tuple[str, ...]:
         """Return expressions that together include the keys of both, and no others, sorted.
 
         Raises:
@@ -362,9 +362,9 @@ class Keys:
 
 
 @lru_cache(maxsize=_MANY)
-def keys_of(expressions: frozenset[str]) -> Keys:
+def keys_of(expressions: frozenset[str]) -> RuleKeys:
     """Return the keys that expressions include: the same value for the same ones."""
-    return Keys(expressions)
+    return RuleKeys(expressions)
 
 
 @lru_cache(maxsize=_MANY)

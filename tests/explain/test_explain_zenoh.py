@@ -288,7 +288,7 @@ def test_the_routers_key_may_do_what_passes_through_it(made: Path, mode: str) ->
     assert [each["enclave"] for each in found["reached"]] == ["/listener", "/recorder"]
     assert zenoh(keystore, "/router", "call", "/nope")["outcome"] == "dropped"
     shown = explain(keystore, "/router", "publish", "/chatter", "--vendor", "zenoh").ok()
-    assert "put 0/chatter/type/hash: entering /listener by rule " in shown.out
+    assert "put 0/chatter/any::type/hash: entering /listener by rule " in shown.out
     assert "note [explain.zenoh-router]" in shown.err
     assert "zenoh-differs" not in shown.err
     who = explain(keystore, "publish", "/chatter", "--who", "--vendor", "zenoh").ok()

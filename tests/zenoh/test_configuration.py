@@ -35,7 +35,10 @@ RIGHTS = RemoteRights(
 )
 
 
-@pytest.mark.parametrize("remotes", [(), (RIGHTS,), (RIGHTS, RemoteRights("/b", ()))])
+SAME = (RIGHTS, RemoteRights("/b", RIGHTS.rules), RemoteRights("/c", ()))
+
+
+@pytest.mark.parametrize("remotes", [(), (RIGHTS,), SAME])
 @pytest.mark.parametrize("settings", SettingsEdition)
 @pytest.mark.parametrize("mode", Mode)
 def test_it_reads_back_as_it_was(
@@ -46,8 +49,12 @@ def test_it_reads_back_as_it_was(
     assert parse_rendered(data, "file") == written
     control = json.loads(data)["access_control"]
     assert (control["enabled"], control["default_permission"]) == (True, "deny")
+    once = settings is SettingsEdition.RULES_ONCE
+    stated = min(len(remotes), 1 if once else 2)
+    assert len(control["rules"]) == stated * len(RIGHTS.rules)
     for rule in control["rules"]:
-        assert sum(json.dumps(rule["id"]) in line for line in data.decode().splitlines()) == 2
+        lines = [line for line in data.decode().splitlines() if json.dumps(rule["id"]) in line]
+        assert len(lines) == (3 if once and remotes is SAME else 2), "a rule, and its policies"
 
 
 def test_another_text_of_the_same_configuration_is_not_one_that_sros_writes() -> None:
