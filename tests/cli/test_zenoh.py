@@ -199,6 +199,17 @@ def test_a_revoked_certificate_that_zenoh_still_accepts_is_noted(folder: Path) -
     assert "a revoked certificate of /a has not expired" in notes
 
 
+def test_the_router_is_moved_before_its_enclave_is_revoked(folder: Path) -> None:
+    sros("zenoh", "ks", cwd=folder).ok()
+    refused = sros("revoke", "ks", "/router", cwd=folder)
+    assert (refused.status, "is the enclave of the Zenoh router" in refused.err) == (2, True)
+    assert "`sros zenoh ks --router /router2`" in refused.err
+    moved = sros("zenoh", "ks", "--router", "/router2", cwd=folder).ok()
+    assert "stop the one that runs in /router, and start it in /router2" in moved.err
+    sros("revoke", "ks", "/router", cwd=folder).ok()
+    sros("zenoh", "ks", "--check", cwd=folder).ok()
+
+
 def test_an_export_has_the_file_of_its_enclave_alone(folder: Path) -> None:
     sros("zenoh", "ks", cwd=folder).ok()
     sros("distribute_key", "ks", "/a", "robot", cwd=folder).ok()

@@ -241,11 +241,10 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
         graph = Graph(listener)
         until(lambda: "talker" in graph.nodes())
         erasing = token(other, "/other", "talker", zid=str(talker.info.zid()))
-        if not rules:  # a token that nobody was told of takes nothing away
-            until(lambda: len([each for each in graph.found if each[3] == "talker"]) == 2)
         erasing.undeclare()
         kept.append(token(other, "/other", "other", "MP /elsewhere"))
         until(lambda: "other MP %elsewhere" in graph.announced())
+        erased = (str(talker.info.zid()), "0", "%", "talker")
         kept += [
             zenoh.ext.declare_advanced_publisher(
                 keeper, key("/map"), cache=zenoh.ext.CacheConfig(max_samples=1)
@@ -306,6 +305,7 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             "nodes": sorted(seen),
             "graph": sorted(graph.nodes()),
             "announced": sorted(graph.announced()),
+            "erased": erased not in graph.found,
             "history": sorted(late),
             "same_enclave": sorted(twin),
         }

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import count
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, UsageError
@@ -132,10 +134,25 @@ def refresh_crl(
 def _check_names(change: KeystoreChange, names: Sequence[str]) -> None:
     """Raise an error unless all ``names`` are enclaves of the keystore."""
     existing = frozenset(change.names)
+    router = change.template.zenoh.router if change.template.zenoh else None
     for name in names:
         check_enclave_name(name)
+        if name == router and name in existing:
+            raise _is_router(change, name)
         if name not in existing:
             raise no_such_enclave(change.keystore, name, change.names, may_create=False)
+
+
+def _is_router(change: KeystoreChange, router: str) -> KeystoreError:
+    where = quote(str(change.root))
+    other = next(n for at in count(2) if (n := f"{router}{at}") not in change.names)
+    return KeystoreError(
+        f"{router} is the enclave of the Zenoh router",
+        "Without a router no node on Zenoh finds the others, and every session believes its key.",
+        f"Move the router first: `sros zenoh {where} --router {other}`. Stop the router that runs in "
+        f"{router}, start one in {other}, restart the processes that the verb names, and revoke "
+        f"{router} then.",
+    )
 
 
 def _move_away(change: KeystoreChange, name: str) -> Entry:

@@ -751,6 +751,9 @@ def set_zenoh(
     with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
         change.begin_issuing(None)
         _check_settings(change, edited=bool(change.notes))
+        before = change.template.zenoh
+        if network and before and before.router != network.router:
+            change.notes.append(_router_moved(before.router, network.router))
         template = replace(change.template, zenoh=network)
         if network and network.router in change.names:
             _check_router(change, network.router)
@@ -761,6 +764,14 @@ def set_zenoh(
         write_enclaves(change, {})
     change.restart = removed or change.restart
     return creation(change, ())
+
+
+def _router_moved(old: str, new: str) -> Note:
+    return Note(
+        "zenoh.router-moved",
+        f"the router is now in enclave {new}: stop the one that runs in {old}, and start it in "
+        f"{new}. Sessions that were not restarted believe {old} still; nobody else does.",
+    )
 
 
 def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
