@@ -149,7 +149,7 @@ def _is_router(change: KeystoreChange, router: str) -> KeystoreError:
     return KeystoreError(
         f"{router} is the enclave of the Zenoh router",
         "Without a router no node on Zenoh finds the others, and every session believes its key.",
-        f"Move the router first: `sros zenoh {where} --router {other}`. Stop the router that runs in "
+        f"Move the router first: `sros zenoh {where} --router {other}`. Stop the router in "
         f"{router}, start one in {other}, restart the processes that the verb names, and revoke "
         f"{router} then.",
     )
