@@ -8,6 +8,7 @@ is tried again without the defence that stops it.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 from sros_tool.demo import forger
 from sros_tool.demo.forger import STOLEN
@@ -721,34 +722,84 @@ _WILDCARD_ROWS = (
 )
 
 
-def _spoofing(name: str, keystore: KeystoreChoice, world: str, removed: str = "") -> Row:
-    impostor = _attacker("impostor", Role.TALKER, keystore, topic="/spoofed")
+class _FalseToken(NamedTuple):
+    """A graph token that an impostor announces: for its node ``talker``, of the enclave ``part``.
+
+    ``announced`` is the enclave that it names in place of its own.
+    """
+
+    attack: str
+    mechanism: str
+    part: str
+    topic: str
+    announced: str = ""
+
+
+_TOKENS = (
+    _FalseToken(
+        "spoofed graph token",
+        "a token passes only with the enclave of its sender's certificate",
+        "guest",
+        "/spoofed",
+        "talker",
+    ),
+    _FalseToken(
+        "another enclave announces a topic",
+        "a token passes only for names that its sender has a right to",
+        "admin",
+        "/not_its_own",
+    ),
+    _FalseToken(
+        "another enclave poses as a node",
+        "a token passes only for nodes that the policy of its sender names",
+        "guest",
+        "/rosout",
+    ),
+)
+
+
+def _announcing(
+    token: _FalseToken, keystore: KeystoreChoice, world: str, how: str = "", removed: str = ""
+) -> Row:
+    """Return a row in which an enclave announces a publisher to an observer of the graph."""
+    impostor = replace(
+        _attacker(f"impostor on {token.topic[1:]}", Role.TALKER, keystore, token.part, token.topic),
+        announced=token.announced,
+    )
     observer = _rightful("observer", Role.OBSERVER, keystore, "client")
     wide, talker, _ = _topic_pair(keystore)
     return _attempt(
-        name,
+        f"{token.attack}{how}",
         RowStatus.VISIBLE if removed else RowStatus.NOT_VISIBLE,
-        "anybody may announce nodes under any name"
-        if removed
-        else "a token passes only with the enclave of its sender's certificate",
-        Claim(Relation.SEES, "observer", "impostor"),
-        (wide, talker, observer, replace(impostor, announced="talker")),
+        "nobody compares what a token names with a policy" if removed else token.mechanism,
+        Claim(Relation.SEES, "observer", impostor.name),
+        (wide, talker, observer, impostor),
         (Claim(Relation.SEES, "observer", "talker"),),
         world=world,
         removed=removed,
     )
 
 
-_TOKEN_ROWS = tries(
-    "spoofed graph token",
-    _spoofing("spoofed graph token", OWN, _PEERS),
-    _spoofing(
-        "spoofed graph token, tokens of any enclave",
-        zenoh_forger.tokens_of_any_enclave,
-        "",
-        "rules that bind tokens to enclaves",
-    ),
-)
+def _false_token_rows(token: _FalseToken) -> tuple[Row, ...]:
+    """Return the rows of a token: past the router, through it, and without the defence."""
+    forgery, wide = zenoh_forger.tokens_of_any_name, "names"
+    if token.announced:
+        forgery, wide = zenoh_forger.tokens_of_any_enclave, "enclaves"
+    return tries(
+        token.attack,
+        _announcing(token, OWN, _PEERS),
+        _announcing(token, zenoh_forger.through_the_router, _CLIENTS, ", through the router"),
+        _announcing(
+            token,
+            forgery,
+            f"tokens of any {wide}",
+            f", tokens of any {wide.removesuffix('s')}",
+            f"rules that bind tokens to {wide}",
+        ),
+    )
+
+
+_TOKEN_ROWS = tuple(row for token in _TOKENS for row in _false_token_rows(token))
 
 
 # ── what was valid earlier ─────────────────────────────────────────────────────────────────

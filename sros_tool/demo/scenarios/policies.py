@@ -94,10 +94,11 @@ def zenoh_policy(topic: str, *, guest_talks: bool = False, silent: str = "") -> 
     """Return the policy of the demo on Zenoh: `attacked_policy` and an action.
 
     With ``guest_talks``, the guest may use the topic as talker and as listener; the enclave
-    ``silent`` may not use it.
+    ``silent`` may not use it.  The guest's node has a name of its own.
     """
     attacked = attacked_policy(topic)
     of = {enclave.path: enclave for enclave in attacked.enclaves}
+    of[GUEST] = of[GUEST].with_profiles(lambda profile: replace(profile, node="guest"))
     if guest_talks:
         of[GUEST] = replace(of[GUEST], profiles=(*of[_TALKER].profiles, *of[_LISTENER].profiles))
     if silent:

@@ -192,14 +192,29 @@ def guest_may_use_the_topic(copy: KeystoreCopy) -> None:
 
 def tokens_of_any_enclave(copy: KeystoreCopy) -> None:
     """Let every enclave announce nodes under any enclave's name."""
+    _widen_tokens(copy, lambda _: f"@ros2_lv/{copy.domain}/**")
+
+
+def tokens_of_any_name(copy: KeystoreCopy) -> None:
+    """Let every enclave announce any node and any name, under the name of its own enclave."""
+
+    def of_enclave(key: str) -> str:
+        chunks = key.split("/")
+        enclave = chunks[6] if len(chunks) > 6 else ""  # Otherwise it is what all may see.
+        return f"@ros2_lv/{copy.domain}/*/*/*/*/{enclave}/**" if enclave else key
+
+    _widen_tokens(copy, of_enclave)
+
+
+def _widen_tokens(copy: KeystoreCopy, wider: Callable[[str], str]) -> None:
+    """Replace the key expressions for graph tokens in all files."""
 
     def change(document: _Document) -> None:
         for rule in document["access_control"]["rules"]:
             if "liveliness_token" in rule["messages"]:
-                rule["key_exprs"] = [
-                    f"@ros2_lv/{copy.domain}/**" if each.startswith("@ros2_lv") else each
-                    for each in rule["key_exprs"]
-                ]
+                keys = rule["key_exprs"]
+                wide = [wider(key) if key.startswith("@ros2_lv") else key for key in keys]
+                rule["key_exprs"] = [*dict.fromkeys(wide)]
 
     _edit_all(copy, change)
 
