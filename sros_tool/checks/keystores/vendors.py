@@ -500,18 +500,30 @@ def _offers_types(access: Access, grant: Grant) -> bool:
     Tries a name that no rule has, and an example for each matching expression.
     """
     wanted = dds_names("reply", f"/*/{_TYPES}").publish[0]
-    nodes = [_SOME_NODE]
+    return any(
+        all(access.publish(topic).outcome.ok for topic in names.publish)
+        and all(access.subscribe(topic).outcome.ok for topic in names.subscribe)
+        for node in _nodes_to_try(grant, wanted)
+        for names in (dds_names("reply", f"{node}/{_TYPES}"),)
+    )
+
+
+def _nodes_to_try(grant: Grant, wanted: str) -> Iterator[str]:
+    """Yield a node that no rule names, and a node for each expression that meets ``wanted``."""
+    yield _SOME_NODE
     with suppress(DocumentError):  # too many wildcards
-        fitting = (each for each in _written(grant) if overlap(each, wanted))
-        examples = (common_name([each, wanted], absolute=False) for each in fitting)
-        nodes += [service_of(each)[0].removesuffix(f"/{_TYPES}") for each in examples if each]
-    for node in nodes:
-        names = dds_names("reply", f"{node}/{_TYPES}")
-        if all(access.publish(each).outcome.ok for each in names.publish) and all(
-            access.subscribe(each).outcome.ok for each in names.subscribe
-        ):
-            return True
-    return False
+        for expression in _written(grant):
+            if not overlap(expression, wanted):
+                continue
+            # Where only the service has a wildcard, its node is the example.
+            beginning = expression.partition("*")[0].rpartition("/")[0]
+            topic = f"{beginning}/{_TYPES}Reply"
+            if not is_expression(topic) and overlap(topic, wanted) and overlap(expression, topic):
+                example: str | None = topic
+            else:
+                example = common_name([expression, wanted], absolute=False)
+            if example:
+                yield service_of(example)[0].removesuffix(f"/{_TYPES}")
 
 
 def _written(grant: Grant) -> Iterator[str]:
