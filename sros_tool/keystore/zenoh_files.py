@@ -25,19 +25,21 @@ from sros_tool.dds.permissions import Grant, parse_permissions
 from sros_tool.errors import KeystoreError, PolicyError, SrosError, UsageError, check_meaning
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    CRL_FILE,
     PERMISSIONS_FILE,
     ROUTER_FILE,
     SESSION_FILE,
     ZENOH_SIGNED,
     enclave_folder,
 )
-from sros_tool.keystore.ledger import Ledger
+from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave
 from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
+from sros_tool.pki.crl import SUPERSEDED, load_crl
 from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Source
 from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import Right, Rules, nodes_from_text, parts
@@ -51,6 +53,7 @@ from sros_tool.translate_zenoh.rights import (
     remote_of,
     remote_rights,
 )
+from sros_tool.validity import iso
 from sros_tool.zenoh.access import (
     AccessControl,
     Flow,
@@ -136,7 +139,9 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
             problems.append(read)
             continue
         found[file] = read
-        if text := _out_of_date(read, file, name, state):
+        if (text := _before_revocation(read, state)) or (
+            text := _out_of_date(read, file, name, state)
+        ):
             problems.append(ZenohProblem(file, text, ZenohFault.OUT_OF_DATE))
     certified = common_name_of(state.certificate.subject) if state.certificate else name
     if found and certified != name:
@@ -192,6 +197,21 @@ def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | Zeno
         return parse_rendered(document, "it")
     except SrosError as error:
         return ZenohProblem(file, error.what, ZenohFault.MALFORMED)
+
+
+def _before_revocation(configuration: Configuration, state: OpenedEnclave) -> str:
+    """Return that a configuration with the rights of others is older than a revocation, or ""."""
+    data = state.files.get(CRL_FILE)
+    if configuration.mode is Mode.CLIENT or data is None:
+        return ""
+    try:
+        crl = load_crl(data, CRL_FILE)
+    except SrosError:
+        return ""  # a problem of the enclave that is told elsewhere
+    dates = [iso(each.date) for each in crl.revoked if each.reason != SUPERSEDED]
+    if configuration.revoked >= max(dates, default=""):
+        return ""
+    return f"it is from before the last revocation in {CRL_FILE}, and may give the revoked rights"
 
 
 def _out_of_date(configuration: Configuration, file: str, name: str, state: OpenedEnclave) -> str:
@@ -254,15 +274,17 @@ class ZenohDocuments:
 class ZenohChange:
     """What a transaction changes in the enclaves of a keystore, as far as Zenoh depends on it.
 
-    ``issued`` are the new permissions of enclaves, ``gone`` the enclaves that are
-    revoked, ``replaced`` those whose earlier certificates are.  ``stated`` are the policies of the
-    enclaves, by whose lines errors are told.
+    ``issued`` are the new permissions of enclaves, ``gone`` the enclaves that are revoked,
+    ``replaced`` those whose earlier certificates are; ``revoked`` is when the last enclave is
+    revoked, if the transaction does it.  ``stated`` are the policies of the enclaves, by whose
+    lines errors are told.
     """
 
     issued: Mapping[str, SignedRights] = field(default_factory=dict)
     gone: Collection[str] = ()
     replaced: Collection[str] = ()
     stated: Mapping[str, Enclave | None] = field(default_factory=dict)
+    revoked: str = ""
 
 
 NO_CHANGE = ZenohChange()
@@ -387,7 +409,8 @@ def zenoh_documents(
     listening = tuple(f"tls/{each}" for each in network.listening())
     of_router = _router_path(network.router)
     remotes = {name: each.remote for name, each in rules.items()}
-    files = {of_router: render_configuration(Mode.ROUTER, listening, (), remotes.values())}
+    revoked = max(last_revocation(reader.ledger.entries), change.revoked)
+    files = {of_router: render_configuration(Mode.ROUTER, listening, (), remotes.values(), revoked)}
     direct = network.mode is Mode.PEER
     listen = (_ANY_PORT_HERE,) if direct else ()
     between = RightsBetween(each.rights for each in rules.values() if each.rights)
@@ -399,6 +422,7 @@ def zenoh_documents(
                 listen,
                 endpoints,
                 _peers(name, rules[name].router, between) if direct else (rules[name].router,),
+                revoked if direct else "",
             )
             for name in some
         }
@@ -418,6 +442,14 @@ def zenoh_documents(
     if only:
         existing = tuple(name for name in existing if name in only)
     return ZenohDocuments(files, enclaves, left_out, existing, reader.ledger)
+
+
+def last_revocation(entries: Iterable[Entry]) -> str:
+    """Return when an enclave was revoked last, by entries of the ledger; "" if none was."""
+    moments = (
+        entry.time for entry in entries if entry.what == "revocation" and entry.reason != SUPERSEDED
+    )
+    return max(moments, default="")
 
 
 def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[RenderedRights]:

@@ -59,6 +59,7 @@ class ZenohNetwork:
         return self.listen or self.endpoints
 
 
+_REVOKED = "last_revocation"
 _QUERY_MILLISECONDS = 600_000
 """How long rmw_zenoh waits for a reply; Zenoh's own default of 10 s would end long calls."""
 _MICROSECONDS_UNTIL_CLOSED = 60_000_000
@@ -81,14 +82,16 @@ class SettingsEdition(Enum):
 class Configuration:
     """The configuration of one Zenoh process: where it listens and connects, and what it enforces.
 
-    Endpoints have the form ``tls/HOST:PORT``.  ``settings`` is the edition of the file that it was
-    read from.
+    Endpoints have the form ``tls/HOST:PORT``.  ``revoked`` is when the last enclave was revoked, in
+    UTC, so that a file of before is known as that; "" if none was, or it does not matter.
+    ``settings`` is the edition of the file that it was read from.
     """
 
     mode: Mode
     listen: tuple[str, ...]
     connect: tuple[str, ...]
     access_control: AccessControl
+    revoked: str = ""
     settings: SettingsEdition = field(default=SettingsEdition.RULES_ONCE, compare=False)
 
     def render(self, settings: SettingsEdition = SettingsEdition.RULES_ONCE) -> bytes:
@@ -97,7 +100,9 @@ class Configuration:
         TLS has no files yet: a session that is not told where its key is does not open.
         """
         rights = [render_rights(each) for each in self.access_control.remotes]
-        return render_configuration(self.mode, self.listen, self.connect, rights, settings)
+        return render_configuration(
+            self.mode, self.listen, self.connect, rights, self.revoked, settings
+        )
 
 
 class RenderedRights(NamedTuple):
@@ -112,11 +117,12 @@ def render_configuration(
     listen: tuple[str, ...],
     connect: tuple[str, ...],
     rights: Iterable[RenderedRights],
+    revoked: str = "",
     settings: SettingsEdition = SettingsEdition.RULES_ONCE,
 ) -> bytes:
     """Return what `Configuration.render` does, from the rendered rights of all remote enclaves."""
     control = _control([*rights], once=settings is SettingsEdition.RULES_ONCE)
-    return f"{_rest(mode, listen, connect, settings)}{_CONTROL}{control}".encode()
+    return f"{_rest(mode, listen, connect, revoked, settings)}{_CONTROL}{control}".encode()
 
 
 _CONTROL = ',\n "access_control": {\n'
@@ -144,7 +150,11 @@ def _control(every: Sequence[RenderedRights], *, once: bool) -> str:
 
 @lru_cache
 def _rest(
-    mode: Mode, listen: tuple[str, ...], connect: tuple[str, ...], settings: SettingsEdition
+    mode: Mode,
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    revoked: str,
+    settings: SettingsEdition,
 ) -> str:
     """Return all but the access control, without the brace at the end."""
     document: dict[str, Any] = {
@@ -181,6 +191,8 @@ def _rest(
     }
     if settings is not SettingsEdition.FEW:
         _add_settings_of_rmw_zenoh(document, mode)
+    if revoked:
+        document["metadata"] = {_REVOKED: revoked}
     return json.dumps(document, indent=1).removesuffix("\n}")
 
 
@@ -289,9 +301,14 @@ class RenderedReader:
             document = json.loads(f"{text}\n}}")
             mode = Mode(document["mode"])
             listen, connect = (tuple(document[key]["endpoints"]) for key in ("listen", "connect"))
-            editions = [e for e in SettingsEdition if _rest(mode, listen, connect, e) == text]
+            revoked = document.get("metadata", {}).get(_REVOKED, "")
+            editions = [
+                edition
+                for edition in SettingsEdition
+                if _rest(mode, listen, connect, revoked, edition) == text
+            ]
             self._beginnings[text] = Configuration(
-                mode, listen, connect, AccessControl(()), editions[0]
+                mode, listen, connect, AccessControl(()), revoked, editions[0]
             )
         return self._beginnings[text]
 

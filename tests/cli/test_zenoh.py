@@ -210,6 +210,26 @@ def test_the_router_is_moved_before_its_enclave_is_revoked(folder: Path) -> None
     sros("zenoh", "ks", "--check", cwd=folder).ok()
 
 
+def test_a_file_of_before_a_revocation_is_refused_where_the_list_is_newer(folder: Path) -> None:
+    """A peer's file has the rights of others, validly signed: those of before are no longer."""
+    sros("zenoh", "ks", "--mode", "peer", cwd=folder).ok()
+    sros("distribute_key", "ks", "/a", "before", cwd=folder).ok()
+    sros("verify", "before", cwd=folder).ok()
+    sros("revoke", "ks", "/b", cwd=folder).ok()
+    sros("zenoh", "ks", "--check", cwd=folder).ok()
+    sros("renew", "ks", "/a", cwd=folder).ok()
+    sros("zenoh", "ks", "--check", cwd=folder).ok()
+    sros("distribute_key", "ks", "/a", "robot", cwd=folder).ok()
+    sros("verify", "robot", cwd=folder).ok()
+    for name in ("session.json5", "session.p7s"):
+        shutil.copy(folder / "before/enclaves/a" / name, folder / "robot/enclaves/a" / name)
+    checked = sros("verify", "robot", cwd=folder)
+    assert (checked.status, "zenoh.out-of-date" in checked.out) == (1, True)
+    assert "it is from before the last revocation in crl.pem" in checked.out
+    refused = sros("env", "robot", "/a", "--rmw", "rmw_zenoh_cpp", cwd=folder)
+    assert (refused.status, "before the last revocation" in refused.err) == (2, True)
+
+
 def test_an_export_has_the_file_of_its_enclave_alone(folder: Path) -> None:
     sros("zenoh", "ks", cwd=folder).ok()
     sros("distribute_key", "ks", "/a", "robot", cwd=folder).ok()

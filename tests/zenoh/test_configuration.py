@@ -44,7 +44,8 @@ SAME = (RIGHTS, RemoteRights("/b", RIGHTS.rules), RemoteRights("/c", ()))
 def test_it_reads_back_as_it_was(
     mode: Mode, settings: SettingsEdition, remotes: tuple[RemoteRights, ...]
 ) -> None:
-    written = Configuration(mode, ("tls/a:1",), ("tls/b:2",), AccessControl(remotes))
+    control, revoked = AccessControl(remotes), "2026-11-25T00:00:00Z" if remotes else ""
+    written = Configuration(mode, ("tls/a:1",), ("tls/b:2",), control, revoked)
     data = written.render(settings)
     assert parse_rendered(data, "file") == written
     control = json.loads(data)["access_control"]

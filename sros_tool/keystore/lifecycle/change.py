@@ -45,6 +45,7 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.keys import PublicKey
 from sros_tool.pki.token import TokenUri
 from sros_tool.policy.model import Enclave
+from sros_tool.validity import iso
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
@@ -332,7 +333,9 @@ class KeystoreChange:
         if self.template.zenoh is None:
             return
         from sros_tool.keystore.issuing.zenoh import keep_zenoh
-        from sros_tool.keystore.zenoh_files import ZenohChange
+        from sros_tool.keystore.zenoh_files import ZenohChange, last_revocation
+
+        revoked = max(last_revocation(self.entries), iso(self.now) if gone else "")
 
         self.zenoh = keep_zenoh(
             self.transaction,
@@ -342,7 +345,9 @@ class KeystoreChange:
             authority=self._permissions_certificate(),
             signer=lambda: self.permissions,
             now=self.now,
-            change=ZenohChange(issued, gone=gone, replaced=replaced, stated=stated or {}),
+            change=ZenohChange(
+                issued, gone=gone, replaced=replaced, stated=stated or {}, revoked=revoked
+            ),
         ).without(created)
         self.notes += self.zenoh.notes
 
