@@ -46,6 +46,7 @@ def test_canonical(chunks: tuple[str, ...], text: str) -> None:
         ("0/a$*b", "0/a", False),
         ("0/$*a$*", "0/*", False),
         ("0/*", "0/a$*", True),
+        ("a/*/**", "a/**/b", False),  # although it includes every key of it
     ],
 )
 def test_includes(wide: str, narrow: str, included: bool) -> None:
