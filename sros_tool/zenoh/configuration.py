@@ -226,12 +226,14 @@ _PERMISSIONS = {True: "allow", False: "deny"}
 
 def render_rights(remote: RemoteRights) -> RenderedRights:
     """Return the rules of a remote enclave as the files have them."""
-    rules = [
+    return RenderedRights(remote.common_name, tuple([_rendered(rule) for rule in remote.rules]))
+
+
+def _rendered(rule: AccessRule) -> str:
+    return (
         f'"permission": "{_PERMISSIONS[rule.allows]}", "flows": ["{rule.flow}"], '
         f'"messages": {_known(rule.messages)}, "key_exprs": {_known(rule.key_expressions)}}}'
-        for rule in remote.rules
-    ]
-    return RenderedRights(remote.common_name, tuple(rules))
+    )
 
 
 @lru_cache(maxsize=4096)  # several rules have the same, and in peer mode many files
@@ -269,13 +271,13 @@ _SECTIONS = re.compile(
 class RenderedReader:
     """Reader of many configurations as `Configuration.render` writes them.
 
-    What several of them say about a remote enclave in the same words is read once.
+    A rule that several of them have in the same words is read once.
     """
 
     def __init__(self) -> None:
         self._beginnings: dict[str, Configuration] = {}
         self._policies: dict[str, tuple[str, list[str]]] = {}
-        self._remotes: dict[RenderedRights, RemoteRights] = {}
+        self._rules: dict[str, AccessRule] = {}
 
     def read(self, data: bytes) -> Configuration | None:
         """Return a configuration, or None if it is not exactly as sros writes it."""
@@ -290,7 +292,9 @@ class RenderedReader:
                 settings = SettingsEdition.RULES_ONCE
             elif _control(rights, once=False) != control:
                 return None
-            remotes = tuple(map(self._remote, rights))
+            remotes = tuple(
+                RemoteRights(each.name, tuple(map(self._rule, each.rules))) for each in rights
+            )
             return replace(found, access_control=AccessControl(remotes), settings=settings)
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):
             return None
@@ -332,22 +336,20 @@ class RenderedReader:
             self._policies[line] = policy["subjects"][0], policy["rules"]
         return self._policies[line]
 
-    def _remote(self, rendered: RenderedRights) -> RemoteRights:
-        if rendered not in self._remotes:
-            rules = tuple(
-                AccessRule(
-                    Flow(rule["flows"][0]),
-                    tuple(map(Message, rule["messages"])),
-                    tuple(rule["key_exprs"]),
-                    rule["permission"] == _PERMISSIONS[True],
-                )
-                for rule in (json.loads(f"{{{rule}") for rule in rendered.rules)
+    def _rule(self, text: str) -> AccessRule:
+        """Return a rule without its id."""
+        if text not in self._rules:
+            stated = json.loads(f"{{{text}")
+            rule = AccessRule(
+                Flow(stated["flows"][0]),
+                tuple(map(Message, stated["messages"])),
+                tuple(stated["key_exprs"]),
+                stated["permission"] == _PERMISSIONS[True],
             )
-            remote = RemoteRights(rendered.name, rules)
-            if render_rights(remote) != rendered:
+            if _rendered(rule) != text:
                 raise ValueError("not as it is rendered")
-            self._remotes[rendered] = remote
-        return self._remotes[rendered]
+            self._rules[text] = rule
+        return self._rules[text]
 
 
 def _lines(section: str) -> list[str]:
