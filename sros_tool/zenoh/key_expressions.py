@@ -18,8 +18,8 @@ from sros_tool.names import has_parts
 ANY_PART, ANY_CHUNKS = "$*", "**"
 _ANY_CHUNK = "*"
 _MANY = 65536
-_SAME_DEPTH = re.compile(r"(?:/\*)*(?:/\$\*::\$\*/\*(?:/\*\*)?)?(?:/@[^*]*(?:/\*\*)?)?")
-"""The wildcards at the end of expressions, by which none includes one with another beginning."""
+_LITERAL = re.compile(r"(?<![^/])[^/*]+(?![^/])")
+"""A chunk without wildcards."""
 _MOST_COMPARED = 100_000
 """Most comparisons to leave out what is not needed: parts of a second."""
 
@@ -84,16 +84,17 @@ class KeyExpressions:
 
     def needed(self) -> list[str]:
         """Return the expressions that no other one includes, sorted; all if they are too alike."""
-        ends = {each[len(_without_wildcards(each)) :] for each in self.all}
-        if len(ends) == 1 and _SAME_DEPTH.fullmatch(ends.pop()):
+        # With the same wildcards at the same places, none includes another.
+        forms = {each: _LITERAL.sub("", each) for each in self.all}
+        if len(set(forms.values())) == 1:
             return sorted(self.all)
         compared = sum(len(self._wider(each)) for each in self.all)
         if compared > _MOST_COMPARED:
             return sorted(self.all)
         return sorted(
             each
-            for each in self.all
-            if not any(wide != each and _includes(wide, each) for wide in self._wider(each))
+            for each, form in forms.items()
+            if not any(form != forms[wide] and _includes(wide, each) for wide in self._wider(each))
         )
 
     def _wider(self, narrow: str) -> list[str]:
