@@ -675,8 +675,8 @@ class ZenohOfKeystore:
         if any(outcome.mode is Mode.PEER for outcome in outcomes):
             text = (
                 "peers decide by their own files, and this is by that of the router, which has the "
-                "same rights if `sros zenoh --check` says so; a question about one enclave also reads "
-                "those of the other end."
+                "same rights if `sros zenoh --check` says so; a question about one enclave also "
+                "reads those of the other end."
             )
             yield Note("explain.zenoh-by-router", text)
 
