@@ -931,18 +931,35 @@ _OPEN_ROWS = (
         "a node of rmw_zenoh needs the whole graph, or it sees nothing",
         "give an identity only to those who may see all names of the robot",
     ),
-    _open(
-        _attempt(
-            "new connections during a flood of useless ones",
-            RowStatus.NOT_LET_IN,
-            "after each failed handshake the router accepts nobody for a moment",
-            hears("listener", _LATE.name),
-            (*_topic_pair(), _attacker("flooder", Role.FLOODER, OWN), _LATE),
-            _CHATTER,
-            evidence="InvalidContentType",
-        ),
-        "anybody who reaches the port keeps others out; open links go on",
-        "let the router listen on localhost, or limit connections with a firewall",
+)
+
+
+def _flooded(name: str, keystore: KeystoreChoice, world: str, removed: str = "") -> Row:
+    """Return a row in which a talker connects while somebody makes useless connections."""
+    late = replace(_LATE, identity=replace(_LATE.identity, keystore=keystore))
+    return _attempt(
+        name,
+        RowStatus.NOT_LET_IN if removed else RowStatus.HEARD,
+        "after each failed handshake the router accepts nobody for a moment"
+        if removed
+        else "the router has room for thousands of handshakes that do not end",
+        hears("listener", late.name),
+        (*_topic_pair(keystore), _attacker("flooder", Role.FLOODER, keystore), late),
+        _CHATTER,
+        world=world,
+        evidence="InvalidContentType" if removed else "",
+        removed=removed,
+    )
+
+
+_FLOOD_ROWS = tries(
+    "new connections during a flood of useless ones",
+    _flooded("new connections during a flood of useless ones", OWN, "flooded"),
+    _flooded(
+        "new connections during a flood, room for few handshakes",
+        zenoh_forger.room_for_few_handshakes,
+        "flooded, few handshakes",
+        "room for many handshakes",
     ),
 )
 
@@ -958,6 +975,7 @@ ATTACKS = _scenario(
     *_WILDCARD_ROWS,
     *_TOKEN_ROWS,
     *_EARLIER_ROWS,
+    *_FLOOD_ROWS,
     *_OPEN_ROWS,
 )
 

@@ -348,6 +348,15 @@ def links_that_outlive_certificates(copy: KeystoreCopy) -> None:
     _edit_all(copy, change)
 
 
+def room_for_few_handshakes(copy: KeystoreCopy) -> None:
+    """Let the router wait for few handshakes at a time, as Zenoh does by itself."""
+
+    def change(document: _Document) -> None:
+        document["transport"].pop("unicast", None)
+
+    _edit_all(copy, change)
+
+
 def in_shared_memory(copy: KeystoreCopy) -> None:
     """Let processes of the host exchange large messages in shared memory."""
 
