@@ -60,7 +60,7 @@ class Letters:
     @classmethod
     def union(cls, sets: Iterable[Letters]) -> Letters:
         """Return the characters that are in at least one of the sets."""
-        return cls._joined(part for some in sets for part in some.ranges)
+        return cls._joined(part for letters in sets for part in letters.ranges)
 
     def __or__(self, other: Letters) -> Letters:
         return self.union((self, other))
@@ -314,9 +314,9 @@ class _Some:
     def accepts(self, name: str) -> bool:
         """Return whether an automaton accepts a name."""
         return any(
-            each.matches(name)
+            automaton.matches(name)
             for length in self._lengths
-            for each in self._by_prefix.get(name[:length], ())
+            for automaton in self._by_prefix.get(name[:length], ())
         )
 
     def meeting(self, own: Automaton) -> Iterator[Automaton]:
@@ -376,8 +376,8 @@ class _Every:
 
     def truth(self, ask: _Ask) -> _Truth:
         result: _Truth = True
-        for each in self.of:
-            inner = each.truth(ask)
+        for part in self.of:
+            inner = part.truth(ask)
             if inner is False:
                 return False
             result = result if inner else None
@@ -392,12 +392,12 @@ class _First:
     last: bool
 
     def parts(self) -> tuple[_Node, ...]:
-        return tuple(each for each, _ in self.of)
+        return tuple(part for part, _ in self.of)
 
     def truth(self, ask: _Ask) -> _Truth:
         possible: set[bool] = set()
-        for each, kept in self.of:
-            inner = each.truth(ask)
+        for part, kept in self.of:
+            inner = part.truth(ask)
             if inner is not False:
                 possible.add(kept)
             if inner or len(possible) > 1:
@@ -420,8 +420,8 @@ class _AtLeast:
     def truth(self, ask: _Ask) -> _Truth:
         sure = 0
         left = len(self.of)
-        for each in self.of:
-            inner = each.truth(ask)
+        for part in self.of:
+            inner = part.truth(ask)
             sure += inner is True
             left -= inner is False
             if sure >= self.count:
@@ -475,16 +475,16 @@ class NameSet:
 
     @classmethod
     def _of(cls, node: _Node) -> NameSet:
-        made = cls()
-        made._node = node
-        return made
+        name_set = cls()
+        name_set._node = node
+        return name_set
 
     @classmethod
     def first(cls, rules: Iterable[tuple[NameSet, bool]], otherwise: bool = False) -> NameSet:
         """Return the names that the first matching rule accepts; ``otherwise`` decides the rest."""
         joined = tuple(
             (cls.union(names for names, _ in same)._node, kept)
-            for kept, same in groupby(rules, key=lambda each: each[1])
+            for kept, same in groupby(rules, key=lambda pair: pair[1])
         )
         return cls._of(_First(joined, otherwise))
 
@@ -503,7 +503,7 @@ class NameSet:
         plain = _Some(frozenset(exact), frozenset(automata))
         if not others:
             return cls._of(plain)
-        return cls._of(_First(tuple((each, True) for each in (plain, *others)), False))
+        return cls._of(_First(tuple((part, True) for part in (plain, *others)), False))
 
     @classmethod
     def at_least(cls, count: int, sets: Iterable[NameSet]) -> NameSet:
@@ -525,9 +525,9 @@ class NameSet:
         return NameSet.union((self, other))
 
     def __and__(self, other: NameSet) -> NameSet:
-        for one, two in ((self, other), (other, self)):
-            if isinstance(one._node, _Some) and not one._node.automata:
-                return NameSet(name for name in one._node.exact if name in two)
+        for name_set, two in ((self, other), (other, self)):
+            if isinstance(name_set._node, _Some) and not name_set._node.automata:
+                return NameSet(name for name in name_set._node.exact if name in two)
         return NameSet._of(_Every((self._node, other._node)))
 
     def __sub__(self, other: NameSet) -> NameSet:
@@ -550,7 +550,7 @@ class NameSet:
 
     def stated(self) -> Iterator[str]:
         """Yield the exact names of this set (not those of wildcards), the shortest first."""
-        exact = {name for each in _leaves(self._node) for name in each.exact}
+        exact = {name for leaf in _leaves(self._node) for name in leaf.exact}
         return (name for name in sorted(exact, key=_length) if name in self)
 
     def example(
@@ -580,7 +580,7 @@ class NameSet:
         if next(self.stated(), None) is not None:
             return False
         limit = limit or SearchLimit()
-        return all(each.shortest(limit, None) is None for each in _searches(self._node, limit))
+        return all(search.shortest(limit, None) is None for search in _searches(self._node, limit))
 
 
 def _between(node: _Node, begin: str, end: str) -> _Node:
@@ -598,12 +598,12 @@ def _between(node: _Node, begin: str, end: str) -> _Node:
         case _Not():
             return _Not(_between(node.of, begin, end))
         case _Every():
-            return _Every(tuple(_between(each, begin, end) for each in node.of))
+            return _Every(tuple(_between(part, begin, end) for part in node.of))
         case _First():
-            of = tuple((_between(each, begin, end), kept) for each, kept in node.of)
+            of = tuple((_between(part, begin, end), kept) for part, kept in node.of)
             return _First(of, node.last)
         case _AtLeast():
-            return _AtLeast(tuple(_between(each, begin, end) for each in node.of), node.count)
+            return _AtLeast(tuple(_between(part, begin, end) for part in node.of), node.count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -622,21 +622,21 @@ def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Sur
         case _Not():
             return None
         case _Every():
-            parts = (_around(each, best) for each in node.of)
+            parts = (_around(part, best) for part in node.of)
             return min(filter(None, parts), key=best, default=None)
         case _First():
-            of = [each for each, kept in node.of if kept]
+            operands = [part for part, kept in node.of if kept]
             if node.last:
                 return None
         case _AtLeast():
-            of = list(node.of)
-    found = [_around(each, best) for each in of]
-    known = [each for each in found if each is not None]
+            operands = list(node.of)
+    found = [_around(operand, best) for operand in operands]
+    known = [surroundings for surroundings in found if surroundings is not None]
     if len(known) < len(found):
         return None
     return Surroundings(
-        frozenset[str]().union(*(each.exact for each in known)),
-        frozenset[Automaton]().union(*(each.automata for each in known)),
+        frozenset[str]().union(*(surroundings.exact for surroundings in known)),
+        frozenset[Automaton]().union(*(surroundings.automata for surroundings in known)),
     )
 
 
@@ -679,24 +679,24 @@ def _reduced(
         return not inner if isinstance(inner, bool) else _Not(inner)
     if isinstance(node, _Every):
         kept: list[_Node] = []
-        for each in node.of:
-            inner = _reduced(each, sure, possible)
+        for part in node.of:
+            inner = _reduced(part, sure, possible)
             if inner is False:
                 return False
             if not isinstance(inner, bool):
                 kept.append(inner)
         return (kept[0] if len(kept) == 1 else _Every(tuple(kept))) if kept else True
     if isinstance(node, _AtLeast):
-        found = [_reduced(each, sure, possible) for each in node.of]
-        count = node.count - found.count(True)
-        open_ones = tuple(each for each in found if not isinstance(each, bool))
+        parts = [_reduced(part, sure, possible) for part in node.of]
+        count = node.count - parts.count(True)
+        open_ones = tuple(part for part in parts if not isinstance(part, bool))
         if count <= 0 or len(open_ones) < count:
             return count <= 0
         return _AtLeast(open_ones, count)
     rules: list[tuple[_Node, bool]] = []
     last = node.last
-    for each, says in node.of:
-        inner = _reduced(each, sure, possible)
+    for part, says in node.of:
+        inner = _reduced(part, sure, possible)
         if inner is True:
             last = says
             break
@@ -729,7 +729,7 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
     everything = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
     around = _around(node, _width)
     for own in sorted(automata if around is None else around.automata, key=_order):
-        met = frozenset(each for leaf in leaves for each in leaf.meeting(own))
+        met = frozenset(automaton for leaf in leaves for automaton in leaf.meeting(own))
         if others := len(met) // _OF_A_STEP:
             limit.spend(others)
         left = _reduced(node, everything | {own}, met)
@@ -759,11 +759,11 @@ def _needed(node: _Node) -> frozenset[Automaton]:
         case _Every():
             return frozenset[Automaton]().union(*map(_needed, node.of))
         case _AtLeast():
-            counts = Counter(need for one in node.of for need in _needed(one))
+            counts = Counter(need for part in node.of for need in _needed(part))
             spare = len(node.of) - node.count
-            return frozenset(each for each, number in counts.items() if number > spare)
+            return frozenset(automaton for automaton, number in counts.items() if number > spare)
         case _First(last=False):
-            return _in_all(_needed(each) for each, says in node.of if says)
+            return _in_all(_needed(part) for part, says in node.of if says)
     return frozenset()
 
 
@@ -775,7 +775,7 @@ def _excepted(node: _Node) -> frozenset[Automaton]:
         case _Every():
             return _in_all(map(_excepted, node.of))
         case _First(last=True):
-            return _in_all(_needed(each) for each, says in node.of if not says)
+            return _in_all(_needed(part) for part, says in node.of if not says)
     return frozenset()
 
 
@@ -953,7 +953,7 @@ def _best(letters: Letters, without: Container[str] = ()) -> str:
         if letter in letters and letter not in without:
             return letter
     # Control characters come last.
-    ranges = sorted(letters.ranges, key=lambda each: (each[1] < ord(" "), each))
+    ranges = sorted(letters.ranges, key=lambda pair: (pair[1] < ord(" "), pair))
     every = (chr(number) for low, high in ranges for number in range(low, high + 1))
     return next((letter for letter in every if letter not in without), "")
 

@@ -151,8 +151,10 @@ def loadable_environment(
     variables = secured_environment(target or root, name, domain)
     if zenoh:
         place = enclave_path(target or root, name)
-        found = _zenoh_environment(place, name, zenoh, variables, environment)
-        return replace(found, notes=()) if target else found  # they are about this process
+        enclave_environment = _zenoh_environment(place, name, zenoh, variables, environment)
+        return (
+            replace(enclave_environment, notes=()) if target else enclave_environment
+        )  # they are about this process
     if (target and not rmw) or RMW_ZENOH in rmw_implementations(environment):
         variables |= REFUSING_ZENOH  # what chooses it later, such as a launch file, starts no node
     if rmw:
@@ -183,15 +185,15 @@ def _check_key_closed(key: Path, root: Path, name: str) -> None:
 def _check_folders_closed(root: Path, folder: Path, name: str) -> None:
     """Raise `KeystoreError` if other users can write to the enclave's folders."""
     trusted = frozenset({0, os.geteuid(), root.stat().st_uid})
-    for each in (folder, *folder.parents):
-        if why := other_writers(each.stat(), trusted):
+    for path in (folder, *folder.parents):
+        if why := other_writers(path.stat(), trusted):
             raise KeystoreError(
                 f"others can replace the files of enclave {name}",
-                f"'{each}': {why}. Whoever replaces them decides whom the process trusts.",
-                f"Run `chmod go-w {quote(str(each))}`, then `sros verify {quote(str(root))}`. To "
+                f"'{path}': {why}. Whoever replaces them decides whom the process trusts.",
+                f"Run `chmod go-w {quote(str(path))}`, then `sros verify {quote(str(root))}`. To "
                 "run it nevertheless, add --accept-readable-key.",
             )
-        if each == root:
+        if path == root:
             return
 
 
@@ -340,14 +342,14 @@ def _opened_zenoh(
     from sros_tool.keystore.layout import PUBLIC
     from sros_tool.keystore.zenoh_files import ZenohFault, open_zenoh
 
-    root, found = keystore.root, open_zenoh(keystore.folder(name), name, state)
-    if not found.problems:
+    root, opened_zenoh = keystore.root, open_zenoh(keystore.folder(name), name, state)
+    if not opened_zenoh.problems:
         _refuse_outdated(keystore, name, now)
-        return found
+        return opened_zenoh
     write = f"`sros zenoh {quote(str(root))}`"
     if not (root / PUBLIC).is_dir():
         write = "`sros zenoh KEYSTORE` where the CA keys are, and export the enclave again"
-    if found.problems[0].fault is ZenohFault.MISSING and not found.files:
+    if opened_zenoh.problems[0].fault is ZenohFault.MISSING and not opened_zenoh.files:
         raise KeystoreError(
             f"enclave {name} has no configuration for rmw_zenoh_cpp",
             "rmw_zenoh_cpp ignores ROS_SECURITY_*: without session.json5 the process would run "
@@ -356,7 +358,7 @@ def _opened_zenoh(
         )
     raise KeystoreError(
         f"a process of rmw_zenoh_cpp cannot run in enclave {name}",
-        "; ".join(map(str, found.problems)) + ".",
+        "; ".join(map(str, opened_zenoh.problems)) + ".",
         f"Write the files again: {write}.",
     )
 

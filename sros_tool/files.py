@@ -151,13 +151,13 @@ def write_new_folder(path: Path, files: Mapping[str, bytes]) -> None:
     Raises:
         OSError: it cannot be made, or something other than an empty folder is there.
     """
-    made = make_folders(path.parent)
+    paths = make_folders(path.parent)
     spare = f".{path.name[:200]}.sros-{secrets.token_hex(4)}"
     try:
-        with new_files(path.parent, {f"{spare}/{each}": files[each] for each in files}) as parent:
+        with new_files(path.parent, {f"{spare}/{file}": files[file] for file in files}) as parent:
             parent.rename(spare, path.name)
     except BaseException:
-        remove_folders(made)
+        remove_folders(paths)
         raise
 
 

@@ -370,17 +370,17 @@ def make_folders(path: Path) -> list[Path]:
     Raises:
         OSError: one of them cannot be made; nothing is left of the others.
     """
-    made: list[Path] = []
+    paths: list[Path] = []
     missing = [each for each in (path, *path.parents) if not each.exists()]
     try:
         for each in reversed(missing):
             with contextlib.suppress(FileExistsError):  # another process created it meanwhile
                 each.mkdir()
-                made.insert(0, each)
+                paths.insert(0, each)
     except BaseException:
-        remove_folders(made)
+        remove_folders(paths)
         raise
-    return made
+    return paths
 
 
 def remove_folders(paths: list[Path]) -> None:

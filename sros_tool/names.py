@@ -240,8 +240,8 @@ def action_part(name: str) -> tuple[str, str]:
 
 ACTION_PARTS: dict[str, tuple[tuple[str, str], ...]] = {
     action: tuple(
-        [(of_services, f"{ACTION_SEPARATOR}{each}") for each in ACTION_SERVICES]
-        + [(of_topics, f"{ACTION_SEPARATOR}{each}") for each in ACTION_TOPICS]
+        [(of_services, f"{ACTION_SEPARATOR}{service}") for service in ACTION_SERVICES]
+        + [(of_topics, f"{ACTION_SEPARATOR}{topic}") for topic in ACTION_TOPICS]
     )
     for action, of_services, of_topics in (
         ("call", "request", "subscribe"),

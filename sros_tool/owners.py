@@ -55,8 +55,8 @@ def file_of_root(path: Path) -> Path | None:
         state = real.lstat()
     except (OSError, RuntimeError, ValueError):  # a loop of links, or a NUL byte
         return None
-    ways = [state, *(each for _, each in _way(real))]
-    ours = stat.S_ISREG(state.st_mode) and not any(other_writers(each, _ROOT) for each in ways)
+    ways = [state, *(status for _, status in _way(real))]
+    ours = stat.S_ISREG(state.st_mode) and not any(other_writers(status, _ROOT) for status in ways)
     return real if ours else None
 
 

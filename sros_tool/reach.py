@@ -218,7 +218,7 @@ class Network:
             met = tuple(other for other in outside if overlap(other, each.topic))
             if each.topic not in met:
                 ends[each.direction].append(_Access(enclave, each.topic, met))
-        self._sides = {direction: _Direction(found) for direction, found in ends.items()}
+        self._sides = {direction: _Direction(accesses) for direction, accesses in ends.items()}
 
     @property
     def enclaves(self) -> tuple[str, ...]:
@@ -294,15 +294,15 @@ def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
     )
 
 
-def _shared(one: _Access, other: _Access) -> str:
+def _shared(access: _Access, other: _Access) -> str:
     """Return a DDS topic that both accesses allow, or ""."""
-    if not overlap(one.topic, other.topic):
+    if not overlap(access.topic, other.topic):
         return ""
-    exact = next((end.topic for end in (one, other) if not is_expression(end.topic)), "")
-    outside = set(one.without + other.without)
+    exact = next((end.topic for end in (access, other) if not is_expression(end.topic)), "")
+    outside = set(access.without + other.without)
     if exact:
         return "" if any(matches(each, exact) for each in outside) else exact
-    return _shared_by_wildcards(*sorted((one.topic, other.topic)), tuple(sorted(outside)))
+    return _shared_by_wildcards(*sorted((access.topic, other.topic)), tuple(sorted(outside)))
 
 
 @lru_cache(maxsize=4096)

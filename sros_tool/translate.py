@@ -175,8 +175,8 @@ def _values(
     """Map each attribute of a rule to the value of the ``protection`` field named by ``term``."""
     chosen = {attribute: getattr(protection, attribute.term) for attribute in attributes(rule)}
     return {
-        each.name: value if each.is_flag else ProtectionKind(value)
-        for each, value in chosen.items()
+        attribute.name: value if attribute.is_flag else ProtectionKind(value)
+        for attribute, value in chosen.items()
     }
 
 
@@ -187,7 +187,7 @@ def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:
     for rule in rules:
         place, among = next(
             (
-                (next(at for at, each in enumerate(ordered) if each is earlier), number)
+                (next(at for at, topic_rule in enumerate(ordered) if topic_rule is earlier), number)
                 for number, earlier in enumerate(wide)
                 if covers(earlier.topic_expression, rule.topic_expression)
                 and not covers(rule.topic_expression, earlier.topic_expression)
@@ -215,21 +215,24 @@ def protection_for(governance: Governance) -> DomainProtection | None:
     if last is None or last.topic_expression != "*":
         return None
     by_protection: dict[TopicProtection, list[str]] = {}
-    for each in narrow:
-        if each is not None:
-            values = TopicProtection(**_terms(each))
-            by_protection.setdefault(values, []).append(each.topic_expression)
+    for topic_rule in narrow:
+        if topic_rule is not None:
+            values = TopicProtection(**_terms(topic_rule))
+            by_protection.setdefault(values, []).append(topic_rule.topic_expression)
     named = []
     for values, expressions in by_protection.items():
         both = (Criteria(tuple(expressions)),)
-        found = ros_rights(Rule(True, rule.domains, both, both))
-        if any(each.kind == "dds" for each in found):
+        rights = ros_rights(Rule(True, rule.domains, both, both))
+        if any(right.kind == "dds" for right in rights):
             return None
-        places = dict.fromkeys((each.kind, each.name) for each in found)
+        places = dict.fromkeys((right.kind, right.name) for right in rights)
         named += [NamedProtection(kind, name, values) for kind, name in places]
-    order = [each.topic_expression for each in narrow if each is not None]
+    order = [topic_rule.topic_expression for topic_rule in narrow if topic_rule is not None]
     named.sort(
-        key=lambda each: min(order.index(one) for one in protected_topics(each.kind, each.name))
+        key=lambda named_protection: min(
+            order.index(topic)
+            for topic in protected_topics(named_protection.kind, named_protection.name)
+        )
     )
     protection = DomainProtection(
         **_terms(rule), default=TopicProtection(**_terms(last)), named=tuple(named)
@@ -244,7 +247,8 @@ def _terms(rule: DomainRule | TopicRule) -> dict[str, Any]:
 
     chosen = {attribute: getattr(rule, attribute.name) for attribute in attributes(type(rule))}
     return {
-        each.term: value if each.is_flag else Level(str(value)) for each, value in chosen.items()
+        attribute.term: value if attribute.is_flag else Level(str(value))
+        for attribute, value in chosen.items()
     }
 
 
@@ -310,8 +314,8 @@ def allows_everything(grant: Grant) -> bool:
     wide = [
         {topic for criteria in criterias for topic in criteria.topics} & _EVERY_TOPIC
         for criterias in (
-            [each for rule in allowed for each in rule.publish],
-            [each for rule in allowed for each in rule.subscribe],
+            [criteria for rule in allowed for criteria in rule.publish],
+            [criteria for rule in allowed for criteria in rule.subscribe],
         )
     ]
     return all(wide) or (grant.default_allow and not any(not rule.allow for rule in grant.rules))
@@ -324,10 +328,10 @@ def grant_rights(enclave: str, grant: Grant) -> frozenset[Right]:
     ignored.
     """
     return frozenset(
-        Right(enclave, each.qualifier, each.right, each.name)
+        Right(enclave, right.qualifier, right.right, right.name)
         for rule in grant.rules
-        for each in ros_rights(rule)
-        if each.name != ROS_DISCOVERY_TOPIC
+        for right in ros_rights(rule)
+        if right.name != ROS_DISCOVERY_TOPIC
     )
 
 

@@ -285,12 +285,12 @@ def _enclave(
         effect = "" if enforced else f"; nodes RUN UNSECURED, as {STRATEGY} is not 'Enforce'"
         yield ENCLAVE_NOT_FOUND.found(ENCLAVE, f"'{root}' has no enclave {name}{hint}{effect}")
         return
-    found = keystore_findings(Keystore(root), now=now, zone=zone, domain=domain, only=(name,))
-    for each in found:
-        if each.id == "enclave.governance-domain":
-            yield DOMAIN_NOT_GOVERNED.found(DOMAIN, each.text, each.file)
+    findings = keystore_findings(Keystore(root), now=now, zone=zone, domain=domain, only=(name,))
+    for finding in findings:
+        if finding.id == "enclave.governance-domain":
+            yield DOMAIN_NOT_GOVERNED.found(DOMAIN, finding.text, finding.file)
         else:
-            yield each
+            yield finding
 
 
 def _governed_domains(root: Path) -> DomainSet | None:
@@ -483,7 +483,7 @@ def _certificates(document: ConfigurationDocument, variable: str) -> Iterator[Fi
     missing: list[str] = []
     for side, needed in _NEEDED.items():
         endpoints = document.listen if side == "listen" else document.connect
-        if any(each.is_encrypted() for each in endpoints):
+        if any(endpoint.is_encrypted() for endpoint in endpoints):
             wanted = needed if side == "listen" or document.tls.mutual else ()
             missing += [
                 each

@@ -34,7 +34,7 @@ def _cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
     first = findings[0]
     assert first.cause, "findings that are shown together have a cause"
     word, place = first.severity.word, first.cause.place or first.place
-    ids = code(", ".join(dict.fromkeys(each.id for each in findings)))
+    ids = code(", ".join(dict.fromkeys(finding.id for finding in findings)))
     yield f"{_SIGNS[word]} **{word}** {code(place)} {plain(first.cause.title)} ({ids})"
     yield code(first.cause.text)
     yield code(first.cause.remedy)
@@ -47,7 +47,7 @@ def _lines(finding: Finding) -> Iterator[str]:
     subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
     by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
     yield code(f"{subject}{finding.text}{by}")
-    yield from (code(f"{each}: {each.text}") for each in finding.related)
+    yield from (code(f"{place}: {place.text}") for place in finding.related)
     yield code(finding.remedy)
 
 
@@ -75,7 +75,7 @@ def sarif(
         "tool": {"driver": driver},
         "columnKind": "unicodeCodePoints",
         "originalUriBaseIds": {_BASE: {"uri": f"{base.absolute().as_uri()}/"}},
-        "results": [_result(each, rules[each.id], base) for each in findings],
+        "results": [_result(finding, rules[finding.id], base) for finding in findings],
     }
     return {"$schema": _SCHEMA, "version": _VERSION, "runs": [run]}
 
@@ -104,10 +104,10 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
         result["relatedLocations"] = [
             {
                 "id": number,
-                **_location(each.file, each.line, base),
-                "message": {"text": _plain(each.text)},
+                **_location(place.file, place.line, base),
+                "message": {"text": _plain(place.text)},
             }
-            for number, each in enumerate(finding.related)
+            for number, place in enumerate(finding.related)
         ]
     if finding.accepted:
         result["suppressions"] = [

@@ -51,7 +51,7 @@ class Severity(StrEnum):
         return self.weight >= Severity(other).weight
 
 
-_WEIGHTS = {each: weight for weight, each in enumerate(Severity)}
+_WEIGHTS = {severity: weight for weight, severity in enumerate(Severity)}
 NOTE, WARNING, ERROR = Severity.NOTE, Severity.WARNING, Severity.ERROR
 
 
@@ -190,14 +190,14 @@ class Finding(NamedTuple):
 def by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
     """Yield groups of findings in order: a cause with all its findings, any other finding alone."""
     groups: dict[Cause, list[Finding]] = {}
-    for each in findings:
-        if each.cause:
-            groups.setdefault(each.cause, []).append(each)
+    for finding in findings:
+        if finding.cause:
+            groups.setdefault(finding.cause, []).append(finding)
     done: set[Cause] = set()
-    for each in findings:
-        cause = each.cause
+    for finding in findings:
+        cause = finding.cause
         if not cause or len(groups[cause]) != cause.number:
-            yield (each,)
+            yield (finding,)
         elif cause not in done:
             done.add(cause)
             yield tuple(groups[cause])

@@ -229,25 +229,28 @@ _ASKING_SIDE = {offering: asking for asking, offering in _OTHER_SIDE.items()}
 
 def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about single names."""
-    for each in checked.statements:
-        if reason := _never(each.name):
-            yield each.found(NEVER_MATCHES, f"{each.name} matches nothing: {reason}")
-        if _DDS_PREFIX.match(each.written):
-            yield each.found(DDS_NAME, f"{each.written} means the ROS name {each.name}")
-        if kind := _belongs(each):
-            yield each.found(
-                WRONG_KIND, f"{each.name} is one of the {kind}, not of the {each.right.kind}"
+    for statement in checked.statements:
+        if reason := _never(statement.name):
+            yield statement.found(NEVER_MATCHES, f"{statement.name} matches nothing: {reason}")
+        if _DDS_PREFIX.match(statement.written):
+            yield statement.found(
+                DDS_NAME, f"{statement.written} means the ROS name {statement.name}"
             )
-        if each.allows:
-            yield from _breadth(each)
+        if kind := _belongs(statement):
+            yield statement.found(
+                WRONG_KIND,
+                f"{statement.name} is one of the {kind}, not of the {statement.right.kind}",
+            )
+        if statement.allows:
+            yield from _breadth(statement)
 
 
 def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about subscribed or called names that no enclave may publish or serve."""
     names: dict[str, set[str]] = {right: set() for pair in RIGHTS.values() for right in pair}
-    for each in checked.statements:
-        if each.allows:
-            names[each.right.right].add(each.name)
+    for statement in checked.statements:
+        if statement.allows:
+            names[statement.right.right].add(statement.name)
     sides = {right: Names(sorted(found)) for right, found in names.items()}
 
     def is_alone(each: _Statement, other: str) -> bool:
@@ -258,30 +261,31 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
         return not sides[other].meets(name) and not action_part(name)[1]
 
     alone = [
-        each
-        for each in checked.statements
-        if (other := _ASKING_SIDE.get(each.right.right)) and is_alone(each, other)
+        statement
+        for statement in checked.statements
+        if (other := _ASKING_SIDE.get(statement.right.right)) and is_alone(statement, other)
     ]
     offered: dict[str, list[_Statement]] = defaultdict(list)
-    for each in alone:
-        if not _is_of_a_node(each.name):
-            offered[each.name].append(each)
+    for statement in alone:
+        if not _is_of_a_node(statement.name):
+            offered[statement.name].append(statement)
     near = NearNames(offered)
-    for each in checked.statements:
-        other = _OTHER_SIDE.get(each.right.right)
-        if not other or not is_alone(each, other):
+    for statement in checked.statements:
+        other = _OTHER_SIDE.get(statement.right.right)
+        if not other or not is_alone(statement, other):
             continue
-        same = [each.name] if each.name in offered else []
-        meant = [
+        same = [statement.name] if statement.name in offered else []
+        statements = [
             one
-            for name in (*same, *near.near(each.name))
+            for name in (*same, *near.near(statement.name))
             for one in offered[name]
-            if one.profile is not each.profile  # a node has, say, a topic and a service of one name
+            if one.profile
+            is not statement.profile  # a node has, say, a topic and a service of one name
         ]
-        if meant:
-            yield _misspelt(each, other, meant)
+        if statements:
+            yield _misspelt(statement, other, statements)
         else:
-            yield each.found(NO_COUNTERPART, f"no enclave may {other} {each.name}")
+            yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}")
 
 
 def _is_of_a_node(name: str) -> bool:
@@ -289,13 +293,17 @@ def _is_of_a_node(name: str) -> bool:
     return name.rpartition("/")[2] in NODE_SERVICES
 
 
-def _misspelt(each: _Statement, other: str, meant: Sequence[_Statement]) -> Finding:
+def _misspelt(each: _Statement, other: str, statements: Sequence[_Statement]) -> Finding:
     """Return the finding that a statement has no counterpart, with similar names as suggestions."""
-    shown = " or ".join(f"{one.name} ({one.right.right})" for one in meant[:_NAMES_SHOWN])
+    shown = " or ".join(
+        f"{statement.name} ({statement.right.right})" for statement in statements[:_NAMES_SHOWN]
+    )
     text = f"no enclave may {other} {each.name}; perhaps you mean {shown}, which nobody uses"
     places = tuple(
-        RelatedPlace(f"{one.right.enclave} may {one.right.describe()}", *_place(one.source))
-        for one in meant[:_NAMES_SHOWN]
+        RelatedPlace(
+            f"{statement.right.enclave} may {statement.right.describe()}", *_place(statement.source)
+        )
+        for statement in statements[:_NAMES_SHOWN]
     )
     return each.found(MISSPELT, text)._replace(related=places)
 
@@ -306,8 +314,13 @@ def _place(source: Source) -> tuple[str, int | None]:
 
 def _check_protection(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about names with contradicting protect= values."""
-    for one, other in islice(contradictions(stated_protections(checked.policy.enclaves)), _MANY):
-        text = f"{other} has protect={other.word}, and {one} has protect={one.word} at {one.source}"
+    for protection, other in islice(
+        contradictions(stated_protections(checked.policy.enclaves)), _MANY
+    ):
+        text = (
+            f"{other} has protect={other.word}, "
+            f"and {protection} has protect={protection.word} at {protection.source}"
+        )
         place = other.source
         yield CONTRADICTING_PROTECTION.found(other.enclave, text, place.file, place.line)
 
@@ -442,23 +455,29 @@ def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
     Names").
     """
     lacking = [
-        each
+        gap
         for enclave in checked.policy.enclaves
         for profile in enclave.all_profiles()
         if profile.node and profile.ns.startswith("/") and not profile.node.startswith("_")
-        for each in _basics(checked, enclave, profile)
+        for gap in _basics(checked, enclave, profile)
     ]
     by_file: dict[str, list[_Lacking]] = defaultdict(list)
-    for each in lacking:
-        if each.has_include:
-            by_file[each.finding.file].append(each)
-    causes = {file: _no_common_part(found) for file, found in by_file.items() if len(found) > 1}
-    for one in lacking:
-        yield one.finding._replace(cause=causes.get(one.finding.file) if one.has_include else None)
-    for said in checked.statements:
-        if said.written in _GLOBAL and said.profile.ns != "/" and said.right.kind == "topics":
-            text = f"{said.written} becomes {said.name} in namespace {said.profile.ns}"
-            yield said.found(RELATIVE_GLOBAL, text, f"Write /{said.written}.")
+    for gap in lacking:
+        if gap.has_include:
+            by_file[gap.finding.file].append(gap)
+    causes = {file: _no_common_part(gaps) for file, gaps in by_file.items() if len(gaps) > 1}
+    for gap in lacking:
+        yield gap.finding._replace(cause=causes.get(gap.finding.file) if gap.has_include else None)
+    for statement in checked.statements:
+        if (
+            statement.written in _GLOBAL
+            and statement.profile.ns != "/"
+            and statement.right.kind == "topics"
+        ):
+            text = (
+                f"{statement.written} becomes {statement.name} in namespace {statement.profile.ns}"
+            )
+            yield statement.found(RELATIVE_GLOBAL, text, f"Write /{statement.written}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -478,9 +497,9 @@ class _Lacking:
 def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
     """Return the common cause of findings in one file: ``common/node.xml`` is not included."""
     file = Path(lacking[0].finding.file)
-    nodes = list(dict.fromkeys(each.node for each in lacking))
-    lines = list(dict.fromkeys(each.finding.line or 0 for each in lacking))
-    counted = Counter(each.finding.kind for each in lacking)
+    nodes = list(dict.fromkeys(gap.node for gap in lacking))
+    lines = list(dict.fromkeys(gap.finding.line or 0 for gap in lacking))
+    counted = Counter(gap.finding.kind for gap in lacking)
     plural = len(nodes) > 1
     what = [
         verb if counted[kind] == len(nodes) else f"{verb} ({_nodes(counted[kind])})"
@@ -491,7 +510,7 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
     target = quote(str(file.parent / COMMON))
     first = "Put" if copied else f"Run `sros policies --copy {target}`, and put"
     place = "the <profile> of every node" if plural else "its <profile>"
-    at = f"line{'s' * (len(lines) > 1)} {some_names([str(each) for each in lines])}"
+    at = f"line{'s' * (len(lines) > 1)} {some_names([str(line) for line in lines])}"
     return Cause(
         f"{_nodes(len(nodes))} lack the common part" if plural else "a node lacks the common part",
         f"{some_names(nodes)} may not {'; '.join(what)}. A node does all this when it starts, and "
@@ -588,7 +607,7 @@ SEVERAL_PROFILES = FindingKind(
     "Put all <profile> of an enclave into one <profiles>.",
 )
 
-_OUTSIDE = {each.id: each for each in (DOCUMENT_SIZE, LONG_NAME, DENY_BLOCKS, CHARACTER_SET)}
+_OUTSIDE = {kind.id: kind for kind in (DOCUMENT_SIZE, LONG_NAME, DENY_BLOCKS, CHARACTER_SET)}
 _MEASURED_FROM_BYTES = MAX_SIGNED_BYTES // 2
 _ANY_TIME = Window(datetime(2026, 1, 1, tzinfo=UTC), datetime(2027, 1, 1, tzinfo=UTC))
 _DOMAINS = DomainSet.of((0, 0))
@@ -611,7 +630,7 @@ def _check_root_enclave(checked: _CheckedPolicy) -> Iterator[Finding]:
     root = checked.policy.enclave("/")
     if root is None:
         return
-    nodes = {expand("~", each.ns, each.node) for each in root.all_profiles()}
+    nodes = {expand("~", profile.ns, profile.node) for profile in root.all_profiles()}
     also = within_root(policy_rights(checked.policy))
     if text := also or (f"/ has the rights of {len(nodes)} nodes" if len(nodes) > 1 else ""):
         yield ROOT_ENCLAVE.found("/", text, root.source.file, root.source.line)
@@ -622,16 +641,16 @@ def within_root(rights: Collection[Right]) -> str:
 
     Rights that every node needs do not count.
     """
-    allowed = [each for each in rights if each.qualifier is ALLOW]
-    root, basics = Rules(each for each in rights if each.enclave == "/"), _basic_rights()
+    allowed = [right for right in rights if right.qualifier is ALLOW]
+    root, basics = Rules(right for right in rights if right.enclave == "/"), _basic_rights()
     own: dict[str, list[Right]] = defaultdict(list)
-    for each in allowed:
-        if each.enclave != "/" and not basics.cover(each._replace(enclave="/")):
-            own[each.enclave].append(each)
+    for right in allowed:
+        if right.enclave != "/" and not basics.cover(right._replace(enclave="/")):
+            own[right.enclave].append(right)
     names = sorted(
         name
         for name, found in own.items()
-        if all(root.allow("/", each.right, each.name) for each in found)
+        if all(root.allow("/", right.right, right.name) for right in found)
     )
     return f"/ has all rights of {first_few(names, _NAMES_SHOWN)}" if names else ""
 
@@ -639,7 +658,7 @@ def within_root(rights: Collection[Right]) -> str:
 def only_basic(rights: Collection[Right]) -> bool:
     """Return whether all rights of an enclave are rights that every node needs."""
     basics = _basic_rights()
-    return all(basics.cover(each._replace(enclave="/")) for each in rights)
+    return all(basics.cover(right._replace(enclave="/")) for right in rights)
 
 
 @cache
@@ -662,12 +681,12 @@ def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
             domains=_DOMAINS,
         )
         size = _signed_bytes(enclave)
-        for found in outside_findings(permissions, size, enclave.path, source.file, source.line):
-            yield _at_denial(found, checked) if found.kind is DENY_BLOCKS else found
+        for finding in outside_findings(permissions, size, enclave.path, source.file, source.line):
+            yield _at_denial(finding, checked) if finding.kind is DENY_BLOCKS else finding
         if len(enclave.profiles) > 1:
             text = f"it has {len(enclave.profiles)} <profiles>"
             yield SEVERAL_PROFILES.found(enclave.path, text, source.file, source.line)
-    if pairs := mistaken_names(each.path for each in checked.policy.enclaves):
+    if pairs := mistaken_names(enclave.path for enclave in checked.policy.enclaves):
         text = f"Cyclone DDS mistakes {some_pairs(pairs)}"
         first = checked.policy.enclave(pairs[0][0])
         line = first.source.line if first else None
@@ -749,11 +768,11 @@ HALF_ACTION = FindingKind(
 
 def _check_rules(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about contradicting, unused and repeated statements of an enclave."""
-    for each in checked.statements:
-        if each.allows:
-            yield from _permission(each, checked.rules)
-        elif not checked.rules.meet(each.right._replace(qualifier=ALLOW)):
-            yield each.found(NO_EFFECT, f"no rule allows to {each.right.describe()}")
+    for statement in checked.statements:
+        if statement.allows:
+            yield from _permission(statement, checked.rules)
+        elif not checked.rules.meet(statement.right._replace(qualifier=ALLOW)):
+            yield statement.found(NO_EFFECT, f"no rule allows to {statement.right.describe()}")
     yield from _redundant(checked)
 
 
@@ -778,18 +797,20 @@ def _permission(each: _Statement, rules: Rules) -> Iterator[Finding]:
 
 def _redundant(checked: _CheckedPolicy) -> Iterator[Finding]:
     wild: dict[tuple[int, str], list[str]] = defaultdict(list)
-    for each in checked.statements:
-        if each.allows and is_expression(each.name):
-            wild[id(each.profile), each.right.right].append(each.name)
+    for statement in checked.statements:
+        if statement.allows and is_expression(statement.name):
+            wild[id(statement.profile), statement.right.right].append(statement.name)
     limit = ComparisonLimit()
     names = {place: Names(found, limit) for place, found in wild.items()}
-    for each in checked.statements:
+    for statement in checked.statements:
         # Included rights are the same for all nodes, so a redundant one is not a mistake.
-        if not each.allows or each.source.file != each.profile.source.file:
+        if not statement.allows or statement.source.file != statement.profile.source.file:
             continue
-        there = names.get((id(each.profile), each.right.right))
-        if there and (wide := next(there.covering(each.name), "")):
-            yield each.found(REDUNDANT_RULE, f"{each.right.describe()} is covered by {wide}")
+        there = names.get((id(statement.profile), statement.right.right))
+        if there and (wide := next(there.covering(statement.name), "")):
+            yield statement.found(
+                REDUNDANT_RULE, f"{statement.right.describe()} is covered by {wide}"
+            )
 
 
 MALFORMED = FindingKind(
@@ -928,19 +949,19 @@ class _IncludeGraph:
         for parent in self._includer.load(self._file).iter():
             includes = list(parent.iterchildren(*_INCLUDES))
             if len(includes) <= _MANY:
-                found = ((each, self._target(self._file, each)) for each in includes)
-                yield [(each, file) for each, file in found if file]
+                found = ((element, self._target(self._file, element)) for element in includes)
+                yield [(element, file) for element, file in found if file]
 
     def reached(self, file: Path) -> frozenset[Path]:
         """Return the files that a file includes, directly or through other files."""
         if file not in self._reached:
-            found: set[Path] = set()
+            paths: set[Path] = set()
             waiting = [file]
-            while waiting and len(found) < _MANY:
-                new = self._included(waiting.pop()) - found
-                found |= new
+            while waiting and len(paths) < _MANY:
+                new = self._included(waiting.pop()) - paths
+                paths |= new
                 waiting += new
-            self._reached[file] = frozenset(found - {file})
+            self._reached[file] = frozenset(paths - {file})
         return self._reached[file]
 
     def _included(self, file: Path) -> frozenset[Path]:
@@ -949,8 +970,8 @@ class _IncludeGraph:
                 includes = list(self._includer.load(file).iter(*_INCLUDES))
             except DocumentError:
                 includes = []  # it stands in a fallback that was not needed, or does not exist
-            targets = (self._target(file, each) for each in includes)
-            self._direct[file] = frozenset(each for each in targets if each)
+            targets = (self._target(file, element) for element in includes)
+            self._direct[file] = frozenset(target for target in targets if target)
         return self._direct[file]
 
     def _target(self, file: Path, element: etree._Element) -> Path | None:
@@ -1042,13 +1063,15 @@ def signed_findings(
         enclaves: the enclaves whose permissions are to be signed; others are not checked.
         distribution: the ROS 2 distribution of the nodes; "" is the latest.
     """
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for each in policies:
         policy = each.for_one_robot() if isinstance(each, FleetPolicy) else each
-        chosen = [one for one in policy.enclaves if one.path in enclaves][:_MOST_ENCLAVES]
-        found += findings_in(replace(policy, enclaves=tuple(chosen)), distribution)
-    shown = [each for each in found if each.severity >= WARNING]
-    shown.sort(key=lambda each: -each.severity.weight)
+        chosen = [enclave for enclave in policy.enclaves if enclave.path in enclaves][
+            :_MOST_ENCLAVES
+        ]
+        findings += findings_in(replace(policy, enclaves=tuple(chosen)), distribution)
+    shown = [finding for finding in findings if finding.severity >= WARNING]
+    shown.sort(key=lambda finding: -finding.severity.weight)
     return list(by_cause(list(dict.fromkeys(shown))))
 
 

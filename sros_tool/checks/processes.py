@@ -156,7 +156,9 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
     elif newer:
         text = f"it started at {iso(process.started)}; {', '.join(newer)} of {name} changed later"
         yield PROCESS_OUTDATED.found(process.label, text)
-    ends = {what: each.not_after for what, each in loaded.windows.items() if each.not_after < now}
+    ends = {
+        what: window.not_after for what, window in loaded.windows.items() if window.not_after < now
+    }
     if ends:
         expired = ", ".join(f"{what} at {iso(end)}" for what, end in ends.items())
         remedy = _NEW_AUTHORITY if ends.keys() & set(_AUTHORITIES.values()) else ""
@@ -168,14 +170,14 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
 
 
 def _required(enclave: ProcessEnclave) -> Sequence[str]:
-    return [each.name for each in enclave.files if each.name not in (CRL_FILE, KEY_URI_FILE)]
+    return [file.name for file in enclave.files if file.name not in (CRL_FILE, KEY_URI_FILE)]
 
 
 def _newer(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
     """Yield the names of the files that changed, or were removed, since a process started."""
     files = enclave.files
     if process.is_zenoh:
-        files = tuple(each for each in files if each.name in _LOADED_BY_ZENOH)
+        files = tuple(file for file in files if file.name in _LOADED_BY_ZENOH)
         files += (process.configuration,) if process.configuration else ()
     newer = [e.name for e in files if e.changed and e.changed > process.started]
     gone = [each for each in enclave.lacking if any(each == file.name for file in files)]
@@ -187,7 +189,7 @@ def _newer(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
 
 
 def _unread_files(process: Process, enclave: ProcessEnclave) -> Iterator[Finding]:
-    unread = [f"{each.name} ({each.problem})" for each in enclave.files if each.problem]
+    unread = [f"{file.name} ({file.problem})" for file in enclave.files if file.problem]
     if unread:
         text = f"its files cannot be looked at: {', '.join(unread)}"
         yield PROCESS_NOT_SEEN.found(process.label, text)
@@ -215,7 +217,7 @@ def _loaded(enclave: ProcessEnclave, newer: Sequence[str], started: datetime) ->
     changed = {each.split()[0] for each in newer}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)
     entries, unknown = _entries(enclave)
-    before = [each for each in entries if each.time <= iso(started)]
+    before = [entry for entry in entries if entry.time <= iso(started)]
     serial = 0
     if certificate and CERTIFICATE_FILE not in changed:
         serial = certificate.serial_number
@@ -230,12 +232,12 @@ def _loaded(enclave: ProcessEnclave, newer: Sequence[str], started: datetime) ->
             windows |= {"its permissions": grant.validity} if grant else {}
     elif recorded := _last(before, "permissions"):
         windows |= _recorded_window("its permissions", recorded)
-    for file, what in _AUTHORITIES.items():
-        found = () if file in changed else _certificates_in(enclave, file)
-        issuers = [e for e in found if certificate and e.subject == certificate.issuer]
-        valid = [validity_of(each) for each in issuers or found]
+    for file, authority in _AUTHORITIES.items():
+        certificates = () if file in changed else _certificates_in(enclave, file)
+        issuers = [e for e in certificates if certificate and e.subject == certificate.issuer]
+        valid = [validity_of(issuer) for issuer in issuers or certificates]
         if valid:
-            windows[what] = max(valid, key=lambda window: window.not_after)
+            windows[authority] = max(valid, key=lambda window: window.not_after)
     return _Loaded(windows, grant, _revoked(enclave, entries, serial), unknown)
 
 
@@ -246,7 +248,7 @@ _AUTHORITIES = {
 
 
 def _last(entries: Sequence[Entry], what: str) -> Entry | None:
-    return next((each for each in reversed(entries) if each.what == what), None)
+    return next((entry for entry in reversed(entries) if entry.what == what), None)
 
 
 def _recorded_window(what: str, entry: Entry) -> Mapping[str, Window]:
@@ -260,18 +262,18 @@ def _revoked(enclave: ProcessEnclave, entries: Sequence[Entry], serial: int) -> 
 
     The ledger and the enclave's revocation list are searched for the serial number.
     """
-    for each in entries:
-        if each.what == "revocation" and each.serial and int(each.serial, 16) == serial:
-            return f"revoked at {_plain_path(each.time)} ({plain(each.reason)})"
+    for entry in entries:
+        if entry.what == "revocation" and entry.serial and int(entry.serial, 16) == serial:
+            return f"revoked at {_plain_path(entry.time)} ({plain(entry.reason)})"
     if not serial and entries:
-        last = [each for each in entries if each.what in ("certificate", "revocation")][-1:]
+        last = [entry for entry in entries if entry.what in ("certificate", "revocation")][-1:]
         if last and last[0].what == "revocation" and last[0].reason != SUPERSEDED:
             return f"revoked at {_plain_path(last[0].time)} ({plain(last[0].reason)})"
     with suppress(SrosError):
         data = enclave.file(CRL_FILE).data
-        for entry in load_crl(data, CRL_FILE).revoked if data else ():
-            if serial and entry.serial == serial:
-                return f"revoked at {iso(entry.date)} ({entry.reason})"
+        for revoked in load_crl(data, CRL_FILE).revoked if data else ():
+            if serial and revoked.serial == serial:
+                return f"revoked at {iso(revoked.date)} ({revoked.reason})"
     return ""
 
 
@@ -290,17 +292,17 @@ def _entries(enclave: ProcessEnclave) -> tuple[Sequence[Entry], str]:
         entries = Keystore(enclave.here).ledger_with("enclave", enclave.name).entries
     except SrosError as error:
         return (), f"the ledger of its keystore cannot be read: {error.what}"
-    return [each for each in entries if each.enclave == enclave.name], ""
+    return [entry for entry in entries if entry.enclave == enclave.name], ""
 
 
 def _certificates_in(enclave: ProcessEnclave, file: str) -> tuple[x509.Certificate, ...]:
     """Return the certificates in a file; none if the file is missing or unreadable."""
     data = enclave.file(file).data
     with suppress(SrosError):
-        found = load_certificates(data, file) if data else ()
-        for each in found:
-            validity_of(each)  # an error for dates that no DDS accepts
-        return found
+        certificates = load_certificates(data, file) if data else ()
+        for certificate in certificates:
+            validity_of(certificate)  # an error for dates that no DDS accepts
+        return certificates
     return ()
 
 
@@ -361,7 +363,7 @@ def _unsecured_because(process: Process) -> str:
         return ""
     if enclave is None:
         return f"{KEYSTORE} is not set"
-    moments = [each for each in enclave.moved.values() if each > process.started]
+    moments = [moment for moment in enclave.moved.values() if moment > process.started]
     if enclave.is_there and not enclave.lacking:
         return ""
     if moments:  # its files may have been there
@@ -532,10 +534,10 @@ def process_findings(
     """
     is_secured_here = environment.get(ENABLE) == "true"
     here = ("", environment.get(DOMAIN) or "0")
-    nodes = [each for each in running.processes if not each.is_daemon]
-    security = {each.pid: _security_of(each) for each in nodes}
-    secured = [each for each in nodes if security[each.pid] is Security.SECURED]
-    closed = {_place(each) for each in nodes if each.asks_for_security}
+    nodes = [process for process in running.processes if not process.is_daemon]
+    security = {node.pid: _security_of(node) for node in nodes}
+    secured = [node for node in nodes if security[node.pid] is Security.SECURED]
+    closed = {_place(node) for node in nodes if node.asks_for_security}
     closed |= {here} if is_secured_here else set()
     open_nodes: list[Process] = []
     for process in running.processes:
@@ -667,13 +669,13 @@ def _not_secured(
     """Yield findings about running open nodes; a single finding if no security is requested."""
     asks = environment.get(ENABLE) not in (None, "", "false") or set_without_enable(environment)
     if asks or not _is_open(environment):
-        for each in nodes:
-            if not each.network:  # the others are named as such, with their security
-                yield NODE_OPEN.found(each.label, f"it runs {_where(each)}")
+        for node in nodes:
+            if not node.network:  # the others are named as such, with their security
+                yield NODE_OPEN.found(node.label, f"it runs {_where(node)}")
         return
     if one_by_one:
-        for each in nodes:
-            yield NOT_SECURED.found(each.label, f"it runs open {_where(each)}")
+        for node in nodes:
+            yield NOT_SECURED.found(node.label, f"it runs open {_where(node)}")
         return
     running = f"; running without it: {_some(nodes)}" if nodes else ""
     yield NOT_SECURED.found(ENABLE, value_text(environment, ENABLE) + running)
@@ -688,8 +690,8 @@ def _some(nodes: Sequence[Process]) -> str:
 
 def _by_place(processes: Iterable[Process]) -> Mapping[tuple[str, str], list[Process]]:
     found: dict[tuple[str, str], list[Process]] = defaultdict(list)
-    for each in processes:
-        found[_place(each)].append(each)
+    for process in processes:
+        found[_place(process)].append(process)
     return found
 
 
@@ -706,8 +708,8 @@ def _mixed_vendors(
         places.setdefault(here, [])
     for place, processes in places.items():
         rmws: dict[str, list[str]] = {}
-        for each in processes:
-            rmws.setdefault(plain(each.rmw), []).append(each.label)
+        for process in processes:
+            rmws.setdefault(plain(process.rmw), []).append(process.label)
         if environment is not None and place == here:
             named = environment.get(RMW) or DEFAULT_RMW
             rmws.setdefault(named, []).append("this environment")
@@ -727,17 +729,17 @@ def _other_keystores(
     here = ("", environment.get(DOMAIN) or "0") if environment is not None else None
     own = _authorities_here(environment) if environment is not None else frozenset()
     for place, processes in _by_place(secured).items():
-        groups = _by_authorities(each for each in processes if not each.is_zenoh)
+        groups = _by_authorities(process for process in processes if not process.is_zenoh)
         if own and place == here:
             main = f"this environment has '{plain((environment or {})[KEYSTORE], _LONGEST_PATH)}'"
             others = [group for keys, group in groups if not keys & own]
         else:
             if len(groups) < 2:
                 continue
-            (_, largest), *more = sorted(groups, key=lambda each: -len(each[1]))
+            (_, largest), *more = sorted(groups, key=lambda pair: -len(pair[1]))
             main = f"{largest[0].label} {_where(largest[0])} has '{_keystore(largest[0])}'"
             others = [group for _, group in more]
-        for process in (each for group in others for each in group):
+        for process in (process for group in others for process in group):
             text = f"it has keystore '{_keystore(process)}', and {main}"
             yield PROCESS_OTHER_KEYSTORE.found(process.label, text)
 
@@ -757,7 +759,7 @@ def _by_authorities(processes: Iterable[Process]) -> list[tuple[_Keys, list[Proc
         keys = _keys(_certificates_in(process.enclave, IDENTITY_CA_FILE) if process.enclave else ())
         if keys:
             together = [process]
-            for of, group in [each for each in groups if each[0] & keys]:
+            for of, group in [group for group in groups if group[0] & keys]:
                 groups.remove((of, group))
                 keys, together = keys | of, [*group, *together]
             groups.append((keys, together))
@@ -777,9 +779,9 @@ def _authorities_here(environment: Mapping[str, str]) -> _Keys:
 
 def _keys(certificates: Iterable[x509.Certificate]) -> _Keys:
     found = set()
-    for each in certificates:
+    for certificate in certificates:
         with suppress(ValueError, UnsupportedAlgorithm):
-            found.add(each.public_key().public_bytes(*_FORM))
+            found.add(certificate.public_key().public_bytes(*_FORM))
     return frozenset(found)
 
 
@@ -787,22 +789,22 @@ _FORM = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
 
 
 def _elsewhere(nodes: Sequence[Process], security: Mapping[int, Security]) -> Iterator[Finding]:
-    for each in nodes:
-        if each.network:
-            text = f"{security[each.pid]}, in domain {each.domain} of {each.network}"
-            yield PROCESS_ELSEWHERE.found(each.label, text)
+    for node in nodes:
+        if node.network:
+            text = f"{security[node.pid]}, in domain {node.domain} of {node.network}"
+            yield PROCESS_ELSEWHERE.found(node.label, text)
 
 
 def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
     """Yield findings about unreadable processes: each known node, and a count of the others."""
-    for each in running.unseen:
-        if each.speaks:
-            text = f"it speaks ROS 2, and cannot be looked at: {each.why}"
-            yield PROCESS_NOT_SEEN.found(each.label, text)
-    others = [each for each in running.unseen if not each.speaks]
+    for process in running.unseen:
+        if process.speaks:
+            text = f"it speaks ROS 2, and cannot be looked at: {process.why}"
+            yield PROCESS_NOT_SEEN.found(process.label, text)
+    others = [process for process in running.unseen if not process.speaks]
     reasons = [running.hidden] if running.hidden else []
     if others:
-        why = ", ".join(sorted({each.why for each in others})[:3])
+        why = ", ".join(sorted({process.why for process in others})[:3])
         count = f"{len(others)} processes" if len(others) > 1 else others[0].label
         reasons.append(f"{count}, of which it is not known whether they are nodes ({why})")
     if running.container:
@@ -819,9 +821,9 @@ def runtime_metrics(
     environment: Mapping[str, str], running: RunningProcesses, *, now: datetime, zone: tzinfo
 ) -> tuple[Metric, ...]:
     """Return the metrics of the running processes, compared with the environment of this shell."""
-    security = Counter(_security_of(each) for each in running.processes)
+    security = Counter(_security_of(process) for process in running.processes)
     findings = process_findings(environment, running, now=now, zone=zone)
-    kinds = Counter((each.severity, each.id) for each in findings)
+    kinds = Counter((finding.severity, finding.id) for finding in findings)
     return (
         Metric(
             "sros_processes",

@@ -97,13 +97,15 @@ class FindingFilter:
 
     def choose(self, findings: Iterable[Finding]) -> ChosenFindings:
         """Return the findings to show, worst first, and the accepted findings that are hidden."""
-        wanted = [each for each in findings if self.wants(each.kind)]
+        wanted = [finding for finding in findings if self.wants(finding.kind)]
         if self.strict:
-            wanted = [each._replace(accepted="") for each in wanted]
-        shown = [each for each in wanted if self._shows(each)]
-        shown.sort(key=lambda each: (-each.severity.weight, each.file, each.line or 0))
-        hidden = [each for each in wanted if not self._shows(each)]
-        accepted = [each for each in hidden if each.accepted and each.kind.severity > NOTE]
+            wanted = [finding._replace(accepted="") for finding in wanted]
+        shown = [finding for finding in wanted if self._shows(finding)]
+        shown.sort(key=lambda finding: (-finding.severity.weight, finding.file, finding.line or 0))
+        hidden = [finding for finding in wanted if not self._shows(finding)]
+        accepted = [
+            finding for finding in hidden if finding.accepted and finding.kind.severity > NOTE
+        ]
         return ChosenFindings(tuple(shown), tuple(accepted), len(hidden) - len(accepted))
 
 
@@ -133,7 +135,7 @@ class ChosenFindings(NamedTuple):
 
     def fails(self, level: Severity) -> bool:
         """Return whether a finding of at least this severity is shown."""
-        return any(each.severity >= level for each in self.shown)
+        return any(finding.severity >= level for finding in self.shown)
 
 
 class SharedCause(NamedTuple):
@@ -181,7 +183,9 @@ def shown_findings(chosen: ChosenFindings) -> ShownFindings:
     """Return the findings in the form that ``--json`` prints."""
     place = {id(finding): index for index, finding in enumerate(chosen.shown)}
     causes = [
-        SharedCause(cause.title, cause.text, cause.remedy, [place[id(one)] for one in group])
+        SharedCause(
+            cause.title, cause.text, cause.remedy, [place[id(finding)] for finding in group]
+        )
         for group in by_cause(chosen.shown)
         if len(group) > 1 and (cause := group[0].cause)
     ]

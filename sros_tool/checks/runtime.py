@@ -97,9 +97,9 @@ def _clock(state: RuntimeState) -> Iterator[Finding]:
     root = state.environment.get(KEYSTORE, "")
     if not root or not Path(root).is_dir():
         return
-    files = [each for name in ("ledger.jsonl", "enclaves/*.p7s", "enclaves/**/cert.pem")
-             for each in Path(root).glob(name)]  # fmt: skip
-    newest = max((each.stat().st_mtime for each in files if each.exists()), default=0.0)
+    files = [path for name in ("ledger.jsonl", "enclaves/*.p7s", "enclaves/**/cert.pem")
+             for path in Path(root).glob(name)]  # fmt: skip
+    newest = max((file.stat().st_mtime for file in files if file.exists()), default=0.0)
     written = datetime.fromtimestamp(newest, UTC)
     clock = state.clock or state.now
     if written > clock + _TOLERANCE:
@@ -128,9 +128,9 @@ class FindingChange:
 
     def __str__(self) -> str:
         """Return the change as one line of text."""
-        of = self.finding
-        head = f"{iso(self.time)} {self.change}: {of.subject}: {of.severity.word}: {of.kind.title}"
-        return f"{head} [{of.id}]: {of.text}"
+        finding = self.finding
+        head = f"{iso(self.time)} {self.change}: {finding.subject}: {finding.severity.word}"
+        return f"{head}: {finding.kind.title} [{finding.id}]: {finding.text}"
 
 
 class FindingNews:
@@ -145,14 +145,14 @@ class FindingNews:
         The number of unreadable processes changes all the time, so it is reported only once.
         """
         found: dict[tuple[str, str], Finding] = {}
-        for each in findings:
-            found.setdefault((each.id, each.subject), each)
+        for finding in findings:
+            found.setdefault((finding.id, finding.subject), finding)
         before, self._before = self._before, found
-        for key, each in before.items():
+        for key, finding in before.items():
             if key not in found:
-                yield FindingChange(now, ChangeKind.OVER, each)
-        for key, each in found.items():
+                yield FindingChange(now, ChangeKind.OVER, finding)
+        for key, finding in found.items():
             if key not in before:
-                yield FindingChange(now, ChangeKind.NEW, each)
-            elif each.text != before[key].text and each.kind is not PROCESS_NOT_SEEN:
-                yield FindingChange(now, ChangeKind.CHANGED, each)
+                yield FindingChange(now, ChangeKind.NEW, finding)
+            elif finding.text != before[key].text and finding.kind is not PROCESS_NOT_SEEN:
+                yield FindingChange(now, ChangeKind.CHANGED, finding)

@@ -87,8 +87,8 @@ def policy_findings(path: Path, at: Circumstances) -> list[Finding]:
     if policies:
         return [
             finding
-            for each in policies
-            for finding in policy_file_findings(each, at.distribution, at.fleet)
+            for policy in policies
+            for finding in policy_file_findings(policy, at.distribution, at.fleet)
         ]
     refuse_earlier(path)
     raise DocumentError(

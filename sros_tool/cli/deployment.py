@@ -301,25 +301,25 @@ def create_request(
     from sros_tool.keystore.delivery.robot import create_request as create
     from sros_tool.keystore.delivery.robot import shown_request
 
-    made = create(folder, name, again=again, key=key, secrets=secrets(), dry_run=dry_run)
+    request = create(folder, name, again=again, key=key, secrets=secrets(), dry_run=dry_run)
     if as_json:
-        print_json(shown_request(folder, made, again=again, dry_run=dry_run))
+        print_json(shown_request(folder, request, again=again, dry_run=dry_run))
         return
     if dry_run:
-        print_plan(folder, made.changes)
+        print_plan(folder, request.changes)
         return
     if again:
         echo(f"made the request of enclave {name} again, for the existing key")
-    elif made.token:
+    elif request.token:
         echo(
-            f"the key of enclave {name} is {made.token.object!r} on the token "
-            f"{made.token.token}, and stays there"
+            f"the key of enclave {name} is {request.token.object!r} on the token "
+            f"{request.token.token}, and stays there"
         )
     else:
         echo(f"made the key of enclave {name}, which stays in '{folder}'")
-    echo(f"  its SHA-256 is {made.key}")
-    echo(f"  have '{made.file}' signed: sros sign_request")
-    print_notes(made.notes)
+    echo(f"  its SHA-256 is {request.key}")
+    echo(f"  have '{request.file}' signed: sros sign_request")
+    print_notes(request.notes)
 
 
 @verb("sign_request")

@@ -95,7 +95,7 @@ def _names_in_rights(path: Path | None, kind: str) -> list[str]:
         rights = load_rights(path or keystore_from_environment()).rights
     except (SrosError, OSError):
         return []
-    names = {each.name for each in rights if each.kind == kind}
+    names = {right.name for right in rights if right.kind == kind}
     return sorted(name for name in names if not is_expression(name))
 
 
@@ -446,7 +446,7 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     documented = ", as documented" if answer.as_documented else ""
     yield f"{may} {answer.question}, on {answer.vendor.title} ({why}{documented})"
     yield _row("why", decision.clause)
-    yield from (_row("and", str(each)) for each in answer.problems[1:])
+    yield from (_row("and", str(problem)) for problem in answer.problems[1:])
     if len(answer.parts) > 1 and not answer.allowed:
         for part in answer.parts:
             sign = "ok" if part.decision.outcome.ok else str(part.decision.outcome)
@@ -538,7 +538,7 @@ def _table_lines(answers: Sequence[Answer]) -> Iterator[str]:
     from sros_tool.explain.vendors import differences
 
     yield f"may {answers[0].enclave.name} {answers[0].question}?"
-    width = max(len(each.vendor.title) for each in answers)
+    width = max(len(answer.vendor.title) for answer in answers)
     for answer in answers:
         remark = " (as documented)" if answer.as_documented else ""
         reason = answer.decision.clause
@@ -599,14 +599,14 @@ def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
 
 def _reached_lines(answer: ZenohAnswer) -> Iterator[str]:
     does, wide_does = _DOES[answer.question.word]
-    able = [each.enclave for each in answer.reached if not each.problem]
+    able = [reached.enclave for reached in answer.reached if not reached.problem]
     yield _row(does, _names(able))
-    for each in [each for each in answer.reached if each.problem][:_MOST_SHOWN]:
-        yield _row("", f"not {each.enclave}, which has the right: {each.problem}")
-    for wide, reached in answer.wildcards:
-        yield _row("wildcard", f"{wide} also matches other names")
+    for reached in [reached for reached in answer.reached if reached.problem][:_MOST_SHOWN]:
+        yield _row("", f"not {reached.enclave}, which has the right: {reached.problem}")
+    for wildcard, enclaves in answer.wildcards:
+        yield _row("wildcard", f"{wildcard} also matches other names")
         if wide_does:
-            yield _row("", f"{wide_does} {_names(reached)}")
+            yield _row("", f"{wide_does} {_names(enclaves)}")
 
 
 def _names(names: Sequence[str]) -> str:

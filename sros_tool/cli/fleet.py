@@ -110,8 +110,8 @@ def _report(folder: Path, robot: str) -> None:
     from sros_tool.keystore.confirmation import make_confirmation, render_confirmation
 
     with progress("reading"):
-        made = make_confirmation(folder, robot, now=now())
-    echo_document(render_confirmation(made))
+        confirmation = make_confirmation(folder, robot, now=now())
+    echo_document(render_confirmation(confirmation))
 
 
 # ── at home ────────────────────────────────────────────────────────────────────────────────

@@ -206,7 +206,7 @@ def _enclave(enclave: DescribedEnclave) -> Iterator[str]:
     for grant in facts.permissions or ():
         yield from _indented(_grant(grant))
     if zenoh := enclave.zenoh:
-        yield f"  Zenoh: {', '.join(each.file for each in zenoh.files) or 'NOT USABLE'}"
+        yield f"  Zenoh: {', '.join(file.file for file in zenoh.files) or 'NOT USABLE'}"
         for problem in zenoh.problems:
             yield f"    {problem}"
 

@@ -44,11 +44,11 @@ def _completions(prefix: str, parsed_args: Namespace, **_more: Any) -> list[str]
     from click.shell_completion import ShellComplete
 
     words = list(getattr(parsed_args, "words", None) or ())
-    found: list[str] = []
+    completions: list[str] = []
     for item in ShellComplete(program, {}, _PROGRAM, "").get_completions(words, prefix):
         if item.type == "plain":
-            found.append(item.value)
+            completions.append(item.value)
         else:
             files = DirectoriesCompleter if item.type == "dir" else FilesCompleter
-            found += files()(item.value or prefix)
-    return found
+            completions += files()(item.value or prefix)
+    return completions

@@ -122,8 +122,12 @@ class DomainSet:
             }
         if any(part.first is None or part.last is None for names in sets for part in names.ranges):
             return tuple(sorted(borders))
-        known = [each for each in sorted(borders) if any(each in one for one in listed)]
-        kinds = {tuple(each in one for one in sets): each for each in reversed(known)}
+        known = [
+            border
+            for border in sorted(borders)
+            if any(border in domain_set for domain_set in listed)
+        ]
+        kinds = {tuple(each in domain_set for domain_set in sets): each for each in reversed(known)}
         return tuple(sorted(kinds.values()))
 
     def preferred(self) -> int:

@@ -86,7 +86,11 @@ class Grant(NamedTuple):
         """Return the domains in which some rule allows something."""
         allowed = (rule.domains.closed() for rule in self.rules if rule.allow)
         return DomainSet.of(
-            *((part.first or 0, part.last or 0) for each in allowed for part in each.ranges)
+            *(
+                (part.first or 0, part.last or 0)
+                for domain_set in allowed
+                for part in domain_set.ranges
+            )
         )
 
 
@@ -254,12 +258,13 @@ def _read_criteria(element: etree._Element) -> Criteria:
     for child in element:
         match child.tag:
             case "topics":
-                topics += tuple(each.text or "" for each in child)
+                topics += tuple(xml_element.text or "" for xml_element in child)
             case "partitions":
-                partitions += tuple(each.text or "" for each in child)
+                partitions += tuple(xml_element.text or "" for xml_element in child)
             case "data_tags":
                 tags += tuple(
-                    (each.findtext("name") or "", each.findtext("value") or "") for each in child
+                    (xml_element.findtext("name") or "", xml_element.findtext("value") or "")
+                    for xml_element in child
                 )
             case _:
                 raise DocumentError(

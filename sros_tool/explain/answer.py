@@ -480,4 +480,4 @@ class Evaluator:
             moment = read_moment(self.vendor.traits.moments, text, self.context.zone)
             if self.enclave.signed and moment is not None and 0 < moment < 2**40:
                 expiries.append(("permissions.p7s", datetime.fromtimestamp(moment, UTC)))
-        return min(expiries, key=lambda each: each[1], default=("", None))
+        return min(expiries, key=lambda pair: pair[1], default=("", None))

@@ -190,7 +190,7 @@ def keystore_enclaves(
     for right in source.rights:
         if right.qualifier is ALLOW and right.enclave in replies:
             replies[right.enclave].append((right.right, right.name))
-    nodes = {name: nodes_served(found) for name, found in replies.items()}
+    nodes = {name: nodes_served(reply) for name, reply in replies.items()}
 
     def load(name: str) -> LoadedEnclave:
         return load_enclave(name, enclave_path(source.path, name), at=context.at)
@@ -324,28 +324,30 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
         if not is_tool(node):
             processes.setdefault(node.participant, []).append(node)
     expected = frozenset(
-        each
-        for each in enclaves.nodes.expected
-        if each.enclave != observer or (each.node and not is_expression(each.node))
+        node
+        for node in enclaves.nodes.expected
+        if node.enclave != observer or (node.node and not is_expression(node.node))
     )
     seen: set[EnclaveNode] = set()
     denied: list[DeniedRight] = []
     refused: dict[str, str] = {}
     judged: list[ObservedNode] = []
     unclear, divided, homeless = [], [], []
-    for found in processes.values():
-        names = ", ".join(sorted(each.fqn for each in found))
-        candidates, together = _enclaves_of(found, enclaves.nodes)
+    for nodes in processes.values():
+        names = ", ".join(sorted(node.fqn for node in nodes))
+        candidates, together = _enclaves_of(nodes, enclaves.nodes)
         if not candidates:
-            homeless += found
+            homeless += nodes
             continue
         seen |= {
-            each
-            for each in expected
-            if each.enclave in candidates
-            and (not each.node or any(_is_of(node.fqn, each.node) for node in found))
+            enclave_node
+            for enclave_node in expected
+            if enclave_node.enclave in candidates
+            and (
+                not enclave_node.node or any(_is_of(node.fqn, enclave_node.node) for node in nodes)
+            )
         }
-        answers = {name: _judge(found, name, enclaves) for name in candidates}
+        answers = {name: _judge(nodes, name, enclaves) for name in candidates}
         chosen = sorted(candidates)
         if not together:
             chosen = [min(chosen, key=lambda name: (len(answers[name].denied), name))]
@@ -356,11 +358,11 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
             denied += answers[name].denied
             if answers[name].refused:
                 refused[name] = answers[name].refused
-        judged += (replace(each, enclaves=tuple(chosen)) for each in found)
+        judged += (replace(node, enclaves=tuple(chosen)) for node in nodes)
     if homeless:
-        for each in enclave_per_node(make_observation(homeless)).observation.nodes:
-            judged.append(each)
-            denied += _without_enclave(each, enclaves.what)
+        for node in enclave_per_node(make_observation(homeless)).observation.nodes:
+            judged.append(node)
+            denied += _without_enclave(node, enclaves.what)
     if divided:
         notes.append(Note("audit.divided-process", f"{_DIVIDED}: {listed(sorted(divided), '; ')}"))
     if unclear:
@@ -480,11 +482,13 @@ def _denied_to(node: ObservedNode, enclave: str, evaluator: Evaluator) -> Iterat
         if not decision.outcome.ok
     }
     for right, needed in _rights_of(node, enclave):
-        found = tuple(each for each in needed if each in decisions)
-        if found:
-            by_rule = [each for each in found if decisions[each].reason == _DENY_RULE]
-            reason = decisions[(by_rule or found)[0]].clause
-            yield DeniedRight(right, (node.fqn,), reason, bool(by_rule), False, found)
+        endpoints = tuple(endpoint for endpoint in needed if endpoint in decisions)
+        if endpoints:
+            by_rule = [
+                endpoint for endpoint in endpoints if decisions[endpoint].reason == _DENY_RULE
+            ]
+            reason = decisions[(by_rule or endpoints)[0]].clause
+            yield DeniedRight(right, (node.fqn,), reason, bool(by_rule), False, endpoints)
 
 
 def _rights_of(node: ObservedNode, enclave: str) -> Iterator[tuple[Right, tuple[Endpoint, ...]]]:
@@ -514,24 +518,24 @@ def _without_enclave(node: ObservedNode, what: str) -> Iterator[DeniedRight]:
 def _by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
     """Return the denied rights without duplicates, sorted, with all nodes that use each right."""
     by_right: dict[Right, DeniedRight] = {}
-    for each in denied:
-        other = by_right.get(each.right, each)
-        nodes = tuple(sorted({*other.nodes, *each.nodes}))
-        by_right[each.right] = replace(other, nodes=nodes)
+    for right in denied:
+        other = by_right.get(right.right, right)
+        nodes = tuple(sorted({*other.nodes, *right.nodes}))
+        by_right[right.right] = replace(other, nodes=nodes)
     return tuple(by_right[right] for right in sorted(by_right, key=order))
 
 
 def _used(denied: Iterable[DeniedRight], observation: Observation) -> Observation:
     """Return the nodes with the endpoints of denied rights, unless a deny rule denies the right."""
     wanted: dict[tuple[str, str], set[Endpoint]] = {}
-    for each in denied:
-        if each.by_rule:
+    for right in denied:
+        if right.by_rule:
             continue
-        needed = set(each.endpoints)
-        if each.right.kind != "dds":
-            needed.update(_endpoints(each.right.right, each.right.name))
-        for node in each.nodes:
-            wanted.setdefault((each.right.enclave, node), set()).update(needed)
+        needed = set(right.endpoints)
+        if right.right.kind != "dds":
+            needed.update(_endpoints(right.right.right, right.right.name))
+        for node in right.nodes:
+            wanted.setdefault((right.right.enclave, node), set()).update(needed)
     return make_observation(
         replace(
             node,

@@ -105,8 +105,8 @@ def read_denials(text: str) -> tuple[Denial, ...]:
         process, rest = labelled_line(line)
         processes.setdefault(process, []).append((number, rest))
     denials = {denial: None for item in processes.items() for denial in _denials_of(*item)}
-    known = {replace(each, direction="") for each in denials if each.direction}
-    return tuple(each for each in denials if each.direction or each not in known)
+    known = {replace(denial, direction="") for denial in denials if denial.direction}
+    return tuple(denial for denial in denials if denial.direction or denial not in known)
 
 
 def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denial]:
@@ -164,7 +164,7 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
         else:
             rights.setdefault(denial.enclave, set()).add(_right(denial))
     return MissingRights(
-        {enclave: _without_parts(found) for enclave, found in rights.items()},
+        {enclave: _without_parts(right) for enclave, right in rights.items()},
         **{kind: tuple(found) for kind, found in rest.items()},
     )
 
@@ -295,11 +295,11 @@ def as_learned(
                 continue
             has = present.get(place, frozenset())
             parts = _whole_parts(denied, place, has, common) if common else ()
-            given = common.given(parts, *place) if common else frozenset[NodeRight]()
+            node_rights = common.given(parts, *place) if common else frozenset[NodeRight]()
             if parts:
                 wholes[_fqn(place)] = ", ".join(parts)
-            groups = groups_of(denied - given, *place)
-            profiles.append(LearnedProfile(path, *place, denied | given, parts, groups))
+            groups = groups_of(denied - node_rights, *place)
+            profiles.append(LearnedProfile(path, *place, denied | node_rights, parts, groups))
     elsewhere = {
         path: f"{len(rights)} right{'s' * (len(rights) > 1)}"
         for path, rights in sorted(missing.rights.items())
@@ -350,7 +350,7 @@ def _by_place(
     for right in rights:
         served = nodes_served([(right.right, right.name)])
         found.setdefault(_place(served[0], present) if served else rest, set()).add(right)
-    return {place: frozenset(some) for place, some in found.items()}
+    return {place: frozenset(node_rights) for place, node_rights in found.items()}
 
 
 def _place(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:
@@ -374,8 +374,8 @@ def _whole_parts(
         return ()
     for part in _NODE_PARTS:
         if part in common.rights:
-            given = common.given([part], *place)
-            if given & denied and not given & has:
+            rights = common.given([part], *place)
+            if rights & denied and not rights & has:
                 return (part,)
     return ()
 
@@ -383,11 +383,13 @@ def _whole_parts(
 def _profiles(policy: Policy | None, path: str) -> dict[tuple[str, str], frozenset[NodeRight]]:
     """Return the rights of each profile of an enclave, by namespace and node name."""
     enclave = policy.enclave(path) if policy else None
-    found: dict[tuple[str, str], frozenset[NodeRight]] = {}
-    for each in enclave.all_profiles() if enclave else ():
-        rights = frozenset(NodeRight(r.right, r.name) for r in profile_rights(path, each))
-        found[each.ns, each.node] = found.get((each.ns, each.node), frozenset()) | rights
-    return found
+    profiles: dict[tuple[str, str], frozenset[NodeRight]] = {}
+    for profile in enclave.all_profiles() if enclave else ():
+        rights = frozenset(NodeRight(r.right, r.name) for r in profile_rights(path, profile))
+        profiles[profile.ns, profile.node] = (
+            profiles.get((profile.ns, profile.node), frozenset()) | rights
+        )
+    return profiles
 
 
 def _notes(missing: MissingRights) -> tuple[Note, ...]:

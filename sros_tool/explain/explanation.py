@@ -102,13 +102,13 @@ def _states_policy(enclave: LoadedEnclave) -> bool:
     with suppress(SrosError):
         grant = parse_permissions(enclave.permissions).grant_of(enclave.subject)
         if grant and grant.rules and not grant.default_allow:
-            meant = permissions_for(
+            permissions = permissions_for(
                 enclave.policy,
                 subject=grant.subject,
                 validity=grant.validity,
                 domains=grant.rules[0].domains,
             )
-            return meant.grants[0].rules == grant.rules
+            return permissions.grants[0].rules == grant.rules
     return False
 
 
@@ -234,7 +234,7 @@ def _is_latest(keystore: Path, enclave: str) -> bool:
     except (SrosError, OSError):
         return True
     last = (entry for entry in entries if (entry.what, entry.enclave) == ("permissions", enclave))
-    digest = next((each.sha256 for each in last), "")
+    digest = next((entry.sha256 for entry in last), "")
     return not digest or digest == hashlib.sha256(signed).hexdigest()
 
 
@@ -339,7 +339,7 @@ def _addition(right: Right, places: Iterable[tuple[str, str]]) -> str:
     """
     known = list(places)
     fitting = [each for each in known if right.name.startswith(each[0].rstrip("/") + "/")]
-    ns, node = max(fitting or known, key=lambda each: len(each[0]), default=_ANY_NODE)
+    ns, node = max(fitting or known, key=lambda pair: len(pair[0]), default=_ANY_NODE)
     group = Group(right.kind, ((right.right, right.qualifier),), (right.name,))
     enclave = Enclave(right.enclave, (Profiles((Profile(ns, node, (group,)),)),))
     from sros_tool.policy.document import write_policy  # an allowed question needs none
@@ -355,7 +355,7 @@ def _places(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, str]]
     if policy:
         yield from ((profile.ns, profile.node) for profile in policy.all_profiles())
         return
-    for node in nodes_served((each.right, each.name) for each in _granted("", answer)):
+    for node in nodes_served((right.right, right.name) for right in _granted("", answer)):
         ns, _, name = node.rpartition("/")
         yield ns or "/", name
 
@@ -412,7 +412,9 @@ def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
     for source, group in groups.items():
         kept: dict[tuple[tuple[str, str], ...], list[str]] = {}
         for name in group.names:
-            rights = tuple(each for each in group.rights if (name, each[0]) not in lifted[source])
+            rights = tuple(
+                right for right in group.rights if (name, right[0]) not in lifted[source]
+            )
             if rights:
                 kept.setdefault(rights, []).append(name)
         yield GroupEdit(source, "\n".join(_xml(group.kind, *item) for item in kept.items()))

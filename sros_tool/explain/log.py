@@ -240,14 +240,14 @@ def explain_log(
     examiner = _Examiner(find, context, root, keystore)
     lines = log_lines(plain)
     denied = read_denials(plain)
-    naming = _lines_naming(lines, {each.topic for each in denied})
-    denials = [(each, naming[each.process, each.topic]) for each in denied]
-    reported = {each.process for each in denied}
+    naming = _lines_naming(lines, {denial.topic for denial in denied})
+    denials = [(denial, naming[denial.process, denial.topic]) for denial in denied]
+    reported = {denial.process for denial in denied}
     hits = _strongest(_hits(_joined(lines)), reported)
     findings = [examiner.message(group) for group in _grouped(hits) if examiner.matters(group[0])]
-    findings += [examiner.denial(each, named) for each, named in denials]
+    findings += [examiner.denial(denial, named) for denial, named in denials]
     findings += _dropped(lines, root)
-    return tuple(sorted(findings, key=lambda each: each.line))
+    return tuple(sorted(findings, key=lambda finding: finding.line))
 
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────
@@ -414,13 +414,13 @@ def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
         what = f"{right} {name}" if right else _GRAPH.get((message.message, message.ingress), "")
         what = what or f"pass {message.message} of {message.key}"
         groups.setdefault((message.process, message.name or message.zid, what), []).append(message)
-    for (process, who, what), found in groups.items():
-        first = found[0]
+    for (process, who, what), messages in groups.items():
+        first = messages[0]
         yield LogFinding(
             "zenoh-dropped",
             None,
             first.line,
-            len(found),
+            len(messages),
             f"{first.message} ({'ingress' if first.ingress else 'egress'}) on {first.key}",
             process,
             first.name,
@@ -662,8 +662,8 @@ class _Examiner:
     ) -> Iterator[tuple[str, str]]:
         """Yield the enclave's faults with remedies; only those in ``faults``, if it has some."""
         fitting = [problem for problem in answer.problems if problem.fault in faults]
-        for each in fitting or answer.problems:
-            yield str(each), remedy(each.fault, self._root, enclave.name, each.file)
+        for problem in fitting or answer.problems:
+            yield str(problem), remedy(problem.fault, self._root, enclave.name, problem.file)
         if not answer.problems and not answer.allowed:
             decision = answer.decision
             yield decision.text, remedy(decision.reason, self._root, enclave.name)

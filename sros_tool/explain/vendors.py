@@ -120,7 +120,7 @@ def differences(answers: Sequence[Answer]) -> str:
     others = [answer for answer in answers if answer.outcome is not first.outcome]
     if not others:
         return "all vendors decide alike"
-    listed = ", ".join(f"{each.vendor.title} ({each.outcome})" for each in others)
+    listed = ", ".join(f"{answer.vendor.title} ({answer.outcome})" for answer in others)
     return f"VENDORS DIFFER: {first.vendor.title} ({first.outcome}), but {listed}"
 
 

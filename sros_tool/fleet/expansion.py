@@ -326,7 +326,7 @@ def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterat
             for part, own in zip(parts(right), parts(right._replace(name=name)), strict=True):
                 exact[own.right, own.name].append(part)
     rules = Rules(stated)
-    wide = [(used, name, some) for (used, name), some in exact.items() if is_expression(name)]
+    wide = [(used, name, rights) for (used, name), rights in exact.items() if is_expression(name)]
     for right in observed:
         same = exact.get((right.right, right.name), [])
         same = (
@@ -340,9 +340,9 @@ def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterat
         # A wildcard for each robot, such as /{robots}/*, stays.
         same = same or [
             part
-            for used, name, some in wide
+            for used, name, rights in wide
             if used == right.right and covers(name, right.name)
-            for part in some
+            for part in rights
         ]
         yield from same or [right._replace(enclave=enclave.path)]
 

@@ -389,10 +389,10 @@ class CommonParts:
         """
         chosen, rest = [], rights
         for part, names in self.rights.items():
-            given = _expanded(names, ns, node)
-            if given <= rights and given & rest:
+            node_rights = _expanded(names, ns, node)
+            if node_rights <= rights and node_rights & rest:
                 chosen.append(part)
-                rest -= given
+                rest -= node_rights
         return tuple(chosen), rest
 
     def given(self, parts: Iterable[str], ns: str, node: str) -> frozenset[NodeRight]:
@@ -792,16 +792,16 @@ def _parted(
     by_name, shown = [], []
     for own in learned.profiles:
         place = own.enclave, own.ns, own.node
-        given = common.given(own.includes, own.ns, own.node)
+        node_rights = common.given(own.includes, own.ns, own.node)
         if place not in known:
             shown.append(own)
-        elif given and not any(
+        elif node_rights and not any(
             (right.right, right.name) in says[place]
             or not rules.allow(own.enclave, right.right, right.name)
-            for right in given
+            for right in node_rights
         ):
             shown.append(own)
-            own = replace(own, rights=own.rights - given)
+            own = replace(own, rights=own.rights - node_rights)
         by_name.append(own)
     return Learned(tuple(by_name)), shown
 
@@ -858,7 +858,7 @@ def _content(profile: LearnedProfile, include: str, unit: str) -> Iterator[str]:
     yield from _includes(profile, include)
     for group in profile.groups:
         item = group.kind.removesuffix("s")
-        rights = "".join(f' {right}="{said}"' for right, said in group.rights)
+        rights = "".join(f' {right}="{qualifier}"' for right, qualifier in group.rights)
         yield f"<{group.kind}{rights}>"
         yield from (f"{unit}<{item}>{name}</{item}>" for name in group.names)
         yield f"</{group.kind}>"

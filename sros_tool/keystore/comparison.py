@@ -191,9 +191,9 @@ def _deciding(domain: DomainRule) -> Callable[[str], TopicRule | None]:
     return rule_for
 
 
-def _equal(one: TopicRule, other: TopicRule) -> bool:
+def _equal(rule: TopicRule, other: TopicRule) -> bool:
     return all(
-        getattr(one, attribute.name) == getattr(other, attribute.name)
+        getattr(rule, attribute.name) == getattr(other, attribute.name)
         for attribute in attributes(TopicRule)
     )
 
@@ -343,7 +343,10 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
 
 def _short_lived_changes(old: Template, new: Template) -> Iterator[SettingChange]:
     """Yield the changes of settings for enclaves whose files expire earlier than others."""
-    lists = [{each.name: each.validity for each in side.short_lived} for side in (old, new)]
+    lists = [
+        {short_lived.name: short_lived.validity for short_lived in side.short_lived}
+        for side in (old, new)
+    ]
     for name in dict.fromkeys(name for side in lists for name in side):
         before, after = (side.get(name) for side in lists)
         if before == after:
@@ -359,7 +362,7 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
     """Yield the changes of a Zenoh network's settings; None: the keystore has no network."""
     if old is None or new is None:
         if old != new:
-            one, other = (each.mode.value if each else "none" for each in (old, new))
+            one, other = (network.mode.value if network else "none" for network in (old, new))
             meaning = "enclaves get files for Zenoh" if new else "no files for Zenoh are kept"
             yield SettingChange(Effect.LATER, "zenoh", one, other, meaning)
         return

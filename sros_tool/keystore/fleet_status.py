@@ -247,7 +247,9 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
     existing = keystore.names
     unassigned = 0 if names else len(existing) - sum(len(robot.enclaves) for robot in compared)
     unrecorded = unrecorded_enclaves(fleet, existing, {robot.name for robot in robots})
-    statuses = tuple(_status(one, known, stages, unrecorded[one.robot.name]) for one in compared)
+    statuses = tuple(
+        _status(robot, known, stages, unrecorded[robot.robot.name]) for robot in compared
+    )
     return FleetStatus(root, stages.at_home, statuses, unassigned)
 
 

@@ -99,35 +99,37 @@ def vendor_problems(
     They are in the order in which a process meets them.  Only signature and size of governance and
     permissions are checked here; problems in their content are taken from ``state``.
     """
-    specific = [each for each in state.problems if _is_specific(each, state)]
-    kept = [each for each in state.problems if each not in specific]
+    specific = [problem for problem in state.problems if _is_specific(problem, state)]
+    kept = [problem for problem in state.problems if problem not in specific]
     if state.token and not traits.reads_tokens:
         text = f"{traits.title} does not read it, and there is no {KEY_FILE}"
         kept.append(Problem(KEY_URI_FILE, text, Fault.KEY_ON_TOKEN))
     # Files that every vendor refuses already: do not report a second problem.
     known = {
-        each.file for each in kept if each.file == CERTIFICATE_FILE or each.fault in _UNREADABLE
+        problem.file
+        for problem in kept
+        if problem.file == CERTIFICATE_FILE or problem.fault in _UNREADABLE
     }
     faults = [
-        each
-        for each in sorted(_faults(traits, state, at), key=_when_met)
-        if each.file not in known or each.fault in CRASHES
+        fault
+        for fault in sorted(_faults(traits, state, at), key=_when_met)
+        if fault.file not in known or fault.fault in CRASHES
     ]
     if not faults:
         return tuple(sorted(kept, key=_when_met))
-    kept += [each for each in faults if _is_of_list(each)]
-    specific = [each for each in specific if not _is_of_list(each)]
-    faults = [each for each in faults if not _is_of_list(each)]
+    kept += [fault for fault in faults if _is_of_list(fault)]
+    specific = [problem for problem in specific if not _is_of_list(problem)]
+    faults = [fault for fault in faults if not _is_of_list(fault)]
     for side in _SIDES:
-        of_side = [each for each in faults if each.file in side]
-        files = {each.file for each in of_side} | ({side[0]} if of_side else set())
+        of_side = [fault for fault in faults if fault.file in side]
+        files = {problem.file for problem in of_side} | ({side[0]} if of_side else set())
         if of_side and of_side[0].fault in CRASHES:
             kept.append(of_side[0])
             continue
-        of_side = [each for each in of_side if each.fault not in CRASHES]
-        kept += [each for each in specific if each.file in files] or of_side
-    if not any(each.fault is Fault.KEY_ALGORITHM for each in kept):
-        kept += [each for each in faults if each.file == KEY_FILE]
+        of_side = [problem for problem in of_side if problem.fault not in CRASHES]
+        kept += [problem for problem in specific if problem.file in files] or of_side
+    if not any(problem.fault is Fault.KEY_ALGORITHM for problem in kept):
+        kept += [fault for fault in faults if fault.file == KEY_FILE]
     return tuple(sorted(kept, key=_when_met))
 
 
@@ -362,7 +364,7 @@ def _signer_fault(
 def _trusted(traits: VendorTraits, certificates: Certificates) -> Certificates:
     if traits.reads_first_authority:
         return certificates[:1]
-    return tuple(dropwhile(lambda each: not _hash_fits(traits, each), certificates))
+    return tuple(dropwhile(lambda certificate: not _hash_fits(traits, certificate), certificates))
 
 
 def _hash_fits(traits: VendorTraits, certificate: x509.Certificate) -> bool:
@@ -432,7 +434,10 @@ def _list_faults(
     try:
         if traits.reads_lists_of_authorities:
             file = IDENTITY_CA_FILE
-            lists += [(each, file) for each in _lists(_content(traits, state.files[file]), file)]
+            lists += [
+                (revocation_list, file)
+                for revocation_list in _lists(_content(traits, state.files[file]), file)
+            ]
         file = CRL_FILE
         if file in state.files:
             lists.append((_list(_content(traits, state.files[file]), file), file))
@@ -446,7 +451,11 @@ def _list_faults(
         return
     chain, fault = build_chain(certificate, _trusted(traits, authorities), (), at)
     # A fault of the chain is reported already.
-    refusal = None if fault else list_refusal(chain, [each for each, _ in lists], at=at)
+    refusal = (
+        None
+        if fault
+        else list_refusal(chain, [revocation_list for revocation_list, _ in lists], at=at)
+    )
     if refusal is None:
         return
     crl, file = next((each for each in lists if each[0] is refusal.list), lists[0])

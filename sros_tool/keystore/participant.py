@@ -121,10 +121,10 @@ class LoadedEnclave(NamedTuple):
         if self.state is None or self.at is None:
             return ()
         return tuple(
-            each
-            for each in vendor_problems(traits, self.state, self.at)
-            if each.fault not in _LEFT_TO_THE_VENDOR
-            and not (self.key_elsewhere and (each.fault, each.file) == _NO_KEY)
+            problem
+            for problem in vendor_problems(traits, self.state, self.at)
+            if problem.fault not in _LEFT_TO_THE_VENDOR
+            and not (self.key_elsewhere and (problem.fault, problem.file) == _NO_KEY)
         )
 
 
@@ -315,10 +315,10 @@ class VendorParticipant:
         Rights to topics are not considered here: they are a matter of the policy.
         """
         join = self.join()
-        if join.reason in {each.fault.id for each in self.problems}:
+        if join.reason in {problem.fault.id for problem in self.problems}:
             return tuple(
-                RefusalCause(join.outcome, each.fault.id, each.file, str(each))
-                for each in self.problems
+                RefusalCause(join.outcome, problem.fault.id, problem.file, str(problem))
+                for problem in self.problems
             )
         stopped = None if join.outcome.ok else join
         if stopped is None and self.access is not None:
@@ -336,7 +336,9 @@ class VendorParticipant:
             self.vendor, enclave.plain_governance or enclave.governance, context.domain
         )
         noticed = [
-            each for each in self.problems if (self.vendor, each.fault) not in _ONLY_PEERS_NOTICE
+            problem
+            for problem in self.problems
+            if (self.vendor, problem.fault) not in _ONLY_PEERS_NOTICE
         ]
         if noticed and not _crashes_before(noticed[0], governed):
             first = noticed[0]
@@ -373,11 +375,11 @@ class EvaluatedEnclave(NamedTuple):
         Causes whose reason is in ``ignored`` do not count.
         """
         sentences = []
-        for each in self.participants:
-            causes = [cause.text for cause in each.causes() if cause.reason not in ignored]
+        for participant in self.participants:
+            causes = [cause.text for cause in participant.causes() if cause.reason not in ignored]
             if not causes:
                 return ""
-            sentences.append(f"{each.vendor.title} refuses it: {'; '.join(causes)}.")
+            sentences.append(f"{participant.vendor.title} refuses it: {'; '.join(causes)}.")
         return " ".join(sentences)
 
     def for_some(self, problems: Sequence[Problem]) -> list[str]:
@@ -385,9 +387,9 @@ class EvaluatedEnclave(NamedTuple):
         clauses = []
         for problem in problems:
             titles = [
-                each.vendor.title
-                for each in self.participants
-                if any(cause.file == problem.file for cause in each.causes())
+                participant.vendor.title
+                for participant in self.participants
+                if any(cause.file == problem.file for cause in participant.causes())
             ]
             if titles and problem not in self.state.problems:
                 clauses.append(f"{problem} (refused by {' and '.join(titles)})")
@@ -421,8 +423,8 @@ def evaluated(
     """
     number = domain if domain is not None else next(iter(state.joined_domains() or ()), 0)
     there, context = loaded(name, folder, state, at=at), JoinContext(number, at, zone)
-    made = tuple(VendorParticipant(each, there, context) for each in vendors)
-    return EvaluatedEnclave(accepted_state(state, made), made)
+    participants = tuple(VendorParticipant(vendor, there, context) for vendor in vendors)
+    return EvaluatedEnclave(accepted_state(state, participants), participants)
 
 
 def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> OpenedEnclave:
@@ -432,20 +434,20 @@ def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> O
     that the enclave signed itself stays a fault, whatever vendor accepts it (CVE-2023-24011).
     ``made`` has at least one participant.
     """
-    loading = [each for each in made if each.permissions is not None]
+    loading = [participant for participant in made if participant.permissions is not None]
     if not (state.problems and loading):
         return state
-    sound = not all(each.causes() for each in made)
+    sound = not all(participant.causes() for participant in made)
     problems = tuple(
         problem
         for problem in state.problems
         if (problem.file == KEY_FILE and problem.fault is Fault.FILE_MISSING)
         or (problem.fault in _LEFT_TO_THE_VENDOR and not sound)
-        or all(problem in each.problems for each in made)
+        or all(problem in participant.problems for participant in made)
         or (problem.fault is Fault.SIGNATURE and not _signed_by_ca(state, problem.file))
     )
-    if any(each.fault is Fault.SIGNATURE for each in problems):
-        named = tuple(_with_acceptance(state, each, made) for each in problems)
+    if any(problem.fault is Fault.SIGNATURE for problem in problems):
+        named = tuple(_with_acceptance(state, problem, made) for problem in problems)
         return replace(state, problems=named)
     return replace(
         state,
@@ -461,8 +463,8 @@ def _with_acceptance(
 ) -> Problem:
     """Return a signature's problem, with the vendors that accept it anyway in its text."""
     titles: dict[bool, list[str]] = {True: [], False: []}
-    for each in made:
-        titles[problem not in each.problems].append(each.vendor.title)
+    for participant in made:
+        titles[problem not in participant.problems].append(participant.vendor.title)
     accepting, refusing = (", ".join(titles[each]) for each in (True, False))
     if problem.fault is not Fault.SIGNATURE or not accepting:
         return problem
@@ -480,14 +482,14 @@ def _signers(state: OpenedEnclave, file: str) -> set[x509.Certificate | None]:
         signed = state.signed(file)
         data = state.files.get(PERMISSIONS_CA_FILE, b"")
         known = (*signed.certificates, *load_certificates(data, PERMISSIONS_CA_FILE))
-        return {each.signer_among(known) for each in signed.signatures}
+        return {signature.signer_among(known) for signature in signed.signatures}
     return set()
 
 
 def _signed_by_ca(state: OpenedEnclave, file: str) -> bool:
     """Return whether all signers of a document have the certificate of a CA."""
     signers = _signers(state, file)
-    return bool(signers) and all(each is not None and _is_ca(each) for each in signers)
+    return bool(signers) and all(signer is not None and _is_ca(signer) for signer in signers)
 
 
 def _is_ca(certificate: x509.Certificate) -> bool:

@@ -30,23 +30,23 @@ def contradictions(
     """Yield each pair of statements with different levels for some common name, in order."""
     limit = ComparisonLimit()
     signed: dict[str, list[StatedProtection]] = {}
-    for each in stated:
-        if each.level is Level.SIGN:
-            for topic in protected_topics(each.kind, each.name):
-                signed.setdefault(topic, []).append(each)
+    for protection in stated:
+        if protection.level is Level.SIGN:
+            for topic in protected_topics(protection.kind, protection.name):
+                signed.setdefault(topic, []).append(protection)
     names = Names(signed, limit)
-    place = {each: number for number, each in enumerate(stated)}
-    for each in stated:
-        if each.level is Level.SIGN:
+    place = {protection: number for number, protection in enumerate(stated)}
+    for protection in stated:
+        if protection.level is Level.SIGN:
             continue
         met = {
             other: None
-            for topic in protected_topics(each.kind, each.name)
+            for topic in protected_topics(protection.kind, protection.name)
             for meeting in names.meeting(topic)
             for other in signed[meeting]
         }
         for other in met:
-            first, second = sorted((each, other), key=place.__getitem__)
+            first, second = sorted((protection, other), key=place.__getitem__)
             yield first, second
 
 
@@ -62,17 +62,20 @@ def with_stated(
         PolicyError: statements contradict each other, or a wildcard in the settings matches only a
             part of a statement's names, so that it is unclear which of both decides.
     """
-    for one, other in contradictions(stated):
+    for stated_protection, other in contradictions(stated):
         raise PolicyError(
-            f'{other.source}: {other} has protect="{other.word}", and {one} has '
-            f'protect="{one.word}" at {one.source}',
+            f'{other.source}: {other} has protect="{other.word}", and {stated_protection} has '
+            f'protect="{stated_protection.word}" at {stated_protection.source}',
             "A keystore has one governance for all enclaves, so each name has one protection; a "
             "wildcard says it of all names that it matches.",
             "Say the same in both places, or in one of them only.",
         )
     raised = _Raising(protection)
-    for each in {(each.kind, each.name, each.level): each for each in stated}.values():
-        raised.state(each)
+    for stated_protection in {
+        (stated_protection.kind, stated_protection.name, stated_protection.level): stated_protection
+        for stated_protection in stated
+    }.values():
+        raised.state(stated_protection)
     result = raised.result()
     missing = next(less_protected(governance_for_all(result), stated), None)
     assert missing is None, f"{missing} is not protected as stated"
@@ -94,8 +97,8 @@ class _Raising:
         self._named = list(protection.named)
         self._added: list[NamedProtection] = []
         self._owner: dict[str, int] = {}
-        for number, each in enumerate(self._named):
-            for topic in protected_topics(each.kind, each.name):
+        for number, named_protection in enumerate(self._named):
+            for topic in protected_topics(named_protection.kind, named_protection.name):
                 self._owner.setdefault(topic, number)
         rules = governance_for_all(protection).domain_access_rules[0].topic_access_rules
         self._rank = {rule.topic_expression: place for place, rule in enumerate(rules)}
@@ -129,7 +132,7 @@ class _Raising:
         """Return whether an entry of the settings is for exactly these topics."""
         own = protected_topics(self._named[number].kind, self._named[number].name)
         return len(own) == len(topics) and all(
-            any(covers(one, other) and covers(other, one) for other in own) for one in topics
+            any(covers(topic, other) and covers(other, topic) for other in own) for topic in topics
         )
 
     def _deciding(self, topic: str, stated: StatedProtection) -> int | None:
@@ -200,16 +203,16 @@ def less_protected(
     not count: no vendor allows its use.
     """
     domains = [_DomainRules(rule) for rule in governance.domain_access_rules]
-    for each in stated:
+    for protection in stated:
         found = [
             level
-            for topic in protected_topics(each.kind, each.name)
+            for topic in protected_topics(protection.kind, protection.name)
             for rules in domains
             for level in rules.levels(topic)
         ]
-        least = min(found, key=_strength, default=each.level)
-        if _strength(least) < _strength(each.level):
-            yield each, least
+        least = min(found, key=_strength, default=protection.level)
+        if _strength(least) < _strength(protection.level):
+            yield protection, least
 
 
 class _DomainRules:
@@ -218,15 +221,15 @@ class _DomainRules:
     def __init__(self, rule: DomainRule) -> None:
         self._rtps = rule.rtps_protection_kind
         self._rules: Mapping[str, tuple[int, TopicRule]] = {
-            each.topic_expression: (number, each)
-            for number, each in reversed(list(enumerate(rule.topic_access_rules)))
+            topic_rule.topic_expression: (number, topic_rule)
+            for number, topic_rule in reversed(list(enumerate(rule.topic_access_rules)))
         }
         self._names = Names(self._rules)
 
     def levels(self, topic: str) -> Iterator[Level]:
         """Yield the levels of all rules that decide on some name of a topic expression."""
         for _, rule in sorted(
-            (self._rules[each] for each in self._names.meeting(topic)), key=lambda each: each[0]
+            (self._rules[each] for each in self._names.meeting(topic)), key=lambda pair: pair[0]
         ):
             kinds: tuple[ProtectionKind, ...] = (
                 rule.data_protection_kind,

@@ -688,7 +688,9 @@ class OpenedEnclave:
         if not (self.certificate and self.permissions):
             return None
         certificates = (self.certificate, self.identity_ca, self.permissions_ca)
-        moments = [validity_of(each).not_after for each in certificates if each]
+        moments = [
+            validity_of(certificate).not_after for certificate in certificates if certificate
+        ]
         try:
             moments += [self.grant.validity.not_after] if self.grant else []
         except DocumentError:
@@ -718,8 +720,8 @@ def weaknesses(state: OpenedEnclave) -> Iterator[tuple[str, str]]:
     """Yield weak cryptography in an enclave's files: the name of the file, and a clause."""
     for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, CERTIFICATE_FILE):
         with suppress(SrosError):
-            for each in load_certificates(state.files.get(file, b""), file):
-                if text := weakness(each):
+            for certificate in load_certificates(state.files.get(file, b""), file):
+                if text := weakness(certificate):
                     yield file, text
     for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
         with suppress(SrosError):
@@ -763,7 +765,7 @@ def _load_crl(
     trusted: tuple[x509.Certificate, ...] = (authority,) if authority else ()
     with suppress(SrosError):
         trusted = load_certificates(authorities, IDENTITY_CA_FILE)
-    return crl, next((each for each in trusted if signed_by(crl, each)), None)
+    return crl, next((certificate for certificate in trusted if signed_by(crl, certificate)), None)
 
 
 class _EnclaveFiles:

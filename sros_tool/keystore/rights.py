@@ -215,7 +215,7 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
     from sros_tool.translate_zenoh.rights import rights_in_rules
 
     access = document.access
-    found = rights_in_rules(access)
+    rules = rights_in_rules(access)
     notes = []
     if not access.enabled or access.allows_by_default:
         text = "its access control is off, so it denies nothing."
@@ -233,15 +233,15 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
     if document.namespace:
         text = f"{path}: it puts a namespace before the keys, which is not taken into account here."
         notes.append(Note("rights.zenoh-namespace", text))
-    if found.left_out:
-        text = f"{path}: {len(found.left_out)} key expressions are no names of ROS, and left out, "
-        text += f"such as {found.left_out[0][:80]}."
+    if rules.left_out:
+        text = f"{path}: {len(rules.left_out)} key expressions are no names of ROS, and left out, "
+        text += f"such as {rules.left_out[0][:80]}."
         notes.append(Note("rights.zenoh-no-name", text))
     return RightsSource(
         path,
         "zenoh",
-        found.rights,
-        found.enclaves,
+        rules.rights,
+        rules.enclaves,
         True,
         tuple(notes),
         enforcers=(access,),
@@ -459,9 +459,11 @@ def _protection_differences(
     """Return what only one of two policies says about protection, with "-" or "+"."""
     if first.protections is None or second.protections is None:
         return []
-    one, other = set(first.protections), set(second.protections)
+    protections, other = set(first.protections), set(second.protections)
     differences = [("-", protection) for protection in first.protections if protection not in other]
-    differences += [("+", protection) for protection in second.protections if protection not in one]
+    differences += [
+        ("+", protection) for protection in second.protections if protection not in protections
+    ]
     return sorted(differences, key=lambda line: (line[1].enclave, line[1].name, line[0] == "+"))
 
 
@@ -509,11 +511,13 @@ class RecordedRights:
         self._gaps = ledger.gaps
         self._unchained = ledger.unchained
         chained = ledger.entries[ledger.unchained :]
-        self._chained = {each.enclave for each in chained if each.what == "permissions"}
+        self._chained = {entry.enclave for entry in chained if entry.what == "permissions"}
         # A keystore of ros2/sros2 has enclaves that no ledger records.
         self._complete = keystore.has(SETTINGS) or not (keystore.is_of_ros2 or ledger.lines)
-        self._last = {each.enclave: each for each in ledger.entries if each.what == "permissions"}
-        self._certain = {each.enclave for each in ledger.certain if each.what == "permissions"}
+        self._last = {
+            entry.enclave: entry for entry in ledger.entries if entry.what == "permissions"
+        }
+        self._certain = {entry.enclave for entry in ledger.certain if entry.what == "permissions"}
 
     def of(self, name: str, digest: str, grant: Grant) -> SignedRights:
         """Return the rights in the permissions of an enclave, to sign them again.
@@ -540,7 +544,7 @@ class RecordedRights:
         """Map enclaves to their last entries, if these are on lines from before the chain."""
         if not self._unchained:
             return {}
-        return {name: each for name, each in self._last.items() if name not in self._chained}
+        return {name: entry for name, entry in self._last.items() if name not in self._chained}
 
     def policy(self, name: str, digest: str) -> str:
         """Return the SHA-256 of the policy of an enclave's permissions; "" if the ledger lacks it.

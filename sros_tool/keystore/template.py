@@ -71,7 +71,11 @@ class Template:
 
     def longest_validity(self, enclave: str) -> timedelta | None:
         """Return the longest validity of a short-lived enclave; None for all others."""
-        found = (each.validity for each in self.short_lived if matches(each.name, enclave))
+        found = (
+            short_lived.validity
+            for short_lived in self.short_lived
+            if matches(short_lived.name, enclave)
+        )
         return min(found, default=None)
 
 
@@ -186,9 +190,9 @@ def render_template(template: Template) -> str:
         "\n[protection.default]",
         *_topic_lines(protection.default),
     ]
-    for each in template.short_lived:
-        lines += ["\n[[enclaves]]", f"names = [{_toml(each.name)}]"]
-        lines.append(f"validity = {_toml(duration_text(each.validity))}")
+    for short_lived in template.short_lived:
+        lines += ["\n[[enclaves]]", f"names = [{_toml(short_lived.name)}]"]
+        lines.append(f"validity = {_toml(duration_text(short_lived.validity))}")
     items = {kind: item for item, kind in _KINDS.items()}
     for named in protection.named:
         lines += [f"\n[[protection.{items[named.kind]}]]", f"names = [{_toml(named.name)}]"]
@@ -297,9 +301,9 @@ def with_values(
     """
     table = parse_toml(render_template(template))
     protection = table["protection"]
-    for kind, name in [*dropped, *((each.kind, each.name) for each in rules)]:
+    for kind, name in [*dropped, *((rule.kind, rule.name) for rule in rules)]:
         entries = protection.get(kind, [])
-        left = [each for each in entries if not _means(each["names"][0], name)]
+        left = [entry for entry in entries if not _means(entry["names"][0], name)]
         if (kind, name) in dropped and len(left) == len(entries):
             raise UsageError(
                 f"the {kind} {name} has no protection of its own",
@@ -307,10 +311,10 @@ def with_values(
                 "See sros.toml of the keystore.",
             )
         protection[kind] = left
-    for each in rules:
-        typed = {key: _typed("", value) for key, value in each.values}
-        name = each.name if each.name.startswith("~") else expand(each.name, "/", "")
-        protection.setdefault(each.kind, []).append({"names": [name], **typed})
+    for rule in rules:
+        typed = {key: _typed("", value) for key, value in rule.values}
+        name = rule.name if rule.name.startswith("~") else expand(rule.name, "/", "")
+        protection.setdefault(rule.kind, []).append({"names": [name], **typed})
     for key, value in values:
         *path, last = key.split(".")
         inner: Any = table

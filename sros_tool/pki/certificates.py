@@ -255,8 +255,8 @@ _UNREADABLE = "It is not a PEM certificate, it is damaged, or its key algorithm 
 
 
 def _blocks(data: bytes, what: str) -> Iterator[pem_file.Block]:
-    found, damage = _known_blocks(data)
-    yield from found
+    blocks, damage = _known_blocks(data)
+    yield from blocks
     if damage:
         raise PkiError(what, _sentence(damage), _RESTORE)
 
@@ -264,12 +264,12 @@ def _blocks(data: bytes, what: str) -> Iterator[pem_file.Block]:
 @lru_cache(maxsize=8)  # several readers ask for the certificate of an enclave, or for all of them
 def _known_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
     """Return the blocks before the first damaged one, and what is damaged ("" if nothing is)."""
-    found: list[pem_file.Block] = []
+    blocks: list[pem_file.Block] = []
     try:
-        found.extend(pem_file.blocks(data))
+        blocks.extend(pem_file.blocks(data))
     except PkiError as error:
-        return tuple(found), error.what
-    return tuple(found), ""
+        return tuple(blocks), error.what
+    return tuple(blocks), ""
 
 
 def _certificate_in(

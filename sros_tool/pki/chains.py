@@ -214,10 +214,13 @@ def _issuer(
     chain: Sequence[x509.Certificate] = (),
 ) -> x509.Certificate | None:
     """Return the first possible issuer that is valid at ``at``, else the last to expire."""
-    found = [each for each in among if likely_issued(certificate, each) and each not in chain]
-    valid = (issuer for issuer in found if validity_of(issuer).contains(at))
+    certificates = [
+        each for each in among if likely_issued(certificate, each) and each not in chain
+    ]
+    valid = (issuer for issuer in certificates if validity_of(issuer).contains(at))
     return next(
-        valid, max(found, key=lambda certificate: certificate.not_valid_after_utc, default=None)
+        valid,
+        max(certificates, key=lambda certificate: certificate.not_valid_after_utc, default=None),
     )
 
 
@@ -270,9 +273,9 @@ def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
             [part.value.public_bytes() for part in certificate.extensions if part.oid == oid]
             for certificate in chain
         ]
-        for each, networks in zip(chain, values, strict=True):
+        for certificate, networks in zip(chain, values, strict=True):
             if len(networks) > 1 or not set(networks) <= set(_INHERITED):
-                yield f"{subject_text(each.subject)} has {title}, not known to sros"
+                yield f"{subject_text(certificate.subject)} has {title}, not known to sros"
         if values[0] and values[-1]:
             yield f"{subject_text(chain[-1].subject)} has {title} of another CA, and is trusted"
 
@@ -322,18 +325,18 @@ def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
         for certificate in filter(has_explicit_curve, chain):
             yield f"the curve of the key of {subject_text(certificate.subject)} has no name"
     below = 0
-    for place, each in enumerate(chain):
-        constraints = extension(each, x509.BasicConstraints)
+    for place, certificate in enumerate(chain):
+        constraints = extension(certificate, x509.BasicConstraints)
         if place:
-            kind = _authority(each)
+            kind = _authority(certificate)
             root = place == len(chain) - 1
             if not kind or (_Authority.OLD in kind and (strict or not root)):
-                yield f"{subject_text(each.subject)} is not a CA: {_not_a_ca(each)}"
+                yield f"{subject_text(certificate.subject)} is not a CA: {_not_a_ca(certificate)}"
         longest = constraints.path_length if constraints else None
         if place > 1 and longest is not None and below > longest:
-            name = subject_text(each.subject)
+            name = subject_text(certificate.subject)
             yield f"the chain is longer than the pathlen of {name} allows"
-        if not place or not is_self_issued(each):
+        if not place or not is_self_issued(certificate):
             below += 1
 
 
@@ -517,7 +520,7 @@ def _names(certificate: x509.Certificate, *, leaf: bool) -> Iterator[x509.Genera
         yield x509.RFC822Name(str(text.value)) if readable else None
     names = tuple(extension(certificate, x509.SubjectAlternativeName) or ())
     yield from (None if isinstance(name, UnreadableName) else name for name in names)
-    if leaf and not any(isinstance(each, x509.DNSName) for each in names):
+    if leaf and not any(isinstance(name, x509.DNSName) for name in names):
         for common in subject.get_attributes_for_oid(NameOID.COMMON_NAME):
             host = str(common.value).rstrip("\0")
             if _HOST.fullmatch(host):

@@ -213,7 +213,14 @@ def lists_as_revoked(crl: x509.CertificateRevocationList, serial: int) -> bool:
     An entry with the reason removeFromCRL does not (OpenSSL 3, x509_vfy.c, cert_crl).
     """
     if serial < 0:  # RFC 5280 forbids it, OpenSSL accepts it, and the search below raises
-        entry = next((each for each in crl if each.serial_number == serial), None)
+        entry = next(
+            (
+                revoked_certificate
+                for revoked_certificate in crl
+                if revoked_certificate.serial_number == serial
+            ),
+            None,
+        )
     else:
         entry = crl.get_revoked_certificate_by_serial_number(serial)
     return entry is not None and _revoked(entry).reason in REASONS
@@ -415,10 +422,10 @@ def _issuer(
         return None
     identifier = _value(crl, x509.AuthorityKeyIdentifier)
     first = 1 if len(chain) > 1 else 0
-    for place, each in enumerate(chain[first:]):
-        named = place == 0 or same_name(each.subject, crl.issuer)
-        if named and (identifier is None or _identifies(identifier, each)):
-            return each
+    for place, certificate in enumerate(chain[first:]):
+        named = place == 0 or same_name(certificate.subject, crl.issuer)
+        if named and (identifier is None or _identifies(identifier, certificate)):
+            return certificate
     return None
 
 

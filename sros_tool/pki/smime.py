@@ -416,14 +416,14 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     fields = der.children(signed_data.content)
     bags = _optional(fields, 3, der.CONTEXT_0)
     lists = _optional(fields, 3, der.CONTEXT_1)
-    if [each.tag for each in fields] != [der.INTEGER, der.SET, der.SEQUENCE, der.SET]:
+    if [value.tag for value in fields] != [der.INTEGER, der.SET, der.SEQUENCE, der.SET]:
         raise ValueError("not the fields of SignedData")
     version, digests, encapsulated, signers = fields
     der.integer(version)
     kind, *contained = der.children(encapsulated.content)
     if (kind.tag, kind.content) != (der.OID, _DATA):
         raise ValueError("not a signature of data")
-    inside = [_octets(each) for each in contained]
+    inside = [_octets(value) for value in contained]
     if len(inside) > 1 or (content is None and not inside):
         raise ValueError("several contents, or none")
     if content is None:

@@ -66,8 +66,8 @@ def _proxy() -> str:
 
     libp11 loads it, too, where no other is named (Debian and Ubuntu, libengine-pkcs11-openssl).
     """
-    found = sorted(path for folder in _PROXIES for path in Path("/").glob(folder))
-    return next((str(real) for path in found if (real := file_of_root(path))), "")
+    paths = sorted(path for folder in _PROXIES for path in Path("/").glob(folder))
+    return next((str(real) for path in paths if (real := file_of_root(path))), "")
 
 
 _PROXIES = ("usr/lib/*/p11-kit-proxy.so", "usr/lib64/p11-kit-proxy.so", "usr/lib/p11-kit-proxy.so")
@@ -485,18 +485,18 @@ def _encoded(text: str) -> str:
 
 def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
     """Decode the attributes of a part of a URI; errors do not show values, which may be secret."""
-    found: dict[str, str] = {}
+    attributes: dict[str, str] = {}
     for part in filter(None, parts):
         name, _, value = part.partition("=")
-        if name not in known or name in found:
+        if name not in known or name in attributes:
             shown = f" {name!r}" if name.replace("-", "").isalpha() else ""
             raise UsageError(
                 f"the attribute{shown} of a PKCS#11 URI is not accepted",
                 "RFC 7512 does not allow it, or not in this part of the URI, or it is there twice.",
                 "Write pkcs11:token=NAME;object=LABEL?module-path=FILE&pin-source=FILE.",
             )
-        found[name] = unquote(value)
-    return found
+        attributes[name] = unquote(value)
+    return attributes
 
 
 # ── the file with a PIN ────────────────────────────────────────────────────────────────────

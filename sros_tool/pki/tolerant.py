@@ -190,10 +190,10 @@ class _TolerantCertificate(_Signed):
         self._key = _public_key(key.whole)
         while rest and rest[0].tag in _UNIQUE_IDENTIFIERS:
             rest.pop(0)
-        found = _sequence(der.first(rest.pop(0).content)) if rest else []
+        values = _sequence(der.first(rest.pop(0).content)) if rest else []
         if rest:
             raise ValueError("its signed part has extra fields that a certificate does not have")
-        self.extensions = _read(found, _in_certificate, _LOOSE_OF_CERTIFICATES)
+        self.extensions = _read(values, _in_certificate, _LOOSE_OF_CERTIFICATES)
 
     @property
     def tbs_certificate_bytes(self) -> bytes:
@@ -233,12 +233,12 @@ class _TolerantList(_Signed):
         self.last_update_utc = dates[0]
         self.next_update_utc = dates[1] if len(dates) == 2 else None
         entries = _sequence(rest.pop(0)) if rest and rest[0].tag == der.SEQUENCE else []
-        found = _sequence(der.first(rest.pop(0).content)) if rest else []
+        values = _sequence(der.first(rest.pop(0).content)) if rest else []
         if rest:
             raise ValueError(
                 "its signed part has extra fields that a revocation list does not have"
             )
-        self.extensions = _read(found, _in_list, _LOOSE_OF_LISTS)
+        self.extensions = _read(values, _in_list, _LOOSE_OF_LISTS)
         self._entries = list(_entries(entries))
 
     @property

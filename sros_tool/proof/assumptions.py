@@ -96,8 +96,8 @@ def _granted(side: AccessSource) -> DomainSet:
     return DomainSet(
         tuple(
             part
-            for each in side.permissions.values()
-            for grant in each.grants
+            for permissions in side.permissions.values()
+            for grant in permissions.grants
             for rule in grant.rules
             for part in rule.domains.ranges
         )

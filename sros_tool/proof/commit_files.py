@@ -100,7 +100,7 @@ class CommitFiles:
         try:
             return [self._policy(policy.path, placeholders) for policy in folder.policies()]
         except SrosError as error:
-            texts = (folder.shown(each) for each in (error.what, error.why, error.remedy))
+            texts = (folder.shown(part) for part in (error.what, error.why, error.remedy))
             raise DocumentError(*texts) from error
 
     def tree(self, path: str) -> Path | None:
@@ -116,35 +116,35 @@ class CommitFiles:
             raise self._no_file(path, entry)
         links: dict[str, TreeEntry] = {}
         plain: dict[str, TreeEntry] = {}
-        for name, each in walk(self.repository, entry.id, most=_MOST_ENTRIES):
+        for name, tree_entry in walk(self.repository, entry.id, most=_MOST_ENTRIES):
             where = f"{path}/{name}"
-            if each.mode not in (*FILES, LINK):
-                raise self._no_file(where, each)
-            (links if each.mode == LINK else plain)[where] = each
-        of_all = (each.id for each in (*plain.values(), *links.values()))
+            if tree_entry.mode not in (*FILES, LINK):
+                raise self._no_file(where, tree_entry)
+            (links if tree_entry.mode == LINK else plain)[where] = tree_entry
+        of_all = (tree_entry.id for tree_entry in (*plain.values(), *links.values()))
         sizes = self.repository.sizes(dict.fromkeys(of_all))
-        if sum(sizes.get(each.id, 0) for each in plain.values()) > _MOST_WRITTEN:
+        if sum(sizes.get(tree_entry.id, 0) for tree_entry in plain.values()) > _MOST_WRITTEN:
             raise DocumentError(f"'{path}' has more than {_MOST_WRITTEN} bytes")
-        for where, each in links.items():  # before they are read: many are too large together
-            if not 0 < sizes.get(each.id, 1) <= _LONGEST_TARGET:
+        for where, link in links.items():  # before they are read: many are too large together
+            if not 0 < sizes.get(link.id, 1) <= _LONGEST_TARGET:
                 raise DocumentError(f"'{where}' is a link that no file system can have")
         places: dict[str, list[str]] = {}
-        for where, each in plain.items():
-            places.setdefault(each.id, []).append(where)
+        for where, tree_entry in plain.items():
+            places.setdefault(tree_entry.id, []).append(where)
         for part in self.repository.contents_in_parts(places, _MOST_BYTES):
             for digits, content in part.items():
                 for where in places[digits]:
                     self._write(where, plain[where], content)
         contents = self.repository.contents(link.id for link in links.values())
-        for where, each in links.items():
-            if b"\0" in contents[each.id]:
+        for where, link in links.items():
+            if b"\0" in contents[link.id]:
                 raise DocumentError(f"'{where}' is a link that no file system can have")
         top = self.folder / path
         with Folder(self.folder) as folder:
             _make_folders(folder, path)
-            for where, each in links.items():  # when all files are written: none goes through one
+            for where, link in links.items():  # when all files are written: none goes through one
                 _make_folders(folder, str(PurePosixPath(where).parent))
-                folder.symlink(os.fsdecode(contents[each.id]), where)
+                folder.symlink(os.fsdecode(contents[link.id]), where)
         for where in links:
             target = str((self.folder / where).readlink())
             real = Path(os.path.realpath(self.folder / where))
@@ -183,7 +183,7 @@ class CommitFiles:
                 if where not in self.files:  # so that no reader takes it for missing
                     with Folder(self.folder) as folder:
                         _make_folders(folder, where)
-                texts = (revision.shown(each) for each in (error.what, error.why, error.remedy))
+                texts = (revision.shown(part) for part in (error.what, error.why, error.remedy))
                 self.refused.append(DocumentError(*texts))
                 raise
             entry = self.entry(where)
@@ -265,8 +265,8 @@ def _is_part(root: etree._Element) -> bool:
     below = list(root.iter(etree.Element))
     only_names = below[0] if root.tag in _NAMES else below[1:]
     return (
-        any(each.keys() and _gives_access(each) for each in below)
-        or (root.tag in _WITH_PARTS and any(each.tag in INCLUDES for each in below))
+        any(element.keys() and _gives_access(element) for element in below)
+        or (root.tag in _WITH_PARTS and any(element.tag in INCLUDES for element in below))
         or (
             (bool(below[1:]) or root.tag in _NAMES)
             and all(e.tag in _NAMES and e.text for e in only_names)
@@ -337,12 +337,12 @@ def _includes(path: str, content: bytes | None) -> Iterator[tuple[str, str]]:
         root = parse(content, "the file", instructions=True) if content is not None else None
     except DocumentError:
         return
-    for each in root.iter(*INCLUDES) if root is not None else ():
-        above = {str(other.tag) for other in each.iterancestors()}
+    for element in root.iter(*INCLUDES) if root is not None else ():
+        above = {str(other.tag) for other in element.iterancestors()}
         if not above & {"metadata", *FALLBACKS}:
-            name = unquote(each.get("href", ""), errors="surrogateescape")
+            name = unquote(element.get("href", ""), errors="surrogateescape")
             target = os.path.normpath(Path(path).parent / name) if name else path
-            yield target, each.get("xpointer", "")
+            yield target, element.get("xpointer", "")
 
 
 def same_root(one: bytes, other: bytes) -> bool:

@@ -165,7 +165,7 @@ def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
     if isinstance(requirement, Protected):
         return
     may = not isinstance(requirement, Must)
-    if not may and any(each.enclave in world.idle for each in witness.uses):
+    if not may and any(use.enclave in world.idle for use in witness.uses):
         return
     confirm = world.confirm if may else world.confirm_own
     for use in witness.uses:
@@ -209,7 +209,7 @@ def _parts_of(right: str) -> tuple[_Part, ...]:
 @lru_cache(maxsize=16)
 def _doing(right: str) -> tuple[_Part, ...]:
     """Return the DDS topics of a right of which a single one is enough to act."""
-    return tuple(each for each in _parts_of(right) if each.writes or right == "subscribe")
+    return tuple(part for part in _parts_of(right) if part.writes or right == "subscribe")
 
 
 def _each(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
@@ -382,7 +382,7 @@ def _shared_by(
 
 def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with the shortest name that a wildcard allows beyond the requirement."""
-    enclaves = [each for each in world.enclaves if _match(requirement.enclaves, each)]
+    enclaves = [enclave for enclave in world.enclaves if _match(requirement.enclaves, enclave)]
     uses: dict[str, Use] = {}
     for right, names in requirement.rights:
         for part in _doing(right):
@@ -407,7 +407,7 @@ _READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
 
 def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with the shortest name to which an enclave has a further right."""
-    enclaves = [each for each in world.enclaves if _match(requirement.enclaves, each)]
+    enclaves = [enclave for enclave in world.enclaves if _match(requirement.enclaves, enclave)]
     uses: dict[str, Use] = {}
     for writes, ordinary in ((True, _WRITTEN_BY_EVERY_NODE), (False, _READ_BY_EVERY_NODE)):
         allowed = NameSet.union(
@@ -508,9 +508,11 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
             patterns = requirement.enclaves
         case Apart():
             patterns = (*requirement.sources, *requirement.targets, *requirement.through)
-    for each in dict.fromkeys(patterns):
-        if not any(fnmatchcase(enclave, each.removeprefix(EXCEPT)) for enclave in world.enclaves):
-            yield f"enclave {each}"
+    for pattern in dict.fromkeys(patterns):
+        if not any(
+            fnmatchcase(enclave, pattern.removeprefix(EXCEPT)) for enclave in world.enclaves
+        ):
+            yield f"enclave {pattern}"
     match requirement:
         case Only() | AtMost() | NotBoth():
             sides = (
@@ -569,8 +571,8 @@ def _anybody(world: World, parts: Iterable[_Part], name: str, limit: SearchLimit
     """Return whether any enclave may use a DDS topic of the name."""
     for part in parts:
         met = world.side(part.writes).meeting(part.topics(name), limit)
-        if any(each.stated for each in met) or any(
-            world.use(each, part.topics(name), limit) for each in met
+        if any(meeting.stated for meeting in met) or any(
+            world.use(meeting, part.topics(name), limit) for meeting in met
         ):
             return True
     return False

@@ -77,7 +77,7 @@ class DroppedRequirement:
     @property
     def now(self) -> tuple[str, ...]:
         """The demands of the new file about some of the same names, as clauses."""
-        return tuple(demand(each) for each in self.kept)
+        return tuple(demand(requirement) for requirement in self.kept)
 
     def text(self) -> str:
         """Return a clause with the part of the requirement that the new file still demands."""
@@ -126,25 +126,25 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
     """Split a requirement into requirements about a single name that together demand the same."""
     match requirement:
         case Widest(rights=rights, enclaves=enclaves):
-            for each in rights:
+            for right in rights:
                 for some in _one_by_one(enclaves):
-                    yield replace(requirement, rights=(each,), enclaves=some)
+                    yield replace(requirement, rights=(right,), enclaves=some)
         case NothingBut(enclaves=enclaves):
             for some in _one_by_one(enclaves):
                 yield replace(requirement, enclaves=some)
         case NotBoth(first=first, second=second):
-            for one in _single_rights(first):
+            for right in _single_rights(first):
                 for other in _single_rights(second):
-                    yield replace(requirement, first=(one,), second=(other,))
+                    yield replace(requirement, first=(right,), second=(other,))
         case (
             Only(rights=rights)
             | Nobody(rights=rights)
             | Must(rights=rights)
             | AtMost(rights=rights)
         ):
-            for right, names in rights:
+            for verb, names in rights:
                 for name in names:
-                    yield replace(requirement, rights=((right, (name,)),))
+                    yield replace(requirement, rights=((verb, (name,)),))
         case Protected(names=pairs):
             for pair in pairs:
                 yield replace(requirement, names=(pair,))

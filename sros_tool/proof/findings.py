@@ -127,9 +127,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     worlds = Worlds(system.worlds)
     for requirement in requirements:
         verdicts = list(worlds.decide(requirement, limit))
-        broken = [(world, each.witness) for world, each in verdicts if each.witness]
+        broken = [(world, verdict.witness) for world, verdict in verdicts if verdict.witness]
         if broken:
-            world, witness = min(broken, key=lambda each: len(each[1].uses))
+            world, witness = min(broken, key=lambda pair: len(pair[1].uses))
             steps = tuple(_step(use, world, system) for use in witness.uses)
             titles = tuple(world.title for world, _ in broken)
             titles = () if len(broken) == len(system.worlds) else titles
@@ -139,9 +139,11 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             )
             idle = isinstance(requirement, Must) and requirement.enclave in world.idle
             violations.append(Violation(requirement, witness, steps, titles, missing, idle))
-        if reasons := tuple(_never_fails([each for _, each in verdicts])):
+        if reasons := tuple(_never_fails([verdict for _, verdict in verdicts])):
             vacuous.append((requirement, reasons))
-        if not broken and (names := [each.assumed for _, each in verdicts if each.assumed]):
+        if not broken and (
+            names := [verdict.assumed for _, verdict in verdicts if verdict.assumed]
+        ):
             assumed.append((requirement, names[0]))
     return Decided(tuple(violations), tuple(vacuous), tuple(assumed))
 
@@ -255,7 +257,7 @@ def _chain(steps: Sequence[Step]) -> str:
     """Return text such as ``/a -publish /x-> /b -publish /y-> /c``."""
     hops = zip(steps[::2], steps[1::2], strict=True)
     return " ".join(
-        (steps[0].use.enclave, *(f"-{said.does()}-> {heard.use.enclave}" for said, heard in hops))
+        (steps[0].use.enclave, *(f"-{step.does()}-> {heard.use.enclave}" for step, heard in hops))
     )
 
 
@@ -317,24 +319,24 @@ def suggest(rights: Iterable[Right], worlds: Sequence[World]) -> tuple[Requireme
     requirements: list[Requirement] = []
     limit = SearchLimit(_MOST_STEPS)
     all_worlds = Worlds(worlds)
-    for each in islice(_candidates(_Stated(rights), worlds), _MOST):
-        verdicts = all_worlds.decide(each, limit)
+    for requirement in islice(_candidates(_Stated(rights), worlds), _MOST):
+        verdicts = all_worlds.decide(requirement, limit)
         if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
-            last = _joined(requirements[-1], each) if requirements else None
-            requirements[-1:] = [last] if last else [*requirements[-1:], each]
+            last = _joined(requirements[-1], requirement) if requirements else None
+            requirements[-1:] = [last] if last else [*requirements[-1:], requirement]
     return tuple(requirements)
 
 
-def _joined(one: Requirement, other: Requirement) -> Requirement | None:
+def _joined(requirement: Requirement, other: Requirement) -> Requirement | None:
     """Join two requirements of a kind that demand the same of different names, or return None."""
-    match one, other:
+    match requirement, other:
         case (
             Nobody(rights=(("request", some),)),
             Nobody(rights=(("request", more),)),
         ) if len(some) < _WIDE_LIST:
-            return replace(one, rights=(("request", (*some, *more)),))
+            return replace(requirement, rights=(("request", (*some, *more)),))
         case Protected(names=some, level=level), Protected(names=more) if other.level is level:
-            return replace(one, names=(*some, *more))
+            return replace(requirement, names=(*some, *more))
     return None
 
 

@@ -246,7 +246,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         )
     sides: tuple[_Edges | None, ...] = ({}, {})
     if added and scope is None:
-        sides = tuple(_edges(each, _borrowed(each, worlds)) for each in (before, after))
+        sides = tuple(_edges(source, _borrowed(source, worlds)) for source in (before, after))
     unknown = "only some enclaves are compared" if scope is not None else ""
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
@@ -257,7 +257,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         tuple(islice(_new_reach(*sides), _MOST_REACH)),
         unknown,
         lost,
-        tuple(replace(each, effect=Effect.TIGHTER) for each in more),
+        tuple(replace(change, effect=Effect.TIGHTER) for change in more),
         tuple(world.title for world in worlds),
         tuple(sorted({domain for world in worlds for domain in world.domains})),
         assumptions(base, head),
@@ -352,13 +352,13 @@ def _zenoh_domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
     for side, other in ((base, head), (head, base)):
         domains.update(DomainSet.of((e, e)) for e in domains_of_robots(side, other).values())
         if side.zenoh is None and side.kind != "policy":
-            domains.update(each.closed() for each in _granted(side))
+            domains.update(domain_set.closed() for domain_set in _granted(side))
     return domains_of((*base.enforcers, *head.enforcers), domains) or (0,)
 
 
 def _domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
     """Return one domain of each kind: between two of them, all have the same rules as the first."""
-    governances = (each.governance for each in (base, head) if each.governance)
+    governances = (source.governance for source in (base, head) if source.governance)
     listed = {rule.domains for governance in governances for rule in governance.domain_access_rules}
     return DomainSet.one_of_each_kind(listed, _granted(base) | _granted(head))
 
@@ -367,8 +367,8 @@ def _granted(side: AccessSource) -> set[DomainSet]:
     """Return the sets of domains for which permissions have rules."""
     return {
         rule.domains
-        for each in side.permissions.values()
-        for grant in each.grants
+        for permissions in side.permissions.values()
+        for grant in permissions.grants
         for rule in grant.rules
     }
 
@@ -443,7 +443,7 @@ def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
             writes = verb is AccessVerb.PUBLISH
             return is_enforced(side.enforcers, enclave, domain, topic, writes=writes)
 
-        writes, reads = (each & ROS_TOPICS for each in (found.writes, found.reads))
+        writes, reads = (name_set & ROS_TOPICS for name_set in (found.writes, found.reads))
         topics = {AccessVerb.PUBLISH: writes, AccessVerb.SUBSCRIBE: reads}
         joins = any(enclave in enforcer.names() for enforcer in side.enforcers)
         return _Access(topics, decide, joins=joins)
@@ -589,10 +589,10 @@ def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> 
     )
 
 
-def _same_grants(one: Permissions | None, other: Permissions | None) -> bool:
-    if one is None or other is None:
-        return one is other
-    return [_without_name(grant) for grant in one.grants] == [
+def _same_grants(permissions: Permissions | None, other: Permissions | None) -> bool:
+    if permissions is None or other is None:
+        return permissions is other
+    return [_without_name(grant) for grant in permissions.grants] == [
         _without_name(grant) for grant in other.grants
     ]
 
@@ -629,7 +629,7 @@ class _Stated:
         rights = new.rights if new.zenoh is None else new.rights | new.zenoh
         earlier = old.rights if old.zenoh is None else old.rights | old.zenoh
         self._allowed = _by_enclave(right for right in rights if right.qualifier is ALLOW)
-        self._denied = _by_enclave(each for each in earlier if each.qualifier is not ALLOW)
+        self._denied = _by_enclave(right for right in earlier if right.qualifier is not ALLOW)
 
     def gains(
         self,
@@ -645,8 +645,8 @@ class _Stated:
         key = enclave, lenders, verb, more, world.style, world.longest  # often in several domains
         if key not in self._found:
             self._found[key] = list(self._searched(enclave, verb, more, world, domain, limit))
-        for each in self._found[key]:
-            yield replace(each, worlds=(world.title,), domains=(domain,))
+        for gain in self._found[key]:
+            yield replace(gain, worlds=(world.title,), domains=(domain,))
 
     def _searched(
         self,
@@ -658,9 +658,9 @@ class _Stated:
         limit: SearchLimit,
     ) -> Iterator[Gain]:
         allowed = [
-            (each, getattr(each.topics, verb))
+            (right, getattr(right.topics, verb))
             for name in (enclave, *world.lenders(self._new, enclave))
-            for each in self._allowed.get(name, ())
+            for right in self._allowed.get(name, ())
         ]
         denied = self._denials(enclave, verb, world.style)
         for right, topics in allowed:
@@ -792,7 +792,7 @@ def _borrowed(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[st
     worlds = tuple(worlds)
     for enclave in side.permissions:
         lenders = (lender for world in worlds for lender in world.lenders(side, enclave))
-        yield from ((enclave, each) for each in dict.fromkeys(lenders))
+        yield from ((enclave, lender) for lender in dict.fromkeys(lenders))
 
 
 def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | None:
@@ -808,7 +808,7 @@ def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | 
     for enclave, lender in borrowed:
         name = f"{enclave} by {lender}"
         real[name] = enclave
-        more += (each._replace(enclave=name) for each in by_enclave.get(lender, ()))
+        more += (right._replace(enclave=name) for right in by_enclave.get(lender, ()))
         if len(more) > _MOST_HOPS:
             return None
     network = Network(
@@ -820,9 +820,9 @@ def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | 
     )
     edges: dict[str, dict[str, Hop]] = defaultdict(dict)
     left = _MOST_HOPS
-    for each in network.enclaves:
-        source = real.get(each, each)
-        for hop in network.hops(each):
+    for enclave in network.enclaves:
+        source = real.get(enclave, enclave)
+        for hop in network.hops(enclave):
             target = real.get(hop.target, hop.target)
             if target != source and target not in edges[source]:
                 edges[source][target] = hop._replace(source=source, target=target)

@@ -94,11 +94,13 @@ def _of_payloads(governance: Governance) -> Governance:
 
 def contradiction(side: AccessSource) -> str:
     """Return the first two statements of policies that demand different protection of a name."""
-    for one, other in contradictions(side.protections or ()):
-        places = (side.shown_source(each.source) for each in (other, one))
+    for protection, other in contradictions(side.protections or ()):
+        places = (
+            side.shown_source(stated_protection.source) for stated_protection in (other, protection)
+        )
         return (
-            f'{next(places)}: {other} has protect="{other.word}", and {one} has '
-            f'protect="{one.word}" at {next(places)}'
+            f'{next(places)}: {other} has protect="{other.word}", and {protection} has '
+            f'protect="{protection.word}" at {next(places)}'
         )
     return ""
 
@@ -147,7 +149,9 @@ def _looser_later(
     if old.later is None or new.later is None:
         return
     domains = DomainSet.of((0, 0))
-    before, after = (governance_for(each.protection, domains) for each in (old.later, new.later))
+    before, after = (
+        governance_for(template.protection, domains) for template in (old.later, new.later)
+    )
     changes = [
         *compare_settings(old.later, new.later, AT),
         *_looser_governance(before, after, limit),
@@ -171,7 +175,7 @@ def _looser_later(
 
 def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
     """Yield the enclaves whose certificate names another enclave, or whose key belonged to one."""
-    names = {each.key: each.name for each in old.certified.values()}
+    names = {enclave.key: enclave.name for enclave in old.certified.values()}
     for enclave, new_one in new.certified.items():
         before = names.get(new_one.key, enclave)
         old_one = old.certified.get(enclave)
@@ -217,17 +221,17 @@ def _looser_governance(
     old: Governance, new: Governance, limit: SearchLimit
 ) -> Iterator[SettingChange]:
     pairs = dict.fromkeys(
-        (one, other)
-        for one in old.domain_access_rules
+        (rule, other)
+        for rule in old.domain_access_rules
         for other in new.domain_access_rules
-        if any(each in other.domains.closed() for each in one.domains.closed())
+        if any(each in other.domains.closed() for each in rule.domains.closed())
     )
-    for one, other in pairs:
-        for change in attribute_changes(one, other, "protection", ""):
+    for rule, other in pairs:
+        for change in attribute_changes(rule, other, "protection", ""):
             if change.effect is Effect.LOOSER:
                 yield change
         for style in Style:
-            yield from _looser_topics(one, other, style, limit)
+            yield from _looser_topics(rule, other, style, limit)
 
 
 def _looser_topics(
@@ -259,8 +263,8 @@ def _by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, Name
         for topic_rule in rule.topic_access_rules
     ]
     return [
-        (kind, NameSet.first((names, each == kind) for names, each in rules))
-        for kind in dict.fromkeys(each for _, each in rules)
+        (kind, NameSet.first((names, topic_rule == kind) for names, topic_rule in rules))
+        for kind in dict.fromkeys(topic_rule for _, topic_rule in rules)
     ]
 
 
@@ -269,24 +273,25 @@ def _no_longer_stated(
 ) -> Iterator[SettingChange]:
     """Yield the names whose protection ``new`` demands less than ``old``, or not at all."""
     later = tuple(new)
-    for each in old:
+    for protection in old:
         enough = [
             other.name
             for other in later
-            if other.kind == each.kind and (other.level, each.level) != (Level.SIGN, Level.ENCRYPT)
+            if other.kind == protection.kind
+            and (other.level, protection.level) != (Level.SIGN, Level.ENCRYPT)
         ]
-        names = _named((each.name,)) - _named(enough)
+        names = _named((protection.name,)) - _named(enough)
         example = names.example(limit)
         if example is not None:
             valid = names & _ABSOLUTE
             name = example if example in _ABSOLUTE else valid.example(limit) or example
-            less = "sign" if name in _named(_signed(later, each.kind)) else "nothing"
+            less = "sign" if name in _named(_signed(later, protection.kind)) else "nothing"
             yield SettingChange(
                 Effect.LOOSER,
-                f"protect {each}",
-                each.word,
+                f"protect {protection}",
+                protection.word,
                 less,
-                f"the policy no longer demands it of {each.kind.removesuffix('s')} {name}",
+                f"the policy no longer demands it of {protection.kind.removesuffix('s')} {name}",
             )
 
 

@@ -168,7 +168,11 @@ class Repository:
             digits = name if _ABBREVIATED.match(name) else described
             ids = self._ask("rev-parse", f"--disambiguate={digits.lower()}").split()
             kinds = {each: kind for each, (kind, _) in self._described(ids).items()}
-            candidates |= {each: each for each in ids if kinds.get(each) in ("commit", "tag")}
+            candidates |= {
+                object_id: object_id
+                for object_id in ids
+                if kinds.get(object_id) in ("commit", "tag")
+            }
         return candidates
 
     def _references(self, name: str) -> dict[str, str]:
@@ -285,7 +289,7 @@ class Repository:
 
     def _described(self, ids: Iterable[str]) -> dict[str, tuple[str, int]]:
         """Return type and size of objects by id, as the repository says."""
-        asked = "".join(f"{each}\n" for each in ids).encode()
+        asked = "".join(f"{object_id}\n" for object_id in ids).encode()
         lines = self._git(["cat-file", "--batch-check"], stdin=asked).decode().splitlines()
         fields = (line.split() for line in lines)
         return {words[0]: (words[1], int(words[2])) for words in fields if len(words) == 3}
@@ -301,10 +305,10 @@ class Repository:
         for part in path.split("/") if path else ():
             if entry.mode != FOLDER:
                 raise DocumentError(f"'{'/'.join(gone)}' is no folder of the revision")
-            found = _folder(self, entry.id).get(part)
-            if found is None:
+            tree_entry = _folder(self, entry.id).get(part)
+            if tree_entry is None:
                 return None
-            entry = found
+            entry = tree_entry
             gone.append(part)
         return entry
 
@@ -334,16 +338,18 @@ class Repository:
 
     def _all(self, kind: str, ids: Sequence[str]) -> dict[str, bytes]:
         objects = self._objects(ids)
-        for each in ids:
-            if each not in objects:
+        for object_id in ids:
+            if object_id not in objects:
                 raise DocumentError(
-                    f"git cannot read it: the object {each} is not in the repository",
+                    f"git cannot read it: the object {object_id} is not in the repository",
                     "",
                     "Fetch all of the commit: no partial clone (`git fetch --refetch`).",
                 )
-            if objects[each][0] != kind:
-                raise DocumentError(f"the object {each} is no {kind}, but a {objects[each][0]}")
-        return {each: objects[each][1] for each in ids}
+            if objects[object_id][0] != kind:
+                raise DocumentError(
+                    f"the object {object_id} is no {kind}, but a {objects[object_id][0]}"
+                )
+        return {object_id: objects[object_id][1] for object_id in ids}
 
     def _objects(self, ids: Sequence[str]) -> dict[str, tuple[str, bytes]]:
         """Return type and content of objects, verified; what is missing is left out.
@@ -354,11 +360,11 @@ class Repository:
         for each, size in self.sizes(ids).items():
             if size > _MOST_BYTES:
                 raise DocumentError(f"the object {each} is larger than {_MOST_BYTES} bytes")
-        asked = "".join(f"{each}\n" for each in ids).encode()
+        asked = "".join(f"{object_id}\n" for object_id in ids).encode()
         data = self._git(["cat-file", "--batch"], stdin=asked)
         objects: dict[str, tuple[str, bytes]] = {}
         at = 0
-        for each in ids:
+        for object_id in ids:
             end = data.find(b"\n", at)
             line, at = data[at:end], end + 1
             words = line.decode(errors="replace").split()
@@ -368,13 +374,13 @@ class Repository:
                 raise DocumentError(f"git cannot read it: {line[:200].decode(errors='replace')}")
             content = data[at : at + int(words[2])]
             at += len(content) + 1
-            if _digest(words[1], content, len(each)) != each:
+            if _digest(words[1], content, len(object_id)) != object_id:
                 raise DocumentError(
-                    f"the object {each} of the repository is damaged",
+                    f"the object {object_id} of the repository is damaged",
                     "Its content does not have this hash.",
                     "Clone the repository again.",
                 )
-            objects[each] = words[1], content
+            objects[object_id] = words[1], content
         return objects
 
     # ── fetching ───────────────────────────────────────────────────────────────────────────

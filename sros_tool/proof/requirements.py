@@ -234,7 +234,7 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
             )
         lines = places.get(kind, [])
         plain = isinstance(requirements, list) and all(
-            isinstance(each, dict) for each in requirements
+            isinstance(requirement, dict) for requirement in requirements
         )
         if not plain or len(requirements) != len(lines):
             raise DocumentError(
@@ -258,11 +258,12 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
         _READERS[table.kind](table) for _, table in sorted(tables, key=lambda e: e[0])
     )
     left = _MOST_PAIRS
-    for each in requirements:
-        left -= _pairs(each)
+    for requirement in requirements:
+        left -= _pairs(requirement)
         if left < 0:
             raise DocumentError(
-                f"{each.source}: there are more than {_MOST_PAIRS} pairs of two names up to here",
+                f"{requirement.source}: there are more than {_MOST_PAIRS} pairs of two names "
+                "up to here",
                 "Each name of one list counts with each one of the other.",
                 "Write patterns in place of names, or divide the file.",
             )
@@ -357,27 +358,27 @@ class _Table:
     def names(self, key: str, *, least: int = 1) -> tuple[str, ...]:
         """Return absolute names, perhaps with wildcards."""
         names = self.texts(key, least=least)
-        for each in names:
-            problem = expression_problem(each)
-            if not problem and each[0] not in "/*":
+        for name in names:
+            problem = expression_problem(name)
+            if not problem and name[0] not in "/*":
                 problem = "It is not absolute: it does not begin with '/' or '*'."
-            if not problem and each == "/":
+            if not problem and name == "/":
                 problem = "It is a namespace."
             if problem:
-                raise self.error(key, f"{_short(each)} is not valid in {key}", problem)
+                raise self.error(key, f"{_short(name)} is not valid in {key}", problem)
         return names
 
     def enclaves(self, key: str) -> tuple[str, ...]:
         """Return names and patterns of enclaves, those that are excepted with ``!`` before them."""
         enclaves = self.texts(key)
-        for each in enclaves:
-            name = each.removeprefix(EXCEPT)
+        for enclave in enclaves:
+            name = enclave.removeprefix(EXCEPT)
             problem = "" if name == "/" else expression_problem(name)
             if not problem and name[0] not in "/*?[":
                 problem = "An enclave begins with '/'."
             if problem:
-                raise self.error(key, f"{_short(each)} is no enclave in {key}", problem)
-        if all(each.startswith(EXCEPT) for each in enclaves):
+                raise self.error(key, f"{_short(enclave)} is no enclave in {key}", problem)
+        if all(enclave.startswith(EXCEPT) for enclave in enclaves):
             raise self.error(key, f"{key} only excepts enclaves", 'Write "*" before them for all.')
         return enclaves
 

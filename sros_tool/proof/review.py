@@ -184,7 +184,9 @@ class Review:
     def findings(self) -> list[Finding]:
         """The findings on HEAD."""
         chosen = [step.content for step in self.steps if isinstance(step.content, ChosenFindings)]
-        return list(dict.fromkeys(f for each in chosen for f in (*each.shown, *each.accepted)))
+        return list(
+            dict.fromkeys(f for choice in chosen for f in (*choice.shown, *choice.accepted))
+        )
 
     def shown(self, text: str) -> str:
         """Return a text with the paths of files as the repository has them."""
@@ -194,8 +196,8 @@ class Review:
     def shown_finding(self, finding: Finding) -> Finding:
         """Return a finding with the paths of files as the repository has them."""
         related = tuple(
-            each._replace(text=self.shown(each.text), file=self.shown(each.file))
-            for each in finding.related
+            place._replace(text=self.shown(place.text), file=self.shown(place.file))
+            for place in finding.related
         )
         return finding._replace(
             subject=self.shown(finding.subject),
@@ -407,8 +409,8 @@ class _Review:
         became = ""
         if entry:
             became = "The change deletes it."
-            for name, each in self._changed(self.head, self.base):
-                if each.id == entry.id:
+            for name, tree_entry in self._changed(self.head, self.base):
+                if tree_entry.id == entry.id:
                     became = f"The change renames it to '{name}'."
         return DocumentError(
             f"'{path}' is not in the commit", became, "Review the files that the robot uses."
@@ -487,7 +489,7 @@ class _Review:
         fleet: Fleet | None,
     ) -> Iterator[str]:
         """Yield policies of which the reviewed ones, or a keystore, have the file, but not all."""
-        named = {str(each.relative_to(self.head.folder)) for each in reviewed}
+        named = {str(path.relative_to(self.head.folder)) for path in reviewed}
         content = self.request.repository.content
         known = {
             path: content(entry.id)
@@ -545,16 +547,22 @@ class _Review:
         for folder in sorted({parent for part in parts for parent in Path(part).parents}):
             entry = self.head.entry("" if folder == Path() else str(folder))
             assert entry
-            for name, each in repository.folders([entry.id])[entry.id].items():
+            for name, tree_entry in repository.folders([entry.id])[entry.id].items():
                 path = str(folder / name)
-                if each.mode in FILES and not _is_below(path, self.request.left_out):
-                    ids[path] = each.id
+                if tree_entry.mode in FILES and not _is_below(path, self.request.left_out):
+                    ids[path] = tree_entry.id
         sizes = repository.sizes(dict.fromkeys(ids.values()))
-        ids = {path: each for path, each in ids.items() if sizes.get(each, 0) <= _MOST_OUTSIDE}
+        ids = {
+            path: object_id
+            for path, object_id in ids.items()
+            if sizes.get(object_id, 0) <= _MOST_OUTSIDE
+        }
         contents: dict[str, bytes] = {}
-        for some in repository.contents_in_parts(ids.values(), _MOST_BYTES):
-            contents |= {digits: data for digits, data in some.items() if includes_files(data)}
-        there = {path: contents[each] for path, each in ids.items() if each in contents}
+        for part in repository.contents_in_parts(ids.values(), _MOST_BYTES):
+            contents |= {digits: data for digits, data in part.items() if includes_files(data)}
+        there = {
+            path: contents[object_id] for path, object_id in ids.items() if object_id in contents
+        }
         users = users_of(parts, there)
         return sorted(e for e in users if e not in files and is_whole_policy(there[e]))
 
@@ -592,7 +600,7 @@ class _Review:
             and not (known and path in side.files)
             and not _is_below(path, self.request.left_out)
         }
-        sizes = side.repository.sizes(dict.fromkeys(each.id for each in wanted.values()))
+        sizes = side.repository.sizes(dict.fromkeys(entry.id for entry in wanted.values()))
         small = {p: e.id for p, e in wanted.items() if sizes.get(e.id, 0) <= _MOST_OUTSIDE}
         of_policies = {
             digits
@@ -737,10 +745,10 @@ class _Review:
 
         def findings() -> tuple[int, Content]:
             findings = (
-                each
-                for each in path_findings(folder, self._circumstances())
-                if (each.id != _FILE_MISSING or Path(each.file).name != KEY_FILE)
-                and (not each.file or _is_below(os.path.normpath(each.file), (str(folder),)))
+                finding
+                for finding in path_findings(folder, self._circumstances())
+                if (finding.id != _FILE_MISSING or Path(finding.file).name != KEY_FILE)
+                and (not finding.file or _is_below(os.path.normpath(finding.file), (str(folder),)))
             )
             chosen = FindingFilter(strict=bool(self.base) and not same).choose(findings)
             return _status(chosen), chosen
@@ -779,7 +787,7 @@ def _holders(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | No
     """Map the enclaves of policies to the robot that gets their keys; None for those of none."""
     if fleet is None:
         return {enclave.path: None for file in files for enclave in read_policy(file).enclaves}
-    policies = (FleetPolicy(read_policy(each, placeholders=True), fleet) for each in files)
+    policies = (FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files)
     return {path: policy.stated(path)[1] for policy in policies for path in policy}
 
 
@@ -810,14 +818,14 @@ def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
         raise PolicyError("requirements are decided of policies, and there is none to read")
     policies = [read_policy_for(file, fleet) for file in files]
     first, *others = policies
-    enclaves = {each.path: each for each in first.enclaves}
-    for each in (enclave for policy in others for enclave in policy.enclaves):
-        if each.path in enclaves:
+    enclaves = {enclave.path: enclave for enclave in first.enclaves}
+    for enclave in (enclave for policy in others for enclave in policy.enclaves):
+        if enclave.path in enclaves:
             raise PolicyError(
-                f"{each.source}: enclave {each.path} is in another policy, too",
-                f"The other one is at {enclaves[each.path].source}.",
+                f"{enclave.source}: enclave {enclave.path} is in another policy, too",
+                f"The other one is at {enclaves[enclave.path].source}.",
                 "Review the policies of each robot in a review of its own.",
             )
-        enclaves[each.path] = each
-    fallbacks = tuple(each for policy in policies for each in policy.fallbacks)
+        enclaves[enclave.path] = enclave
+    fallbacks = tuple(fallback for policy in policies for fallback in policy.fallbacks)
     return replace(first, enclaves=tuple(enclaves.values()), fallbacks=fallbacks)

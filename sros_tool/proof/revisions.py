@@ -51,27 +51,31 @@ class Revision:
             return (self,)
         below = f"{self.path}/" if self.path else ""
         files = [
-            (Revision(self.repository, self.name, self.commit, below + name), each)
-            for name, each in walk(self.repository, entry.id, most=_MOST_ENTRIES)
+            (Revision(self.repository, self.name, self.commit, below + name), tree_entry)
+            for name, tree_entry in walk(self.repository, entry.id, most=_MOST_ENTRIES)
         ]
-        for file, each in files:
-            if each.mode not in FILES:
-                raise DocumentError(f"'{file}' is {each.kind}", "", "Name a policy in the folder.")
-        ids = dict.fromkeys(each.id for _, each in files)
+        for file, tree_entry in files:
+            if tree_entry.mode not in FILES:
+                raise DocumentError(
+                    f"'{file}' is {tree_entry.kind}", "", "Name a policy in the folder."
+                )
+        ids = dict.fromkeys(tree_entry.id for _, tree_entry in files)
         sizes = self.repository.sizes(ids)
-        if sum(sizes.get(each.id, 0) for _, each in files) > _MOST_BYTES:
+        if sum(sizes.get(tree_entry.id, 0) for _, tree_entry in files) > _MOST_BYTES:
             raise DocumentError(
                 f"'{self}' has more than {_MOST_BYTES} bytes", "", "Name a policy in it."
             )
         contents = self.repository.contents(ids)
         policies = [
-            file for file, each in files if is_policy(file.path, contents[each.id], f"'{file}'")
+            file
+            for file, tree_entry in files
+            if is_policy(file.path, contents[tree_entry.id], f"'{file}'")
         ]
         if len(policies) > _MOST_FILES:
             raise DocumentError(
                 f"'{self}' has more than {_MOST_FILES} policies", "", "Name one of them."
             )
-        return tuple(sorted(policies, key=lambda each: each.path))
+        return tuple(sorted(policies, key=lambda revision: revision.path))
 
     def read(self, file: Path) -> bytes:
         """Return the content of a file that has a `place` in this revision.

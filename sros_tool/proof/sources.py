@@ -188,13 +188,13 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         str(path),
         source.kind,
         source.rights,
-        {name: _without_dates(each) for name, each in source.documents.items()},
+        {name: _without_dates(permissions) for name, permissions in source.documents.items()},
         scope=source.scope,
         notes=source.notes,
         fleet=source.fleet,
     )
-    for enclave, each in source.documents.items():
-        if len(each.grants) > 1:
+    for enclave, permissions in source.documents.items():
+        if len(permissions.grants) > 1:
             raise DocumentError(
                 f"the permissions of {enclave} in '{path}' have several grants",
                 "Vendors differ in which one of them counts.",
@@ -225,7 +225,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
     keystore = Keystore(path)
     folders = {name: enclave_path(path, name) for name in enclave_names(path, hidden=True)}
     trusting = {
-        name: (each / IDENTITY_CA_FILE, each / CRL_FILE) for name, each in folders.items()
+        name: (folder / IDENTITY_CA_FILE, folder / CRL_FILE) for name, folder in folders.items()
     } | {KEYSTORE_ITSELF: (path / ca_certificate(IDENTITY), path / CRL)}
     side = replace(
         side,
@@ -237,20 +237,20 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
     )
     if not has_zenoh_files(path, hidden=True):
         return side
-    found = load_zenoh_rights(keystore, hidden=True)
-    for note in found.notes:
+    rights_source = load_zenoh_rights(keystore, hidden=True)
+    for note in rights_source.notes:
         if note.id in UNCERTAIN:
             raise DocumentError(f"'{path}' cannot be compared: {note.text.rstrip('.')}")
     names = {folder: name for name, folder in folders.items()}
     configurations = {
         f"{names[file.parent]} {file.name}": _zenoh_file(file, document)
-        for file, document in found.configurations.items()
+        for file, document in rights_source.configurations.items()
     }
     return replace(
         side,
-        zenoh=found.rights,
-        enforcers=found.enforcers,
-        router=found.router,
+        zenoh=rights_source.rights,
+        enforcers=rights_source.enforcers,
+        router=rights_source.router,
         zenoh_files=configurations,
     )
 
@@ -311,7 +311,9 @@ def _authorities(folders: Iterable[Path]) -> frozenset[tuple[str, str]]:
         for role, file in (("identity", IDENTITY_CA_FILE), ("permissions", PERMISSIONS_CA_FILE))
         if (folder / file).exists()
     }
-    return frozenset((role, each) for role, pem in authorities for each in fingerprints(pem))
+    return frozenset(
+        (role, fingerprint) for role, pem in authorities for fingerprint in fingerprints(pem)
+    )
 
 
 _NEVER = "9999"
@@ -350,7 +352,7 @@ def _trusts(
         lists: dict[str, bytes] = {}
         for data in dict.fromkeys(([] if own is None else [own]) + embedded_lists(pem)):
             found = load_crl(data, CRL_FILE)
-            key = next((key for each, key in keys if signed_by(found.list, each)), "")
+            key = next((key for certificate, key in keys if signed_by(found.list, certificate)), "")
             if refusal := refusal_of(found.list) or ("" if key else "it is of another CA"):
                 raise DocumentError(f"its revocation list refuses everybody: {refusal}")
             if len(found.revoked) < len(found.list) or names_issuers(found.list):
@@ -406,7 +408,7 @@ def _of_revision(revision: Revision, fleet: Fleet | None) -> AccessSource:
         policies = [_read(policy.place, fleet, policy.read) for policy in revision.policies()]
         side = _of_policies(str(revision), policies)
     except SrosError as error:
-        texts = (revision.shown(each) for each in (error.what, error.why, error.remedy))
+        texts = (revision.shown(part) for part in (error.what, error.why, error.remedy))
         raise DocumentError(*texts) from error
     return replace(side, revision=revision)
 
@@ -426,26 +428,26 @@ def _of_policies(shown: str, policies: list[_Read]) -> AccessSource:
     enclaves: dict[str, Enclave] = {}
     for policy, _ in policies:
         refuse_fallbacks(policy)
-    for each in (enclave for policy, _ in policies for enclave in policy.enclaves):
-        if each.path in enclaves:
+    for enclave in (enclave for policy, _ in policies for enclave in policy.enclaves):
+        if enclave.path in enclaves:
             raise DocumentError(
-                f"{each.source}: enclave {each.path} is in another policy, too",
-                f"The other one is at {enclaves[each.path].source}.",
+                f"{enclave.source}: enclave {enclave.path} is in another policy, too",
+                f"The other one is at {enclaves[enclave.path].source}.",
                 "Compare one policy with another, or name each enclave in one file.",
             )
-        enclaves[each.path] = each
+        enclaves[enclave.path] = enclave
     if not policies:
         raise DocumentError(f"'{shown}' has no policies", "", "Name a policy file.")
     permissions = {
         path: permissions_for(
-            each, subject=subject_text(common_name(path)), validity=_VALID, domains=ALL_DOMAINS
+            enclave, subject=subject_text(common_name(path)), validity=_VALID, domains=ALL_DOMAINS
         )
-        for path, each in enclaves.items()
+        for path, enclave in enclaves.items()
     }
     rights = frozenset(right for policy, _ in policies for right in policy_rights(policy))
     stated = stated_protections(enclaves.values())
     fleets = [fleet for _, fleet in policies if fleet]
-    patterns = dict.fromkeys(each for fleet in fleets for each in fleet.enclaves)
+    patterns = dict.fromkeys(enclave for fleet in fleets for enclave in fleet.enclaves)
     fleet = fleets[0].with_enclaves(tuple(patterns)) if fleets else None
     return AccessSource(
         shown, "policy", rights, permissions, fleet=fleet, protections=stated, enclaves=enclaves

@@ -73,7 +73,7 @@ from sros_tool.zenoh.access import AccessControl, Enforcement
 
 _ZENOH = "zenoh"
 """Name of the world of Zenoh."""
-WORLDS = (*(each.value for each in MEASURED), _ZENOH)
+WORLDS = (*(vendor.value for vendor in MEASURED), _ZENOH)
 """The worlds that are decided: the measured vendors, and Zenoh."""
 _PLANNED = timedelta(days=365)
 """The assumed validity of permissions that are not signed yet."""
@@ -175,10 +175,10 @@ def policy_system(
         if world in ("", vendor.value):
             governed = GovernedDomain(vendor, governance, domain)
             access = {
-                name: (Access(governed, each, subjects[name], at=at),)
-                for name, each in signed.items()
+                name: (Access(governed, permissions, subjects[name], at=at),)
+                for name, permissions in signed.items()
             }
-            granted = {} if unique else {name: (each,) for name, each in subjects.items()}
+            granted = {} if unique else {name: (subject,) for name, subject in subjects.items()}
             lenders = also_fitting(vendor.traits, subjects, granted)
             worlds.append(_dds_world(vendor, access, stated, demanded=demanded, lenders=lenders))
     left_out = None
@@ -237,12 +237,12 @@ def _dds_world(
         writes, reads = ([getattr(e, side) for e in every] for side in ("writes", "reads"))
         return TopicAccess(NameSet.union(writes), NameSet.union(reads))
 
-    weak = _weak(each for some in access.values() for each in some)
+    weak = _weak(each for accesses in access.values() for each in accesses)
     if demanded is not None:
         weak[Level.ENCRYPT] |= demanded[Level.SIGN]
     return World(
         title or vendor.title,
-        {name: topics(some) for name, some in access.items()},
+        {name: topics(accesses) for name, accesses in access.items()},
         confirm=confirm,
         stated=stated,
         weak=weak,
@@ -274,7 +274,7 @@ def _demanded(protections: Iterable[StatedProtection]) -> dict[Level, NameSet]:
     topics: dict[Level, list[str]] = {level: [] for level in PROTECT.values()}
     for protection in protections:
         topics[protection.level] += protected_topics(protection.kind, protection.name)
-    return {level: NameSet.union(map(named, some)) for level, some in topics.items()}
+    return {level: NameSet.union(map(named, topic)) for level, topic in topics.items()}
 
 
 def _rank(domain: DomainRule, rule: TopicRule) -> int:
@@ -331,15 +331,18 @@ def _keystore_system(
     )
     loaded = {name: load_enclave_of(keystore, name, at=at) for name in names}
     if public:
-        loaded = {name: each._replace(key_elsewhere=True) for name, each in loaded.items()}
-    for name, each in loaded.items():
-        if not each.permissions and (file := enclave_path(root, name) / PERMISSIONS_FILE).exists():
+        loaded = {name: enclave._replace(key_elsewhere=True) for name, enclave in loaded.items()}
+    for name, enclave in loaded.items():
+        if (
+            not enclave.permissions
+            and (file := enclave_path(root, name) / PERMISSIONS_FILE).exists()
+        ):
             raise KeystoreError(
                 f"what enclave {name} may do is not known: '{file}' cannot be read",
                 "",
                 f"`sros check {quote(str(root))}` shows what is wrong with it.",
             )
-    documents = {each.governance for each in loaded.values()} - {b""}
+    documents = {enclave.governance for enclave in loaded.values()} - {b""}
     if names and not documents:
         raise KeystoreError(
             f"keystore '{root}' has no governance that can be read",
@@ -357,8 +360,8 @@ def _keystore_system(
         for document in documents
         for rule in parse_governance(document).domain_access_rules
     }
-    grants = {name: each.grants for name, each in source.documents.items()}
-    granted = {rule.domains for some in grants.values() for each in some for rule in each.rules}
+    grants = {name: document.grants for name, document in source.documents.items()}
+    granted = {rule.domains for grant in grants.values() for each in grant for rule in each.rules}
     domains = (domain,) if domain is not None else DomainSet.one_of_each_kind(listed, granted)
     domains = domains or (0,)
     if len(domains) > _MOST_DOMAINS:
@@ -367,8 +370,8 @@ def _keystore_system(
             "",
             "Name one with --domain.",
         )
-    subjects = {name: each.subject for name, each in loaded.items() if each.subject}
-    granting = {name: [each.subject for each in some] for name, some in grants.items()}
+    subjects = {name: enclave.subject for name, enclave in loaded.items() if enclave.subject}
+    granting = {name: [each.subject for each in grant] for name, grant in grants.items()}
     moments = {name: (at, *_later(name, grants.get(name, ()), at)) for name in names}
     worlds = []
     for vendor, number in product(MEASURED, domains):
@@ -389,8 +392,8 @@ def _keystore_system(
                 _possible(enclave, grants.get(name, ()), document) for document in documents
             )
             accesses = (
-                Evaluator(vendor, each, JoinContext(number, moment, zone)).access
-                for each, moment in product(possible, moments[name])
+                Evaluator(vendor, loaded_enclave, JoinContext(number, moment, zone)).access
+                for loaded_enclave, moment in product(possible, moments[name])
             )
             access[name] = tuple(each for each in accesses if each is not None)
         lenders = also_fitting(vendor.traits, subjects, granting)
@@ -444,19 +447,19 @@ def _zenoh_worlds(
     Raises:
         KeystoreError: there are no configurations of Zenoh, or it is not certain what they enforce.
     """
-    root, found = keystore.root, load_zenoh_rights(keystore, hidden=True)
-    for note in found.notes:
+    root, source = keystore.root, load_zenoh_rights(keystore, hidden=True)
+    for note in source.notes:
         if note.id in UNCERTAIN:
             raise KeystoreError(
                 f"what Zenoh enforces in keystore '{root}' is not known: {note.text.rstrip('.')}",
                 "",
                 "Write its files again with `sros zenoh`, or name a vendor of DDS with --vendor.",
             )
-    enforcers = found.enforcers
+    enforcers = source.enforcers
     domains = (domain,) if domain is not None else domains_of(enforcers) or (0,)
     for each in domains:
         title = "Zenoh" if len(domains) == 1 else f"Zenoh in domain {each}"
-        yield _enforced(title, enforcers, {*stated} - {found.router}, each, stated)
+        yield _enforced(title, enforcers, {*stated} - {source.router}, each, stated)
 
 
 def _enforced(

@@ -153,11 +153,13 @@ class Side:
                     stated.setdefault(enclave, []).append(topic)
         own = _wild(topics.expression)
         if own is None:
-            alike = [each for each in self._wild if each.matches(topics.expression)]
+            alike = [automaton for automaton in self._wild if automaton.matches(topics.expression)]
         else:
             limit.spend(len(self._wild) // _OF_A_STEP)
-            alike = [each for each in self._wild if each.may_meet(own)]
-        wild = {enclave for each in alike for enclave in self._wild[each]}.union(self._any)
+            alike = [automaton for automaton in self._wild if automaton.may_meet(own)]
+        wild = {enclave for automaton in alike for enclave in self._wild[automaton]}.union(
+            self._any
+        )
         return [
             Meeting(each, self.of[each], tuple(stated.get(each, ())), each in wild)
             for each in sorted(wild.union(stated))
@@ -204,8 +206,8 @@ class Side:
         met: set[str] = set()
         for topic in self._matching(own, limit):
             met.update(self.exact[topic])
-        for each, enclaves in self._wild.items():
-            if each.may_meet(own):
+        for automaton, enclaves in self._wild.items():
+            if automaton.may_meet(own):
                 met.update(enclaves)
         limit.spend(len(met))  # they are kept
         return frozenset(met)
@@ -213,10 +215,10 @@ class Side:
     def users_of(self, topic: str) -> list[str]:
         """Return the enclaves that may use one topic, sorted."""
         users = set(self.exact.get(topic, ())).union(self._any)
-        for each, enclaves in self._wild.items():
-            if not users.issuperset(enclaves) and each.matches(topic):
+        for automaton, enclaves in self._wild.items():
+            if not users.issuperset(enclaves) and automaton.matches(topic):
                 users.update(enclaves)
-        return sorted(each for each in users if topic in self.of[each])
+        return sorted(user for user in users if topic in self.of[user])
 
 
 def _starting(ordered: list[str], begin: str) -> range:
@@ -344,9 +346,11 @@ class World:
 
     def any_example(self, names: NameSet, limit: SearchLimit) -> str | None:
         """Return a topic of a set, preferably a stated topic or one that nodes can have."""
-        sets = (names, *(names & each for each in _VALID))
-        stated = (next(each.stated(), None) for each in sets)
-        examples = (each.example(limit, longest=self.longest) for each in (*sets[1:], names))
+        sets = (names, *(names & name_set for name_set in _VALID))
+        stated = (next(name_set.stated(), None) for name_set in sets)
+        examples = (
+            name_set.example(limit, longest=self.longest) for name_set in (*sets[1:], names)
+        )
         return next(filter(None, (*stated, *examples)), None)
 
     def use(self, met: Meeting, topics: Topics, limit: SearchLimit) -> str | None:
@@ -371,7 +375,8 @@ class World:
             both = written & self._readers.of[reader]
             valid = (both & names for names in _VALID)
             example = next(
-                filter(None, (each.example(limit, longest=self.longest) for each in valid)), None
+                filter(None, (name_set.example(limit, longest=self.longest) for name_set in valid)),
+                None,
             )
             self._shared[writer, reader] = example or both.example(limit, longest=self.longest)
         return self._shared[writer, reader]
@@ -420,7 +425,7 @@ def dds_access(access: Access) -> TopicAccess:
 def ros_access(stated: Iterable[StatedRight]) -> TopicAccess:
     """Return the topics of the ROS names that rights allow, and denials do not take away."""
     names: dict[tuple[bool, str, bool], list[NameSet]] = defaultdict(list)
-    for right in (each.right for each in stated):
+    for right in (right.right for right in stated):
         for writes, topic in topics_of(right):
             names[writes, topic[:2], right.qualifier is ALLOW].append(named(topic))
 
@@ -453,7 +458,9 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
     every = tuple(enforcers)
     return TopicAccess(
         *(
-            NameSet.union(topics(each, writes, begin) for each in every for begin in _ENDS)
+            NameSet.union(
+                topics(enforcement, writes, begin) for enforcement in every for begin in _ENDS
+            )
             for writes in (True, False)
         )
     )
@@ -484,8 +491,8 @@ def domains_of(
     for number, enforcer in enumerate(enforcers):
         subjects: dict[str, list[str]] = defaultdict(list)
         for policy in enforcer.policies:
-            for each in policy.rules:
-                subjects[each] += policy.subjects
+            for rule_id in policy.rules:
+                subjects[rule_id] += policy.subjects
         for rule in enforcer.rules:
             what = number, frozenset(subjects[rule.id]), rule.allows, rule.flows, rule.messages
             for key in rule.key_expressions:
@@ -497,7 +504,7 @@ def domains_of(
     known = {*rules, *(range(MAX_DOMAIN + 1) if others else ()), *([unnamed] if wild else ())}
     kinds: dict[object, int] = {}
     for each in sorted(known, reverse=True):
-        inside = tuple(each in one for one in others)
+        inside = tuple(each in domain_set for domain_set in others)
         if each in rules or any(inside) or wild:
             kinds[frozenset(rules.get(each, ())), inside] = each
     return tuple(sorted(kinds.values()))
@@ -522,7 +529,7 @@ def _topics(key: str, domain: int, begin: str) -> NameSet:
         for each in around.exact
         if each.startswith(f"{space}/") and each.endswith(_TYPE)
     )
-    return NameSet(exact, (each.surrounded(begin, end) for each in inner))
+    return NameSet(exact, (automaton.surrounded(begin, end) for automaton in inner))
 
 
 def zenoh_message(topic: str, domain: int, *, writes: bool) -> list[tuple[Flow, Message, str]]:

@@ -483,8 +483,8 @@ def version_of(path: Path) -> str:
     return version.group(1) if version else "of unknown version"
 
 
-def _same_size(one: Path, other: Path) -> bool:
-    return one.stat().st_size == other.stat().st_size
+def _same_size(path: Path, other: Path) -> bool:
+    return path.stat().st_size == other.stat().st_size
 
 
 def plugins_next_to(path: Path) -> Path | None:

@@ -215,7 +215,7 @@ class ProcessTable:
         begin = now - timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME)) + _LOADING
         self._reader.begin()
         before, self._looked = self._looked, {}
-        found: list[Process] = []
+        processes: list[Process] = []
         closed: list[UnseenProcess] = []
         pids = [int(each) for each in os.listdir(self._proc) if each.isdigit()]
         for pid in sorted(pids):
@@ -228,15 +228,18 @@ class ProcessTable:
                         continue
                     self._looked[pid] = looked
                     if looked.process:
-                        found.append(self._with_files(looked.process, folder))
+                        processes.append(self._with_files(looked.process, folder))
             except PermissionError:
                 closed.append(UnseenProcess(pid, (), "/proc hides it", speaks=False))
             except OSError:  # it has ended
                 continue
-        waiting = self._waiting(found)
+        waiting = self._waiting(processes)
         return RunningProcesses(
-            tuple(each for each in found if each.pid not in waiting),
-            (*(each.unseen for each in self._looked.values() if each.unseen), *closed),
+            tuple(process for process in processes if process.pid not in waiting),
+            (
+                *(looked_at.unseen for looked_at in self._looked.values() if looked_at.unseen),
+                *closed,
+            ),
             "" if (self._proc / "1").exists() else "those of other users, which /proc hides",
             _namespace(self._proc / "self/ns/pid") not in ("", _FIRST_PID_NAMESPACE),
         )
@@ -299,17 +302,17 @@ class ProcessTable:
         An example is ``timeout 60 sros run ROOT NAME -- talker --ros-args``: no library of ROS 2 or
         DDS, and a process below it that has them.
         """
-        parents = {pid: each.stat.parent for pid, each in self._looked.items()}
+        parents = {pid: looked_at.stat.parent for pid, looked_at in self._looked.items()}
         above: set[int] = set()
-        for each in processes:
-            pid = parents.get(each.pid, 0)
+        for process in processes:
+            pid = parents.get(process.pid, 0)
             while pid in parents and pid not in above:
                 above.add(pid)
                 pid = parents[pid]
         return {
-            each.pid
-            for each in processes
-            if not each.libraries and (each.pid in above or _is_sros_run(each.command))
+            process.pid
+            for process in processes
+            if not process.libraries and (process.pid in above or _is_sros_run(process.command))
         }
 
 
@@ -498,7 +501,7 @@ class ProcessEnclave:
         """The names of the required files that are missing."""
         there = {file.name for file in self.files if file.changed or file.problem}
         there |= {_KEY} if _KEY_ON_TOKEN in there else set()
-        return tuple(each for each in ENCLAVE_FILES if each not in there)
+        return tuple(file for file in ENCLAVE_FILES if file not in there)
 
 
 class FileReader:
@@ -551,8 +554,8 @@ class ProcessRoot:
         """Return the state of a file at an absolute path, with its content if ``read``."""
         try:
             with self._opened(path) as (handle, way):
-                links = [each for _, each in way[:-1] if stat.S_ISLNK(each.st_mode)]
-                changed = max(each.st_ctime_ns for each in (*links, way[-1][1]))
+                links = [status for _, status in way[:-1] if stat.S_ISLNK(status.st_mode)]
+                changed = max(status.st_ctime_ns for status in (*links, way[-1][1]))
                 data = self._reader.read(handle, way[-1][1]) if read else b""
         except OSError as error:
             return LoadedFile(name, problem=_reason(error))

@@ -129,10 +129,12 @@ class Arrival:
     def enclave_of(self, finding: Finding) -> str:
         """Return the enclave that a finding is about, or ""."""
         file = Path(finding.file)
-        for each in self.enclaves:
-            of_enclave = file.name in _FILES and file.parent == enclave_path(self.root, each.name)
-            if each.name == finding.subject or of_enclave:
-                return each.name
+        for enclave in self.enclaves:
+            of_enclave = file.name in _FILES and file.parent == enclave_path(
+                self.root, enclave.name
+            )
+            if enclave.name == finding.subject or of_enclave:
+                return enclave.name
         return ""
 
     def file_of(self, finding: Finding) -> str:
@@ -189,24 +191,28 @@ def verify_arrival(
     keystore = Keystore(root)
     enclaves = tuple(_enclave(keystore, name, now, domain, zone) for name in names)
     elsewhere = {
-        str(enclave_path(root, each.name) / KEY_FILE) for each in enclaves if each.key_on_robot
+        str(enclave_path(root, enclave.name) / KEY_FILE)
+        for enclave in enclaves
+        if enclave.key_on_robot
     }
-    found = [
-        each
-        for each in keystore_findings(
+    findings = [
+        finding
+        for finding in keystore_findings(
             keystore, now=now, zone=zone, domain=domain, only=only, on_robot=True
         )
-        if not (each.file in elsewhere and each.id == _FILE_MISSING)
+        if not (finding.file in elsewhere and finding.id == _FILE_MISSING)
     ]
     if secrets:
-        found += [each for name in names for each in _token_findings(keystore, name, now, secrets)]
-    shown = FindingFilter().choose(found).shown
+        findings += [
+            finding for name in names for finding in _token_findings(keystore, name, now, secrets)
+        ]
+    shown = FindingFilter().choose(findings).shown
     return Arrival(
         path,
         root,
         kind,
         enclaves,
-        tuple(each for each in found if each in shown or each.kind is WAITS),
+        tuple(finding for finding in findings if finding in shown or finding.kind is WAITS),
     )
 
 

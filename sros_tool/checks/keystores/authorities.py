@@ -128,9 +128,9 @@ def _authority_findings(
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain[:1]), "")):
         yield CA_PURPOSE.found(subject, fault, file)
     signs_documents = role == PERMISSIONS  # no vendor asks for small keys then (measured)
-    for found in key_findings(certificate, subject, file, what=f"{name} has"):
-        if found.kind is not KEY_ALGORITHM or not signs_documents:
-            yield found
+    for finding in key_findings(certificate, subject, file, what=f"{name} has"):
+        if finding.kind is not KEY_ALGORITHM or not signs_documents:
+            yield finding
     yield from _extensions(certificate, subject, name, file)
 
 
@@ -156,7 +156,7 @@ def _extensions(
     if denies_issuing(certificate):
         yield NOT_A_CA.found(subject, f"{name} may not issue certificates", file)
     wanted = (x509.KeyUsage, x509.SubjectKeyIdentifier, x509.AuthorityKeyIdentifier)
-    present = {type(each.value) for each in certificate.extensions}
+    present = {type(extension.value) for extension in certificate.extensions}
     missing = [kind.__name__ for kind in wanted if kind not in present]
     if missing:
         yield CA_EXTENSIONS.found(subject, f"{name} lacks {', '.join(missing)}", file)
@@ -337,10 +337,10 @@ _LIST_SOON = timedelta(days=30)
 
 def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about the certificates and keys of the CAs, and the revocation list."""
-    for each in keystore.unread:
-        why = f"{each.error.what}. {each.error.why}".strip()
-        yield UNREADABLE.found(each.path, why, keystore.shown(each.path), remedy=each.error.remedy)
-    unread = {each.path for each in keystore.unread}
+    for part in keystore.unread:
+        why = f"{part.error.what}. {part.error.why}".strip()
+        yield UNREADABLE.found(part.path, why, keystore.shown(part.path), remedy=part.error.remedy)
+    unread = {part.path for part in keystore.unread}
     if keystore.is_home:
         for role in (IDENTITY, PERMISSIONS):
             path = ca_certificate(role)
@@ -471,10 +471,10 @@ def _locked() -> str:
 
 
 def _shared_ca(keystore: CheckedKeystore) -> Iterator[Finding]:
-    found = [chain[0] for chain in keystore.authorities.values()]
-    if len(found) == 2:
+    certificates = [chain[0] for chain in keystore.authorities.values()]
+    if len(certificates) == 2:
         yield from shared_ca_findings(
-            keystore, found[0], found[1], keystore.shown(ca_certificate(IDENTITY))
+            keystore, certificates[0], certificates[1], keystore.shown(ca_certificate(IDENTITY))
         )
 
 
@@ -517,5 +517,5 @@ def _revocation_list(keystore: CheckedKeystore) -> Iterator[Finding]:
         text = f"it expires at {iso(crl.next_update)}, and DDS then refuses every participant"
         yield CRL_EXPIRES_SOON.found("revocation list", text, file)
     identity = keystore.authorities.get(IDENTITY, ())
-    if identity and not any(signed_by(crl.list, each) for each in identity):
+    if identity and not any(signed_by(crl.list, certificate) for certificate in identity):
         yield CRL_ISSUER.found("revocation list", "no identity CA of the keystore signed it", file)

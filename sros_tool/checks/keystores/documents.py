@@ -263,27 +263,31 @@ def _form(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     for problem in dict.fromkeys(problems):
         yield DOMAIN_RANGE.found(name, f"the range {problem}", file)
     criteria = [each for rule in grant.rules for each in (*rule.publish, *rule.subscribe)]
-    if any(each.partitions for each in criteria):
+    if any(criterion.partitions for criterion in criteria):
         yield PARTITIONS.found(name, _partitions_text(grant), file)
-    if any(not topic.strip() for each in criteria for topic in each.topics):
+    if any(not topic.strip() for criterion in criteria for topic in criterion.topics):
         yield EMPTY_TOPIC.found(name, "a <topic> in a rule is empty", file)
-    topics = sorted({topic for each in criteria for topic in each.topics})
-    if odd := [each for each in topics if "[^" in each or "[:" in each]:
+    topics = sorted({topic for criterion in criteria for topic in criterion.topics})
+    if odd := [topic for topic in topics if "[^" in topic or "[:" in topic]:
         yield CHARACTER_CLASS.found(name, f"a rule names {some_names([*map(repr, odd)])}", file)
-    if blank := [each.strip() for each in topics if each != each.strip() != ""]:
+    if blank := [topic.strip() for topic in topics if topic != topic.strip() != ""]:
         yield BLANKS.found(name, f"there are spaces or line ends around {some_names(blank)}", file)
 
 
 def _partitions_text(grant: Grant) -> str:
     """Return a clause on the topics that rules allow only in partitions, which ROS 2 never uses."""
     for rule in grant.rules:
-        for each in (*rule.publish, *rule.subscribe) if rule.allow else ():
-            if each.topics and each.partitions and not any(map(_is_default, each.partitions)):
-                word = "partition" if len(each.partitions) == 1 else "partitions"
-                topics = some_names(each.topics)
+        for criteria in (*rule.publish, *rule.subscribe) if rule.allow else ():
+            if (
+                criteria.topics
+                and criteria.partitions
+                and not any(map(_is_default, criteria.partitions))
+            ):
+                word = "partition" if len(criteria.partitions) == 1 else "partitions"
+                topics = some_names(criteria.topics)
                 return (
-                    f"{topics} {'is' if len(each.topics) == 1 else 'are'} allowed only in {word} "
-                    f"{some_names(each.partitions)}, which ROS 2 does not use"
+                    f"{topics} {'is' if len(criteria.topics) == 1 else 'are'} allowed only in "
+                    f"{word} {some_names(criteria.partitions)}, which ROS 2 does not use"
                 )
     return "a rule names partitions"
 
@@ -359,7 +363,9 @@ def _hidden(
         yield UNREACHABLE.found(name, text, file)
         return
     for by, topics in hidden.items():
-        what = " and ".join(f"{direction} {some_names(some)}" for direction, some in topics.items())
+        what = " and ".join(
+            f"{direction} {some_names(topic)}" for direction, topic in topics.items()
+        )
         text = f"rule {index + 1} allows to {what} after one that denies {by}"
         yield UNREACHABLE.found(name, text, file)
 
@@ -394,12 +400,12 @@ class _Topics:
         return ""
 
 
-def _share_domains(one: Rule, other: Rule) -> bool:
-    return any(domain in other.domains.closed() for domain in one.domains.closed())
+def _share_domains(rule: Rule, other: Rule) -> bool:
+    return any(domain in other.domains.closed() for domain in rule.domains.closed())
 
 
 def _topics(criteria: tuple[Criteria, ...]) -> list[str]:
-    return [topic for each in criteria for topic in each.topics]
+    return [topic for criterion in criteria for topic in criterion.topics]
 
 
 def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
@@ -676,12 +682,15 @@ def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
     on_cyclone = vendor is Vendor.CYCLONE
     hides = on_cyclone or rule.discovery_protection_kind is not ProtectionKind.NONE
     opened = [
-        each.topic_expression
-        for each in rule.topic_access_rules
-        if (on_cyclone or not (each.enable_read_access_control or each.enable_write_access_control))
-        and not (each.enable_discovery_protection and hides)
-        and each.metadata_protection_kind is ProtectionKind.NONE
-        and each.data_protection_kind is ProtectionKind.NONE
+        topic_rule.topic_expression
+        for topic_rule in rule.topic_access_rules
+        if (
+            on_cyclone
+            or not (topic_rule.enable_read_access_control or topic_rule.enable_write_access_control)
+        )
+        and not (topic_rule.enable_discovery_protection and hides)
+        and topic_rule.metadata_protection_kind is ProtectionKind.NONE
+        and topic_rule.data_protection_kind is ProtectionKind.NONE
     ]
     if not opened:
         return "they reach no topic, because all are controlled or protected"
@@ -699,20 +708,18 @@ def _domain_rule(rule: DomainRule, asked: Sequence[Vendor]) -> Iterator[tuple[Fi
 
 def _open_attributes(rule: DomainRule | TopicRule) -> Iterator[tuple[str, str]]:
     """Yield the name and a description of each attribute of `_OPEN` with an open value."""
-    for each in attributes(type(rule)):
-        if each.name in _OPEN and each.is_open(rule):
-            yield (
-                each.name,
-                f"{each.name} is {json.dumps(each.open) if each.is_flag else each.open}",
-            )
+    for attribute in attributes(type(rule)):
+        if attribute.name in _OPEN and attribute.is_open(rule):
+            value = json.dumps(attribute.open) if attribute.is_flag else attribute.open
+            yield attribute.name, f"{attribute.name} is {value}"
 
 
 def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
-    expressions = [each.topic_expression for each in rule.topic_access_rules]
-    if not any(covers(each, ROS_DISCOVERY_TOPIC) for each in expressions):
+    expressions = [topic_rule.topic_expression for topic_rule in rule.topic_access_rules]
+    if not any(covers(expression, ROS_DISCOVERY_TOPIC) for expression in expressions):
         yield NO_TOPIC_RULE, f"no topic rule matches {ROS_DISCOVERY_TOPIC}"
     elif "*" not in expressions:
-        of_ros = all(any(covers(each, one) for each in expressions) for one in _OF_ROS)
+        of_ros = all(any(covers(expression, one) for expression in expressions) for one in _OF_ROS)
         yield NO_OTHER_TOPIC_RULE if of_ros else NO_TOPIC_RULE, "there is no rule for *"
     names = Names(expressions)
     first = {each: index for index, each in reversed([*enumerate(expressions)])}

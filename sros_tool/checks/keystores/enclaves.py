@@ -211,7 +211,7 @@ ON_TOKEN = FindingKind(
     NOTE,
     *(Fault.KEY_ON_TOKEN.title, Fault.KEY_ON_TOKEN.why, Fault.KEY_ON_TOKEN.source),
     Fault.KEY_ON_TOKEN.remedy,
-    vendors=tuple(each for each in Vendor if not each.traits.reads_tokens),
+    vendors=tuple(vendor for vendor in Vendor if not vendor.traits.reads_tokens),
 )
 TOKEN_ON_ZENOH = FindingKind(
     "zenoh.key-on-token",

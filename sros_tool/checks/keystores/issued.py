@@ -205,7 +205,9 @@ def _list_number(enclave: CheckedEnclave) -> int:
 def _number_if_signed(data: bytes, authority: bytes) -> int:
     try:
         crl = load_crl(data, CRL_FILE)
-        authentic = any(signed_by(crl.list, each) for each in load_certificates(authority, ""))
+        authentic = any(
+            signed_by(crl.list, certificate) for certificate in load_certificates(authority, "")
+        )
     except SrosError:
         return -1
     return crl.number if authentic else -1
@@ -226,11 +228,11 @@ def check_issued(
     """Yield findings that compare enclaves with each other, the ledger and the policies."""
     for (_, serial), names in _twice(((t.issuer, t.serial), t.name) for t in summaries):
         yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
-    for _, names in _twice((each.key, each.name) for each in summaries):
+    for _, names in _twice((summary.key, summary.name) for summary in summaries):
         yield KEY_TWICE.found(", ".join(names), "their certificates have the same public key")
     # A subject with a unique part matches no other one.
-    plain = {each.name for each in summaries if not each.unique}
-    names = [each.name for each in summaries]
+    plain = {summary.name for summary in summaries if not summary.unique}
+    names = [summary.name for summary in summaries]
     pairs = [(inner, outer) for inner, outer in mistaken_names(names) if inner in plain]
     if pairs:
         from sros_tool.checks.policies import ENCLAVE_NAMES
@@ -248,7 +250,7 @@ def check_issued(
     yield from _lists(keystore, summaries)
     yield from _ledger(keystore, summaries)
     if keystore.policies:
-        wanted = {each.path for policy in keystore.policies for each in policy.enclaves}
+        wanted = {enclave.path for policy in keystore.policies for enclave in policy.enclaves}
         for name in sorted(wanted.difference(keystore.names)):
             yield NOT_IN_KEYSTORE.found(
                 name, "the keystore does not have this enclave", str(keystore.root)
@@ -258,16 +260,20 @@ def check_issued(
 
 def _less_protected(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about names that the governance protects less than a policy demands."""
-    stated = stated_protections(each for policy in keystore.policies for each in policy.enclaves)
+    stated = stated_protections(
+        enclave for policy in keystore.policies for enclave in policy.enclaves
+    )
     if not stated:
         return
     try:
         governance = parse_governance(keystore.opened.files.signed(keystore.governance).document)
     except SrosError:
         return  # another check reports it
-    for each, level in less_protected(governance, stated):
-        text = f"{each} has {level.lower()}, and the policy says {each.word}"
-        yield LESS_PROTECTED.found(each.enclave, text, each.source.file, each.source.line)
+    for protection, level in less_protected(governance, stated):
+        text = f"{protection} has {level.lower()}, and the policy says {protection.word}"
+        yield LESS_PROTECTED.found(
+            protection.enclave, text, protection.source.file, protection.source.line
+        )
 
 
 def _twice(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, list[str]]]:
@@ -284,51 +290,61 @@ def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> It
     old and the new CA, so one common CA is enough.
     """
     for index, (role, file) in enumerate(zip(ROLES, _AUTHORITY_FILES, strict=True)):
-        everyone = [each for each in summaries if each.trusted[index]]
+        everyone = [summary for summary in summaries if summary.trusted[index]]
         if not everyone:
             continue
-        usual, _ = Counter(each.trusted[index] for each in everyone).most_common(1)[0]
+        usual, _ = Counter(summary.trusted[index] for summary in everyone).most_common(1)[0]
         others = "most other enclaves"
         if chain := keystore.authorities.get(role):
-            usual = frozenset(each.fingerprint(hashes.SHA256()).hex() for each in chain)
+            usual = frozenset(
+                certificate.fingerprint(hashes.SHA256()).hex() for certificate in chain
+            )
             others = "the keystore"
-        for each in everyone:
-            if not each.trusted[index] & usual:
-                place = f"{keystore.root}/{enclave_folder(each.name)}/{file}"
+        for summary in everyone:
+            if not summary.trusted[index] & usual:
+                place = f"{keystore.root}/{enclave_folder(summary.name)}/{file}"
                 text = f"{file} contains another CA than {others}"
-                yield AUTHORITIES_DIFFER.found(each.name, text, place)
+                yield AUTHORITIES_DIFFER.found(summary.name, text, place)
 
 
 def _exported_governance(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
     """Yield findings about exported enclaves whose governance differs from the first enclave's."""
-    copies = [each for each in summaries if each.governance]
-    for each in copies[1:]:
-        if each.governance != copies[0].governance:
-            file = f"{keystore.root}/{enclave_folder(each.name)}/governance.p7s"
+    copies = [summary for summary in summaries if summary.governance]
+    for copy in copies[1:]:
+        if copy.governance != copies[0].governance:
+            file = f"{keystore.root}/{enclave_folder(copy.name)}/governance.p7s"
             text = f"its governance differs from the one of {copies[0].name}"
-            yield GOVERNANCE_DIFFERS.found(each.name, text, file)
+            yield GOVERNANCE_DIFFERS.found(copy.name, text, file)
 
 
 def _lists(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
     """Yield findings about enclaves whose revocation list is not the newest list of their CA."""
-    for issuer in dict.fromkeys(each.issuer for each in summaries):
-        enclaves = [each for each in summaries if each.issuer == issuer]
-        newest = max(enclaves, key=lambda each: each.list_number)
-        older = [each for each in enclaves if each.list_number < newest.list_number]
+    for issuer in dict.fromkeys(summary.issuer for summary in summaries):
+        enclaves = [summary for summary in summaries if summary.issuer == issuer]
+        newest = max(enclaves, key=lambda summary: summary.list_number)
+        older = [enclave for enclave in enclaves if enclave.list_number < newest.list_number]
         if not older:
             continue
         path = enclave_path(keystore.root, newest.name) / CRL_FILE
         crl = load_crl(keystore.opened.read(path, "revocation list"), f"'{path}'")
-        for each in older:
-            folder = str(enclave_path(keystore.root, each.name))
+        for summary in older:
+            folder = str(enclave_path(keystore.root, summary.name))
             of = f"the one of {newest.name} has number {newest.list_number}"
-            if crl.revokes(each.serial):
-                yield REVOKED_BY_NEWER_LIST.found(each.name, f"{of}, and revokes it", folder)
-            elif each.list_number >= 0 or not keystore.crl:  # another check reports a missing list
-                own = f"has number {each.list_number}" if each.list_number >= 0 else "is missing"
-                yield OLDER_LIST.found(each.name, f"its list {own}, {of}", f"{folder}/{CRL_FILE}")
+            if crl.revokes(summary.serial):
+                yield REVOKED_BY_NEWER_LIST.found(summary.name, f"{of}, and revokes it", folder)
+            elif (
+                summary.list_number >= 0 or not keystore.crl
+            ):  # another check reports a missing list
+                own = (
+                    f"has number {summary.list_number}"
+                    if summary.list_number >= 0
+                    else "is missing"
+                )
+                yield OLDER_LIST.found(
+                    summary.name, f"its list {own}, {of}", f"{folder}/{CRL_FILE}"
+                )
 
 
 def _ledger(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
@@ -340,18 +356,21 @@ def _ledger(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> I
     for entry in entries:
         if entry.what == "permissions":
             signed[entry.enclave].append(entry.sha256)
-    for each in summaries:
-        place = f"{keystore.root}/{enclave_folder(each.name)}"
+    for summary in summaries:
+        place = f"{keystore.root}/{enclave_folder(summary.name)}"
         for file, digest in (
-            ("cert.pem", each.certificate),
-            ("permissions.p7s", each.permissions),
+            ("cert.pem", summary.certificate),
+            ("permissions.p7s", summary.permissions),
         ):
             if digest and digest not in known:
                 text = f"{file} is not in the ledger"
-                yield UNEXPLAINED.found(each.name, text, f"{place}/{file}")
-        if each.permissions in signed[each.name] and each.permissions != signed[each.name][-1]:
+                yield UNEXPLAINED.found(summary.name, text, f"{place}/{file}")
+        if (
+            summary.permissions in signed[summary.name]
+            and summary.permissions != signed[summary.name][-1]
+        ):
             text = "the ledger has permissions that were signed later"
-            yield OLD_PERMISSIONS.found(each.name, text, f"{place}/permissions.p7s")
+            yield OLD_PERMISSIONS.found(summary.name, text, f"{place}/permissions.p7s")
 
 
 def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -> Iterator[Finding]:

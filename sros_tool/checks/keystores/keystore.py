@@ -130,7 +130,7 @@ def keystore_findings(
             enclave = evaluation.enclave
             own = list(_enclave_findings(enclave, wanted, common, vendors))
             if not waits_for_answer(enclave.folder):
-                shared = [] if any(each.kind is DIFFERS for each in own) else about_governance
+                shared = [] if any(finding.kind is DIFFERS for finding in own) else about_governance
                 own += check_vendors(evaluation, [*about_authorities, *shared, *own])
             if not on_robot and name not in wanted:  # a policy knows more exactly of its nodes
                 own = check_starting(evaluation, own)
@@ -146,7 +146,7 @@ def keystore_findings(
     outcomes = [outcome for _, outcome in map_slices(names, work)]
     found = [*about_governance, *(finding for findings, *_ in outcomes for finding in findings)]
     if only is None:
-        issued = [each for _, share, _ in outcomes for each in share]
+        issued = [summary for _, share, _ in outcomes for summary in share]
         of_keystore = [*check_files(keystore), *about_authorities]
         found = [*of_keystore, *check_issued(keystore, issued), *found]
     else:
@@ -160,8 +160,8 @@ def keystore_findings(
         chosen = tuple(each for each in policy.enclaves if only is None or each.path in only)
         found += findings_in(replace(policy, enclaves=chosen), distribution)
     real_root = os.path.realpath(root)
-    located = (_at_real_file(each, root, real_root) for each in found)
-    found = with_causes(joined([_with_names(each, root) for each in located]))
+    located = (_at_real_file(finding, root, real_root) for finding in found)
+    found = with_causes(joined([_with_names(finding, root) for finding in located]))
     return _with_cause_of_ros2(found, opened) if keystore.is_home else found
 
 
@@ -185,11 +185,11 @@ def _enclave_findings(
 def joined(findings: Sequence[Finding]) -> list[Finding]:
     """Join findings that several enclaves have because of a shared file or a keystore setting."""
     together: dict[tuple[object, ...], list[Finding]] = {}
-    for each in findings:
-        one = each.accepted or each.id in _OF_THE_KEYSTORE
-        file = "" if each.id in _OF_SEVERAL_FILES else each.file
-        place = (each.accepted,) if one else (file, each.line, each.text)
-        together.setdefault((each.id, *place), []).append(each)
+    for finding in findings:
+        one = finding.accepted or finding.id in _OF_THE_KEYSTORE
+        file = "" if finding.id in _OF_SEVERAL_FILES else finding.file
+        place = (finding.accepted,) if one else (file, finding.line, finding.text)
+        together.setdefault((finding.id, *place), []).append(finding)
     return [_one_of(group) for group in together.values()]
 
 
@@ -246,7 +246,7 @@ def _with_names(finding: Finding, root: Path) -> Finding:
 
 
 def _one_of(group: list[Finding]) -> Finding:
-    subjects = list(dict.fromkeys(each.subject for each in group))
+    subjects = list(dict.fromkeys(finding.subject for finding in group))
     if len(subjects) == 1:
         return group[0]
     return group[0]._replace(subject=first_few(subjects, _NAMES_SHOWN))
@@ -266,7 +266,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
     """Return the findings; several findings that ros2/sros2 causes get a common cause."""
     root = keystore.root
     if keystore.is_of_ros2:
-        chosen = [each for each in findings if each.kind in _OF_A_KEYSTORE]
+        chosen = [finding for finding in findings if finding.kind in _OF_A_KEYSTORE]
         text = f"It has neither sros.toml nor ledger.jsonl. Found: {_kinds(chosen)}."
         return _with(
             findings,
@@ -278,13 +278,13 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
             "with its CA, keys and rights, closes the keys to other users, and signs the "
             "permissions again.",
         )
-    unknown = {each.subject for each in findings if each.kind is UNEXPLAINED}
+    unknown = {finding.subject for finding in findings if finding.kind is UNEXPLAINED}
     names = sorted(name for name in unknown if _is_plain(findings, name))
     keys = {f"{enclave_path(root, name)}/{KEY_FILE}" for name in names}
     chosen = [
-        each
-        for each in findings
-        if each.kind in _OF_AN_ENCLAVE and (each.subject in names or each.file in keys)
+        finding
+        for finding in findings
+        if finding.kind in _OF_AN_ENCLAVE and (finding.subject in names or finding.file in keys)
     ]
     shown = " ".join(map(quote, names)) if len(names) <= _MOST_NAMED else "NAME..."
     command = f"sros create_permission {quote(str(root))} {shown} POLICY_FILE --revoke-old"
@@ -305,7 +305,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
 
 def _is_plain(findings: Sequence[Finding], name: str) -> bool:
     """Return whether neither certificate nor permissions of an enclave are in the ledger."""
-    return sum(each.kind is UNEXPLAINED and each.subject == name for each in findings) > 1
+    return sum(finding.kind is UNEXPLAINED and finding.subject == name for finding in findings) > 1
 
 
 def _with(
@@ -317,16 +317,19 @@ def _with(
     remedy: str,
 ) -> list[Finding]:
     """Return the findings, where the errors and warnings among ``chosen`` get a common cause."""
-    together = {id(each) for each in chosen if each.severity >= WARNING}
+    together = {id(finding) for finding in chosen if finding.severity >= WARNING}
     if len(together) < 2:
         return list(findings)
     cause = Cause(title, text, remedy, len(together), str(root))
-    return [each._replace(cause=cause) if id(each) in together else each for each in findings]
+    return [
+        finding._replace(cause=cause) if id(finding) in together else finding
+        for finding in findings
+    ]
 
 
 def _kinds(findings: Sequence[Finding]) -> str:
     """Return text with the titles of the findings' kinds and how often each occurs."""
-    counted = Counter(each.kind.title for each in findings if each.severity >= WARNING)
+    counted = Counter(finding.kind.title for finding in findings if finding.severity >= WARNING)
     return "; ".join(
         f"{title} ({number} times)" if number > 1 else title for title, number in counted.items()
     )

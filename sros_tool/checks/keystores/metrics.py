@@ -53,11 +53,11 @@ def keystore_metrics(
     lifetimes, unreadable = survey(keystore)
     expiries = [*_shared(keystore), *_of_enclaves(keystore, lifetimes)]
     earliest: dict[str, datetime] = {}
-    for each in expiries:
-        earliest[each.kind] = min(each.moment, earliest.get(each.kind, each.moment))
+    for expiry in expiries:
+        earliest[expiry.kind] = min(expiry.moment, earliest.get(expiry.kind, expiry.moment))
     place = {"keystore": str(keystore.root.absolute())}
-    severities = Counter(each.severity for each in findings)
-    kinds = Counter((each.severity, each.id) for each in findings)
+    severities = Counter(finding.severity for finding in findings)
+    kinds = Counter((finding.severity, finding.id) for finding in findings)
     return (
         Metric(
             "sros_examined_timestamp_seconds",
@@ -87,17 +87,20 @@ def keystore_metrics(
             f"The expiry of a file by its kind ({_KINDS}), in seconds since 1970; "
             "without enclave for a file that all share.",
             tuple(
-                Sample(_seconds(each.moment), {**place, "kind": each.kind, "enclave": each.enclave})
-                for each in expiries
-                if each_enclave or not each.enclave
+                Sample(
+                    _seconds(expiry.moment),
+                    {**place, "kind": expiry.kind, "enclave": expiry.enclave},
+                )
+                for expiry in expiries
+                if each_enclave or not expiry.enclave
             ),
         ),
         Metric(
             "sros_findings",
             "Number of findings of `sros check` by severity (error, warning or note).",
             tuple(
-                Sample(severities[each], {**place, "severity": each.word})
-                for each in sorted(Severity, reverse=True)
+                Sample(severities[severity], {**place, "severity": severity.word})
+                for severity in sorted(Severity, reverse=True)
             ),
         ),
         Metric(
@@ -129,11 +132,11 @@ def _shared(keystore: Keystore) -> Iterator[Expiry]:
 
 
 def _of_enclaves(keystore: Keystore, lifetimes: Iterable[Lifetime]) -> Iterator[Expiry]:
-    for each in lifetimes:
-        yield Expiry("certificate", each.name, each.certificate.not_after)
-        yield Expiry("permissions", each.name, each.permissions.not_after)
+    for lifetime in lifetimes:
+        yield Expiry("certificate", lifetime.name, lifetime.certificate.not_after)
+        yield Expiry("permissions", lifetime.name, lifetime.permissions.not_after)
         if not keystore.is_home:
-            yield from _exported(keystore, each.name)
+            yield from _exported(keystore, lifetime.name)
 
 
 def _exported(keystore: Keystore, name: str) -> Iterator[Expiry]:

@@ -143,7 +143,7 @@ def has_foreign_letters(name: str) -> bool:
 
 def _foreign_problem(name: str) -> str:
     letters = dict.fromkeys(_FOREIGN.findall(_WILDCARD.sub("", name)))
-    shown = " ".join("a blank" if each.isspace() else each for each in letters)
+    shown = " ".join("a blank" if letter.isspace() else letter for letter in letters)
     advice = ""
     if "{" in name or "$(" in name:
         advice = ": fill in the template"
@@ -181,5 +181,5 @@ def _stated(grant: Grant, *, allow: bool) -> Iterator[str]:
 
 
 def _topics(criteria: Sequence[Criteria]) -> Iterator[str]:
-    for each in criteria:
-        yield from each.topics
+    for criterion in criteria:
+        yield from criterion.topics

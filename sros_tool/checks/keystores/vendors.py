@@ -164,8 +164,8 @@ def evaluate(
         }
         for number in numbers
     }
-    made = [each for some in by_domain.values() for each in some.values()]
-    state = accepted_state(enclave.state, made) if made else enclave.state
+    participants = [participant for some in by_domain.values() for participant in some.values()]
+    state = accepted_state(enclave.state, participants) if participants else enclave.state
     return EnclaveEvaluation(
         CheckedEnclave(keystore, enclave.name, state), by_domain, there.portable is not None
     )
@@ -178,15 +178,15 @@ def check_vendors(evaluation: EnclaveEvaluation, known: Collection[Finding]) -> 
     """
     enclave = evaluation.enclave
     for domain, made in evaluation.by_domain.items():
-        if found := list(_refusals(enclave, made, known)):
-            yield from found
+        if findings := list(_refusals(enclave, made, known)):
+            yield from findings
             return
         # Vendors decide alike on a document as sros writes it, and every topic takes long.
-        if evaluation.portable and all(_file(each) != PERMISSIONS_FILE for each in known):
+        if evaluation.portable and all(_file(finding) != PERMISSIONS_FILE for finding in known):
             continue
-        ids = {each.id for each in known}
-        if found := list(_different_rights(enclave, made, domain, ids)):
-            yield from found
+        ids = {finding.id for finding in known}
+        if findings := list(_different_rights(enclave, made, domain, ids)):
+            yield from findings
             return
 
 
@@ -194,14 +194,14 @@ def _domains(state: OpenedEnclave) -> tuple[int, ...]:
     """Return example domains of an enclave, one for each combination of document rules."""
     if state.governance is None:
         return (0,)
-    rules = [each.domains for each in state.governance.domain_access_rules]
-    granted = [each.domains for each in state.grant.rules] if state.grant else []
+    rules = [rule.domains for rule in state.governance.domain_access_rules]
+    granted = [rule.domains for rule in state.grant.rules] if state.grant else []
     if len(sets := {*rules, *granted}) == 1:
         (only,) = sets
         return (next(iter(only.closed()), 0),)
     joined = state.joined_domains() or DomainSet(())
     kinds = DomainSet.one_of_each_kind([joined], [*rules, *granted])
-    return tuple(each for each in kinds if each in joined)[:_MOST_DOMAINS] or (0,)
+    return tuple(kind for kind in kinds if kind in joined)[:_MOST_DOMAINS] or (0,)
 
 
 _MOST_DOMAINS = 8
@@ -220,24 +220,29 @@ def _refusals(
     Yields nothing if errors in ``known`` name a cause for every vendor.  A refusal by only some
     vendors is left out if a finding in ``known`` names its cause.
     """
-    causes = {vendor: each.causes() for vendor, each in made.items()}
+    causes = {vendor: participant.causes() for vendor, participant in made.items()}
     by_cause: dict[RefusalCause, list[Vendor]] = {}
-    for vendor, some in causes.items():
-        for each in some:
-            by_cause.setdefault(each, []).append(vendor)
+    for vendor, cause in causes.items():
+        for refusal_cause in cause:
+            by_cause.setdefault(refusal_cause, []).append(vendor)
     if not by_cause:
         return
     all_refuse = all(causes.values())
     if all_refuse:
-        errors = [each for each in known if each.severity is ERROR]
-        if all(any(_is_named(each, errors) for each in some) for some in causes.values()):
+        errors = [finding for finding in known if finding.severity is ERROR]
+        if all(
+            any(_is_named(refusal_cause, errors) for refusal_cause in cause)
+            for cause in causes.values()
+        ):
             return
     else:
-        by_cause = {each: some for each, some in by_cause.items() if not _is_named(each, known)}
+        by_cause = {
+            cause: vendors for cause, vendors in by_cause.items() if not _is_named(cause, known)
+        }
         if not by_cause:
             return
-    clauses = [_clause(cause, some) for cause, some in by_cause.items()]
-    accepting = [vendor.title for vendor, some in causes.items() if not some]
+    clauses = [_clause(cause, vendors) for cause, vendors in by_cause.items()]
+    accepting = [vendor.title for vendor, cause in causes.items() if not cause]
     if accepting:
         clauses.append(
             f"{enumerated(accepting)} {'accepts' if len(accepting) == 1 else 'accept'} it"
@@ -257,7 +262,8 @@ def _is_named(cause: RefusalCause, known: Iterable[Finding]) -> bool:
     wanted = _NAMED_BY.get(cause.reason, frozenset())
     own = f"enclave.{cause.reason}"
     return any(
-        each.id in wanted or (each.id == own and _file(each) == cause.file) for each in known
+        finding.id in wanted or (finding.id == own and _file(finding) == cause.file)
+        for finding in known
     )
 
 
@@ -269,7 +275,7 @@ def _file(finding: Finding) -> str:
 def _clause(cause: RefusalCause, vendors: Sequence[Vendor]) -> str:
     several, one = _HIT_PEERS if cause.hits_peers else _SAYS.get(cause.outcome, _REFUSES)
     says = one if len(vendors) == 1 else several
-    return f"{enumerated([each.title for each in vendors])} {says} ({cause.text})"
+    return f"{enumerated([vendor.title for vendor in vendors])} {says} ({cause.text})"
 
 
 # ── what they decide differently ───────────────────────────────────────────────────────────
@@ -290,7 +296,9 @@ def _different_rights(
     ``known`` are the ids of the other findings about the enclave.
     """
     answers = {
-        vendor: each.access for vendor, each in made.items() if each.access and not each.causes()
+        vendor: participant.access
+        for vendor, participant in made.items()
+        if participant.access and not participant.causes()
     }
     differing = list(_differences(answers, _topics_to_ask(enclave, known)))
     if differing:
@@ -304,9 +312,9 @@ def _differences(answers: Mapping[Vendor, Access], topics: list[str]) -> Iterato
     ]
     for verb, topic in questions:
         said = {vendor.title: answer.decide(verb, topic) for vendor, answer in answers.items()}
-        if len({each.outcome.ok for each in said.values()}) > 1:
+        if len({decision.outcome.ok for decision in said.values()}) > 1:
             answers_text = ", ".join(
-                f"{title}: {each.outcome.value}" for title, each in said.items()
+                f"{title}: {decision.outcome.value}" for title, decision in said.items()
             )
             yield f"{verb.value} {topic} ({answers_text})"
 
@@ -413,18 +421,18 @@ def check_starting(evaluation: EnclaveEvaluation, known: Sequence[Finding]) -> l
         return [*known]
     has_denials = any(not rule.allow for rule in grant.rules)
     for domain, made in evaluation.by_domain.items():
-        running = [each for each in made.values() if not each.causes()]
+        running = [participant for participant in made.values() if not participant.causes()]
         # Vendors decide alike on a document as sros writes it.
         asked = running[:1] if evaluation.portable and not has_denials else running
-        denials = [_denial(each, grant, described=described) for each in asked]
+        denials = [_denial(participant, grant, described=described) for participant in asked]
         if not denials or None in denials:
             continue
-        worst = max(filter(None, denials), key=lambda each: len(each.text))
+        worst = max(filter(None, denials), key=lambda denial: len(denial.text))
         where = f"on domain {domain}, " if len(evaluation.by_domain) > 1 else ""
         if len(running) < len(made):
-            where += f"on {' and '.join(each.vendor.title for each in running)} "
-        found = NO_NODE.found(enclave.name, f"{where}{worst}", enclave.file(PERMISSIONS_FILE))
-        return [*(each for each in known if not worst.explains(each)), found]
+            where += f"on {' and '.join(participant.vendor.title for participant in running)} "
+        finding = NO_NODE.found(enclave.name, f"{where}{worst}", enclave.file(PERMISSIONS_FILE))
+        return [*(each for each in known if not worst.explains(each)), finding]
     return [*known]
 
 
@@ -455,7 +463,7 @@ def _denial(participant: VendorParticipant, grant: Grant, *, described: bool) ->
     """
     access = participant.access
     assert access is not None
-    denied = [each for each in _ENDPOINTS if not access.decide(*each).outcome.ok]
+    denied = [endpoint for endpoint in _ENDPOINTS if not access.decide(*endpoint).outcome.ok]
     verbs = [verb.value for verb, topic in denied if topic == ROS_DISCOVERY_TOPIC]
     wanted = [f"{' or '.join(verbs)} {ROS_DISCOVERY_TOPIC}"] if verbs else []
     wanted += [
@@ -543,13 +551,13 @@ def _is_own(topic: str) -> bool:
 def with_causes(findings: Sequence[Finding]) -> list[Finding]:
     """Return the findings, with a common cause if several enclaves let no node start."""
     same: dict[str, list[Finding]] = defaultdict(list)
-    for each in findings:
-        if each.kind is NO_NODE:
-            same[each.text].append(each)
+    for finding in findings:
+        if finding.kind is NO_NODE:
+            same[finding.text].append(finding)
     causes = {
         text: Cause(
             f"{counted(len(group), 'enclave')} in which no ordinary node of ROS 2 can start",
-            f"In {some_names([each.subject for each in group])}, {text}. {NO_NODE.why}",
+            f"In {some_names([finding.subject for finding in group])}, {text}. {NO_NODE.why}",
             group[0].remedy,
             len(group),
         )
@@ -557,6 +565,6 @@ def with_causes(findings: Sequence[Finding]) -> list[Finding]:
         if len(group) > 1
     }
     return [
-        each._replace(cause=causes.get(each.text)) if each.kind is NO_NODE else each
-        for each in findings
+        finding._replace(cause=causes.get(finding.text)) if finding.kind is NO_NODE else finding
+        for finding in findings
     ]

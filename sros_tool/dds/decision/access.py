@@ -219,7 +219,7 @@ class _GrantRules:
     @cached_property
     def _index(self) -> ExpressionIndex:
         """The index that finds the entries which match a topic."""
-        texts = (_usable_expression(self._traits, each.expression) for each in self._entries)
+        texts = (_usable_expression(self._traits, entry.expression) for entry in self._entries)
         return ExpressionIndex(self._traits.style, texts)
 
     def ask(self, topic: str, partitions: tuple[str, ...]) -> RuleVerdict:
@@ -248,15 +248,15 @@ class _GrantRules:
         from sros_tool.automata import NameSet
 
         rules: list[tuple[NameSet, bool]] = []
-        for _, some in groupby(self._entries, key=lambda each: each.criteria):
-            group = list(some)
+        for _, entries in groupby(self._entries, key=lambda entry: entry.criteria):
+            group = list(entries)
             fits = self._fits(group[0], _DEFAULT_PARTITION)
             if fits or self._traits.topic_decides:
                 rules += [(names, allowed and fits) for names, allowed in self._deciding(group)]
                 continue
             # Only the first matching topic of a criteria counts: one without text crashes the
             # process if no other one of the criteria stands before it and matches.
-            before = list(takewhile(lambda each: each.expression, group))
+            before = list(takewhile(lambda entry: entry.expression, group))
             if len(before) < len(group):
                 passed = self._names_of(before)
                 rules.append((_every_topic() - passed, False))
@@ -271,7 +271,7 @@ class _GrantRules:
     def _deciding(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
         """Yield verdicts with their topics; neighbouring entries with one verdict are merged."""
         for allowed, some in groupby(
-            entries, key=lambda each: each.allow and bool(each.expression)
+            entries, key=lambda entry: entry.allow and bool(entry.expression)
         ):
             yield self._names_of(some), allowed
 
@@ -343,7 +343,7 @@ class GovernedDomain:
         self._topic_rules = self.rule.topic_access_rules if self.rule else ()
         self._topics = ExpressionIndex(
             traits.style,
-            (_usable_expression(traits, each.topic_expression) for each in self._topic_rules),
+            (_usable_expression(traits, rule.topic_expression) for rule in self._topic_rules),
             both_ways=traits.governance_both_ways,
         )
 

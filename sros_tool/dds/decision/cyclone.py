@@ -264,7 +264,7 @@ class _Node:
     ) -> None:
         self.tag = element.name.lower()
         self.attribute = element.attributes.get("name")
-        self.text = "".join(each for each in element.children if isinstance(each, str))
+        self.text = "".join(child for child in element.children if isinstance(child, str))
         _check_attributes(element, self.tag)
         if self.text and self.tag in grammar:
             raise UnreadableError(f"<{self.tag}> holds text")
@@ -305,8 +305,8 @@ def _check_attributes(element: XmlElement, tag: str) -> None:
 
 def _check_skipped(element: XmlElement) -> None:
     _check_attributes(element, "")
-    for each in element.elements:
-        _check_skipped(each)
+    for xml_element in element.elements:
+        _check_skipped(xml_element)
 
 
 # ── values ─────────────────────────────────────────────────────────────────────────────────

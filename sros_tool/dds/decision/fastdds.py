@@ -199,13 +199,13 @@ def read_governance(xml: bytes) -> Governance:
     if root.children[-1] is not parent:
         # A comment there is refused too.
         raise UnreadableError("something follows <domain_access_rules>")
-    return Governance(tuple(_domain_rule(each) for each in _all(parent, "domain_rule")))
+    return Governance(tuple(_domain_rule(element) for element in _all(parent, "domain_rule")))
 
 
 def read_permissions(xml: bytes) -> Permissions:
     """Return the permissions in ``xml``; raise `UnreadableError` if Fast DDS refuses them."""
     return Permissions(
-        tuple(_grant(each) for each in _all(_first(read(xml), "permissions"), "grant"))
+        tuple(_grant(element) for element in _all(_first(read(xml), "permissions"), "grant"))
     )
 
 
@@ -402,7 +402,7 @@ def _grant(element: XmlElement) -> Grant:
     take = _Sequence(element)
     subject = _required(take.next("subject_name"))
     not_before, not_after = _validity(take.next("validity"))
-    rules = tuple(_rule(each) for each in take.while_named("allow_rule", "deny_rule"))
+    rules = tuple(_rule(xml_element) for xml_element in take.while_named("allow_rule", "deny_rule"))
     default = _required(take.next("default"))
     if default not in ("ALLOW", "DENY"):
         raise UnreadableError(f"<default> holds {default!r}")
@@ -440,9 +440,9 @@ def _criteria(element: XmlElement) -> Criteria:
     for child in element.elements:
         match child.name:
             case "topics":
-                topics += [_required(each) for each in _all(child, "topic")]
+                topics += [_required(xml_element) for xml_element in _all(child, "topic")]
             case "partitions":
-                partitions += [_partition(each) for each in _all(child, "partition")]
+                partitions += [_partition(xml_element) for xml_element in _all(child, "partition")]
             case "data_tags":
                 pass
             case other:

@@ -242,7 +242,7 @@ def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
 def _would_be_shut_out(
     root: Path, old: x509.Certificate, vendors: Sequence[Vendor], remedy: str
 ) -> KeystoreError:
-    name, titles = subject_text(old.subject), enumerated([each.title for each in vendors])
+    name, titles = subject_text(old.subject), enumerated([vendor.title for vendor in vendors])
     options = " ".join(f"--allow-refusal {vendor.value}" for vendor in vendors)
     return KeystoreError(
         f"processes that still have certificates of {name} would be refused in '{root}'",

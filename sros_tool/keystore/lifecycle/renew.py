@@ -187,9 +187,9 @@ class _Renewer:
         subject = enclave_subject(name, unique=unique)
         if name in self._tokens.places:
             self._refuse_key_on_robot(name)
-            made = self._tokens.key(name)
-            self.notes += token_notes(made)
-            identity = NewIdentity(subject, made.public_key(), made)
+            token_key = self._tokens.key(name)
+            self.notes += token_notes(token_key)
+            identity = NewIdentity(subject, token_key.public_key(), token_key)
         elif self._new_key:
             key = self._generate_key(name)
             identity = NewIdentity(subject, key.public_key(), key)

@@ -160,7 +160,7 @@ def rotate_ca(
     return _step(
         change,
         stage=stage,
-        files=tuple(each.file for each in rotator.replacements),
+        files=tuple(replacement.file for replacement in rotator.replacements),
         kept_elsewhere=tuple(rotator.kept_elsewhere),
         cut_off=cut_off,
     )
@@ -188,18 +188,22 @@ def robots_cut_off(keystore: Keystore, rotation: Rotation, to: RotationStage) ->
     if to is RotationStage.DISTRIBUTE or checked_fleet(keystore) is None:
         return ()
     stages = list(RotationStage)
-    robots = [each for each in fleet_status(keystore).robots if each.enclaves]
+    robots = [robot for robot in fleet_status(keystore).robots if robot.enclaves]
     if stages.index(to) - stages.index(rotation.stage) > 1:
-        return tuple(each.robot for each in robots)  # stages that no robot was ever at
-    roles = {role for each in rotation.replacements for role in keystore.authority_files[each.file]}
+        return tuple(robot.robot for robot in robots)  # stages that no robot was ever at
+    roles = {
+        role
+        for replacement in rotation.replacements
+        for role in keystore.authority_files[replacement.file]
+    }
     needed = {f"{role}_ca" for role in roles}
     if rotation.stage is RotationStage.REISSUE:
         needed.update(kind for role in roles for kind in _ISSUED[role])
     return tuple(
-        each.robot
-        for each in robots
-        if each.received is None
-        or any(file.kind in needed and not file.surplus for file in each.pending)
+        robot.robot
+        for robot in robots
+        if robot.received is None
+        or any(file.kind in needed and not file.surplus for file in robot.pending)
     )
 
 
@@ -242,11 +246,13 @@ def _refuse_edited(keystore: Keystore) -> None:
 def _was_replaced(keystore: Keystore) -> bool:
     """Return whether the ledger records a CA that another CA replaced."""
     names = (keystore.certificates_of(f"{role}_ca") for role in ROLES)
-    trusted = {subject_text(each.subject) for certificates in names for each in certificates}
+    trusted = {
+        subject_text(certificate.subject) for certificates in names for certificate in certificates
+    }
     made = Counter(
-        each.subject
-        for each in keystore.ledger_with("what", "ca").entries
-        if each.what == "ca" and each.reason != SAME_KEY
+        entry.subject
+        for entry in keystore.ledger_with("what", "ca").entries
+        if entry.what == "ca" and entry.reason != SAME_KEY
     )
     return any(number > 1 or subject not in trusted for subject, number in made.items())
 
@@ -416,13 +422,13 @@ class _Rotator:
             window(self._change.now, validity or self._template.authority_validity),
             next_to=next_to,
         )
-        for each in successors:
+        for successor in successors:
             if validity is None:
-                self._note_earlier(each.old[0], each.new.certificate)
+                self._note_earlier(successor.old[0], successor.new.certificate)
             self._change.entries.append(
-                certificate_entry(self._change.now, "ca", each.new.certificate)
+                certificate_entry(self._change.now, "ca", successor.new.certificate)
             )
-        self.replacements = [each.replacement() for each in successors]
+        self.replacements = [successor.replacement() for successor in successors]
         return successors
 
     def _note_earlier(self, old: x509.Certificate, new: x509.Certificate) -> None:
@@ -446,11 +452,13 @@ class _Rotator:
                 self._change.notes.append(note)
 
     def _distribute(self, successors: list[_Successor]) -> None:
-        for each in successors:
-            bundle = b"".join(map(pem, (*each.old, each.new.certificate)))
-            if self._takes_crl(each) and (old := self._keystore.revocation_list):
-                bundle += self._empty_crl(each.new, old.number + 1)
-            write_bundle(self._transaction, each.file, each.roles, bundle, self._change.names)
+        for successor in successors:
+            bundle = b"".join(map(pem, (*successor.old, successor.new.certificate)))
+            if self._takes_crl(successor) and (old := self._keystore.revocation_list):
+                bundle += self._empty_crl(successor.new, old.number + 1)
+            write_bundle(
+                self._transaction, successor.file, successor.roles, bundle, self._change.names
+            )
         self._write_state(RotationStage.DISTRIBUTE)
 
     def _empty_crl(self, authority: Authority, number: int) -> bytes:
@@ -467,8 +475,8 @@ class _Rotator:
         This happens if the first revocation was during the stage DISTRIBUTE.
         """
         return (self._root / CRL).exists() and any(
-            self._takes_crl(each) and not self._keystore.embedded_list(each.file)
-            for each in successors
+            self._takes_crl(successor) and not self._keystore.embedded_list(successor.file)
+            for successor in successors
         )
 
     def _takes_crl(self, successor: _Successor) -> bool:
@@ -480,23 +488,28 @@ class _Rotator:
     def _reissue(
         self, successors: list[_Successor], stage: RotationStage, progress: Progress | None
     ) -> None:
-        of = {role: each for each in successors for role in each.roles}
+        of = {role: successor for successor in successors for role in successor.roles}
         self._issue_again(of.get(IDENTITY), of.get(PERMISSIONS), progress)
         self.replacements = []
-        for each in successors:
-            trusted = (each.new.certificate, *(each.old if stage is RotationStage.REISSUE else ()))
+        for successor in successors:
+            trusted = (
+                successor.new.certificate,
+                *(successor.old if stage is RotationStage.REISSUE else ()),
+            )
             bundle = b"".join(map(pem, trusted))
-            if IDENTITY in each.roles and (old := self._keystore.revocation_list):
+            if IDENTITY in successor.roles and (old := self._keystore.revocation_list):
                 if stage is RotationStage.REISSUE:
                     bundle += self._keystore.read(CRL, "revocation list")
-                crl = self._empty_crl(each.new, old.number + 2)
+                crl = self._empty_crl(successor.new, old.number + 2)
                 self._transaction.write(CRL, crl)
                 write_copies(self._transaction, self._change.names, CRL_FILE, crl)
-            write_bundle(self._transaction, each.file, each.roles, bundle, self._change.names)
-            old_key = self._install_key(each)
-            self.replacements.append(replace(each.replacement(), old_key=old_key))
+            write_bundle(
+                self._transaction, successor.file, successor.roles, bundle, self._change.names
+            )
+            old_key = self._install_key(successor)
+            self.replacements.append(replace(successor.replacement(), old_key=old_key))
             if stage is RotationStage.RETIRE:
-                self._keep_certificate(each.old[0])
+                self._keep_certificate(successor.old[0])
         self._write_settings(successors)
         if stage is RotationStage.REISSUE:
             self._write_state(stage)
@@ -550,9 +563,9 @@ class _Rotator:
     def _sign_governance(self, permissions: _Successor) -> None:
         """Stage the governance, unchanged but signed by the new CA, with its copies in enclaves."""
         copies = [
-            f"{enclave_folder(each)}/{GOVERNANCE_FILE}"
-            for each in self._change.names
-            if each != "/"
+            f"{enclave_folder(name)}/{GOVERNANCE_FILE}"
+            for name in self._change.names
+            if name != "/"
         ]
         for path in (GOVERNANCE_P7S, *copies):
             real = self._root / path
@@ -567,11 +580,17 @@ class _Rotator:
 
     def _retire(self) -> None:
         files = self._keystore.authority_files
-        for each in self._rotation.replacements:
-            new, *others = self._keystore.certificates_of(each.file)
-            (old,) = [one for one in others if digest(one) == each.old]
+        for replacement in self._rotation.replacements:
+            new, *others = self._keystore.certificates_of(replacement.file)
+            (old,) = [
+                certificate for certificate in others if digest(certificate) == replacement.old
+            ]
             write_bundle(
-                self._transaction, each.file, files[each.file], pem(new), self._change.names
+                self._transaction,
+                replacement.file,
+                files[replacement.file],
+                pem(new),
+                self._change.names,
             )
             self._keep_certificate(old)
             key = retired_key(old)
@@ -616,9 +635,9 @@ class _Rotator:
     def _write_settings(self, successors: list[_Successor]) -> None:
         """Stage the settings with the places of the new keys."""
         places = {
-            role: "" if each.key.startswith(f"{PRIVATE}/") else each.key
-            for each in successors
-            for role in each.roles
+            role: "" if successor.key.startswith(f"{PRIVATE}/") else successor.key
+            for successor in successors
+            for role in successor.roles
         }
         template: Template = replace(
             self._template,
@@ -784,20 +803,24 @@ def _distributed(change: KeystoreChange, rotation: Rotation) -> list[_Successor]
     """Return the new CAs of a rotation at the stage DISTRIBUTE, with their keys."""
     found = []
     files = change.keystore.authority_files
-    for each in rotation.replacements:
-        roles = files[each.file]
-        certificates = change.keystore.certificates_of(each.file)
-        (new,) = [one for one in certificates if digest(one) == each.new]
-        moved = replace(change.template, identity_key=each.key, permissions_key=each.key)
+    for replacement in rotation.replacements:
+        roles = files[replacement.file]
+        certificates = change.keystore.certificates_of(replacement.file)
+        (new,) = [
+            certificate for certificate in certificates if digest(certificate) == replacement.new
+        ]
+        moved = replace(
+            change.template, identity_key=replacement.key, permissions_key=replacement.key
+        )
         key = replace(change.keyring, places={}).open(change.keystore, roles[0], moved)
         if not same_key(new, key):
             raise KeystoreError(
-                f"the key at '{each.key}' does not belong to the new {roles[0]} CA",
+                f"the key at '{replacement.key}' does not belong to the new {roles[0]} CA",
                 "",
                 "Restore the key from a backup.",
             )
-        old = tuple(one for one in certificates if one != new)
-        found.append(_Successor(each.file, roles, old, Authority(new, key), each.key))
+        old = tuple(certificate for certificate in certificates if certificate != new)
+        found.append(_Successor(replacement.file, roles, old, Authority(new, key), replacement.key))
     return found
 
 

@@ -139,10 +139,14 @@ def read_rotation(keystore: Keystore) -> Rotation:
         read = parse_json(keystore.read(path, "file of the rotation"))
         replacements = tuple(_replacement(each) for each in read["replacements"])
         rotation = Rotation(RotationStage(read["stage"]), replacements)
-        for each in replacements:
-            issuing = each.old if rotation.stage is RotationStage.DISTRIBUTE else each.new
-            there = [digest(found) for found in keystore.certificates_of(each.file)]
-            if there[0] != issuing or not {each.old, each.new} <= set(there):
+        for replacement in replacements:
+            issuing = (
+                replacement.old if rotation.stage is RotationStage.DISTRIBUTE else replacement.new
+            )
+            there = [
+                digest(certificate) for certificate in keystore.certificates_of(replacement.file)
+            ]
+            if there[0] != issuing or not {replacement.old, replacement.new} <= set(there):
                 raise ValueError
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise KeystoreError(
@@ -178,12 +182,12 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
     keystore = open_keystore(root)
     names = keystore.names
     rotation = read_rotation(keystore)
-    by_file = {each.file: each for each in rotation.replacements}
+    by_file = {replacement.file: replacement for replacement in rotation.replacements}
     states = []
     for file, roles in keystore.authority_files.items():
-        found = keystore.certificates_of(file)
-        counts = _count(keystore, roles[0], found)
-        for index, certificate in enumerate(found):
+        certificates = keystore.certificates_of(file)
+        counts = _count(keystore, roles[0], certificates)
+        for index, certificate in enumerate(certificates):
             replaced = by_file.get(file)
             state = "issuing" if index == 0 else "old"
             if replaced and index and digest(certificate) == replaced.new:
@@ -221,11 +225,11 @@ def _count(
         try:
             if role == IDENTITY:
                 own = keystore.certificate_of(name)
-                fits = [issued_by(own, each) for each in authorities]
+                fits = [issued_by(own, authority) for authority in authorities]
             else:
                 message = keystore.read(keystore.folder(name) / PERMISSIONS_FILE, "permissions")
                 signer = keystore.files.signed(message).signer()
-                fits = [signer == each for each in authorities]
+                fits = [signer == authority for authority in authorities]
         except SrosError:  # `sros inspect` reports the error
             continue
         if True in fits:
@@ -239,17 +243,17 @@ def _count(
 def _expiry_remarks(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
     """Return remarks on CAs that expire soon, or have expired."""
     remarks = []
-    for each in states:
-        if each.state != "issuing" or each.validity.not_after - now > _SOON:
+    for state in states:
+        if state.state != "issuing" or state.validity.not_after - now > _SOON:
             continue
-        name = "CA" if len(each.roles) > 1 else f"{each.roles[0]} CA"
-        end = iso(each.validity.not_after)
-        if each.validity.not_after < now:
+        name = "CA" if len(state.roles) > 1 else f"{state.roles[0]} CA"
+        end = iso(state.validity.not_after)
+        if state.validity.not_after < now:
             remarks.append(
                 f"The {name} expired at {end}, and processes no longer start: replace it now with "
                 "--finish."
             )
-        elif each.roles == (IDENTITY,):
+        elif state.roles == (IDENTITY,):
             remarks.append(
                 f"The {name} expires at {end}: extend it with --same-key, which interrupts no "
                 "process; or begin to replace it with --next."
@@ -267,7 +271,7 @@ EXPORT_FIRST = "Where they run from an export, export the enclaves again first."
 
 def _restart_remarks(keystore: Keystore, rotation: Rotation) -> list[str]:
     """Return remarks, by vendor, on the processes to restart at the stage DISTRIBUTE or REISSUE."""
-    files = [each.file for each in rotation.replacements]
+    files = [replacement.file for replacement in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
         return [
             "All vendors: restart the processes one by one, at any time; processes before and "

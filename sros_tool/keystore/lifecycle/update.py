@@ -128,11 +128,14 @@ class KeystoreUpdate(Changed):
     def looser(self) -> tuple[str, ...]:
         """Clauses on everything that the update allows and that was not allowed before."""
         gained = [
-            f"{each.enclave} gains {rights_text(each.gained)}"
-            for each in self.rights
-            if each.gained
+            f"{right.enclave} gains {rights_text(right.gained)}"
+            for right in self.rights
+            if right.gained
         ]
-        return (*(str(each) for each in self.settings if each.effect is Effect.LOOSER), *gained)
+        return (
+            *(str(setting) for setting in self.settings if setting.effect is Effect.LOOSER),
+            *gained,
+        )
 
 
 # ── what is, and what shall be ─────────────────────────────────────────────────────────────
@@ -347,7 +350,7 @@ def _signed_payloads(before: DomainProtection, after: DomainProtection) -> list[
             name
             for name, data in (
                 ("everything without protection of its own", side.default.data),
-                *((str(each), each.protection.data) for each in side.named),
+                *((str(protection), protection.protection.data) for protection in side.named),
             )
             if data is Level.SIGN
         }
@@ -447,7 +450,7 @@ class _Updater:
         if done:
             self._part_authorities()
             change.entries.append(write_settings(change.transaction, after, change.now))
-        superseded = [each.old for each in reissued if each.old]
+        superseded = [document.old for document in reissued if document.old]
         revoked = self._revoke_old and bool(superseded)
         if revoked:
             change.revoke(superseded, names=names)
@@ -456,7 +459,9 @@ class _Updater:
             replaced = [old.name for old in superseded] if revoked else ()
             change.keep_zenoh(self._writer.signed, replaced=replaced)
         change.record()
-        rights = tuple(each.rights.revoked() if revoked else each.rights for each in reissued)
+        rights = tuple(
+            document.rights.revoked() if revoked else document.rights for document in reissued
+        )
         settings = (
             *compare_governance(self._present.governance, governance),
             *compare_settings(before, after, change.now),
@@ -464,7 +469,7 @@ class _Updater:
         if revoked or governance != self._present.governance:
             change.restart = names
         else:
-            issued = (each.name for each in reissued)
+            issued = (document.name for document in reissued)
             change.restart = tuple(sorted({*issued, *change.zenoh.restart}))
         if change.restart:
             disturbed = mismatch(self._present.governance, governance)
@@ -472,9 +477,11 @@ class _Updater:
             change.remarks.append(exports_note(self._root, names))
         change.remarks += self._still_open()
         change.remarks += self._open_tasks(settings)
-        ends = [each.works_until for each in rights if each.works_until]
-        renewed = dict.fromkeys((each.name for each in reissued if each.old), "renewed")
-        signed = dict.fromkeys((each.name for each in reissued if not each.old), "signed")
+        ends = [right.works_until for right in rights if right.works_until]
+        renewed = dict.fromkeys((document.name for document in reissued if document.old), "renewed")
+        signed = dict.fromkeys(
+            (document.name for document in reissued if not document.old), "signed"
+        )
         return lambda: change.result(
             KeystoreUpdate,
             before=before.name,
@@ -482,7 +489,7 @@ class _Updater:
             done=done,
             left=left,
             settings=settings,
-            rights=tuple(each for each in rights if each.lost or each.gained),
+            rights=tuple(right for right in rights if right.lost or right.gained),
             outcomes=renewed | signed,
             works_until=max(ends, default=None),
         )
@@ -514,12 +521,15 @@ class _Updater:
                 return UnreadableEnclave(name, error)
 
         found = self._writer.for_each(names, work, progress).values()
-        unreadable = tuple(each for each in found if isinstance(each, UnreadableEnclave))
+        unreadable = tuple(enclave for enclave in found if isinstance(enclave, UnreadableEnclave))
         refuse_unreadable(unreadable, "updated")
-        opened = [each for each in found if isinstance(each, _KeptOpen)]
-        self._kept_open = tuple(each.name for each in opened)
-        reissued = [each.reissued if isinstance(each, _KeptOpen) else each for each in found]
-        return [each for each in reissued if isinstance(each, _Reissued)]
+        opened = [kept_open for kept_open in found if isinstance(kept_open, _KeptOpen)]
+        self._kept_open = tuple(kept_open.name for kept_open in opened)
+        reissued = [
+            kept_open.reissued if isinstance(kept_open, _KeptOpen) else kept_open
+            for kept_open in found
+        ]
+        return [document for document in reissued if isinstance(document, _Reissued)]
 
     def _reissue_one(self, state: Credentials) -> _Reissued | None:
         name = state.name
@@ -569,14 +579,14 @@ class _Updater:
         if earlier.policy not in ("", default.digest):
             return False
         validity, domains = state.lifetime().permissions, self._before.of(state.name)
-        (meant,) = permissions_for(
+        (grant,) = permissions_for(
             default, subject=state.grant.subject, validity=validity, domains=domains
         ).grants
         own = grant_rights(state.name, state.grant)
         if before.default_permissions == EVERYTHING:  # ros2/sros2 adds the DDS topic *
-            own = frozenset(each for each in own if each.kind != "dds")
-        difference = compare(grant_rights(state.name, meant), own)
-        return all(each in difference.covered for _, each in difference.lines())
+            own = frozenset(right for right in own if right.kind != "dds")
+        difference = compare(grant_rights(state.name, grant), own)
+        return all(right in difference.covered for _, right in difference.lines())
 
     def _on_domains(self, name: str, grant: Grant) -> Grant:
         """Return a grant whose rules are for the new domains.
@@ -587,14 +597,14 @@ class _Updater:
         before, after = self._before.of(name), self._after.of(name)
         if before == after:
             return grant
-        if any(each.domains.closed() != before for each in grant.rules):
+        if any(rule.domains.closed() != before for rule in grant.rules):
             raise KeystoreError(
                 f"the permissions of enclave {name} are not for domain {before}",
                 "So it is not certain which rights it shall have in other domains.",
                 f"State them with `sros create_permission {quote(str(self._root))} {name} "
                 "POLICY_FILE`.",
             )
-        rules = tuple(each._replace(domains=after) for each in grant.rules)
+        rules = tuple(rule._replace(domains=after) for rule in grant.rules)
         return grant._replace(rules=rules)
 
     # ── authorities ────────────────────────────────────────────────────────────────────────

@@ -517,11 +517,11 @@ def _open_keys(root: Path) -> Iterator[str]:
         folders = [f"{root}/{top}"]
         for folder in folders:  # which grows; os.walk would follow each link to see what it is
             with contextlib.suppress(OSError), os.scandir(folder) as entries:
-                for each in sorted(entries, key=lambda entry: entry.name):
-                    if each.is_dir(follow_symlinks=False) and not each.name.startswith("."):
-                        folders.append(each.path)
-                    elif each.name.endswith(KEY_FILE) and _is_open(each.path, stat.S_IFREG):
-                        yield os.path.relpath(each.path, root)
+                for entry in sorted(entries, key=lambda entry: entry.name):
+                    if entry.is_dir(follow_symlinks=False) and not entry.name.startswith("."):
+                        folders.append(entry.path)
+                    elif entry.name.endswith(KEY_FILE) and _is_open(entry.path, stat.S_IFREG):
+                        yield os.path.relpath(entry.path, root)
 
 
 def _is_open(path: str, kind: int) -> bool:
