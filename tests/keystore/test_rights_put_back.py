@@ -201,7 +201,7 @@ def test_a_number_is_never_given_twice(root: Path, tmp_path: Path) -> None:
     again = answer(root, tmp_path, "rosout", "wide").archive
     with pytest.raises(KeystoreError, match="older than the installed one") as caught:
         import_answer(robot, again, now=NOW)
-    assert "set back" in caught.value.why
+    assert "reset in between" in caught.value.why
 
 
 def test_a_ledger_from_before_the_chain_vouches_for_no_rights(root: Path, tmp_path: Path) -> None:
