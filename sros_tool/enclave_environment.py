@@ -376,7 +376,7 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
     if not keystore.has(SETTINGS):
         return
     network = keystore.settings.zenoh if keystore.settings else None
-    if network is None or (network.router != name and network.mode is Mode.CLIENT):
+    if network is None or (name not in network.router_names() and network.mode is Mode.CLIENT):
         return
     authority = keystore.ca_certificate(PERMISSIONS)
 

@@ -16,6 +16,9 @@ _VALIDITY = "validity"
 DEFAULT = "[protection.default]"
 
 
+OF_ROUTER = '[zenoh.routers."/r1/router"]'
+
+
 class Key(NamedTuple):
     """A key of a table: an example of its value, its values or their kind, and its meaning."""
 
@@ -200,6 +203,36 @@ KEYS: tuple[Key, ...] = (
         "the domains of the sessions",
         "those of the keystore",
     ),
+    Key(
+        "[zenoh]",
+        "crossing",
+        '["/fleet/*"]',
+        "a list of names",
+        "the topics and services that may pass from one router to another",
+        "all that enclaves at both ends have rights to",
+    ),
+    Key(
+        OF_ROUTER,
+        "endpoints",
+        '["r1.local:7447"]',
+        "a list of `HOST:PORT`",
+        "where sessions and other routers connect to it",
+    ),
+    Key(
+        OF_ROUTER,
+        "listen",
+        '["[::]:7447"]',
+        "a list of `HOST:PORT`",
+        "where it listens",
+        "at these ports of all addresses",
+    ),
+    Key(
+        OF_ROUTER,
+        "enclaves",
+        '["/r1/*"]',
+        "a list of names of enclaves",
+        "the enclaves whose sessions connect to it",
+    ),
 )
 
 ABOUT = {
@@ -208,6 +241,8 @@ ABOUT = {
     "[[protection.topic]]": "Topics with a protection of their own; the table can be repeated. "
     "`[[protection.service]]` and `[[protection.action]]` have the same keys.",
     "[zenoh]": "Only in a keystore with a [network of Zenoh](../zenoh.md); `sros zenoh` adds it.",
+    OF_ROUTER: "A further router, by its enclave, such as that of a robot; the table can be "
+    "repeated. Of two that name the same enclave, the first one has it.",
 }
 """What is said of a table before its keys."""
 

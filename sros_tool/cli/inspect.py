@@ -144,6 +144,13 @@ def _keystore(keystore: DescribedKeystore) -> Iterator[str]:
             f"  Zenoh in {network.mode} mode: router {network.router} at "
             f"{', '.join(network.endpoints)}"
         )
+        for router in network.routers:
+            yield (
+                f"    router {router.router} at {', '.join(router.endpoints)} for "
+                f"{', '.join(router.enclaves)}"
+            )
+        if network.crossing:
+            yield f"    between routers: {', '.join(network.crossing)}"
     if keystore.ledger:
         yield f"  LEDGER DAMAGED: {'; '.join(keystore.ledger)}"
     yield f"  {counted(len(keystore.enclaves), 'enclave')}"

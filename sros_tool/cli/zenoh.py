@@ -44,7 +44,14 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
 
 @verb("zenoh")
 @click.argument("root", type=PATH, required=False)
-@click.option("--router", metavar="NAME", help="Enclave of the router; usually /router.")
+@click.option(
+    "--router",
+    "routers",
+    multiple=True,
+    metavar="NAME[=HOST:PORT]",
+    help="Enclave of the router; usually /router. With an endpoint: another router, for the "
+    "enclaves beside it; /r1/router=r1.local:7447 is for /r1/*. NAME= drops it.",
+)
 @click.option(
     "--endpoint",
     "endpoints",
@@ -57,6 +64,14 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     multiple=True,
     metavar="HOST:PORT",
     help="Where the router listens, if not at the endpoints. May be repeated.",
+)
+@click.option(
+    "--cross",
+    "crossing",
+    multiple=True,
+    metavar="NAME",
+    help="Let only these topics and services pass between routers, such as '/fleet/*'; usually "
+    "all that enclaves at both ends have rights to. May be repeated; '' is all again.",
 )
 @click.option(
     "--mode",
@@ -82,9 +97,10 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
 @json_option
 def zenoh(
     root: Path | None,
-    router: str | None,
+    routers: tuple[str, ...],
     endpoints: tuple[str, ...],
     listen: tuple[str, ...],
+    crossing: tuple[str, ...],
     mode: str | None,
     domain: str | None,
     off: bool,
@@ -108,6 +124,7 @@ def zenoh(
       wrote keystore/enclaves/router/router.json5
       wrote keystore/enclaves/talker/session.json5
       $ sros zenoh keystore --endpoint robot:7447 --listen [::]:7447
+      $ sros zenoh keystore --router /r1/router=r1.local:7447
       $ sros zenoh keystore --check
       $ sros zenoh --from session.json5 -o policy.xml
 
@@ -120,7 +137,9 @@ def zenoh(
     from sros_tool.keystore.reader import Keystore, of_one_state
 
     if existing:
-        _refuse_with_from(root, router, *endpoints, *listen, mode, domain, off, only_check)
+        _refuse_with_from(
+            root, *routers, *endpoints, *listen, *crossing, mode, domain, off, only_check
+        )
         raise SystemExit(
             _show_from(existing, output, force=force, dry_run=dry_run, as_json=as_json)
         )
@@ -130,16 +149,17 @@ def zenoh(
     check_keystore(root)
     settings = Keystore(root).template
     chosen = {
-        "router": router,
+        "router": ",".join(name for name in routers if "=" not in name),
         "endpoints": ",".join(endpoints),
         "listen": ",".join(listen),
         "mode": mode,
         "domains": _domains(domain),
     }
     given = {f"zenoh.{key}": text for key, text in chosen.items() if text}
-    if off and given:
+    further = [name.partition("=")[::2] for name in routers if "=" in name]
+    if off and (given or further or crossing):
         raise UsageError("--off takes no other choice of the network", "", "Leave one of them out.")
-    network = None if off else _network(settings, given)
+    network = None if off else _network(settings, given, further, crossing)
     with progress("writing the files of Zenoh"):
         work = of_one_state(set_zenoh) if only_check else set_zenoh
         result = work(root, network, now=now(), keyring=keyring(), dry_run=dry_run or only_check)
@@ -179,14 +199,53 @@ def _refuse_with_from(*given: object) -> None:
         )
 
 
-def _network(settings: Template, given: dict[str, str]) -> ZenohNetwork:
-    """Return the network of the settings, or the usual one, with the values that are ``given``."""
+def _network(
+    settings: Template,
+    given: dict[str, str],
+    routers: Sequence[tuple[str, str]],
+    crossing: Sequence[str],
+) -> ZenohNetwork:
+    """Return the network of the settings, or the usual one, with the values that are ``given``.
+
+    ``routers`` are further ones with their endpoints, "" for those to drop.
+    """
     from sros_tool.keystore.template import with_values
     from sros_tool.zenoh.configuration import ZenohNetwork
 
     network = settings.zenoh or ZenohNetwork()
+    if crossing:
+        network = replace(network, crossing=tuple(filter(None, crossing)))
+    for name, endpoint in routers:
+        network = _with_router(network, name, endpoint)
     chosen = with_values(replace(settings, zenoh=network), list(given.items())).zenoh
     return chosen or network
+
+
+def _with_router(network: ZenohNetwork, name: str, endpoint: str) -> ZenohNetwork:
+    """Return a network with a router at an endpoint, or without it if there is no endpoint."""
+    from sros_tool.zenoh.configuration import ZenohRouter
+
+    known = {router.name: router for router in network.routers}
+    if not endpoint:
+        if known.pop(name, None) is None:
+            raise UsageError(
+                f"the network has no further router {name}",
+                f"It has {', '.join(known) or 'none'} besides {network.router}.",
+                "Name one of them.",
+            )
+        return replace(network, routers=tuple(known.values()))
+    folder = name.rpartition("/")[0]
+    if name not in known and not folder:
+        raise UsageError(
+            f"it is not known which enclaves connect to the router {name}",
+            "A router that is named with an endpoint is for the enclaves beside it, and not for "
+            "those of all hosts.",
+            "Name one such as /r1/router, or state its enclaves in sros.toml, at "
+            f'[zenoh.routers."{name}"].',
+        )
+    router = known.get(name) or ZenohRouter(name, (), (), (f"{folder}/*",))
+    known[name] = replace(router, endpoints=(endpoint,))
+    return replace(network, routers=tuple(known.values()))
 
 
 def _domains(text: str | None) -> str:

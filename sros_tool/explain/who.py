@@ -196,7 +196,7 @@ def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) ->
     names = enclave_names(source.path) if of_keystore or source.kind == "zenoh" else ()
     without, questions = ((), ()) if infrastructure else (OF_EVERY_NODE, QUESTIONS)
     rights = source.rights
-    if enclave == source.router:
+    if enclave in source.routers:
         # It may say and hear what passes through it: the other end of everybody's rights.
         rights |= {right.opposite(enclave) for right in rights if right.qualifier is ALLOW}
     network = Network(

@@ -34,6 +34,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.rights import check_routers
 from sros_tool.keystore.selection import no_such_enclave
 from sros_tool.keystore.zenoh_files import Drift, is_signed, signed_path, zenoh_drift
 from sros_tool.pki.certificates import common_name_of, validity_of
@@ -237,8 +238,8 @@ class WhoOnZenoh(NamedTuple):
 class ZenohEvaluator:
     """An evaluator of questions about the enclaves of one keystore, reusable for many questions.
 
-    Raises `KeystoreError` if the keystore has no configurations of Zenoh, or no router's or several
-    routers': what they enforce together cannot be known then.
+    Raises `KeystoreError` if the keystore has no configurations of Zenoh, none of a router, or
+    those of routers that do not know each other: what they enforce cannot be known then.
     """
 
     def __init__(self, keystore: Keystore, *, at: datetime, domain: int) -> None:
@@ -251,21 +252,21 @@ class ZenohEvaluator:
         self._file = cache(self._read)
         self._rendered = RenderedReader()
         self._is_signed = cache(self._verified)
-        self.router = self._router()
+        self.routers = self._routers()
 
-    def _router(self) -> ZenohFile:
-        routers = [
-            name for name in self.names if (enclave_path(self.root, name) / ROUTER_FILE).exists()
-        ]
-        if len(routers) == 1:
-            return self._file(routers[0], ROUTER_FILE)
+    def _routers(self) -> dict[str, ZenohFile]:
+        """Return the routers' files by their enclaves: of one router, or of connected ones."""
+        routers = {
+            name: self._file(name, ROUTER_FILE)
+            for name in self.names
+            if (enclave_path(self.root, name) / ROUTER_FILE).exists()
+        }
         if routers:
-            raise KeystoreError(
-                f"keystore '{self.root}' has the files of several routers",
-                f"{ROUTER_FILE} is in {', '.join(routers[:5])}, and sessions connect to one.",
-                "Remove those that no process uses, or write all files again: "
-                f"`sros zenoh {quote(str(self.root))}`.",
-            )
+            known = {
+                name: file.process.access.names() for name, file in routers.items() if file.process
+            }
+            check_routers(self.root, known)
+            return routers
         if has_zenoh_files(self.root):
             raise KeystoreError(
                 f"keystore '{self.root}' has no {ROUTER_FILE}",
@@ -279,6 +280,13 @@ class ZenohEvaluator:
             "runs without any access control.",
             f"Write them: `sros zenoh {quote(str(self.root))}`.",
         )
+
+    def _router_of(self, enclave: str) -> ZenohFile:
+        """Return the router that has rules for an enclave, or the first one."""
+        for file in self.routers.values():
+            if file.process and file.process.access.rules_for(enclave):
+                return file
+        return next(iter(self.routers.values()))
 
     def answer(
         self, enclave: str, question: Question, *, reach: bool = True, brief: bool = False
@@ -304,15 +312,16 @@ class ZenohEvaluator:
             return answer
         if own.process.mode is Mode.ROUTER:
             return self._of_router(answer, own.process, brief=brief)
-        if self.router.process is None:
-            text = f"no link to the router {self.router.enclave}: {self.router.problem}"
+        router = self._router_of(enclave)
+        if router.process is None:
+            text = f"no link to the router {router.enclave}: {router.problem}"
             return replace(answer, text=text)
-        if not _meet(own.endpoints, self.router.endpoints):
+        if not _meet(own.endpoints, router.endpoints):
             text = f"no link to the router: {own.file} connects to {_listed(own.endpoints)}, and "
-            text += f"{ROUTER_FILE} listens at {_listed(self.router.endpoints)}"
+            text += f"{ROUTER_FILE} listens at {_listed(router.endpoints)}"
             return replace(answer, text=text)
         wanted = self._rights(enclave, question)
-        checks = self._deciding(own.process, self.router.process, wanted, brief=brief)
+        checks = self._deciding(own.process, router.process, wanted, brief=brief)
         answer = replace(answer, checks=checks)
         assert answer.deciding
         by = answer.deciding.enforcer
@@ -340,7 +349,7 @@ class ZenohEvaluator:
                 return None
             domains = self.keystore.domains
             authority = self.keystore.ca_certificate(PERMISSIONS)
-            ours = {answer.enclave, self.router.enclave}
+            ours = {answer.enclave, *self.routers}
             deciding = ours | {check.enforcer for check in answer.checks}
             if answer.mode is not Mode.CLIENT:
                 deciding |= self._other_ends(answer)
@@ -374,7 +383,7 @@ class ZenohEvaluator:
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
     def _file_of(self, enclave: str) -> str:
-        return ROUTER_FILE if enclave == self.router.enclave else SESSION_FILE
+        return ROUTER_FILE if enclave in self.routers else SESSION_FILE
 
     def _read(self, enclave: str, file: str) -> ZenohFile:
         """Return the configuration of an enclave's process, or why it opens no session."""
@@ -419,10 +428,10 @@ class ZenohEvaluator:
 
     def _unsigned(self, own: ZenohFile) -> tuple[str, ...]:
         return tuple(
-            f"{each.enclave}/{each.file}"
-            for each in (own, self.router)
-            if each.process
-            and not self._is_signed(enclave_path(self.root, each.enclave) / each.file)
+            f"{file.enclave}/{file.file}"
+            for file in dict.fromkeys((own, *self.routers.values()))
+            if file.process
+            and not self._is_signed(enclave_path(self.root, file.enclave) / file.file)
         )
 
     # ── decisions ──────────────────────────────────────────────────────────────────────────
@@ -440,7 +449,7 @@ class ZenohEvaluator:
                 continue
             # The router's rules state the same rights, and are at hand.
             deliveries = self._direct(own, _unrestricted(name, Mode.CLIENT), wanted)
-            other = self._file(name, SESSION_FILE) if not brief else None
+            other = self._file(name, self._file_of(name)) if not brief else None
             if other and other.process and all(each.arrives for each in deliveries):
                 lawless = _unrestricted(own.name, Mode.ROUTER)
                 deliveries = self._direct(lawless, other.process, wanted)
@@ -483,7 +492,7 @@ class ZenohEvaluator:
         if own.mode is not Mode.PEER or brief or all(each.allowed for each in checks):
             return checks
         for name in self.names:
-            if name in (own.name, self.router.enclave):
+            if name == own.name or name in self.routers:
                 continue
             # What the session itself lets through comes first: it needs no other file.
             alone = self._decided(own, _unrestricted(name, Mode.PEER), wanted)
@@ -523,17 +532,16 @@ class ZenohEvaluator:
     def _graph(self, own: ZenohProcess, other: ZenohProcess) -> tuple[Delivery, Delivery]:
         """Return how a node is announced in the graph, and how it sees all others."""
         everything = f"@ros2_lv/{self.domain}/**"
-        assert self.router.process
-        stated = self.router.process.access.allowed_keys(
-            own.name, Flow.INGRESS, Message.LIVELINESS_TOKEN
-        )
+        router = self._router_of(own.name).process
+        assert router
+        stated = router.access.allowed_keys(own.name, Flow.INGRESS, Message.LIVELINESS_TOKEN)
         node = example_token(self.domain, own.name, stated)
         return token((own, other), node, everything), token((other, own), everything, everything)
 
     def _reached(self, own: ZenohFile, wanted: Sequence[Right]) -> Iterator[Reached]:
         """Yield the enclaves that have the right at the other end."""
         for name in self.names if wanted else ():
-            if name in (own.enclave, self.router.enclave):
+            if name == own.enclave or name in self.routers:
                 continue
             assert own.process
             # What the others decide comes first: it needs no file of that enclave.
@@ -549,8 +557,9 @@ class ZenohEvaluator:
     def _between(
         self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right], key: str = ""
     ) -> tuple[Delivery, ...]:
-        assert self.router.process
-        way = route(own, other, self.router.process)
+        ends = [self._router_of(process.name).process for process in (own, other)]
+        routers = [router for router in ends if router]
+        way = route(own, other, routers[0], routers[-1])
         return tuple(self._delivery(way, right, key) for right in wanted)
 
     def _wildcards(

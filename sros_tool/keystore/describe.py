@@ -60,7 +60,13 @@ from sros_tool.translate_zenoh.rights import domains_of, stated_names
 from sros_tool.validity import iso
 from sros_tool.values import Words, shows
 from sros_tool.xml import parse, read_bytes
-from sros_tool.zenoh.configuration import Configuration, Mode, ZenohNetwork, parse_rendered
+from sros_tool.zenoh.configuration import (
+    Configuration,
+    Mode,
+    ZenohNetwork,
+    ZenohRouter,
+    parse_rendered,
+)
 from sros_tool.zenoh.document import parse_configuration
 
 _OF_ZENOH = (".json5", ".json", ".yaml", ".yml")
@@ -253,6 +259,24 @@ class ZenohFiles(NamedTuple):
     ]
 
 
+class RouterFacts(NamedTuple):
+    """A router of a robot or a host."""
+
+    router: str
+    """Its enclave."""
+    endpoints: Sequence[str]
+    """Where sessions and other routers connect to it, as HOST:PORT."""
+    listen: Sequence[str]
+    """Where it listens, as HOST:PORT."""
+    enclaves: Sequence[str]
+    """The enclaves whose sessions connect to it, perhaps with wildcards."""
+
+
+def router_facts(router: ZenohRouter) -> RouterFacts:
+    """Return what is shown of a router."""
+    return RouterFacts(router.name, router.endpoints, router.listening(), router.enclaves)
+
+
 class NetworkFacts(NamedTuple):
     """The Zenoh network of a keystore."""
 
@@ -264,6 +288,10 @@ class NetworkFacts(NamedTuple):
     """Endpoints on which the router listens, as HOST:PORT."""
     mode: Mode
     """Whether sessions also connect to each other (``peer``), or only to the router."""
+    routers: Sequence[RouterFacts]
+    """Further routers, of robots or hosts."""
+    crossing: Sequence[str]
+    """The names that may pass between routers; empty for all that enclaves have rights to."""
 
 
 class SignerFacts(NamedTuple):
@@ -615,7 +643,15 @@ def _governance_of(
 
 
 def _network(network: ZenohNetwork) -> NetworkFacts:
-    return NetworkFacts(network.router, network.endpoints, network.listening(), network.mode)
+    routers = [router_facts(router) for router in network.routers]
+    return NetworkFacts(
+        network.router,
+        network.endpoints,
+        network.listening(),
+        network.mode,
+        routers,
+        network.crossing,
+    )
 
 
 def _zenoh(folder: Path, now: datetime) -> ZenohFiles | None:

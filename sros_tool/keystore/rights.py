@@ -8,7 +8,7 @@ rights that its access control gives other enclaves.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,8 +69,8 @@ class RightsSource:
     part of it: a signature that does not verify, or permissions that are missing or malformed.
     ``fleet`` is the fleet that it is for, or None.  ``protections`` are a policy's statements about
     the protection of names; None for anything else.  ``documents`` are the permissions of enclaves,
-    ``enforcers`` the access control of each Zenoh process that checks others; ``router`` is the
-    enclave of a keystore's router, or "".  ``configurations`` are the Zenoh configurations that
+    ``enforcers`` the access control of each Zenoh process that checks others; ``routers`` are the
+    enclaves of a keystore's routers.  ``configurations`` are the Zenoh configurations that
     were read, also those of clients.  ``policy`` is the policy in a policy file.
     """
 
@@ -88,7 +88,7 @@ class RightsSource:
     protections: tuple[StatedProtection, ...] | None = None
     documents: Mapping[str, Permissions] = field(default_factory=dict)
     enforcers: tuple[Enforcement, ...] = ()
-    router: str = ""
+    routers: tuple[str, ...] = ()
     configurations: Mapping[Path, ConfigurationDocument] = field(default_factory=dict)
     policy: Policy | None = None
 
@@ -143,11 +143,12 @@ def load_rights(
 def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSource:
     """Return the rights that the Zenoh configurations of a keystore together give its enclaves.
 
-    These are the configurations of the router, and of peers, which also connect without the router.
+    These are the configurations of routers, and of peers, which also connect without the router.
     ``hidden`` is as in `load_rights`.
 
     Raises:
-        KeystoreError: there is no configuration of a router, or there are several.
+        KeystoreError: there is no configuration of a router, or there are several that do not
+            know each other.
         DocumentError: Zenoh would not accept a configuration.
     """
     from sros_tool.zenoh.configuration import Mode
@@ -161,13 +162,6 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
             f"keystore '{root}' has no {ROUTER_FILE}",
             "Only this file shows which rights Zenoh enforces.",
             f"Write the file with `sros zenoh {quote(str(root))}`.",
-        )
-    if len(routers) > 1:
-        raise KeystoreError(
-            f"keystore '{root}' has the files of several routers",
-            f"{ROUTER_FILE} is in {', '.join(routers[:5])}, and nothing shows which is in use.",
-            "Remove the files that no process uses, or write all files again: "
-            f"`sros zenoh {quote(str(root))}`.",
         )
     sources = []
     configurations: dict[Path, ConfigurationDocument] = {}
@@ -183,8 +177,13 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
                 name not in routers and document.mode is not Mode.CLIENT
             ):
                 sources.append(_zenoh_rights(file, document))
+    check_routers(
+        root, {one: configurations[files[one] / ROUTER_FILE].access.names() for one in routers}
+    )
     # Peers state the rights that both ends of a link have: parts of those that the router states.
-    of_router = next(source.rights for source in sources if source.path.name == ROUTER_FILE)
+    of_router = frozenset(
+        right for source in sources if source.path.name == ROUTER_FILE for right in source.rights
+    )
     stated = Rules(of_router)
     rights = (right for source in sources for right in source.rights)
     return RightsSource(
@@ -199,9 +198,27 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
         True,
         tuple(dict.fromkeys(note for source in sources for note in source.notes)),
         enforcers=tuple(item for source in sources for item in source.enforcers),
-        router=routers[0],
+        routers=tuple(routers),
         configurations=configurations,
     )
+
+
+def check_routers(root: Path, known: Mapping[str, Collection[str]]) -> None:
+    """Raise `KeystoreError` if one of several routers has no rules for another one.
+
+    ``known`` maps the enclave of each router to the names for which its configuration has rules.
+    A router that has none for any enclave has nothing to pass on.
+    """
+    routing = [name for name, names in known.items() if not known.keys() >= {*names}]
+    for name in routing:
+        if strangers := sorted({*routing} - {name, *known[name]}):
+            raise KeystoreError(
+                f"keystore '{root}' has the files of several routers that are not connected",
+                f"{ROUTER_FILE} of {name} has no rules for {', '.join(strangers[:5])}, so it is "
+                "not known which of them routes.",
+                "Remove those that no process uses, or write all files again: "
+                f"`sros zenoh {quote(str(root))}`.",
+            )
 
 
 def is_zenoh(data: bytes, path: Path) -> bool:

@@ -23,7 +23,7 @@ from sros_tool.validity import Span, duration_text, parse_duration, parse_span, 
 from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
-    from sros_tool.zenoh.configuration import ZenohNetwork
+    from sros_tool.zenoh.configuration import ZenohNetwork, ZenohRouter
 
 DEFAULT_TEMPLATE = "development"
 EVERYTHING, NODE_BASICS = "everything", "node_basics"
@@ -230,20 +230,58 @@ def _zenoh(table: _Table) -> ZenohNetwork:
         tuple(table.texts("listen", [])),
         Mode(table.one_of("mode", (Mode.CLIENT.value, Mode.PEER.value), usual.mode.value)),
         tuple(sorted(set(table.numbers("domains", MAX_DOMAIN)))),
+        tuple(_zenoh_routers(table.table("routers"))),
+        tuple(_crossing(table)),
     )
-    try:
-        check_enclave_name(network.router)
-    except SrosError as error:
-        raise _TemplateError(f"{table.path}.router: {error}".removesuffix(".")) from error
-    for key in ("endpoints", "listen"):
-        for each in getattr(network, key):
-            if not is_endpoint(each):
-                raise _TemplateError(
-                    f"{table.path}.{key} has {each!r}, which is not HOST:PORT, such as "
-                    "localhost:7447 or [::1]:7447"
-                )
+    names = network.router_names()
+    for name in names:
+        try:
+            check_enclave_name(name)
+        except SrosError as error:
+            raise _TemplateError(f"{table.path}.router: {error}".removesuffix(".")) from error
+        if names.count(name) > 1:
+            raise _TemplateError(f"{table.path}.routers has {name}, which is {table.path}.router")
+    for router in (network, *network.routers):
+        for key in ("endpoints", "listen"):
+            for each in getattr(router, key):
+                if not is_endpoint(each):
+                    raise _TemplateError(
+                        f"{table.path}.{key} has {each!r}, which is not HOST:PORT, such as "
+                        "localhost:7447 or [::1]:7447"
+                    )
     table.finish()
     return network
+
+
+def _zenoh_routers(tables: _Table) -> Iterator[ZenohRouter]:
+    """Yield the further routers of a network, each with its enclaves."""
+    from sros_tool.zenoh.configuration import ZenohRouter
+
+    for name in tables.names():
+        table = tables.table(name)
+        router = ZenohRouter(
+            name,
+            tuple(table.texts("endpoints")),
+            tuple(table.texts("listen", [])),
+            tuple(table.texts("enclaves")),
+        )
+        for pattern in router.enclaves:
+            if not pattern.startswith("/") or set(pattern) & set("?[]"):
+                raise _TemplateError(
+                    f"{table.path}.enclaves has {pattern!r}, which is not the name of enclaves, "
+                    "such as /r1/*"
+                )
+        table.finish()
+        yield router
+
+
+def _crossing(table: _Table) -> Iterator[str]:
+    for name in table.texts("crossing", []):
+        if not name.startswith("/") or expression_problem(name):
+            raise _TemplateError(
+                f"{table.path}.crossing has {name!r}, which is not a name such as /fleet/*"
+            )
+        yield name
 
 
 def _zenoh_lines(network: ZenohNetwork) -> Iterator[str]:
@@ -254,6 +292,13 @@ def _zenoh_lines(network: ZenohNetwork) -> Iterator[str]:
     yield f"mode = {_toml(network.mode)}"
     if network.domains:
         yield f"domains = {list(network.domains)}"
+    if network.crossing:
+        yield f"crossing = [{', '.join(map(_toml, network.crossing))}]"
+    for router in network.routers:
+        yield f"\n[zenoh.routers.{_toml(router.name)}]"
+        for key in ("endpoints", "listen", "enclaves"):
+            if texts := getattr(router, key):
+                yield f"{key} = [{', '.join(map(_toml, texts))}]"
 
 
 def settings_values(template: Template) -> dict[str, str]:
@@ -354,7 +399,9 @@ class NamedValues(NamedTuple):
 
 
 def _typed(key: str, text: str) -> str | bool | list[str] | list[int]:
-    if key in ("zenoh.endpoints", "zenoh.listen"):
+    if key in ("zenoh.endpoints", "zenoh.listen", "zenoh.crossing") or key.startswith(
+        "zenoh.routers."
+    ):
         return text.split(",")
     if key == "zenoh.domains":
         return [int(each) if each.isdecimal() else -1 for each in text.split(",")]
@@ -465,6 +512,9 @@ class _Table:
 
     def has(self, key: str) -> bool:
         return key in self._values
+
+    def names(self) -> list[str]:
+        return list(self._values)
 
     def table(self, key: str) -> _Table:
         return _Table(self._values.pop(key, {}), self._at(key))

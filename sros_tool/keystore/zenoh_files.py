@@ -44,11 +44,12 @@ from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Source
 from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import Right, Rules, nodes_from_text, parts
 from sros_tool.translate import grant_rights
-from sros_tool.translate_zenoh.graph import nodes_in_rules
+from sros_tool.translate_zenoh.graph import GRAPH, nodes_in_rules
 from sros_tool.translate_zenoh.rights import (
     ANY_TYPE,
     StatedRight,
     as_router,
+    crossing_rules,
     domains_of,
     remote_of,
     remote_rights,
@@ -62,6 +63,8 @@ from sros_tool.zenoh.access import (
     RightsBetween,
     is_within,
     joined,
+    joined_rights,
+    narrowed,
 )
 from sros_tool.zenoh.configuration import (
     Configuration,
@@ -384,43 +387,49 @@ def zenoh_documents(
     of_network = _domains(network, domains, root)
     existing = keystore.names if existing is None else existing
     names = sorted({*existing, *change.issued}.difference(change.gone))
-    if network.router not in names:
-        raise KeystoreError(
-            f"keystore '{root}' has no enclave {network.router}, and the router of Zenoh needs it",
-            "Its certificate shows to all others that the process is the router.",
-            f"Create it with `sros create_enclave {quote(str(root))} {network.router}`, name "
-            "another one with `sros zenoh --router NAME`, or end the network with `sros zenoh "
-            f"{quote(str(root))} --off`.",
-        )
-    if change.stated.get(network.router):
-        raise UsageError(
-            f"a policy has rights for {network.router}, the enclave of the Zenoh router",
-            "The router passes on what all others say, so it would have the rights of all there.",
-            "Give the node an enclave of its own.",
-        )
-    names.remove(network.router)
+    for router in network.router_names():
+        if router not in names:
+            raise KeystoreError(
+                f"keystore '{root}' has no enclave {router}, and the router of Zenoh needs it",
+                "Its certificate shows to all others that the process is the router.",
+                f"Create it with `sros create_enclave {quote(str(root))} {router}`, name "
+                "another one with `sros zenoh --router NAME`, or end the network with `sros zenoh "
+                f"{quote(str(root))} --off`.",
+            )
+        if change.stated.get(router):
+            raise UsageError(
+                f"a policy has rights for {router}, the enclave of the Zenoh router",
+                "The router passes on what all others say, so it would have the rights of all "
+                "there.",
+                "Give the node an enclave of its own.",
+            )
+        names.remove(router)
     reader = _RightsReader(keystore, authority, of_network, network, now, change)
     read: dict[str, _RulesOfEnclave | str] = {}
     for _, each in map_slices(names, reader.read):
         read |= each
     rules = {name: each for name, each in read.items() if not isinstance(each, str)}
     left_out = {name: each for name, each in read.items() if isinstance(each, str)}
-    endpoints = tuple(f"tls/{each}" for each in network.endpoints)
-    listening = tuple(f"tls/{each}" for each in network.listening())
-    of_router = _router_path(network.router)
-    remotes = {name: each.remote for name, each in rules.items()}
     revoked = max(last_revocation(reader.ledger.entries), change.revoked)
-    files = {of_router: render_configuration(Mode.ROUTER, listening, (), remotes.values(), revoked)}
+    try:
+        files = _router_files(network, of_network, rules, revoked)
+    except TooManyExpressions:
+        raise PolicyError(
+            "what enclaves of two routers may send each other cannot be said to Zenoh",
+            "A router allows another one what the enclaves at both ends may do, and with the "
+            "wildcards of these that takes too many key expressions.",
+            "Use fewer wildcards, or name what may pass with `sros zenoh --cross`.",
+        ) from None
     direct = network.mode is Mode.PEER
     listen = (_ANY_PORT_HERE,) if direct else ()
-    between = RightsBetween(each.rights for each in rules.values() if each.rights)
+    between = RightsBetween(each.rights for each in rules.values() if each.rights and direct)
 
     def sessions(some: Sequence[str]) -> dict[str, bytes]:
         return {
             _session_path(name): render_configuration(
                 network.mode,
                 listen,
-                endpoints,
+                _tls(network.router_of(name).endpoints),
                 _peers(name, rules[name].router, between) if direct else (rules[name].router,),
                 revoked if direct else "",
             )
@@ -438,7 +447,8 @@ def zenoh_documents(
             "In peer mode each has the rights of all enclaves that it may communicate with.",
             f"Take client mode: `sros zenoh {quote(str(root))} --mode client`.",
         )
-    enclaves = {of_router: network.router, **{_session_path(name): name for name in chosen}}
+    enclaves = {_router_path(name): name for name in network.router_names()}
+    enclaves |= {_session_path(name): name for name in chosen}
     if only:
         existing = tuple(name for name in existing if name in only)
     return ZenohDocuments(files, enclaves, left_out, existing, reader.ledger)
@@ -472,6 +482,50 @@ def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[Re
     return sorted(found, key=lambda each: each.name)
 
 
+def _tls(endpoints: Iterable[str]) -> tuple[str, ...]:
+    return tuple(f"tls/{endpoint}" for endpoint in endpoints)
+
+
+def _router_files(
+    network: ZenohNetwork,
+    domains: Sequence[int],
+    rules: Mapping[str, _RulesOfEnclave],
+    revoked: str,
+) -> dict[str, bytes]:
+    """Return the configurations of all routers, by their paths; ``revoked`` is as in the files.
+
+    A router trusts the name of another one for what the enclaves at both ends may do.
+
+    Raises:
+        TooManyExpressions: that takes too many key expressions.
+    """
+    routers, connects = network.every_router(), network.connects()
+    sides: dict[str, list[str]] = {router.name: [] for router in routers}
+    for name in rules:
+        sides[network.router_of(name).name].append(name)
+    together = {
+        router: joined_rights(router, (each for n in of if (each := rules[n].rights)))
+        for router, of in sides.items()
+        if network.routers
+    }
+    if network.crossing:
+        most = crossing_rules(network.crossing, domains)
+        together = {router: narrowed(of, most, GRAPH) for router, of in together.items()}
+    between = RightsBetween(together.values())
+    files = {}
+    for router in routers:
+        remotes = [rules[name].remote for name in sides[router.name]]
+        remotes += [
+            render_rights(rights)
+            for rights in (between.of_all(router.name) if together else ())
+            if rights.rules and rights.common_name != router.name
+        ]
+        files[_router_path(router.name)] = render_configuration(
+            Mode.ROUTER, _tls(router.listening()), _tls(connects[router.name]), remotes, revoked
+        )
+    return files
+
+
 def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int, ...]:
     """Return the ROS domains of the network, all of which the governance has."""
     if others := [each for each in network.domains if each not in domains]:
@@ -498,7 +552,7 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
 class _RulesOfEnclave(NamedTuple):
     """What other processes allow to an enclave, and what the enclave allows to the router.
 
-    ``rights`` are the former as a value, if processes connect to each other.
+    ``rights`` are the former as a value, if they are needed for more than one file.
     """
 
     remote: RenderedRights
@@ -569,7 +623,10 @@ class _RightsReader:
         remotes = {name: self._remote(name, each) for name, each in stated.items()}
         for name, remote in remotes.items():
             _prove(name, remote, stated[name])
-        routers = {name: as_router(self._network.router, each) for name, each in remotes.items()}
+        routers = {
+            name: as_router(self._network.router_of(name).name, rights)
+            for name, rights in remotes.items()
+        }
         rendered = {name: render_rights(each) for name, each in remotes.items()}
         return {
             name: left_out[name]
@@ -577,7 +634,7 @@ class _RightsReader:
             else _RulesOfEnclave(
                 rendered[name],
                 render_rights(routers[name]),
-                remotes[name] if self._network.mode is Mode.PEER else None,
+                remotes[name] if self._network.mode is Mode.PEER or self._network.routers else None,
             )
             for name in names
         }

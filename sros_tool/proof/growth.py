@@ -435,7 +435,7 @@ def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
     def access(side: AccessSource, enclave: str, domain: int) -> _Access:
         if side.zenoh is None:
             return stated[id(side)](enclave, domain)
-        if enclave == side.router:
+        if enclave in side.routers:
             return _NO_ACCESS
         found = enforced_access(side.enforcers, enclave, domain)
 

@@ -132,9 +132,10 @@ def less_protection(
     if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
         text = "nothing enforces on Zenoh what its files enforced"
         yield SettingChange(Effect.LOOSER, "files of Zenoh", "present", "missing", text)
-    if old.router and new.router and old.router != new.router:
+    if old.routers and not {*new.routers} <= {*old.routers}:
         text = "whoever plays the router reads and changes all that passes"
-        yield SettingChange(Effect.LOOSER, "router of Zenoh", old.router, new.router, text)
+        before, after = (", ".join(side.routers) for side in (old, new))
+        yield SettingChange(Effect.LOOSER, "router of Zenoh", before, after, text)
     if new.zenoh_files:
         yield from looser_settings(old.zenoh_files, new.zenoh_files)
     if old.protections and new.protections is not None:

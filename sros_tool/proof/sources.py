@@ -104,7 +104,7 @@ class AccessSource:
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh"; ``shown`` is its name.
     ``permissions`` are what DDS would load for each enclave, or would if it were signed; ``rights``
     are in ROS terms, ``zenoh`` those that rules of Zenoh give, or None without any; ``enforcers``
-    are these rules, ``router`` is the enclave of the router.  ``scope`` are the enclaves that it is
+    are these rules, ``routers`` are those of routers.  ``scope`` are the enclaves that it is
     for; None for all.  ``governance`` is None if it has none of its own.  ``authorities`` are the
     CAs that its enclaves trust, pairs of role and fingerprint, and ``trusts`` whom each of them
     trusts, and `KEYSTORE_ITSELF`; None if it does not say.  ``later`` are the settings for enclaves
@@ -119,7 +119,7 @@ class AccessSource:
     permissions: Mapping[str, Permissions]
     zenoh: frozenset[Right] | None = None
     enforcers: tuple[Enforcement, ...] = ()
-    router: str = ""
+    routers: tuple[str, ...] = ()
     governance: Governance | None = None
     authorities: frozenset[tuple[str, str]] | None = None
     trusts: Mapping[str, Trust] | None = None
@@ -250,7 +250,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         side,
         zenoh=rights_source.rights,
         enforcers=rights_source.enforcers,
-        router=rights_source.router,
+        routers=rights_source.routers,
         zenoh_files=configurations,
     )
 

@@ -459,7 +459,7 @@ def _zenoh_worlds(
     domains = (domain,) if domain is not None else domains_of(enforcers) or (0,)
     for each in domains:
         title = "Zenoh" if len(domains) == 1 else f"Zenoh in domain {each}"
-        yield _enforced(title, enforcers, {*stated} - {source.router}, each, stated)
+        yield _enforced(title, enforcers, {*stated}.difference(source.routers), each, stated)
 
 
 def _enforced(

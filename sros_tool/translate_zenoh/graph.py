@@ -22,7 +22,7 @@ from sros_tool.policy.subtraction import CannotSubtract, listed
 from sros_tool.zenoh.access import AccessRule, Flow, Message
 from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical
 
-_GRAPH = "@ros2_lv"
+GRAPH = "@ros2_lv"
 _NODE = "NN"
 _KINDS = {"publish": "MP", "subscribe": "MS", "reply": "SS", "request": "SC"}
 """The kind of what a right lets a node announce."""
@@ -40,7 +40,7 @@ def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName,
         if rule.messages == _ANNOUNCING and rule.allows:
             for key in rule.key_expressions:
                 chunks = key.split("/")
-                if chunks[0] == _GRAPH and chunks[5:7] == [_NODE, _part(enclave)]:
+                if chunks[0] == GRAPH and chunks[5:7] == [_NODE, _part(enclave)]:
                     names = [each.replace(ANY_PART, "*").replace("%", "/") for each in chunks[7:]]
                     found[NodeName(*names)] = None
     return tuple(found)
@@ -57,7 +57,7 @@ def graph_rules(
     """
     tokens = _Tokens(enclave, domain, [*nodes] or [_ANY_NODE])
     allowed, denied = tokens.of(rights)
-    everything = f"{_GRAPH}/{domain}/{ANY_CHUNKS}"
+    everything = f"{GRAPH}/{domain}/{ANY_CHUNKS}"
     yield AccessRule(Flow.INGRESS, _ANNOUNCING, allowed)
     if denied:
         yield AccessRule(Flow.INGRESS, _ANNOUNCING, denied, allows=False)
@@ -70,7 +70,7 @@ class _Tokens:
     """The tokens of an enclave in a ROS domain."""
 
     def __init__(self, enclave: str, domain: int, nodes: Iterable[NodeName]) -> None:
-        self._begin = f"{_GRAPH}/{domain}/*/*/*"
+        self._begin = f"{GRAPH}/{domain}/*/*/*"
         self._enclave = _part(enclave)
         named = (
             NodeName(ns, name)
@@ -161,7 +161,7 @@ def _part(name: str) -> str:
 
 def example_token(domain: int, enclave: str, key_expressions: Iterable[str]) -> str:
     """Return the token of a node of an enclave: if there is one, of those that are allowed."""
-    begin = f"{_GRAPH}/{domain}/"
+    begin = f"{GRAPH}/{domain}/"
     for key in key_expressions:
         chunks = key.split("/")
         if key.startswith(begin) and chunks[5:7] == [_NODE, _part(enclave)]:

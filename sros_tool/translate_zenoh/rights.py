@@ -17,7 +17,17 @@ from typing import NamedTuple
 
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
 from sros_tool.names import check_enclave_name, expression_problem, is_expression
-from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
+from sros_tool.policy.model import (
+    ALLOW,
+    DENY,
+    RIGHTS,
+    Enclave,
+    Group,
+    Policy,
+    Profile,
+    Profiles,
+    Source,
+)
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers
 from sros_tool.policy.rights import (
     KIND_OF,
@@ -211,6 +221,18 @@ def as_router(router: str, own: RemoteRights) -> RemoteRights:
     It may send and get what the process itself may get and send: it passes on what others said.
     """
     return RemoteRights(router, in_order(rule.mirrored() for rule in own.rules))
+
+
+def crossing_rules(names: Iterable[str], domains: Iterable[int]) -> tuple[AccessRule, ...]:
+    """Return rules that allow everything about topics and services with these names."""
+    place = Source("crossing", 0)
+    rights = [
+        StatedRight(Right("", ALLOW, right, name), place)
+        for name in names
+        for of in (RIGHTS["topics"], RIGHTS["services"])
+        for right in of
+    ]
+    return remote_of("/", dict.fromkeys(domains, rights)).rules
 
 
 # ── names and denials ──────────────────────────────────────────────────────────────────────

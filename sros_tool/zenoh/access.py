@@ -150,6 +150,15 @@ class AccessControl:
         names = [each.common_name for each in self.remotes]
         return dict(zip(names, rule_ids([each.rules for each in self.remotes], names), strict=True))
 
+    def names(self) -> frozenset[str]:
+        """Return the common names that rules are for."""
+        return frozenset(self._by_name)
+
+    def rules_for(self, common_name: str) -> int:
+        """Return the number of rules that name a remote process."""
+        remote = self._by_name.get(common_name)
+        return len(remote.rules) if remote else 0
+
     @cached_property
     def _by_name(self) -> Mapping[str, RemoteRights]:
         return {remote.common_name: remote for remote in self.remotes}
@@ -233,6 +242,11 @@ def in_order(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     )
 
 
+def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
+    """Return the rights of all enclaves together, for a process named ``name``."""
+    return RemoteRights(name, joined(rule for each in rights for rule in each.rules))
+
+
 class RightsBetween:
     """What processes of two enclaves may send each other directly: what both may by their rights.
 
@@ -301,6 +315,21 @@ def _shared(one: _Place, other: _Place) -> tuple[Message, ...]:
 
 def _sorted(some: tuple[str, ...], others: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(sorted({*some, *others})) if some else others
+
+
+def narrowed(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> RemoteRights:
+    """Return those of some rights that ``most`` has, too, and all on keys that begin with ``kept``.
+
+    ``kept`` is for the graph, whose keys have names of nodes and topics as parts.
+
+    Raises:
+        TooManyExpressions: that takes too many key expressions.
+    """
+    graph = [rule for rule in rights.rules if rule.key_expressions[0].startswith(kept)]
+    others = tuple(rule for rule in rights.rules if rule not in graph)
+    limit = RemoteRights("", tuple(rule.mirrored() for rule in most))
+    both, _ = RightsBetween((RemoteRights(rights.common_name, others), limit)).of_all("")
+    return RemoteRights(rights.common_name, in_order((*graph, *both.rules)))
 
 
 def is_within(remote: RemoteRights, own: RemoteRights) -> bool:
@@ -417,6 +446,12 @@ class MessageFilter(Protocol):
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
         """Return the key expressions that rules allow, whatever others deny of them."""
+
+    def rules_for(self, common_name: str) -> int:
+        """Return the number of rules that name a remote process."""
+
+    def names(self) -> frozenset[str]:
+        """Return the common names that rules are for."""
 
 
 _OF_HISTORY = (Message.PUT, Message.QUERY)
@@ -535,6 +570,14 @@ class Enforcement:
             for rule in self.rules_of(subject.id)
             if rule.allows and flow in rule.flows and message in rule.messages
             for key in rule.key_expressions
+        )
+
+    def rules_for(self, common_name: str) -> int:
+        """Return the number of rules of subjects that have a name."""
+        return sum(
+            len(self.rules_of(subject.id))
+            for subject in self.subjects
+            if common_name in (subject.cert_common_names or ())
         )
 
     def passing(

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum
+from fnmatch import fnmatchcase
 from functools import lru_cache
+from itertools import combinations
 from json.encoder import encode_basestring_ascii
 from typing import Any, NamedTuple
 
@@ -39,13 +41,36 @@ class Mode(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class ZenohRouter:
+    """A router of a host or a robot: its enclave, and the enclaves whose sessions connect to it.
+
+    ``endpoints`` (``HOST:PORT``) are where these sessions and other routers connect to it, and
+    ``listen`` is where it listens; without it, at these ports of all its addresses.  ``enclaves``
+    are names, in which ``*`` stands for any characters.
+    """
+
+    name: str
+    endpoints: tuple[str, ...]
+    listen: tuple[str, ...] = ()
+    enclaves: tuple[str, ...] = ()
+
+    def listening(self) -> tuple[str, ...]:
+        """Return where it listens."""
+        ports = dict.fromkeys(endpoint.rpartition(":")[2] for endpoint in self.endpoints)
+        return self.listen or tuple(f"[::]:{port}" for port in ports)
+
+
+@dataclass(frozen=True, slots=True)
 class ZenohNetwork:
     """The Zenoh network of a keystore's enclaves.
 
     ``router`` is the enclave of the router; ``endpoints`` (``HOST:PORT``) are where the sessions
     connect to it, and ``listen`` is where it listens, if elsewhere, such as ``[::]:7447``.
     ``mode`` is that of the sessions, client or peer.  ``domains`` are ROS domains; empty for those
-    of the keystore's governance.
+    of the keystore's governance.  ``routers`` are further routers, connected to it and to each
+    other, which have the sessions of some enclaves; the first one that names an enclave has it.
+    ``crossing`` are the names of the topics and services that may pass from one router to another,
+    with wildcards, if not all that the rights of the enclaves at both ends allow.
     """
 
     router: str = "/router"
@@ -53,10 +78,47 @@ class ZenohNetwork:
     listen: tuple[str, ...] = ()
     mode: Mode = Mode.CLIENT
     domains: tuple[int, ...] = ()
+    routers: tuple[ZenohRouter, ...] = ()
+    crossing: tuple[str, ...] = ()
 
     def listening(self) -> tuple[str, ...]:
         """Return where the router listens."""
         return self.listen or self.endpoints
+
+    def every_router(self) -> tuple[ZenohRouter, ...]:
+        """Return all routers; the first one has the sessions of what no other one has."""
+        return (ZenohRouter(self.router, self.endpoints, self.listening(), ("*",)), *self.routers)
+
+    def router_names(self) -> tuple[str, ...]:
+        """Return the enclaves of all routers."""
+        return (self.router, *(router.name for router in self.routers))
+
+    def router_of(self, enclave: str) -> ZenohRouter:
+        """Return the router to which the sessions of an enclave connect."""
+        for router in self.routers:
+            if any(fnmatchcase(enclave, pattern) for pattern in router.enclaves):
+                return router
+        return self.every_router()[0]
+
+    def connects(self) -> Mapping[str, tuple[str, ...]]:
+        """Map each router to where it connects to others; of two routers, one connects.
+
+        Raises:
+            UsageError: neither of two routers can reach the other one.
+        """
+        found: dict[str, tuple[str, ...]] = {router.name: () for router in self.every_router()}
+        for one, other in combinations(self.every_router(), 2):
+            for listening, connecting in ((one, other), (other, one)):
+                if reachable := _far(listening):
+                    found[connecting.name] += reachable[:1]
+                    break
+            else:
+                raise UsageError(
+                    f"the routers {one.name} and {other.name} cannot connect to each other",
+                    "The endpoints of both are on their own host, or they listen there alone.",
+                    "Name an endpoint by which another host reaches one of them.",
+                )
+        return found
 
 
 _REVOKED = "last_revocation"
@@ -372,6 +434,8 @@ def check_network(network: ZenohNetwork) -> None:
     A host is known by its name alone: two names may be one host, but only those of the loopback
     surely are this one.
     """
+    if network.routers:
+        _check_routers(network)
     connect, listen = ({_place(each) for each in of} for of in (network.endpoints, network.listen))
     hosts = {host for host, _ in connect}
     far = sorted(hosts - {_LOOPBACK})
@@ -405,6 +469,27 @@ def check_network(network: ZenohNetwork) -> None:
             "Another host cannot reach a router that listens at localhost.",
             f"Let it listen for other hosts, such as `--listen [::]:{min(listen)[1]}`.",
         )
+
+
+def _check_routers(network: ZenohNetwork) -> None:
+    """Raise `UsageError` if several routers do not fit together."""
+    if network.mode is Mode.PEER:
+        raise UsageError(
+            "several routers are for client mode",
+            "Sessions in peer mode would look for those of other hosts at their own.",
+            "Take client mode: `--mode client`.",
+        )
+    network.connects()
+    for router in network.routers:
+        # What is said of one router holds for each of them.
+        check_network(ZenohNetwork(router.name, router.endpoints, router.listening(), network.mode))
+
+
+def _far(router: ZenohRouter) -> tuple[str, ...]:
+    """Return the endpoints at which other hosts reach a router."""
+    listens = {_place(each)[0] for each in router.listening()}
+    far = tuple(each for each in router.endpoints if _place(each)[0] != _LOOPBACK)
+    return () if listens == {_LOOPBACK} else far
 
 
 _LOOPBACK = "localhost"

@@ -86,20 +86,24 @@ class Delivery:
 
 
 Route = tuple[ZenohProcess, ...]
-"""The processes that a message passes, with those at both ends; two or three.
+"""The processes that a message passes, with those at both ends; two to four.
 
 A session and the router alone are the part of a way that the rights of one enclave decide.
 """
 
 
-def route(source: ZenohProcess, target: ZenohProcess, router: ZenohProcess) -> Route:
-    """Return the way from one process to another.
+def route(
+    source: ZenohProcess, target: ZenohProcess, router: ZenohProcess, to: ZenohProcess | None = None
+) -> Route:
+    """Return the way from one process to another; ``to`` is the target's router if it has another.
 
     Peers connect to each other, and a router passes nothing on between peers; from or to a client
-    everything goes through the router.
+    everything goes through the router, and from there through the target's.
     """
     if source.mode is Mode.PEER and target.mode is Mode.PEER:
         return source, target
+    if to and to.name != router.name:
+        return source, router, to, target
     return source, router, target
 
 

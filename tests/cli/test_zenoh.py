@@ -94,6 +94,8 @@ def test_the_choices_reach_the_files(folder: Path) -> None:
         "listen": ["[::]:7000"],
         "mode": "client",
         "domains": [0],
+        "routers": [],
+        "crossing": [],
     }
     session = json.loads((folder / "ks" / SESSION).read_text())
     router = json.loads((folder / "ks" / ROUTER).read_text())

@@ -398,7 +398,8 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
 def _is_plain_router(enclave: CheckedEnclave, grant: Grant | None) -> bool:
     """Return whether an enclave is the Zenoh router that sros made, without rights of its own."""
     settings = enclave.keystore.settings
-    if not (settings and settings.zenoh and settings.zenoh.router == enclave.name and grant):
+    network = settings.zenoh if settings else None
+    if not (network and enclave.name in network.router_names() and grant):
         return False
     from sros_tool.checks.policies import only_basic
 

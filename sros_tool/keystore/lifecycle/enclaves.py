@@ -72,7 +72,7 @@ def write_enclaves(
 ) -> tuple[ReplacedRights, ...]:
     """Create or complete enclaves, sign the permissions of their policies, and commit the change.
 
-    In a keystore with a Zenoh network, the enclave of the router is created, too.
+    In a keystore with a Zenoh network, the enclaves of its routers are created, too.
 
     Args:
         change: the change of the keystore.
@@ -86,8 +86,8 @@ def write_enclaves(
         The rights that enclaves gain and lose with their new permissions.
     """
     network = change.template.zenoh
-    if network and network.router not in change.names:
-        wanted = ChainMap({network.router: None}, wanted)  # type: ignore[arg-type]
+    if routers := set(network.router_names() if network else ()).difference(change.names):
+        wanted = ChainMap(dict.fromkeys(sorted(routers)), wanted)  # type: ignore[arg-type]
     writer = change.writer(keys_on_token=bool(places))
     maker = _EnclaveMaker(change, writer, places, revoke_old=revoke_old, keep_same=keep_same)
     done = writer.for_each(list(wanted), lambda name: maker.make(name, wanted[name]), progress)
@@ -302,8 +302,8 @@ def _is_file(path: Path, content: bytes) -> bool:
 
 
 def _default_rights(template: Template, name: str) -> Enclave:
-    """Return the rights of a new enclave without a policy; the basics for the router."""
-    if template.zenoh and template.zenoh.router == name:
+    """Return the rights of a new enclave without a policy; the basics for a router."""
+    if template.zenoh and name in template.zenoh.router_names():
         template = replace(template, default_permissions=NODE_BASICS)
     return default_rights(template, name)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, NamedTuple, TypeVar
 
 from sros_tool.errors import Note
+from sros_tool.keystore.describe import RouterFacts, router_facts
 from sros_tool.keystore.layout import ROLES
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights
 from sros_tool.keystore.outcomes import (
@@ -195,6 +196,10 @@ class NetworkSettings(NamedTuple):
     """Whether sessions also connect to each other (``peer``), or only to the router."""
     domains: Sequence[int]
     """The ROS domains of the network."""
+    routers: Sequence[RouterFacts]
+    """Further routers, of robots or hosts."""
+    crossing: Sequence[str]
+    """The names that may pass between routers; empty for all that enclaves have rights to."""
 
 
 class ZenohFileState(NamedTuple):
@@ -238,6 +243,8 @@ def shown_zenoh(
             network.listening(),
             network.mode.value,
             network.domains or tuple(result.domains),
+            [router_facts(router) for router in network.routers],
+            network.crossing,
         )
     files = [
         ZenohFileState(name, result.root / path, path not in changed)

@@ -765,8 +765,9 @@ def set_zenoh(
         if network and before and before.router != network.router:
             change.notes.append(_router_moved(before.router, network.router))
         template = replace(change.template, zenoh=network)
-        if network and network.router in change.names:
-            _check_router(change, network.router)
+        for router in network.router_names() if network else ():
+            if router in change.names:
+                _check_router(change, router)
         if template != change.template:
             change.template = template
             change.entries.append(write_settings(change.transaction, template, now))
