@@ -77,7 +77,7 @@ _MAX_LENGTH = 1000  # characters of a href or an xpointer
 
 
 class IncludedFile(NamedTuple):
-    """A document, and the includes that lead to it, each with file and xpointer.
+    """A document, and the chain of includes that leads to it, as pairs of file and xpointer.
 
     ``linked`` says that the last include names the file by a symbolic link.
     """
@@ -100,16 +100,16 @@ It raises `MissingFileError` if there is none, and `DocumentError` if that is no
 
 @dataclass(slots=True)
 class Includer:
-    """A reader of the policy files in ``root`` and below; each file is read once.
+    """A reader of the policy files in ``root`` and below; it reads every file once.
 
     What is included counts each time: a few small files can stand for gigabytes.
     """
 
     root: Path
     read: PolicyFiles | None = None
-    """Where files are read from; None stands for the file system."""
+    """Function that returns a file's content; None reads from the file system."""
     fallbacks: list[tuple[Source, str]] = field(default_factory=list)
-    """The includes whose fallback was used, with the file that is absent."""
+    """The includes whose fallback was used, with the missing file."""
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
     _sizes: dict[Path, int] = field(default_factory=dict)
     _includes: int = 0
@@ -256,7 +256,7 @@ class Includer:
     def _selected(
         self, roots: Iterator[tuple[etree._Element, IncludedFile]], pointer: str, where: str
     ) -> list[tuple[etree._Element, IncludedFile]]:
-        """Return the elements that an xpointer selects in a document with its includes replaced."""
+        """Return the elements that an xpointer selects in a document with resolved includes."""
         path = pointer.removeprefix("xpointer(").removesuffix(")")
         steps = list(_STEP.finditer(path[:_MAX_LENGTH]))
         if f"xpointer({''.join(step[0] for step in steps)})" != pointer or not steps:
@@ -282,7 +282,7 @@ class Includer:
 
 
 COMMON = "common"
-"""Name of the folder of the parts that policies include."""
+"""Name of the folder with the fragments that shipped policies include."""
 
 
 def _is_there(file: Path) -> bool:
@@ -291,7 +291,7 @@ def _is_there(file: Path) -> bool:
 
 
 def _missing_remedy(file: Path) -> str:
-    """Return how to get an included file that ships with sros, or "" for any other file."""
+    """Return how to get a missing include that ships with sros, or "" for any other file."""
     from sros_tool.files import policies_dir  # what writes files is not needed to read policies
 
     tail = file.parts[file.parts.index(COMMON) :] if COMMON in file.parts else ()
@@ -308,7 +308,7 @@ _PROTECT = re.compile(r"""protect\s*=\s*(?:"(?P<one>[^"]*)"|'(?P<other>[^']*)')\
 
 
 def _check_instructions(root: etree._Element, file: Path) -> None:
-    """Raise `PolicyError` if a processing instruction for sros stands in no name."""
+    """Raise `PolicyError` if a processing instruction for sros is outside of a name."""
     around = (*root.itersiblings(preceding=True), *root.itersiblings())
     for instruction in (*around, *root.iter(etree.PI)):
         if not isinstance(instruction, etree._ProcessingInstruction):
@@ -351,7 +351,7 @@ _VERSION = re.compile(r"0\.2\.[0-9]+\Z")
 _EARLIER = "Version 0.1.0, of ROS 2 Crystal to Eloquent, has nodes in place of enclaves."
 _EARLIER_BLOCKS = ("profiles", "contexts")
 _EARLIER_ROOTS = ("profiles",)
-"""The elements of earlier formats that are converted without a <policy> around them."""
+"""Root elements of earlier formats that are converted without a <policy> around them."""
 _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
@@ -362,7 +362,7 @@ def read_policy(
     placeholders: bool = False,
     read: PolicyFiles | None = None,
 ) -> Policy:
-    """Return the policy in a file and its includes, which must be in its folder or below.
+    """Read a policy file with its includes, which must be in its folder or below.
 
     ``content`` replaces the content of the file, which then need not exist.  With
     ``placeholders``, names may have those of `sros_tool.policy.placeholders`, and are not filled
@@ -377,7 +377,7 @@ def read_policy(
 
 
 def refuse_fallbacks(policy: Policy) -> None:
-    """Raise `PolicyError` if a policy has rights only because a file is absent."""
+    """Raise `PolicyError` if a policy used the fallback of an include because a file is missing."""
     for source, file in policy.fallbacks:
         raise PolicyError(
             f"{source}: the fallback of the include is used, because '{file}' is absent",
@@ -388,7 +388,7 @@ def refuse_fallbacks(policy: Policy) -> None:
 
 class _Reader:
     _other_roots: tuple[str, ...] = ()
-    """The root elements that are read besides <policy>."""
+    """Root elements that are accepted besides <policy>."""
 
     def __init__(
         self,
@@ -401,7 +401,7 @@ class _Reader:
         self._shown = path
         self._placeholders = placeholders
         self._owner: Parts = ()
-        """The path of the enclave that is being read, if it has placeholders."""
+        """The path of the current enclave if it contains placeholders."""
         self._file = Path(os.path.realpath(path))
         self._includer = Includer(self._file.parent, read)
         if content is not None:
@@ -540,7 +540,7 @@ class _Reader:
         return Profile(ns, node, groups, self._source(element, place))
 
     def _groups(self, element: etree._Element, place: IncludedFile, node: str) -> Iterator[Group]:
-        """Yield the names of a group together with those that have the same protection."""
+        """Yield the names of a group, split into groups with the same protection."""
         kind = tag_of(element)
         if kind not in RIGHTS:
             raise PolicyError(
@@ -584,7 +584,7 @@ class _Reader:
             yield Group(kind, tuple(rights), names, level, source, lines if whole else ())
 
     def _protect(self, element: etree._Element, place: IncludedFile) -> Level | None:
-        """Return the protection that a name demands, or None."""
+        """Return the protection level that a name requires, or None."""
         if not len(element):
             return None
         where = self._where(element, place)
@@ -630,13 +630,13 @@ class _Reader:
         return name
 
     def _written(self, element: etree._Element) -> str:
-        """Return the name in an element, as written."""
+        """Return the text of a name element, unchanged."""
         return element.text or ""
 
     def _sample(
         self, text: str, element: etree._Element, place: IncludedFile, *, several: bool
     ) -> str:
-        """Return a name to check in place of one with placeholders, or ``text``, which has none.
+        """Return an example name with the placeholders filled in, to check the name's grammar.
 
         ``several`` says whether names for each robot can stand in its place.
         """
@@ -651,7 +651,7 @@ class _Reader:
         *,
         several: bool | None = None,
     ) -> Parts | None:
-        """Return the parts of a name, or None: it has no placeholder.
+        """Return the text and placeholders of a name, or None if it has no placeholder.
 
         Without ``several``, it is the path of an enclave.
         """
@@ -739,7 +739,7 @@ class _Reader:
 
 
 def _absolute(profile: Profile) -> tuple[Profile, ...]:
-    """Return the profiles that say the same with namespaces that begin with "/".
+    """Return equivalent profiles whose namespaces begin with "/".
 
     Every ROS name begins with "/", so the first ``*`` of a namespace stands for nothing before a
     "/", or for a text that begins with one.
@@ -756,7 +756,7 @@ def _absolute(profile: Profile) -> tuple[Profile, ...]:
 
 
 class ConvertedPolicy(NamedTuple):
-    """A policy of an earlier format with the same rights, as `Policy`.
+    """A policy converted from an earlier format to `Policy`, with the same rights.
 
     ``left_out`` are the profiles that no enclave can stand for, with the reason; without them the
     policy gives less than before, never more.
@@ -769,56 +769,56 @@ class ConvertedPolicy(NamedTuple):
 
 @shows(optional=("document",))
 class PrintedConversion(NamedTuple):
-    """The converted policy."""
+    """The result of converting a policy of an earlier format."""
 
     policy: Path
-    """The earlier policy."""
+    """Path of the policy in the earlier format."""
     enclaves: Sequence[str]
-    """The enclaves of the converted policy."""
+    """Paths of the enclaves in the converted policy."""
     left_out: Sequence[str]
-    """What cannot be converted: the exit status is 1."""
+    """Profiles that cannot be converted, with the reason; with any, the exit status is 1."""
     output: Path | None
-    """The file that was written, or null."""
+    """Path of the file that was written, or null."""
     dry_run: DryRun
     changes: FileChanges
     notes: Notes
     document: str | None
-    """The converted policy, if no file was to be written."""
+    """The converted policy as XML, or null if it was written to a file."""
 
 
 class PolicyFile(NamedTuple):
-    """A policy."""
+    """A policy that ships with sros."""
 
     file: Path
-    """Its file."""
+    """Path of the policy file."""
     enclaves: Sequence[str]
-    """Its enclaves."""
+    """Paths of the enclaves in the policy."""
 
 
 class ShippedPolicies(NamedTuple):
-    """The policies."""
+    """The policies that ship with sros."""
 
     policies: Sequence[PolicyFile]
-    """The policies."""
+    """The policies that ship with sros, one entry for each file."""
 
 
 class CopiedPolicies(NamedTuple):
-    """The copy."""
+    """The result of copying policies."""
 
     folder: Path
-    """The new folder."""
+    """Path of the folder with the copies."""
     dry_run: DryRun
     changes: FileChanges
     notes: Notes
 
 
 def copy_policies(source: Path, target: Path, *, dry_run: bool = False) -> list[FileChange]:
-    """Copy the policies in a folder, or their common parts to a folder ``common``; return the new.
+    """Copy a folder of policies, or only its common fragments; return the changed files.
 
-    Files that are there stay as they are.
+    Existing files stay unchanged.
 
     Raises:
-        UsageError: ``target`` is no folder, or a file in it differs; then nothing is copied.
+        UsageError: ``target`` is not a folder, or one of its files differs; nothing is copied.
     """
     from sros_tool.files import new_files, write_new_folder
 
@@ -849,7 +849,7 @@ def copy_policies(source: Path, target: Path, *, dry_run: bool = False) -> list[
 
 
 def convert_policy(path: Path) -> ConvertedPolicy:
-    """Return the policy in a file of version 0.1.0, with an enclave for each node.
+    """Convert a policy file of version 0.1.0: every node gets an enclave.
 
     The enclave has the name of the node in its namespace, as its key had (ros2/sros2 0.6 to 0.8).
     A private name is ``~/name`` since ROS 2 Eloquent; until then it was written ``~name``.  Files
@@ -870,7 +870,7 @@ _ONE_NODE = f"""<policy version="{VERSION}" xmlns:xi="http://www.w3.org/2001/XIn
 
 
 def with_node_rights(policy: Policy, folder: Path) -> Policy:
-    """Return the policy with what every node needs added to each profile that lacks it.
+    """Return the policy with the rights that every node needs added to profiles that lack them.
 
     ``folder`` has ``common/node.xml``, which says what every node of ROS 2 needs.
     """
@@ -900,7 +900,7 @@ def with_node_rights(policy: Policy, folder: Path) -> Policy:
 
 
 class _EarlierReader(_Reader):
-    """Reader of a policy of an earlier format."""
+    """Reader of policies in an earlier format."""
 
     _other_roots = _EARLIER_ROOTS
 
@@ -992,12 +992,12 @@ _WORDS = {level: word for word, level in PROTECT.items()}
 
 
 def instruction_text(protect: Level | None) -> str:
-    """Return the text that marks a name with this protection, or "" for None."""
+    """Return the processing instruction for a protection level, or "" for None."""
     return f'<?{_INSTRUCTION} protect="{_WORDS[protect]}"?>' if protect else ""
 
 
 def write_policy(policy: Policy) -> bytes:
-    """Return the policy as XML in UTF-8; `read_policy` reads the same value from it."""
+    """Return the policy as XML (UTF-8 bytes) that `read_policy` reads as an equal policy."""
     root = etree.Element("policy", version=policy.version)
     enclaves = etree.SubElement(root, "enclaves")
     metadata: list[tuple[etree._Element, str]] = []
@@ -1026,7 +1026,7 @@ def write_policy(policy: Policy) -> bytes:
 def checked_text(
     policy: Policy, output: Path | None, what: str, *, placeholders: bool = False
 ) -> bytes:
-    """Return the document of a policy that is read as the same policy where it is written.
+    """Return the policy as XML after a check that it reads back as an equal policy.
 
     Args:
         policy: the policy.
@@ -1050,7 +1050,7 @@ def checked_text(
 def _write_profile(
     parent: etree._Element, profile: Profile
 ) -> Iterator[tuple[etree._Element, Level]]:
-    """Append a profile; yield the elements of its names that have a protection."""
+    """Append a profile to the XML; yield the name elements that need a protection."""
     element = etree.SubElement(parent, "profile", ns=profile.ns, node=profile.node)
     for group in profile.groups:
         child = etree.SubElement(element, group.kind)
@@ -1068,7 +1068,7 @@ def _write_profile(
 
 _MOST_FILES = 10_000
 _LOOKED_AT = 256 * 1024
-"""Size in bytes of the largest file with another name that is searched for a policy."""
+"""Size in bytes of the largest file without the ending ``.xml`` that is searched for a policy."""
 
 
 def policy_files(folder: Path) -> Iterator[Path]:
@@ -1088,7 +1088,7 @@ def policy_files(folder: Path) -> Iterator[Path]:
 
 
 def is_policy(name: str, content: bytes, shown: str) -> bool:
-    """Return whether the file ``name`` of a folder is a policy; errors name it as ``shown``.
+    """Return whether a file is a policy; errors call the file ``shown``.
 
     Raises:
         DocumentError: that is not certain, or only its name says that it is none.
@@ -1106,7 +1106,7 @@ def is_policy(name: str, content: bytes, shown: str) -> bool:
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
-    """Yield the regular files in a folder and below it, sorted; links to folders are refused."""
+    """Yield the regular files in a folder and below, sorted; refuse links to folders."""
 
     def fail(error: OSError) -> None:
         raise DocumentError(f"'{error.filename}' cannot be read", str(error.strerror)) from error

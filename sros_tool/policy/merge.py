@@ -44,23 +44,23 @@ _SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """A right that one side allows and the other denies, completely or in part.
+    """A right that one policy allows and the other denies, completely or in part.
 
     The denial always wins.  With ``new``, the merge adds the denial to a file that allows the
     right; otherwise the file has the denial, and the merge requests the right.
     """
 
     denied: Right
-    """The denial."""
+    """The rule that denies the right."""
     allowed: Right
-    """The right."""
+    """The rule that allows the right."""
     new: bool
-    """Whether the denial is new in the file."""
+    """Whether the merge adds the denial to the policy file."""
 
 
 @dataclass(frozen=True, slots=True)
 class AddedName:
-    """A name to add to a profile, as written there, with its rights and its protection."""
+    """A name to add to a profile, as written there, with its rights and protection level."""
 
     kind: str
     name: str
@@ -79,7 +79,7 @@ class ProfileKey:
 
 @dataclass(frozen=True, slots=True)
 class MergePlan:
-    """The names to add to each profile, the rights that they add, and the contradictions."""
+    """The names to add to each profile, the rights added by them, and the contradictions."""
 
     entries: dict[ProfileKey, tuple[AddedName, ...]]
     added: tuple[Right, ...]
@@ -147,7 +147,7 @@ class _Planner:
 
 @dataclass(slots=True)
 class _Name:
-    """A name as first written, the rights to add to it, and its protection."""
+    """A name to add, as first written, with the rights to add and the protection level."""
 
     written: str
     rights: dict[tuple[str, Qualifier], None]
@@ -172,7 +172,7 @@ def _entry_order(entry: AddedName) -> tuple[int, GroupRights, str]:
 
 
 def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
-    """Return a note for each denial that limits a merge."""
+    """Return a note for each denial that keeps a requested right from being added."""
     by_denial: dict[tuple[Right, bool], list[Right]] = {}
     for contradiction in contradictions:
         by_denial.setdefault((contradiction.denied, contradiction.new), []).append(
@@ -202,7 +202,7 @@ _COMMENTS_OF_THE_LINE = re.compile(r"(?>[ \t]*<!--.*?-->)++(?=[ \t]*(?:\r?\n|\Z)
 
 @dataclass(slots=True)
 class PlacedElement:
-    """An element and its positions in the text, in characters from the start of the document.
+    """An XML element with its offsets in the text, in characters from the start of the document.
 
     ``inner`` is the start of its content, ``close`` the start of its end tag.  An element without
     end tag (``<a/>``) has ``inner == close == end``.
@@ -290,7 +290,7 @@ class EditedText:
         return before
 
     def _unit(self) -> str:
-        """Return the indentation of one level."""
+        """Return the white space of one indentation level."""
         stack = [self.root]
         while stack:
             parent = stack.pop()
@@ -303,7 +303,7 @@ class EditedText:
         return "  "
 
     def after(self, element: PlacedElement) -> int:
-        """Return the position after an element and after the comments on the rest of its line."""
+        """Return the position after an element and the comments on its last line."""
         comments = _COMMENTS_OF_THE_LINE.match(self.text, element.end)
         if comments and self.indent_of(element) is not None:
             return comments.end()
@@ -312,7 +312,7 @@ class EditedText:
     # ── edits ───────────────────────────────────────────────────────────────────────────
 
     def put(self, place: int, text: str, until: int | None = None) -> None:
-        """Insert ``text`` at position ``place``; with ``until``, replace the text up to there."""
+        """Insert ``text`` at offset ``place``; with ``until``, replace the text up to there."""
         self._edits.append((place, place if until is None else until, text))
 
     def document(self) -> bytes:
@@ -325,7 +325,7 @@ class EditedText:
 
 
 def _encoding(data: bytes, root: etree._Element) -> str:
-    """Return the encoding of a document that keeps a byte order mark as a character."""
+    """Return the encoding of a document; decoding keeps a byte order mark as a character."""
     declared = root.getroottree().docinfo.encoding or "utf-8"
     if data.startswith(codecs.BOM_UTF16_LE):
         return "utf-16-le"
@@ -348,25 +348,25 @@ class Merged:
 
 @shows(optional=("document",))
 class MergedPolicy(NamedTuple):
-    """The rights that were added to a policy."""
+    """The result of merging policies into a policy file."""
 
     policy: Path
-    """POLICY, as it was named."""
+    """Path of the policy file, as given on the command line."""
     added: Sequence[Right]
-    """The rights that POLICY did not have."""
+    """Rights that were added to the policy."""
     contradictions: Sequence[Contradiction]
-    """Rights that one side allows and the other denies; the denial wins."""
+    """Rights that one policy allows and the other denies; the denial wins."""
     output: Path | None
-    """The file that was written, or null."""
+    """Path of the file that was written, or null."""
     document: str | None
-    """The merged policy, if no file was to be written."""
+    """The merged policy as XML, or null if it was written to a file."""
     dry_run: DryRun
     changes: FileChanges
     notes: Notes
 
 
 def merge_into(path: Path, additions: Policy) -> Merged:
-    """Return the policy file at ``path`` with the rights of ``additions``; write nothing.
+    """Merge the rights of ``additions`` into the policy file at ``path``; write nothing.
 
     Raises:
         PolicyError: (or another `DocumentError`) the file is not a policy, or a right cannot be
@@ -377,7 +377,7 @@ def merge_into(path: Path, additions: Policy) -> Merged:
 
 
 def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
-    """Return the policy file at ``path`` with several policies merged one after the other."""
+    """Merge several policies, one after the other, into the file at ``path``; write nothing."""
     document = read_bytes(path, "policy file")
     before = read_policy(path, document)
     added: list[Right] = []
@@ -416,7 +416,7 @@ def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right])
 
 
 def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
-    """Raise `PolicyError` unless ``merged`` says of names what ``additions`` say of them.
+    """Raise `PolicyError` unless ``merged`` protects names as ``additions`` require.
 
     A name that the file already has is not edited: which of its places should say it is the
     author's choice.
@@ -439,7 +439,7 @@ def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _New:
-    """An element to be written: its start tag without brackets, and its content."""
+    """An XML element to write: its start tag without brackets, and its content."""
 
     start: str
     content: str = ""
@@ -456,7 +456,7 @@ def _group(kind: str, rights: GroupRights, entries: Iterable[AddedName]) -> _New
 
 
 def _groups(entries: Sequence[AddedName]) -> list[_New]:
-    """Return the groups for names that come sorted by kind and rights."""
+    """Group names that are sorted by kind and rights."""
     return [
         _group(kind, rights, same)
         for (kind, rights), same in groupby(entries, key=lambda entry: (entry.kind, entry.rights))
@@ -477,7 +477,7 @@ class _Editor:
         self._text = EditedText(document, f"the policy file '{path}'")
 
     def add(self, entries: dict[ProfileKey, tuple[AddedName, ...]]) -> bytes:
-        """Return the document with ``entries``."""
+        """Return the document with ``entries`` added."""
         blocks = list(self._text.root.named("enclaves"))
         own = {
             element.get("path"): element for block in blocks for element in block.named("enclave")
@@ -536,7 +536,7 @@ class _Editor:
                 self._add_names(group, kind, list(same))
 
     def _add_names(self, group: PlacedElement, kind: str, entries: Sequence[AddedName]) -> None:
-        """Insert names into a group: in order if it is sorted, otherwise at its end."""
+        """Insert names into a group: sorted if the group is sorted, otherwise at its end."""
         present = [child.xml.text or "" for child in group.named(kind.removesuffix("s"))]
         is_sorted = len(present) == len(group.children) and present == sorted(present)
         for entry in entries:
@@ -552,7 +552,7 @@ class _Editor:
     # ── writing elements ───────────────────────────────────────────────────────────────────
 
     def _append(self, parent: PlacedElement, new: _New) -> None:
-        """Write an element after the last child of ``parent``, but before its metadata."""
+        """Insert an element after the last child of ``parent``, but before its metadata."""
         last = next((child for child in reversed(parent.children) if child.tag != "metadata"), None)
         if last:
             self._put_after(last, new)
@@ -564,7 +564,7 @@ class _Editor:
         self._text.put(self._text.after(sibling), self._rendered(new, indent))
 
     def _put_first(self, parent: PlacedElement, new: _New) -> None:
-        """Write an element first, or second if a comment stands before the first one."""
+        """Insert an element as first child, or after a comment that is the first child."""
         text, first = self._text, parent.children[0]
         if text.text[parent.inner : first.start].strip():
             self._put_after(first, new)
@@ -587,7 +587,7 @@ class _Editor:
         text.put(place, rendered)
 
     def _rendered(self, new: _New, indent: str | None) -> str:
-        """Return the text of an element, on separate lines if its neighbours are."""
+        """Return the XML of an element, on separate lines if its siblings are."""
         tag = new.start.split(" ", 1)[0]
         before = "" if indent is None else self._text.newline + indent
         if not new.children:

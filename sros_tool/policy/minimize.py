@@ -50,14 +50,14 @@ _Pair = tuple[str, str]
 
 
 class WideRule(NamedTuple):
-    """A wildcard."""
+    """A wildcard that matches more names than were used."""
 
     rule: Right
-    """The wildcard."""
+    """The rule with the wildcard."""
     used: tuple[Right, ...]
-    """Observed rights that the wildcard gives."""
+    """Observed rights that the wildcard allows."""
     replacement: tuple[Right, ...]
-    """Rights that replace it, without those that other rules of the enclave allow by exact name."""
+    """Exact rights that replace the wildcard and that no other rule of the enclave states."""
 
 
 @shows(
@@ -66,36 +66,36 @@ class WideRule(NamedTuple):
 )
 @dataclass(frozen=True, slots=True)
 class EnclaveUse:
-    """The rights of an enclave compared with its observed rights."""
+    """Comparison of an enclave's rights with its observed rights."""
 
     enclave: str
-    """The enclave."""
+    """Path of the enclave."""
     observed_at_all: bool
-    """Whether it was observed; if not, it does not change."""
+    """Whether the enclave was observed; an enclave that was not observed is not changed."""
     never_observed: tuple[Right, ...]
-    """Rights that are removed."""
+    """Rights that were never observed, and are removed."""
     kept_for_every_node: tuple[Right, ...]
-    """Rights that were not observed, and stay because every node needs them."""
+    """Rights that were not observed, but stay because every node needs them."""
     wildcards: tuple[WideRule, ...]
-    """Wildcards that are wider than used."""
+    """Wildcards that match more names than were used."""
     not_allowed: tuple[Right, ...]
-    """Rights that were observed, and that the policy does not give."""
+    """Rights that were observed, but that the policy does not allow."""
     allowed: int
-    """Number of pairs of a right and a name that the policy has."""
+    """Number of pairs (right, name) that the policy allows."""
     observed: int
-    """Number of these pairs that were observed."""
+    """Number of allowed pairs that were observed."""
     remaining: int
-    """Number of these pairs that the policy keeps."""
+    """Number of allowed pairs that the narrowed policy keeps."""
 
     @property
     def ratio(self) -> float | None:
-        """Allowed divided by observed, or null."""
+        """Over-privilege: allowed pairs divided by observed pairs; null if none was observed."""
         return self.allowed / self.observed if self.observed else None
 
 
 @dataclass(frozen=True, slots=True)
 class MinimizedPolicy:
-    """The narrowed policy, with its includes written out, and the use of each enclave."""
+    """The narrowed policy with its includes written out, and a comparison for each enclave."""
 
     policy: Policy
     uses: tuple[EnclaveUse, ...]
@@ -104,7 +104,7 @@ class MinimizedPolicy:
 def minimize(
     policy: Policy, observed: Iterable[Right], common: Sequence[Group] = ()
 ) -> MinimizedPolicy:
-    """Return ``policy`` narrowed to the ALLOW rights in ``observed``.
+    """Narrow ``policy`` to the ALLOW rights in ``observed``, and return the result.
 
     Every DENY stays.  ``common`` are the rights that every node needs.  They stay, observed or not,
     if the policy allows them to a node with a profile.
@@ -127,7 +127,7 @@ def minimize(
 
 
 def _protected_as_before(before: Policy, after: Policy) -> Policy:
-    """Return ``after`` with the protection that only removed names stated, where it still applies.
+    """Return ``after`` with the protection levels that only removed names stated.
 
     One enclave states it for all: those that keep a right to the name need it, too.
     """
@@ -159,7 +159,7 @@ def _protected_as_before(before: Policy, after: Policy) -> Policy:
 
 
 class _KnownNames:
-    """All exact names in policies and observations, by kind, sorted."""
+    """All exact names in policies and observations: by kind, sorted."""
 
     def __init__(self, all_rights: Iterable[Iterable[Right]]) -> None:
         found: dict[str, set[str]] = defaultdict(set)
@@ -170,7 +170,7 @@ class _KnownNames:
         self._names = {kind: sorted(names) for kind, names in found.items()}
 
     def of(self, kind: str) -> Sequence[str]:
-        """Return the known names of topics, services or actions."""
+        """Return the known names of a kind (topics, services or actions)."""
         return self._names.get(kind, ())
 
     def matched(self, kind: str, expression: str) -> Iterator[str]:
@@ -184,7 +184,7 @@ class _KnownNames:
 
 
 class _Narrowing:
-    """One enclave while it is narrowed to its observed rights."""
+    """The narrowing of one enclave to its observed rights."""
 
     def __init__(
         self,
@@ -214,7 +214,7 @@ class _Narrowing:
         return self._rules.cover(part) and not self._rules.cover(part._replace(qualifier=DENY))
 
     def _is_usable(self, part: Right) -> bool:
-        """Return whether a right, or a part of a wildcard, is allowed."""
+        """Return whether the enclave allows a right, or a part of the right's wildcard."""
         if self._is_allowed(part):
             return True
         return is_expression(part.name) and self._rules.meet(part)
@@ -254,7 +254,7 @@ class _Narrowing:
     # ── rules that stay, and replacements of wildcards ─────────────────────────────────────
 
     def _stays(self, rule: Right) -> bool:
-        """Return whether a rule stays: common, an observed name, or itself an observed wildcard."""
+        """Return whether a rule stays unchanged: it is common, or was observed as written."""
         if rule in self._common:
             return True
         if not is_expression(rule.name):
@@ -267,7 +267,7 @@ class _Narrowing:
         )
 
     def _narrowed(self, kept: set[Right]) -> tuple[WideRule, ...]:
-        """Return the used and common wildcards to replace, and the rights that replace each."""
+        """Map each wildcard to replace to the rights that replace the wildcard."""
         wide = [rule for rule in self._stated if is_expression(rule.name) and rule not in kept]
         owners: dict[Right, list[Right]] = defaultdict(list)
         for rule in wide:
@@ -299,7 +299,7 @@ class _Narrowing:
         )
 
     def _prove(self, remaining: Sequence[Right]) -> None:
-        """Check that no right was added, and no observed right was lost."""
+        """Raise unless the narrowed enclave adds no right and keeps every observed right."""
         after = Rules(remaining)
         more = [right for right in remaining if not self._rules.cover(right)]
         lost = [p for p in self._in_use if self._is_allowed(p) and not after.cover(p)]
@@ -335,7 +335,7 @@ class _Narrowing:
         }
 
     def _with_actions(self, found: set[_Pair], rules: Rules) -> set[_Pair]:
-        """Return the pairs, with every action that ``rules`` allow completely as one pair."""
+        """Return the pairs; an action that ``rules`` allow completely counts as one pair."""
         pairs = set(found)
         for action in ("call", "execute"):
             for name in self._names.of(KIND_OF[action]):
@@ -347,7 +347,7 @@ class _Narrowing:
 
 
 def _for_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:
-    """Yield the ``common`` rights of each node that the enclave has a profile for."""
+    """Yield the ``common`` rights for each node that has a profile in the enclave."""
     for profile in enclave.all_profiles():
         for group in common:
             for name in group.names:
@@ -362,7 +362,7 @@ def _for_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:
 def _narrowed_enclave(
     enclave: Enclave, kept: Set[Right], replacements: Mapping[Right, Sequence[Right]]
 ) -> Enclave:
-    """Return ``enclave`` with its denials, the ALLOW rights in ``kept``, and names for wildcards.
+    """Return ``enclave`` with its denials, the rights in ``kept``, and exact names for wildcards.
 
     The names that replace a wildcard are written once, where it occurs first, and in its form:
     relative, private or absolute.  Profiles without a rule stay.
@@ -374,7 +374,7 @@ def _narrowed_enclave(
 def _profile(
     path: str, profile: Profile, kept: Set[Right], pending: dict[Right, Sequence[Right]]
 ) -> Profile:
-    """Return the narrowed profile; remove the replacements that it contains from ``pending``."""
+    """Return the narrowed profile; remove the replacements that it states from ``pending``."""
     said: dict[tuple[str, str, Level | None], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
         level = group.protect
@@ -401,7 +401,7 @@ def _profile(
 
 
 def _written(fqn: str, like: str, profile: Profile) -> str:
-    """Return an absolute name in the form of ``like`` (relative, private), if possible."""
+    """Return an absolute name written like ``like`` (relative or private) if possible."""
     if like.startswith("/"):
         return fqn
     prefix = expand("~/" if like.startswith("~") else "", profile.ns, profile.node)
@@ -418,16 +418,16 @@ _FEWEST = 3  # names that a wildcard must replace
 
 
 class WildcardProposal(NamedTuple):
-    """A wildcard in place of names: a safe one adds no known name, but allows unused names."""
+    """A wildcard that could replace several names of an enclave."""
 
     rule: Right
-    """The wildcard."""
+    """The rule with the wildcard."""
     replaces: tuple[Right, ...]
     """Rights that the wildcard replaces."""
     adds: tuple[Right, ...]
-    """Known names of other enclaves that the wildcard newly allows."""
+    """Known names, used by other enclaves, that the wildcard additionally allows."""
     saves: int
-    """Number of bytes that the wildcard saves."""
+    """Bytes saved in the permissions document."""
 
 
 def propose_wildcards(
@@ -438,7 +438,7 @@ def propose_wildcards(
     needed: int,
     size: Callable[[Right], int],
 ) -> tuple[WildcardProposal, ...]:
-    """Return wildcards that make an enclave's document ``needed`` bytes smaller, if possible.
+    """Propose wildcards that make an enclave's document ``needed`` bytes smaller.
 
     ``rights`` are the rights of this enclave, ``known`` the rights of all enclaves; ``size``
     returns the size of a right in bytes.  The largest savings come first; wildcards that newly
@@ -479,7 +479,7 @@ def propose_wildcards(
 
 
 def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
-    """Map wildcards to the rights that they can replace, at least `_FEWEST` of them."""
+    """Map candidate wildcards to the rights that they can replace, at least `_FEWEST` each."""
     found: dict[Right, list[Right]] = defaultdict(list)
     for right in rights:
         if right.name.startswith("/") and not is_expression(right.name):
@@ -489,7 +489,7 @@ def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
 
 
 def _wider(name: str) -> Iterator[str]:
-    """Yield wildcards for a name: ``*`` after each namespace but the root, or for numbers."""
+    """Yield wildcards that match a name: ``*`` after a namespace (not "/"), or for numbers."""
     tokens = name.split("/")[1:-1]
     for depth in range(1, len(tokens) + 1):
         yield "/" + "/".join((*tokens[:depth], "*"))
@@ -501,7 +501,7 @@ def _wider(name: str) -> Iterator[str]:
 
 
 def _foreign(enclave: str, own: Rules, known: Iterable[Right]) -> dict[str, list[str]]:
-    """Map each right to the known names for which the enclave lacks it, actions as parts."""
+    """Map rights to the known names for which the enclave lacks the right; actions are split."""
     by_service: dict[bool, set[str]] = {True: set(), False: set()}
     for part in unfolded(known):
         if not is_expression(part.name):

@@ -21,13 +21,13 @@ RIGHTS: dict[str, tuple[str, str]] = {
     "services": ("request", "reply"),
     "actions": ("call", "execute"),
 }
-"""The kinds of groups, and the two rights that a group of each kind allows or denies."""
+"""The two rights that a group of each kind (topics, services, actions) allows or denies."""
 OTHER_SIDE = {one: other for pair in RIGHTS.values() for one, other in (pair, pair[::-1])}
-"""For each right, the right at the other end."""
+"""Maps a right to the right that the peer needs, such as publish to subscribe."""
 
 
 class Qualifier(StrEnum):
-    """The qualifier of a right in a rule."""
+    """Whether a rule allows or denies a right."""
 
     ALLOW = "ALLOW"
     DENY = "DENY"
@@ -38,12 +38,12 @@ DENY = Qualifier.DENY
 
 
 class Source(NamedTuple):
-    """The file and line (from 1) that something was read from; without a line it is 0."""
+    """The file and line that a value was read from; the line counts from 1, 0 means no line."""
 
     file: str
-    """The file."""
+    """Path of the file."""
     line: int
-    """The line, from 1."""
+    """Line number, from 1; 0 if there is no line."""
 
     def __str__(self) -> str:
         return f"{self.file}:{self.line}" if self.line else self.file
@@ -87,7 +87,7 @@ class Profile:
 
 
 class Profiles(NamedTuple):
-    """A set of profiles with its free ``type`` and its ``metadata`` (XML text, or "")."""
+    """A set of profiles with its ``type`` attribute and its ``metadata`` (XML text, or "")."""
 
     profiles: tuple[Profile, ...]
     type: str = ""
@@ -107,11 +107,11 @@ class Enclave:
     digest: str = field(default="", compare=False)
 
     def all_profiles(self) -> tuple[Profile, ...]:
-        """Return every profile of the enclave, in order."""
+        """Return all profiles of the enclave, in document order."""
         return tuple(profile for block in self.profiles for profile in block.profiles)
 
     def with_profiles(self, change: Callable[[Profile], Profile]) -> Enclave:
-        """Return the enclave with every profile replaced by what ``change`` returns for it."""
+        """Return the enclave with ``change`` applied to every profile."""
         blocks = (
             block._replace(profiles=tuple(map(change, block.profiles))) for block in self.profiles
         )
@@ -148,14 +148,14 @@ class Policy:
 
 
 def with_profiles(policy: Policy, change: Callable[[Profile], Profile]) -> Policy:
-    """Return the policy with every profile replaced by what ``change`` returns for it."""
+    """Return the policy with ``change`` applied to every profile."""
     return replace(
         policy, enclaves=tuple(enclave.with_profiles(change) for enclave in policy.enclaves)
     )
 
 
 def with_groups(policy: Policy, change: Callable[[Group, Profile], Iterable[Group]]) -> Policy:
-    """Return the policy with every group replaced by those that ``change`` returns for it."""
+    """Return the policy with every group replaced by the groups that ``change`` returns."""
 
     def with_new_groups(profile: Profile) -> Profile:
         groups = tuple(new for group in profile.groups for new in change(group, profile))
@@ -168,7 +168,7 @@ def with_groups(policy: Policy, change: Callable[[Group, Profile], Iterable[Grou
 
 
 class Level(StrEnum):
-    """The strength of a protection; the long forms also prove which writer a message came from."""
+    """Protection level of messages; the long forms also authenticate the writer of a message."""
 
     NONE = "NONE"
     SIGN = "SIGN"
@@ -178,12 +178,12 @@ class Level(StrEnum):
 
 
 PROTECT: dict[str, Level] = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
-"""The levels that a policy can demand of a name, by their words in it."""
+"""Maps the words that a policy uses for protection levels to the levels."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicProtection:
-    """The protection of a topic: its payload, its submessages, and its access control."""
+    """The protection of a topic: payload, submessages, and access control."""
 
     data: Level = Level.ENCRYPT
     metadata: Level = Level.ENCRYPT
@@ -195,20 +195,20 @@ class TopicProtection:
 
 @dataclass(frozen=True, slots=True)
 class NamedProtection:
-    """The protection of the topics, services or actions (``kind``) that match a name."""
+    """The protection of topics, services or actions (``kind``) whose names match an expression."""
 
     kind: str
     name: str
     protection: TopicProtection
 
     def __str__(self) -> str:
-        """Return kind and absolute name, as in "topic /camera/*"."""
+        """Return kind and absolute name, such as "topic /camera/*"."""
         return f"{self.kind.removesuffix('s')} {expand(self.name, '/', '')}"
 
 
 @dataclass(frozen=True, slots=True)
 class DomainProtection:
-    """The protection of a domain and of single names in it; ``default`` applies to other names."""
+    """The protection of a domain and of names in the domain; ``default`` applies to other names."""
 
     rtps: Level = Level.SIGN
     discovery: Level = Level.ENCRYPT
@@ -225,33 +225,33 @@ class DomainProtection:
 @shows("enclave", "kind", "name", "level")
 @dataclass(frozen=True, slots=True)
 class StatedProtection:
-    """The least protection of the topics, services or actions (``kind``) that match a name.
+    """The least protection that a policy requires for matching names of one ``kind``.
 
     ``name`` is absolute; ``enclave`` and ``source`` are where a policy says it.
     """
 
     enclave: str
-    """The enclave that says it."""
+    """Path of the enclave whose rules require the protection."""
     kind: Annotated[str, Words(RIGHTS)]
-    """The kind of the name."""
+    """Kind of the names: topics, services or actions."""
     name: str
     """The absolute ROS name, perhaps with wildcards."""
     level: Level
-    """The least protection of its messages."""
+    """The least protection level of messages."""
     source: Source = field(compare=False)
 
     def __str__(self) -> str:
-        """Return kind and name, as in "topic /camera/*"."""
+        """Return kind and name, such as "topic /camera/*"."""
         return f"{self.kind.removesuffix('s')} {self.name}"
 
     @property
     def word(self) -> str:
-        """The level as a policy writes it."""
+        """The protection level as written in a policy."""
         return self.level.lower()
 
 
 def stated_protections(enclaves: Iterable[Enclave]) -> tuple[StatedProtection, ...]:
-    """Return what enclaves say about the protection of names, in order.
+    """Return the protection levels that enclaves require for names, in order, without duplicates.
 
     What an enclave says several times is returned once, with the first place.
     """

@@ -1,4 +1,4 @@
-"""Expressions with wildcards: which names they match, and whether they cover or overlap others.
+"""Name expressions with wildcards: matching, covering and overlapping.
 
 ``*`` matches any characters, also "/"; ``?`` matches one character; ``[abc]`` and ``[a-c]`` match
 one character of a set, ``[!a-c]`` one that is not in it.  This is fnmatch of glibc without escapes,
@@ -31,12 +31,12 @@ _PIECE = re.compile(r"\*+|\?|\[(!?)([^\]]+)\]|(.)", re.DOTALL)
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _ALPHABET = frozenset(map(chr, range(33, 127)))  # wider than ROS names: DDS topics may be foreign
 _ANY = frozenset([""])
-"""The piece of a pattern that means ``*``."""
+"""The pattern piece for ``*``."""
 
 
 @lru_cache(maxsize=_MANY)
 def compiled(expression: str) -> re.Pattern[str]:
-    """Return the regular expression that matches the same names as ``expression``."""
+    """Return a compiled regular expression that matches the same names as ``expression``."""
     return re.compile(translate(expression))
 
 
@@ -70,7 +70,7 @@ def covers(wide: str, narrow: str) -> bool:
 
 
 def overlap(one: str, other: str) -> bool:
-    """Return whether some name matches both expressions."""
+    """Return whether at least one name matches both expressions."""
     if not is_expression(one):
         return matches(other, one) if is_expression(other) else one == other
     if not is_expression(other):
@@ -83,7 +83,7 @@ _Pieces = tuple[frozenset[str], ...]
 
 
 class _Form:
-    """The pieces of an expression, and its positions as the bits of an integer.
+    """An expression as pieces, with its positions as the bits of an integer.
 
     Bit i of a set of positions stands for "the first i pieces matched".
     """
@@ -102,7 +102,7 @@ class _Form:
         self._meeting: dict[frozenset[str], int] = {}
 
     def covers(self, narrow: _Form) -> bool:
-        """Return whether these pieces cover those of ``narrow``, one by one."""
+        """Return whether the pieces cover the pieces of ``narrow``, pair by pair."""
         reached = self._begin()
         for piece in narrow.pieces:
             kept = reached & self.stars
@@ -114,7 +114,7 @@ class _Form:
         return bool(reached >> len(self.pieces))
 
     def overlaps(self, other: _Form) -> bool:
-        """Return whether some name matches both."""
+        """Return whether at least one name matches both expressions."""
         if not (all(self.pieces) and all(other.pieces)):
             return False  # a set without members matches nothing
         if self.starred and other.starred:
@@ -126,7 +126,7 @@ class _Form:
         return self._meets(other) if self.starred else other._meets(self)
 
     def _meets(self, fixed: _Form) -> bool:
-        """Return whether a name of the pieces of ``fixed``, which has no star, matches."""
+        """Return whether a name of the pieces of ``fixed``, without ``*``, matches."""
         reached = self._begin()
         for piece in fixed.pieces:
             kept = reached & self.stars | (reached & self._meets_at(piece)) << 1
@@ -139,7 +139,7 @@ class _Form:
         return 1 | (self.stars & 1) << 1
 
     def _covers_at(self, piece: frozenset[str]) -> int:
-        """Return the positions of the pieces that match all letters of ``piece``."""
+        """Return the positions whose pieces match all letters of ``piece``."""
         if piece not in self._covering:
             every = ~0
             for letter in piece:
@@ -148,7 +148,7 @@ class _Form:
         return self._covering[piece]
 
     def _meets_at(self, piece: frozenset[str]) -> int:
-        """Return the positions of the pieces that match some letter of ``piece``."""
+        """Return the positions whose pieces match at least one letter of ``piece``."""
         if piece not in self._meeting:
             some = 0
             for letter in piece:
@@ -165,7 +165,7 @@ class _Form:
 
 
 def _meet(one: _Pieces, other: _Pieces) -> bool:
-    """Return whether pieces at the same position have a common letter; more of one do not count."""
+    """Return whether pieces at equal positions share a letter; extra pieces are ignored."""
     return not any(map(frozenset.isdisjoint, one, other))
 
 
@@ -175,7 +175,7 @@ def _form(expression: str) -> _Form:
 
 
 def _pieces(expression: str) -> _Pieces:
-    """Return the pieces of an expression: `_ANY` for ``*``, else the set of matching characters."""
+    """Split an expression into pieces: `_ANY` for ``*``, else the set of matching characters."""
     found: list[frozenset[str]] = []
     for piece in _PIECE.finditer(expression):
         negated, members, literal = piece.groups()
@@ -205,17 +205,17 @@ def _members(text: str) -> frozenset[str]:
 
 
 class ComparisonLimit:
-    """A limit for the comparisons of one question, so that nobody waits without end."""
+    """A limit on comparisons, so that a question about many expressions ends in time."""
 
     def __init__(self, most: int = 60_000_000) -> None:
-        """Allow comparisons in vain of expressions with ``most`` characters: some ten seconds."""
+        """Set the limit to ``most`` characters; the default takes about ten seconds."""
         self._left = most
 
     def spend(self, characters: int) -> None:
-        """Count a comparison of expressions with so many characters that had no result.
+        """Count a comparison without result against the limit, by the length of the expressions.
 
         Raises:
-            DocumentError: there were too many.
+            DocumentError: the limit is exceeded.
         """
         self._left -= characters
         if self._left < 0:
@@ -228,7 +228,7 @@ class ComparisonLimit:
 
 
 _FEW = 16
-"""So many expressions are compared one by one, without an index."""
+"""Up to this number, expressions are compared one by one, without an index."""
 _LAST = "\U0010ffff"
 _END = re.compile(r".*[*?\]]", re.DOTALL)
 _BETWEEN = "\0"
@@ -237,7 +237,7 @@ _GRAM = 4
 
 
 class Names:
-    """Names and expressions in an order, and a fast search for those that cover or meet others.
+    """An ordered set of names and expressions with a fast search for covering and overlapping ones.
 
     Only those are compared that have the same beginning, end or letters.  ``limit`` limits the
     comparisons: sets that are asked for one purpose share it.
@@ -251,24 +251,24 @@ class Names:
         self._limit = limit or ComparisonLimit()
 
     def cover(self, name: str) -> bool:
-        """Return whether ``name`` is one of these, or another one covers it."""
+        """Return whether the set contains ``name``, or an expression that covers ``name``."""
         return name in self._every or (bool(self._wild) and any(self.covering(name)))
 
     def covering(self, name: str) -> Iterator[str]:
-        """Yield the other expressions that cover ``name``, as `covers` decides, in their order."""
+        """Yield the other expressions that cover ``name`` (see `covers`), in set order."""
         for wide in self._that_may_cover(name):
             if wide != name and self._tried(covers(wide, name), wide, name):
                 yield wide
 
     def meets(self, name: str) -> bool:
-        """Return whether some name of this set and ``name`` match a common name."""
+        """Return whether an expression of the set overlaps with ``name``."""
         if is_expression(name):
             candidates = map(self._names.__getitem__, self._that_may_meet(name))
             return any(self._tried(overlap(e, name), e, name) for e in candidates)
         return name in self._exact or (bool(self._wild) and any(self.covering(name)))
 
     def meeting(self, name: str) -> Iterator[str]:
-        """Yield the names of this set that overlap with ``name``, in their order."""
+        """Yield the expressions of the set that overlap with ``name``, in the order of the set."""
         if is_expression(name):
             for expression in map(self._names.__getitem__, sorted(self._that_may_meet(name))):
                 if self._tried(overlap(expression, name), expression, name):
@@ -297,7 +297,7 @@ class Names:
 
     @cached_property
     def _by_letters(self) -> dict[str, list[int]]:
-        """The numbers of the expressions, by letters that every name that they match has.
+        """Map letters that every matching name has to the numbers of the expressions.
 
         Of the letters of an expression, those are taken that the fewest others have.
         """
@@ -317,7 +317,7 @@ class Names:
         return found
 
     def _that_may_meet(self, expression: str) -> Sequence[int]:
-        """Return the numbers of the names that may overlap with an expression, in any order."""
+        """Return the numbers of the expressions that could overlap with ``expression``, unordered."""
         if len(self._names) <= _FEW:
             return range(len(self._names))
         begin, end = literal_prefix(expression), _END.sub("", expression)[::-1]
@@ -342,7 +342,7 @@ class Names:
 
 
 class _Beginnings:
-    """Numbered texts, some of which go on with anything."""
+    """An index of numbered texts by their beginnings; open texts continue with anything."""
 
     def __init__(self, texts: Sequence[tuple[str, bool]]) -> None:
         ordered = sorted((text, number) for number, (text, _) in enumerate(texts))
@@ -355,7 +355,7 @@ class _Beginnings:
         self._sizes = sorted({len(text) for text in self._open})
 
     def compatible(self, begin: str) -> list[int]:
-        """Return the numbers of texts that begin so, and of open ones that ``begin`` goes on."""
+        """Return the numbers of the texts that can begin with ``begin``."""
         first = bisect_left(self._texts, begin)
         found = self._numbers[first : bisect_left(self._texts, begin + _LAST, lo=first)]
         for size in self._sizes:
@@ -366,7 +366,7 @@ class _Beginnings:
 
 
 def _letters_of(expression: str) -> str:
-    """Return the letters of an expression that are fixed, with NUL in place of the others."""
+    """Return the fixed letters of an expression, with NUL for all other characters."""
     if "[" not in expression:
         return expression.replace("*", _BETWEEN).replace("?", _BETWEEN)
     pieces = _form(expression).pieces
@@ -376,7 +376,7 @@ def _letters_of(expression: str) -> str:
 
 
 def _grams(run: str) -> Iterator[str]:
-    """Yield the parts of four letters of a run of letters, or the run if it is shorter."""
+    """Yield the four-letter parts of a text, or the whole text if it is shorter."""
     for i in range(max(len(run) - _GRAM, 0) + 1):
         yield run[i : i + _GRAM]
 
@@ -387,7 +387,7 @@ def _grams(run: str) -> Iterator[str]:
 # Most questions need no automata, which take long to import.
 @cache
 def _ros_names(absolute: bool) -> NameSet:
-    """Return all names that the grammar of ROS allows, with or without a leading "/"."""
+    """Return the set of all valid ROS names, with or without a leading "/"."""
     from sros_tool.automata import Automaton, Letters, NameSet
 
     word, slash = Letters.between([("A", "Z"), ("a", "z"), ("_", "_")]), Letters.of("/")
@@ -398,7 +398,7 @@ def _ros_names(absolute: bool) -> NameSet:
 
 @lru_cache(maxsize=_MANY)
 def _names_of(expression: str) -> NameSet:
-    """Return the names that an expression matches."""
+    """Return the set of the names that an expression matches."""
     from sros_tool.automata import Automaton, NameSet
 
     if not is_expression(expression):
@@ -419,7 +419,7 @@ def _as_letters(piece: frozenset[str]) -> Letters:
 def common_name(
     wanted: Iterable[str], unwanted: Iterable[str] = (), *, absolute: bool = True
 ) -> str | None:
-    """Return the shortest absolute ROS name that all of ``wanted`` and none of ``unwanted`` match.
+    """Return the shortest absolute ROS name that matches all ``wanted`` and no ``unwanted``.
 
     Without ``absolute``, the name has no leading "/", like DDS topics.  Returns None if there is no
     such name.

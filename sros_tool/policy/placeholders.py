@@ -1,4 +1,4 @@
-"""Placeholders in the names of a policy: what differs between the robots of a fleet.
+"""Placeholders in policy names, which stand for names that differ between robots of a fleet.
 
 ``{robot}`` and ``{namespace}`` stand for the name and the ROS namespace of one robot, ``{robots}``
 and ``{namespaces}`` for one name for each robot.  ``{robot:carriers}`` means the robots of a group.
@@ -20,7 +20,7 @@ _SAMPLES = {"robot": "r", "namespace": "/r"}
 
 
 class Placeholder(NamedTuple):
-    """A placeholder: ``value`` is robot or namespace; ``group`` is "" for the whole fleet."""
+    """A placeholder: ``value`` is "robot" or "namespace"; ``group`` is "" for the whole fleet."""
 
     value: str
     plural: bool = False
@@ -32,17 +32,17 @@ class Placeholder(NamedTuple):
 
 
 Parts = tuple[str | Placeholder, ...]
-"""A name: text, and placeholders in it."""
+"""A name split into text and placeholders."""
 
 
 def has_placeholder(text: str) -> bool:
-    """Return whether ``text`` has a brace, which only a placeholder may have."""
+    """Return whether ``text`` contains a brace, which only placeholders use."""
     return "{" in text or "}" in text
 
 
 @lru_cache(maxsize=4096)
 def parts_of(text: str) -> Parts:
-    """Return the text and the placeholders of a name.
+    """Split a name into text and placeholders.
 
     Raises:
         ValueError: a brace is not of a placeholder, or one stands where it may not; the message
@@ -72,7 +72,7 @@ def parts_of(text: str) -> Parts:
 
 
 def _place_problem(placeholder: Placeholder, before: str, after: str) -> str:
-    """Return why a placeholder may not stand between these texts, as a sentence, or ""."""
+    """Return why a placeholder is not allowed between two texts, as a sentence, or ""."""
     around = before.rpartition("/")[2] + after.partition("/")[0]
     in_set = before.rfind("[") > before.rfind("]")
     if in_set or not _WILDCARDS.isdisjoint(around):
@@ -94,12 +94,12 @@ def placeholders_of(parts: Parts) -> tuple[Placeholder, ...]:
 
 
 def sample(parts: Parts) -> str:
-    """Return the name that the shortest values give, for checks of its grammar."""
+    """Return the name filled with the shortest possible values, to check the name's grammar."""
     return "".join(part if isinstance(part, str) else _SAMPLES[part.value] for part in parts)
 
 
 def check_path(path: Parts) -> None:
-    """Check that the path of an enclave is one enclave, or one for each robot of one group.
+    """Raise unless an enclave path names one enclave, or one enclave for each robot of one group.
 
     Raises:
         ValueError: it is not; the message is a sentence.
@@ -113,7 +113,7 @@ def check_path(path: Parts) -> None:
 
 
 def check_name(name: Parts, path: Parts, *, several: bool) -> None:
-    """Check that a name has only placeholders that mean something in its enclave.
+    """Raise unless all placeholders of a name have a value in the name's enclave.
 
     Args:
         name: the name.
@@ -139,7 +139,7 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
 
 
 def fill(parts: Parts, robot: str, namespace: str, *, plural: bool = False) -> Parts:
-    """Return the parts with the singular or, with ``plural``, the plural placeholders filled in."""
+    """Fill in the placeholders of a name: the singular or, with ``plural``, the plural ones."""
     values = {"robot": robot, "namespace": namespace}
     if namespace == "/" and len(parts) > 1:
         values["namespace"] = ""  # in the root namespace, {namespace}/scan is /scan

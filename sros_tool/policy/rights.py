@@ -1,4 +1,4 @@
-"""Rights and denials on absolute names: the rights of a policy, and how two policies differ.
+"""Rights and denials with absolute names: reading them from policies, and comparing them.
 
 Two documents have the same meaning if their rights in normal form are equal.  An action consists of
 three services and two topics (ROS 2 design "Actions"): `unfolded` splits it into them, `folded`
@@ -29,7 +29,7 @@ from sros_tool.policy.patterns import ComparisonLimit, Names
 from sros_tool.values import Words, shows
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
-"""The kind of group for each right, such as topics for publish."""
+"""Maps a right to the kind of its names, such as publish to topics."""
 
 KindOfName = Annotated[str, Words((*RIGHTS, "dds"))]
 
@@ -37,41 +37,41 @@ RIGHT_ORDER = {right: number for number, right in enumerate(KIND_OF)}
 """The order in which rights are listed: publish, subscribe, request, reply, call, execute."""
 
 WHOLE = {"request": "call", "reply": "execute"}
-"""The right to an action, for each right to its services."""
+"""Maps a right to a service to the right to a whole action."""
 
 
 @shows("enclave", "qualifier", "kind", "right", "name")
 class Right(NamedTuple):
-    """A right or a denial of an enclave.
+    """A right or a denial of one enclave for one name.
 
     A name without a leading "/" is a DDS topic without a ROS name; it occurs only in permissions
     that sros did not make.
     """
 
     enclave: str
-    """The enclave."""
+    """Path of the enclave."""
     qualifier: Qualifier
-    """Whether it is a right or a denial."""
+    """Whether the rule allows or denies."""
     right: Annotated[str, Words(KIND_OF)]
-    """The right in the words of the policy language."""
+    """The right, as policies write it: publish, subscribe, request, reply, call or execute."""
     name: str
     """The absolute ROS name, perhaps with wildcards."""
 
     @property
     def kind(self) -> KindOfName:
-        """The kind of the name; ``dds`` is a DDS topic without a ROS name."""
+        """Kind of the name; ``dds`` is a DDS topic without a ROS name."""
         return KIND_OF[self.right] if self.name.startswith("/") else "dds"
 
     @property
     def topics(self) -> DdsNames:
-        """The DDS topics that it is about, to publish and to subscribe, perhaps with wildcards."""
+        """The DDS topics of the right, to publish and to subscribe, perhaps with wildcards."""
         if self.kind != "dds":
             return dds_names(self.right, self.name)
         writes = self.right == "publish"
         return DdsNames((self.name,) if writes else (), () if writes else (self.name,))
 
     def opposite(self, enclave: str) -> Right:
-        """Return the right at the other end, for an enclave: publish for subscribe, and so on."""
+        """Return the right that a peer enclave needs, such as subscribe for publish."""
         return self._replace(enclave=enclave, right=OTHER_SIDE[self.right])
 
     def __str__(self) -> str:
@@ -85,7 +85,7 @@ class Right(NamedTuple):
 
 
 def order(right: Right) -> tuple[str, int, str, str]:
-    """Return the sort key of a right: by enclave, then kind and right, then name."""
+    """Return a sort key: by enclave, then kind and right, then name."""
     return right.enclave, RIGHT_ORDER[right.right], right.name, right.qualifier
 
 
@@ -94,7 +94,7 @@ GroupRights = tuple[tuple[str, Qualifier], ...]
 
 
 def groupable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
-    """Yield the groups for ``rights`` to a name: two if a right is both allowed and denied."""
+    """Yield groups for ``rights`` to one name: two if a right is both allowed and denied."""
     ordered = sorted(rights, key=lambda right: (RIGHT_ORDER[right[0]], right[1]))
     if len({right for right, _ in ordered}) == len(ordered):
         yield tuple(ordered)
@@ -104,7 +104,7 @@ def groupable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
 
 
 def policy_rights(policy: Policy) -> frozenset[Right]:
-    """Return the rights in a policy as written there, but with absolute names."""
+    """Return all rights in a policy, with absolute names."""
     return frozenset(
         right
         for enclave in policy.enclaves
@@ -114,7 +114,7 @@ def policy_rights(policy: Policy) -> frozenset[Right]:
 
 
 class PlacedRight(NamedTuple):
-    """A right as a group of a policy states it; ``written`` is the name as written there."""
+    """A right with its position in a policy; ``written`` is the name as written there."""
 
     right: Right
     written: str
@@ -124,7 +124,7 @@ class PlacedRight(NamedTuple):
 
 
 def placed_rights(enclave: Enclave) -> Iterator[PlacedRight]:
-    """Yield each right and denial of an enclave with its place, in the order of the document."""
+    """Yield each right and denial of an enclave with its position, in document order."""
     for profile in enclave.all_profiles():
         for group in profile.groups:
             for index, written in enumerate(group.names):
@@ -135,7 +135,7 @@ def placed_rights(enclave: Enclave) -> Iterator[PlacedRight]:
 
 
 def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
-    """Yield the rights in one profile of an enclave."""
+    """Yield the rights in one profile of an enclave, with absolute names."""
     ns, node = profile.ns, profile.node
     for group in profile.groups:
         for name in group.names:
@@ -148,7 +148,7 @@ def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
 
 
 def parts(right: Right) -> tuple[Right, ...]:
-    """Return the topics and services of a right: itself, or the five parts of an action."""
+    """Split an action's right into its five topics and services; keep other rights."""
     found = ACTION_PARTS.get(right.right)
     if found is None:
         return (right,)
@@ -158,12 +158,12 @@ def parts(right: Right) -> tuple[Right, ...]:
 
 
 def unfolded(rights: Iterable[Right]) -> frozenset[Right]:
-    """Return the same rights with every action as its parts."""
+    """Return the rights with every action split into its topics and services."""
     return frozenset(part for right in rights for part in parts(right))
 
 
 def folded(rights: Iterable[Right]) -> frozenset[Right]:
-    """Return the normal form: the five parts of an action are replaced by the action."""
+    """Return the normal form: the five parts of an action joined to one right."""
     remaining = set(unfolded(rights))
     actions = [
         Right(right.enclave, right.qualifier, WHOLE[right.right], right.name.removesuffix(GOAL))
@@ -180,7 +180,7 @@ def folded(rights: Iterable[Right]) -> frozenset[Right]:
 
 
 class Rules:
-    """A set of rights with fast queries: exact names are looked up, only wildcards are matched."""
+    """A set of rights with fast queries: exact names by lookup, wildcards by matching."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
         self._stated = unfolded(rights)
@@ -191,20 +191,20 @@ class Rules:
         self._names = {place: Names(found, limit) for place, found in names.items()}
 
     def cover(self, right: Right) -> bool:
-        """Return whether these rights cover all of ``right`` (an ALLOW, or a DENY)."""
+        """Return whether the set covers all of ``right``, an ALLOW or a DENY."""
         return all(self._covering(part) for part in parts(right))
 
     def covering(self, right: Right) -> tuple[Right, ...]:
-        """Return the rights that together cover all of ``right``, or () if `cover` is false."""
+        """Return the rights that together cover ``right``, or () if it is not covered."""
         found = [self._covering(part) for part in parts(right)]
         return tuple(dict.fromkeys(each for each in found if each)) if all(found) else ()
 
     def meet(self, right: Right) -> bool:
-        """Return whether some right of this set matches a name that ``right`` matches."""
+        """Return whether a right of the set has a name in common with ``right``."""
         return any(self._at(part).meets(part.name) for part in parts(right))
 
     def meeting(self, right: Right) -> tuple[Right, ...]:
-        """Return the rights of this set that match some name that ``right`` matches."""
+        """Return the rights of the set that have a name in common with ``right``."""
         return tuple(
             Right(*part[:3], name)
             for part in parts(right)
@@ -212,7 +212,7 @@ class Rules:
         )
 
     def allow(self, enclave: str, right: str, name: str) -> bool:
-        """Return whether ``name`` is allowed completely, and no part of it is denied."""
+        """Return whether the set allows ``name`` completely and denies no part of ``name``."""
         for part in parts(Right(enclave, ALLOW, right, name)):
             allowed = self._names.get((enclave, ALLOW, part.right))
             denied = self._names.get((enclave, DENY, part.right))
@@ -251,7 +251,7 @@ class RightsDifference:
         return bool(self.only_first or self.only_second)
 
     def lines(self) -> list[tuple[str, Right]]:
-        """Return each different right with "-" (first side only) or "+" (second), by `order`."""
+        """Return the different rights with "-" (only first side) or "+" (only second side)."""
         found = [("-", right) for right in self.only_first] + [("+", e) for e in self.only_second]
         return sorted(found, key=lambda line: (*order(line[1]), line[0] == "+"))
 
@@ -259,7 +259,7 @@ class RightsDifference:
 def compare(
     first: Iterable[Right], second: Iterable[Right], scope: frozenset[str] | None = None
 ) -> RightsDifference:
-    """Return the differences of two sets of rights, for the enclaves in ``scope`` (None: all).
+    """Compare two sets of rights of the enclaves in ``scope`` (None: all enclaves).
 
     An action counts as its services and topics.  A right that only one side states is no difference
     if wildcards that both state cover it: large permissions leave such names out.
@@ -293,24 +293,24 @@ OWN_SERVICES = (
     "set_parameters",
     "set_parameters_atomically",
 )
-"""The services that every node has, below its own name (rclcpp and rclpy of ROS 2 Jazzy)."""
+"""Services that every node offers under its own name (rclcpp and rclpy of ROS 2 Jazzy)."""
 _SHOWING = frozenset(f"~/{service}" for service in OWN_SERVICES)
 
 
 class NodeName(NamedTuple):
-    """The namespace and the name of a node, perhaps with wildcards."""
+    """Namespace and name of a node, perhaps with wildcards."""
 
     ns: str
     name: str
 
 
 def nodes_of(enclave: Enclave) -> tuple[NodeName, ...]:
-    """Return the nodes of an enclave, as the profiles of its policy name them."""
+    """Return the nodes of an enclave, from the profiles of its policy."""
     return tuple(dict.fromkeys(map(_node_of, enclave.all_profiles())))
 
 
 def nodes_not_shown(enclave: Enclave) -> tuple[NodeName, ...]:
-    """Return the nodes of a policy's enclave that its rights do not show, as `nodes_of_rights`."""
+    """Return the nodes of a policy's enclave that `nodes_of_rights` cannot derive."""
     hidden = (profile for profile in enclave.all_profiles() if not any(map(_shows, profile.groups)))
     return tuple(dict.fromkeys(map(_node_of, hidden)))
 
@@ -326,7 +326,7 @@ def _shows(group: Group) -> bool:
 
 
 def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
-    """Return the nodes whose own services an enclave may offer: those that it may be."""
+    """Return the nodes whose standard services the rights of an enclave allow to offer."""
     found: dict[NodeName, None] = {}
     for _, qualifier, right, name in rights:
         if right == "reply" and qualifier is ALLOW:
@@ -339,7 +339,7 @@ def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
 
 
 def _nodes(name: str) -> Iterator[NodeName]:
-    """Yield the nodes whose namespace and name together match ``name``.
+    """Yield the nodes whose full name matches ``name``.
 
     A star may stand for the "/" between both, too.
     """
@@ -352,11 +352,11 @@ def _nodes(name: str) -> Iterator[NodeName]:
 
 
 def nodes_as_text(nodes: Iterable[NodeName]) -> str:
-    """Return nodes as the ledger has them: namespace and name, with commas between nodes."""
+    """Return nodes as text for the ledger: full names, separated by commas."""
     return ", ".join(f"{node.ns} {node.name}" for node in nodes)
 
 
 def nodes_from_text(text: str) -> tuple[NodeName, ...]:
-    """Return the nodes of `nodes_as_text`."""
+    """Parse the text that `nodes_as_text` returns."""
     pairs = (node.partition(" ") for node in text.split(", ") if node)
     return tuple(NodeName(ns, name) for ns, _, name in pairs)

@@ -1,4 +1,4 @@
-"""Names that an expression matches and others do not, as a union of expressions without exceptions.
+"""Subtract name expressions from another one; the result is a union of expressions.
 
 For access control that only allows, such as that of Zenoh.  The result is exact on ROS names, whose
 characters are few: "/*" without "/ab" is every name that begins with another letter than a, "/a",
@@ -18,27 +18,27 @@ from typing import NamedTuple
 from sros_tool.policy.patterns import covers, overlap
 
 IN_PART = "#"
-"""In a result: any characters but "/"; ``*`` stands for any characters, as in policies."""
+"""In a result: any characters except "/"; ``*`` stands for any characters, as in policies."""
 
 _LETTERS = "_" + digits + ascii_letters
 _PIECE = re.compile(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _STARS = re.compile(r"\*\*+")
 _MOST_CHARACTERS = 1_000_000
-"""Most characters that one search compares: about a second."""
+"""Most characters that one search compares: about one second."""
 
 
 class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it
     """The difference is no union of expressions, or of too many; ``denied`` is why, if not ""."""
 
     def __init__(self, denied: str = "") -> None:
-        """Record the expression that cannot be taken away."""
+        """Record the expression that cannot be subtracted."""
         super().__init__(denied)
         self.denied = denied
 
 
 def listed(expression: str, most: int) -> list[str]:
-    """Return expressions with ``*`` alone that match the same ROS names: one for each choice.
+    """Return expressions whose only wildcard is ``*`` and that match the same ROS names.
 
     A ``?`` is any character of ROS names.
 
@@ -69,7 +69,7 @@ def _choices(negated: str, members: str, one: str, text: str) -> Sequence[str]:
 
 @dataclass
 class SubtractionEffort:
-    """How many characters may still be compared: for all subtractions that belong together."""
+    """A budget of characters to compare, shared by subtractions of one task."""
 
     left: int = _MOST_CHARACTERS
 
@@ -77,7 +77,7 @@ class SubtractionEffort:
 def subtract(
     wide: str, denied: Iterable[str], most: int, effort: SubtractionEffort | None = None
 ) -> list[str]:
-    """Return expressions that match the names that ``wide`` and none of ``denied`` matches.
+    """Return expressions for the names that match ``wide`` and none of ``denied``.
 
     All are absolute, with ``*`` as the only wildcard; the results may also have `IN_PART`.
 
@@ -114,7 +114,7 @@ class _Place(NamedTuple):
 
 @dataclass
 class _Difference:
-    """The search: names are read from their start, until nothing denied can follow any more.
+    """The search: it reads names from their start until no denied expression can match any more.
 
     Where all that is denied begins with a star, a second search reads backwards from their end.
     """
@@ -125,7 +125,7 @@ class _Difference:
     found: dict[str, None] = field(default_factory=dict)
 
     def run(self, places: list[_Place]) -> None:
-        """Find the names of all places."""
+        """Run the search from the empty name to the end."""
         seen = set()
         while places:
             place = places.pop()
@@ -134,7 +134,7 @@ class _Difference:
                 places += self._following(place)
 
     def _following(self, place: _Place) -> Iterable[_Place]:
-        """Keep the names of a place, if one expression matches them; else return its parts."""
+        """Keep the names of a place if one expression matches all of them; else split the place."""
         read, wide, denied, _ = place
         self.effort.left -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
         if self.effort.left < 0:
@@ -154,7 +154,7 @@ class _Difference:
         return self._by_next_letter(place._replace(denied=denied))
 
     def _by_next_letter(self, place: _Place) -> Iterator[_Place]:
-        """Divide the names of a place; ``wide`` begins with a star."""
+        """Split the names of a place by their next letter; ``wide`` begins with a star."""
         read, wide, denied, letters = place
         rest = wide[1:]
         parts = [expression.partition("/")[0] for expression in denied]
@@ -186,7 +186,7 @@ class _Difference:
             self._keep(read + expression[::-1])
 
     def _keep(self, expression: str) -> None:
-        """Keep an expression unless it matches no name: with an empty part."""
+        """Keep an expression, unless it has an empty name part and so matches no name."""
         if self.backwards or not ("//" in expression or expression.endswith("/")):
             self.found[expression] = None
         if len(self.found) > self.most:
@@ -194,7 +194,7 @@ class _Difference:
 
 
 def _after(letter: str, expressions: Iterable[str]) -> tuple[str, ...]:
-    """Return what has to follow for the expressions to match, after a letter was read."""
+    """Return the rests of the expressions after one letter was read."""
     found = []
     for expression in expressions:
         if expression.startswith("*"):

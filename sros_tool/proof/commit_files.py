@@ -1,4 +1,4 @@
-"""Files of a commit in a private folder, for readers that need files: nothing is checked out.
+"""Write files of a commit to a private folder without a checkout.
 
 Only files that are asked for are written, as the commit has them: without filters, conversions of
 line ends or anything else that a repository configures.  No symbolic link of the commit is followed
@@ -49,7 +49,7 @@ def checked_path(text: str) -> str:
 
 @dataclass(slots=True)
 class CommitFiles:
-    """The files of a commit that were asked for, below ``folder``, which is new and private.
+    """The files of a commit that were requested, written below the private folder ``folder``.
 
     ``name`` is what messages call the commit.  ``fell_back`` has the includes whose file is not in
     the commit, so that their fallback counts; ``refused`` why a file was not read.
@@ -68,10 +68,10 @@ class CommitFiles:
         return self.repository.find(self.commit, path)
 
     def file(self, path: str) -> Path | None:
-        """Return the file at a path of the commit, written to its place; None if nothing is there.
+        """Write the file at a path of the commit; return where, or None if it does not exist.
 
         Raises:
-            DocumentError: it is no file, but for instance a link.
+            DocumentError: the path is not a file, but for instance a link.
         """
         entry = self.entry(path)
         if entry is None:
@@ -81,12 +81,12 @@ class CommitFiles:
         return self._write(path, entry, self.repository.content(entry.id))
 
     def policies(self, path: str, *, placeholders: bool) -> list[Path]:
-        """Return the policies at a path, a file or a folder, written to their places.
+        """Write the policies at a path, a file or folder, and return their locations.
 
-        The files that they include are written, too.  The list is empty if nothing is there.
+        Included files are written, too.  The list is empty if the path does not exist.
 
         Raises:
-            DocumentError: it is no file and no folder, a file that could be a policy is damaged, or
+            DocumentError: the path is no file or folder, a possible policy is damaged, or
                 the folder has links, submodules, or too much.
         """
         entry = self.entry(path)
@@ -104,10 +104,10 @@ class CommitFiles:
             raise DocumentError(*texts) from error
 
     def tree(self, path: str) -> Path | None:
-        """Return a folder with all that is below it, such as a keystore; None if nothing is there.
+        """Write a folder such as a keystore with all content; return its location, or None.
 
         Raises:
-            DocumentError: it is no folder, too large, or has a submodule or a link that leads out.
+            DocumentError: not a folder, too large, or with a submodule or a link that leads out.
         """
         entry = self.entry(path)
         if entry is None:
@@ -157,7 +157,7 @@ class CommitFiles:
         return top
 
     def differing(self, work_tree: Path) -> list[str]:
-        """Return the files of this snapshot that differ in a work tree, or are missing there."""
+        """Return the files of this snapshot that differ from a work tree, or are missing there."""
         paths = []
         with Folder(work_tree) as folder:
             for path in self.files:
@@ -215,7 +215,7 @@ class CommitFiles:
 
 
 def _make_folders(folder: Folder, path: str) -> None:
-    """Make the folder at a path, and those above it, if they are missing."""
+    """Create the folder at a path, with its missing parents."""
     for each in reversed((PurePosixPath(path), *PurePosixPath(path).parents[:-1])):
         if str(each) != "." and not folder.is_folder(str(each)):
             folder.mkdir(str(each), 0o700)
@@ -227,7 +227,7 @@ _OF_POLICIES = (
     *((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns=")),
     *((b"<topics", b"ALLOW"), (b"<services", b"ALLOW"), (b"<actions", b"ALLOW")),
 )
-"""What an XML file that is a policy, or a part of one, has, and what follows in it."""
+"""The texts by which an XML file is recognized as a policy or a part, with the next character."""
 _EBCDIC = b"\x4c\x6f\xa7\x94"
 """The beginning of an XML file in EBCDIC (XML 1.0, appendix F)."""
 _ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
@@ -242,7 +242,7 @@ _WHOLE = re.compile(r"(?:xpointer\(/(?:\*|[\w.-]+)(?P<below>/\*)?\))?")
 
 
 def may_be_policy(content: bytes) -> bool:
-    """Return whether a file could be a policy, or a part of one, whatever its name is."""
+    """Return whether a file could be a policy or a part of a policy, whatever its name."""
     text = content.replace(b"\0", b"")  # UTF-16 has a zero in each letter
     if text.startswith(_EBCDIC):
         return True
@@ -296,7 +296,7 @@ def is_whole_policy(content: bytes) -> bool:
 
 
 def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) -> dict[str, bool]:
-    """Map the files that policies use completely to whether their root element is used, too.
+    """Map files that policies include completely to whether their root element is included, too.
 
     Args:
         policies: the paths of the policies.
@@ -321,7 +321,7 @@ def includes_files(content: bytes) -> bool:
 
 
 def users_of(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str]:
-    """Return the files that include some of the parts, directly or through other files."""
+    """Return the files that include one of the parts, directly or through other files."""
     includes = {
         path: {target for target, _ in _includes(path, data)} for path, data in files.items()
     }
@@ -332,7 +332,7 @@ def users_of(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str]:
 
 
 def _includes(path: str, content: bytes | None) -> Iterator[tuple[str, str]]:
-    """Yield file and xpointer of the includes in a file, without unused fallbacks."""
+    """Yield file and xpointer of the includes in a file, without fallbacks."""
     try:
         root = parse(content, "the file", instructions=True) if content is not None else None
     except DocumentError:

@@ -1,4 +1,4 @@
-"""Objects and references of a git repository, read without trusting the repository.
+"""Read objects and references of a git repository without trusting the repository.
 
 Git only reads objects here, and each one is verified by its hash: what is returned for a commit is
 what the commit says, whatever replacements, grafts, alternates, attributes or settings the
@@ -22,10 +22,10 @@ from sros_tool.errors import DocumentError, UnavailableError, UsageError
 
 FOLDER, LINK, SUBMODULE = "40000", "120000", "160000"
 FILES = ("100644", "100755")
-"""Modes of entries of a folder, in octal digits, as git checks them out."""
+"""File modes of the entries of a git tree, in octal digits."""
 
 _MOST_BYTES = 32 * 1024 * 1024
-"""Bytes of the largest object that is read."""
+"""Size in bytes of the largest object that is read."""
 _AT_ONCE = 64 * 1024 * 1024
 _MOST_DEPTH = 200
 _MOST_TAGS = 10
@@ -52,9 +52,9 @@ _ELSEWHERE = (
     *("GIT_GRAFT_FILE", "GIT_INDEX_FILE", "GIT_NAMESPACE", "GIT_OBJECT_DIRECTORY", "GIT_PREFIX"),
     *("GIT_REPLACE_REF_BASE", "GIT_SHALLOW_FILE", "GIT_WORK_TREE"),
 )
-"""Variables that would have git read another repository than that of its folder."""
+"""Environment variables that make git read another repository than the folder's."""
 _OF_SETTINGS = ("HOME", "XDG_CONFIG_HOME", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM")
-"""Variables that say where git reads settings outside of the repository."""
+"""Environment variables that say where git reads settings outside of the repository."""
 _NO_BASE = "none"
 _FIRST_PARENT = "^1"
 _HASH = re.compile(r"[0-9a-f]{40}(?:[0-9a-f]{24})?\Z")
@@ -65,28 +65,28 @@ _EXPRESSION = re.compile(r"(?P<name>(?:[^~^@:]|@(?!\{))+|@)(?P<rest>.*)\Z", re.D
 
 @dataclass(frozen=True, slots=True)
 class TreeEntry:
-    """What a folder of a commit has under a name."""
+    """An entry of a git tree: a file, link, folder or submodule."""
 
     mode: str
     id: str
 
     @property
     def kind(self) -> str:
-        """What it is, in words."""
+        """The kind of the entry, in words, such as "folder"."""
         kinds = {FOLDER: "a folder", LINK: "a symbolic link", SUBMODULE: "a submodule"}
         return kinds.get(self.mode, "a file" if self.mode in FILES else "no file")
 
 
 @dataclass(frozen=True, slots=True)
 class Repository:
-    """The git repository that the folder ``folder`` is in."""
+    """The git repository that contains the folder ``folder``."""
 
     folder: Path
 
     # ── references ─────────────────────────────────────────────────────────────────────────
 
     def exact_commit(self, name: str) -> str:
-        """Return the full id of the commit that a full id or a full reference names.
+        """Return the full commit id for a full id or a full reference.
 
         Nothing else is taken: git looks up a shorter name in several places, and who may push a tag
         can put one there that is found first.
@@ -113,7 +113,7 @@ class Repository:
         return self._peeled(digits, name)
 
     def commit(self, name: str) -> str:
-        """Return the full id of the commit that a name stands for, such as ``main`` or ``HEAD~2``.
+        """Return the full commit id for a name such as ``main`` or ``HEAD~2``.
 
         Raises:
             DocumentError: git finds none, or the name could stand for several things.
@@ -144,7 +144,7 @@ class Repository:
         return self._peeled(found, name)
 
     def _candidates(self, name: str) -> dict[str, str]:
-        """Return everything that a short name can stand for, and the ids.
+        """Return all references that a short name can stand for, with their ids.
 
         Raises:
             DocumentError: it is the name of a branch of a remote repository, but here a tag or a
@@ -176,7 +176,7 @@ class Repository:
         return candidates
 
     def _references(self, name: str) -> dict[str, str]:
-        """Return the references that git looks up for a short name, and their ids."""
+        """Return the references that git looks up for a short name, with their ids."""
         places = ("refs/", "refs/tags/", "refs/heads/", "refs/remotes/")
         names = [f"{place}{name}" for place in places] + [f"refs/remotes/{name}/HEAD"]
         commits = self._targets(names)
@@ -186,11 +186,11 @@ class Repository:
         return commits
 
     def _target(self, reference: str) -> str:
-        """Return the id that exactly this reference has, or ""."""
+        """Return the id that a reference points to, or "" if the reference does not exist."""
         return self._targets([reference]).get(reference, "")
 
     def _targets(self, references: Sequence[str]) -> dict[str, str]:
-        """Return the ids of exactly these references; those that do not exist are left out."""
+        """Return the ids of references by name, without references that do not exist."""
         wanted = [reference for reference in references if not _NO_REFERENCE.search(reference)]
         if not wanted:
             return {}
@@ -199,7 +199,7 @@ class Repository:
         return {each: targets[each] for each in wanted if each in targets}
 
     def _peeled(self, digits: str, name: str) -> str:
-        """Return the commit that an id names, also by annotated tags."""
+        """Return the commit that an id names, directly or by annotated tags."""
         for _ in range(_MOST_TAGS):
             kind, content = self._objects([digits]).get(digits, ("", b""))
             if kind == "commit":
@@ -218,17 +218,17 @@ class Repository:
     # ── objects ────────────────────────────────────────────────────────────────────────────
 
     def tree(self, commit: str) -> str:
-        """Return the id of the top folder of a commit."""
+        """Return the id of a commit's root tree."""
         return _header(self._objects([commit])[commit][1], b"tree")
 
     def parents(self, commit: str) -> tuple[str, ...]:
-        """Return the ids of the commits that a commit follows; a merge has several."""
+        """Return the ids of a commit's parents; a merge commit has several."""
         head = self._objects([commit])[commit][1].partition(b"\n\n")[0]
         lines = head.decode(errors="replace").split("\n")
         return tuple(line.removeprefix("parent ") for line in lines if line.startswith("parent "))
 
     def base_commit(self, name: str, remote: str | None) -> str:
-        """Return the full id of the commit to compare with, or "" for the name ``none``.
+        """Return the full id of the base commit to compare with, or "" for the name ``none``.
 
         The name is that of `exact_commit`, or of a merge commit and ``^1``.  With a ``remote``, a
         commit that is not there is fetched.
@@ -244,11 +244,11 @@ class Repository:
         return self.exact_commit(name)
 
     def head_commit(self, name: str) -> str:
-        """Return the full id of the commit to look at; the name is ``HEAD``, or an exact one."""
+        """Return the full id of the commit to review: ``HEAD``, a full id or a full reference."""
         return self.commit(name) if name == "HEAD" else self.exact_commit(name)
 
     def merged_into(self, merge: str) -> str:
-        """Return the id of the first parent of a merge commit: what its others were merged into.
+        """Return the id of a merge commit's first parent: the branch that was merged into.
 
         Raises:
             UsageError: ``merge`` is not a full id.
@@ -266,7 +266,7 @@ class Repository:
         return parents[0]
 
     def folders(self, ids: Iterable[str]) -> dict[str, dict[str, TreeEntry]]:
-        """Return the entries of folders by id and name.
+        """Return the entries of git trees, by tree id and name.
 
         Raises:
             DocumentError: one is missing or malformed, or has a name that no file system has.
@@ -276,7 +276,7 @@ class Repository:
         return {each: _entries(data, len(each) // 2) for each, data in trees.items()}
 
     def contents(self, ids: Iterable[str]) -> dict[str, bytes]:
-        """Return the contents of files by id.
+        """Return the contents of files, by id.
 
         Raises:
             DocumentError: one is missing, damaged, or larger than `_MOST_BYTES`.
@@ -284,18 +284,18 @@ class Repository:
         return self._all("blob", list(dict.fromkeys(ids)))
 
     def sizes(self, ids: Iterable[str]) -> dict[str, int]:
-        """Return the sizes of objects by id, in bytes; those that are missing are left out."""
+        """Return the sizes of objects in bytes, by id; missing objects are left out."""
         return {each: size for each, (_, size) in self._described(ids).items()}
 
     def _described(self, ids: Iterable[str]) -> dict[str, tuple[str, int]]:
-        """Return type and size of objects by id, as the repository says."""
+        """Return type and size of objects by id, as git reports them."""
         asked = "".join(f"{object_id}\n" for object_id in ids).encode()
         lines = self._git(["cat-file", "--batch-check"], stdin=asked).decode().splitlines()
         fields = (line.split() for line in lines)
         return {words[0]: (words[1], int(words[2])) for words in fields if len(words) == 3}
 
     def find(self, commit: str, path: str) -> TreeEntry | None:
-        """Return what is at a path of a commit, "" for its top; None if nothing is.
+        """Return the tree entry at a path of a commit ("": the root), or None.
 
         Raises:
             DocumentError: the path leads through something that is no folder, such as a link.
@@ -313,7 +313,7 @@ class Repository:
         return entry
 
     def contents_in_parts(self, ids: Iterable[str], most: int) -> Iterator[dict[str, bytes]]:
-        """Yield the contents of files by id, in parts that fit into memory.
+        """Yield the contents of files by id, in batches that fit into memory.
 
         Raises:
             DocumentError: as of `contents`, or all of them have more than ``most`` bytes.
@@ -333,7 +333,7 @@ class Repository:
         yield self.contents(part)
 
     def content(self, digits: str) -> bytes:
-        """Return the content of a file, as `contents`; many policies include the same ones."""
+        """Return the content of a file, as `contents` does, from a cache."""
         return _content(self, digits)
 
     def _all(self, kind: str, ids: Sequence[str]) -> dict[str, bytes]:
@@ -352,7 +352,7 @@ class Repository:
         return {object_id: objects[object_id][1] for object_id in ids}
 
     def _objects(self, ids: Sequence[str]) -> dict[str, tuple[str, bytes]]:
-        """Return type and content of objects, verified; what is missing is left out.
+        """Return type and content of objects by id, verified by hash; missing ones are left out.
 
         Raises:
             DocumentError: one is damaged, or larger than `_MOST_BYTES`.
@@ -386,7 +386,7 @@ class Repository:
     # ── fetching ───────────────────────────────────────────────────────────────────────────
 
     def fetch_missing(self, digits: str, remote: str) -> None:
-        """Fetch a commit without its history, unless it is there, by the settings of a remote.
+        """Fetch a missing commit from a remote, without its history.
 
         Those of the clone, the user and the machine count, because they have the credentials.
 
@@ -410,7 +410,7 @@ class Repository:
         self._git(["fetch", *options], environment=_FETCHING, wait=_WAIT_FOR_SERVER)
 
     def _refuse_settings_inside(self) -> None:
-        """Refuse settings of git that lie in the work tree, whose files anybody may have written.
+        """Raise if git would read settings from the work tree, which anybody may have written.
 
         Raises:
             UsageError: a variable names such a place; a fetch would run programs named there.
@@ -431,17 +431,17 @@ class Repository:
     # ── git ────────────────────────────────────────────────────────────────────────────────
 
     def top(self) -> Path | None:
-        """Return the top folder of the work tree; None without one."""
+        """The top folder of the work tree; None for a repository without work tree."""
         bare = self._ask("rev-parse", "--is-inside-work-tree") != "true"
         shown = b"" if bare else self._git(["rev-parse", "--show-toplevel"]).removesuffix(b"\n")
         return Path(os.fsdecode(shown)) if shown else None
 
     def prefix(self) -> str:
-        """Return the path of the folder from the top of the work tree, with "/" at its end."""
+        """The path from the top of the work tree to the folder, with "/" at its end."""
         return os.fsdecode(self._git(["rev-parse", "--show-prefix"]).removesuffix(b"\n"))
 
     def _ask(self, *words: str) -> str:
-        """Return the answer of git, or "" if it has none."""
+        """Run git and return its output, or "" if git fails."""
         return self._git(words, quiet=True).decode(errors="replace").strip()
 
     def _git(
@@ -453,7 +453,7 @@ class Repository:
         environment: dict[str, str] | None = None,
         wait: int = _WAIT,
     ) -> bytes:
-        """Return what git prints.
+        """Run git and return its output.
 
         Raises:
             DocumentError: git fails; if ``quiet``, only if it says why.
@@ -499,7 +499,7 @@ def _content(repository: Repository, digits: str) -> bytes:
 def walk(
     repository: Repository, tree: str, *, most: int, other: str = ""
 ) -> Iterator[tuple[str, TreeEntry]]:
-    """Yield path and entry of all that is below a folder and is no folder, folders level by level.
+    """Yield path and entry of all files, links and submodules below a folder, level by level.
 
     With ``other``, only what this folder does not have with the same content at the same path.
 
@@ -535,7 +535,7 @@ def walk(
 
 @lru_cache(maxsize=8)
 def _program(path: str) -> str:
-    """Return the path of git; folders of ``path`` that depend on the working directory are skipped.
+    """Return the path of the program git; skip relative folders in ``path``.
 
     Raises:
         UnavailableError: git is not installed.
@@ -572,7 +572,7 @@ def _digest(kind: str, content: bytes, digits: int) -> str:
 
 
 def _header(content: bytes, key: bytes) -> str:
-    """Return the id in the first line of a commit or a tag."""
+    """Return the id in the first line of a commit or tag object."""
     first, _, digits = content.partition(b"\n")[0].partition(b" ")
     found = digits.decode(errors="replace")
     if first != key or not _HASH.match(found):
@@ -581,7 +581,7 @@ def _header(content: bytes, key: bytes) -> str:
 
 
 def _entries(data: bytes, length: int) -> dict[str, TreeEntry]:
-    """Return the entries of a folder, by name; ids have ``length`` bytes.
+    """Parse a git tree; return its entries by name. Ids have ``length`` bytes.
 
     Raises:
         DocumentError: the object is malformed, or has a name twice, or one that leads elsewhere.
@@ -605,12 +605,12 @@ _TYPE_BITS, _EXECUTABLE = 0o170000, 0o100
 
 
 def _checked_out(mode: bytes) -> str:
-    """Return the mode that git checks an entry out with, whatever further bits a change gave it.
+    """Return the file mode that git uses when it checks an entry out.
 
     Source: git 2.39, cache.h (canon_mode); what is no file, link or folder is a submodule.
 
     Raises:
-        DocumentError: it is no octal number.
+        DocumentError: the mode is not an octal number.
     """
     if not _OCTAL.fullmatch(mode):
         raise DocumentError("an object of the repository is malformed", "It has a mode of no type.")

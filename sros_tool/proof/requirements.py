@@ -33,13 +33,13 @@ _MOST_TEXTS = 1000  # of one key
 _MOST_PAIRS = 20_000  # that requirements of one file make of the names of two lists
 _LONGEST_TEXT = 500  # characters of a name or a reason
 EXCEPT = "!"
-"""What stands before the enclaves that a list of enclaves excepts."""
+"""Prefix of an enclave that a list of enclaves excepts."""
 _LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Requirement:
-    """What all requirements have: the place of their table, and two texts for people, or ""."""
+    """Base of all requirements: position of the table, own name, and reason ("": none)."""
 
     KIND: ClassVar[str]
 
@@ -48,24 +48,24 @@ class Requirement:
     why: str = ""
 
     def __str__(self) -> str:
-        """Return the own name of the requirement, or what it demands."""
+        """Return the requirement's own name, or the sentence with its demand."""
         return self.name or demand(self)
 
 
 RightNames = tuple[tuple[str, tuple[str, ...]], ...]
-"""The rights that a requirement is about, each with names that can have wildcards."""
+"""Maps rights to names, perhaps with wildcards."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OfRights(Requirement):
-    """A requirement about ``rights`` to names."""
+    """Base of requirements about ``rights`` to names."""
 
     rights: RightNames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Only(OfRights):
-    """No enclave except ``enclaves`` has one of the rights to one of the names."""
+    """Only the listed ``enclaves`` may have one of the rights to one of the names."""
 
     KIND = "only"
 
@@ -74,14 +74,14 @@ class Only(OfRights):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nobody(OfRights):
-    """No enclave has one of the rights to one of the names."""
+    """No enclave may have one of the rights to one of the names."""
 
     KIND = "nobody"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Must(OfRights):
-    """The enclave has all the rights to all the names."""
+    """The enclave must have all rights to all names."""
 
     KIND = "must"
 
@@ -90,7 +90,7 @@ class Must(OfRights):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AtMost(OfRights):
-    """No single name can be used by more than ``most`` enclaves, with one right or a part of it."""
+    """At most ``most`` enclaves may use a single name, with a right or a part of the right."""
 
     KIND = "at_most"
 
@@ -99,7 +99,7 @@ class AtMost(OfRights):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Widest(OfRights):
-    """Wildcards give the enclaves the rights to no other names; without names, to none at all.
+    """Wildcards may give the enclaves the rights to these names only; without names, to no name.
 
     What an enclave may use because its exact name is stated does not count.
     """
@@ -111,7 +111,7 @@ class Widest(OfRights):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NothingBut(OfRights):
-    """The enclaves have no rights but these, and what every node needs to start."""
+    """The enclaves may have only these rights, and the rights that every node needs to start."""
 
     KIND = "nothing_but"
 
@@ -120,7 +120,7 @@ class NothingBut(OfRights):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NotBoth(Requirement):
-    """No enclave has one of the rights ``first`` and one of the rights ``second``."""
+    """No enclave may have both a right of ``first`` and a right of ``second``."""
 
     KIND = "not_both"
 
@@ -130,7 +130,7 @@ class NotBoth(Requirement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Protected(Requirement):
-    """The messages of all ``names`` (pairs of kind and name) are signed, or encrypted."""
+    """The messages of all ``names`` (pairs of kind and name) must be signed, or encrypted."""
 
     KIND = "protected"
 
@@ -140,7 +140,7 @@ class Protected(Requirement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Apart(Requirement):
-    """The enclaves ``sources`` cannot influence ``targets``, except through ``through``."""
+    """The enclaves ``sources`` must not influence ``targets``, except through ``through``."""
 
     KIND = "apart"
 
@@ -150,7 +150,7 @@ class Apart(Requirement):
 
 
 def demand(requirement: Requirement) -> str:
-    """Return what a requirement demands, as a clause such as ``nobody may publish /x``."""
+    """Return a requirement's demand as a clause, such as ``nobody may publish /x``."""
     match requirement:
         case Only(rights=rights, enclaves=enclaves):
             return f"only {_those(enclaves)} may {_said(rights)}"
@@ -177,7 +177,7 @@ def demand(requirement: Requirement) -> str:
 
 
 def _said(rights: RightNames, link: str = "or") -> str:
-    """Return text such as ``publish /cmd_vel or call action /dock``."""
+    """Return rights as text, such as ``publish /cmd_vel or call action /dock``."""
     texts = (
         f"{right}{' action' if KIND_OF[right] == 'actions' else ''} {_listed(names)}"
         for right, names in rights
@@ -186,7 +186,7 @@ def _said(rights: RightNames, link: str = "or") -> str:
 
 
 def _those(enclaves: Iterable[str]) -> str:
-    """Return a list of enclaves as text, with those that it excepts."""
+    """Return a list of enclaves as text, with the excepted enclaves."""
     every = list(enclaves)
     excepted = [each[len(EXCEPT) :] for each in every if each.startswith(EXCEPT)]
     text = _listed(each for each in every if not each.startswith(EXCEPT))
@@ -194,7 +194,7 @@ def _those(enclaves: Iterable[str]) -> str:
 
 
 def _listed(names: Iterable[str]) -> str:
-    """Return a list as text; of a long one only its beginning."""
+    """Return a list as text; a long list is shortened."""
     return first_few(list(names), 4) or "nothing"
 
 
@@ -202,7 +202,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def read_requirements(path: Path) -> tuple[Requirement, ...]:
-    """Return the requirements in a TOML file, in its order.
+    """Read the requirements in a TOML file; return them in file order.
 
     Raises:
         DocumentError: the file cannot be read, or a part of it is not valid; names file and line.
@@ -211,12 +211,12 @@ def read_requirements(path: Path) -> tuple[Requirement, ...]:
 
 
 def read_all_requirements(paths: Iterable[Path]) -> tuple[Requirement, ...]:
-    """Return the requirements in several files; raises what `read_requirements` raises."""
+    """Read the requirements in several TOML files; raises what `read_requirements` raises."""
     return tuple(requirement for path in paths for requirement in read_requirements(path))
 
 
 def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
-    """Return the requirements in a TOML document; ``file`` names it in errors and sources.
+    """Parse a TOML document of requirements; errors and sources call the document ``file``.
 
     Raises:
         DocumentError: a part of it is not valid.
@@ -271,7 +271,7 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
 
 
 def _pairs(requirement: Requirement) -> int:
-    """Return how many pairs of names a requirement is about that has two lists."""
+    """Return the number of name pairs that a requirement with two lists compares."""
     match requirement:
         case NotBoth(first=first, second=second):
             one, other = (sum(len(names) for _, names in each) for each in (first, second))
@@ -287,14 +287,14 @@ _KEY = re.compile(r"[ \t]*([A-Za-z0-9_-]+)[ \t]*=")
 
 
 def _headers(text: str) -> Iterator[tuple[int, str]]:
-    """Yield the number and the name of each line that begins a table."""
+    """Yield line number and name of each line that begins a TOML table."""
     for number, line in enumerate(text.split("\n"), 1):
         if found := _HEADER.match(line):
             yield number, found[1]
 
 
 def _places(text: str) -> dict[str, list[tuple[int, dict[str, int]]]]:
-    """Map each kind to the lines of its tables, each with the lines of its keys."""
+    """Map each kind of requirement to its tables' lines, each with the lines of its keys."""
     places: dict[str, list[tuple[int, dict[str, int]]]] = {}
     keys: dict[str, int] = {}
     for number, line in enumerate(text.split("\n"), 1):
@@ -308,7 +308,7 @@ def _places(text: str) -> dict[str, list[tuple[int, dict[str, int]]]]:
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """One table of a file, with the lines of its keys, and functions that check its values."""
+    """One TOML table with the line numbers of its keys, and checks of its values."""
 
     kind: str
     values: Mapping[str, Any]
@@ -316,7 +316,7 @@ class _Table:
     lines: Mapping[str, int]
 
     def known(self, *keys: str) -> dict[str, Any]:
-        """Return the arguments of every requirement, after a check that all keys are known."""
+        """Return the arguments of every requirement; raise if a key is unknown."""
         every = (*keys, "name", "why")
         for key in self.values:
             if key not in every:
@@ -339,7 +339,7 @@ class _Table:
         return value
 
     def texts(self, key: str, *, least: int = 1) -> tuple[str, ...]:
-        """Return the texts of a list."""
+        """Return the strings of a list value."""
         value = self.values.get(key)
         if value is None:
             raise self.error(key, f"{key} is missing in [[{self.kind}]]", "")
@@ -356,7 +356,7 @@ class _Table:
         return tuple(dict.fromkeys(value))
 
     def names(self, key: str, *, least: int = 1) -> tuple[str, ...]:
-        """Return absolute names, perhaps with wildcards."""
+        """Return a list of absolute names, perhaps with wildcards."""
         names = self.texts(key, least=least)
         for name in names:
             problem = expression_problem(name)
@@ -369,7 +369,7 @@ class _Table:
         return names
 
     def enclaves(self, key: str) -> tuple[str, ...]:
-        """Return names and patterns of enclaves, those that are excepted with ``!`` before them."""
+        """Return a list of enclave names and patterns; excepted enclaves begin with ``!``."""
         enclaves = self.texts(key)
         for enclave in enclaves:
             name = enclave.removeprefix(EXCEPT)
@@ -383,7 +383,7 @@ class _Table:
         return enclaves
 
     def rights(self, *, least: int = 1) -> RightNames:
-        """Return the rights that the table names, at least one, each with ``least`` names."""
+        """Return the rights of the table, at least one, with at least ``least`` names each."""
         rights = tuple(
             (right, self.names(right, least=least)) for right in KIND_OF if right in self.values
         )

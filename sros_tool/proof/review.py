@@ -92,7 +92,7 @@ class ReviewRequest:
 
 @dataclass(frozen=True, slots=True)
 class AccessChange:
-    """The access that HEAD gives and BASE does not."""
+    """Access that HEAD allows and BASE does not."""
 
     before: AccessSource
     after: AccessSource
@@ -109,9 +109,9 @@ class RightsChange:
 
 @dataclass(frozen=True, slots=True)
 class DroppedRequirements:
-    """Findings on requirements of BASE that HEAD does not demand in full, and how many there are.
+    """Findings on requirements of BASE that HEAD drops or weakens, and the number of these.
 
-    There is a finding for each of them, and one for each that does not hold in HEAD.
+    Every such requirement gives a finding, and another one if HEAD breaks the requirement.
     """
 
     count: int
@@ -120,7 +120,7 @@ class DroppedRequirements:
 
 @dataclass(frozen=True, slots=True)
 class ExpiryCheck:
-    """Enclaves of a keystore that need to be renewed, and those that could not be read."""
+    """Enclaves of a keystore that must be renewed, and enclaves that could not be read."""
 
     due: tuple[Lifetime, ...]
     unreadable: tuple[UnreadableEnclave, ...]
@@ -129,7 +129,7 @@ class ExpiryCheck:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Facts that are lines of text; the first of each pair is a sentence, the second a name."""
+    """Facts as lines of text: pairs of a sentence and a name."""
 
     lines: tuple[tuple[str, str], ...]
 
@@ -147,7 +147,7 @@ Content = (
 
 @dataclass(frozen=True, slots=True)
 class ReviewStep:
-    """One step of a review, its exit status, and what it found.
+    """One step of a review, with its exit status and result.
 
     ``kind`` is "files", "policy", "requirements", "requirements-before", "new-access", "rights",
     "keystore" or "expiry"; ``subject`` is the path that it is about.  An error says why it could
@@ -162,7 +162,7 @@ class ReviewStep:
 
 @dataclass(frozen=True, slots=True)
 class Review:
-    """All steps of a review, and what it left out, as clauses.
+    """All steps of a review, and clauses on the parts that were not reviewed.
 
     ``base`` and ``head`` are full ids of commits; ``base`` is "" if nothing was compared.
     ``head_folder`` and ``base_folder`` are where the files were read, which nobody has to see.
@@ -177,24 +177,24 @@ class Review:
 
     @property
     def status(self) -> int:
-        """The worst status of all steps."""
+        """The worst exit status of all steps."""
         return max((step.status for step in self.steps), default=_OK)
 
     @property
     def findings(self) -> list[Finding]:
-        """The findings on HEAD."""
+        """The findings on HEAD, of all steps."""
         chosen = [step.content for step in self.steps if isinstance(step.content, ChosenFindings)]
         return list(
             dict.fromkeys(f for choice in chosen for f in (*choice.shown, *choice.accepted))
         )
 
     def shown(self, text: str) -> str:
-        """Return a text with the paths of files as the repository has them."""
+        """Return a text with file paths relative to the top of the repository."""
         base = f"git:{self.base[:12]}:"
         return text.replace(f"{self.head_folder}/", "").replace(f"{self.base_folder}/", base)
 
     def shown_finding(self, finding: Finding) -> Finding:
-        """Return a finding with the paths of files as the repository has them."""
+        """Return a finding with file paths relative to the top of the repository."""
         related = tuple(
             place._replace(text=self.shown(place.text), file=self.shown(place.file))
             for place in finding.related
@@ -218,34 +218,34 @@ class StepResult(NamedTuple):
     """The result of one step of a review."""
 
     step: Annotated[str, Words(_STEPS)]
-    """Name of the step; ``requirements-before`` finds requirements that the change drops."""
+    """Name of the step; ``requirements-before`` reports requirements that the change drops."""
     subject: str | None
-    """The paths that the step is about; null for the whole commit."""
+    """Path that the step checks; null for the whole commit."""
     status: int
     """Exit status of the step: 0, 1 or 2, as for the review."""
     result: str
-    """A sentence with the result, or why the step could not be decided."""
+    """The result as a sentence, or why the step could not be decided."""
 
 
 class ReviewResult(NamedTuple):
     """The review of a change of policies, requirements and keystores in git."""
 
     base: str | None
-    """The full id of the commit with the access of before; null without a comparison."""
+    """Full id of the base commit; null without a comparison."""
     head: str
     """The full id of the commit that was reviewed."""
     status: int
-    """The exit status: 0 nothing found, 1 something found, 2 something could not be decided."""
+    """Exit status: 0 nothing found, 1 findings, 2 a step could not be decided."""
     steps: Sequence[StepResult]
     """The steps of the review."""
     findings: Sequence[Finding]
-    """The findings on the commit that was reviewed."""
+    """Findings on the reviewed commit."""
     left_out: Sequence[str]
-    """Parts that the review did not look at, as clauses."""
+    """Parts that were not reviewed, as clauses."""
 
 
 def review(request: ReviewRequest, folder: Path) -> Review:
-    """Return the review of a change; the files of both commits are written below ``folder``.
+    """Review a change, and return the result; files of both commits are written below ``folder``.
 
     Args:
         request: what is reviewed.
@@ -280,7 +280,7 @@ class _Review:
 
     @property
     def _new_access(self) -> int:
-        """Exit status of a step that finds more access."""
+        """The exit status of a step that finds more access: 0 if the request allows new access."""
         return _OK if self.request.allow_new_access else _FOUND
 
     def all(self) -> Iterator[ReviewStep]:
@@ -342,7 +342,7 @@ class _Review:
         *,
         if_any: bool = True,
     ) -> Iterator[ReviewStep]:
-        """Yield a step with the result of ``decide``, or with the error that it raises."""
+        """Run ``decide`` and yield a step with its result or its error."""
         if not if_any:
             return
         try:
@@ -357,7 +357,7 @@ class _Review:
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
     def _fleet(self, side: CommitFiles | None) -> Generator[ReviewStep, None, Fleet | None]:
-        """Return the fleet of a side; None without one."""
+        """Return the fleet of BASE or HEAD; None if there is no fleet."""
         path = self.request.fleet
         if not path or not side:
             return None
@@ -374,7 +374,7 @@ class _Review:
     def _policies(
         self, side: CommitFiles, fleet: Fleet | None
     ) -> Generator[ReviewStep, None, list[Path]]:
-        """Return the files of the policies of a side."""
+        """Return the policy files of BASE or HEAD."""
         policies: list[Path] = []
         for path in self.request.policies:
             try:
@@ -388,7 +388,7 @@ class _Review:
         return policies
 
     def _keystores(self, side: CommitFiles) -> Generator[ReviewStep, None, dict[str, Path]]:
-        """Return the folders of the keystores of a side, by their paths."""
+        """Return the keystore folders of BASE or HEAD, by path."""
         keystores: dict[str, Path] = {}
         for path in self.request.keystores:
             try:
@@ -404,7 +404,7 @@ class _Review:
         return keystores
 
     def _missing(self, path: str) -> DocumentError:
-        """Return the error that HEAD does not have a file, and what became of it."""
+        """Return the error that a file is missing in HEAD, with a hint such as a rename."""
         entry = self.base.entry(path) if self.base else None
         became = ""
         if entry:
@@ -418,7 +418,7 @@ class _Review:
 
     @staticmethod
     def _changed(side: CommitFiles, other: CommitFiles | None) -> Iterator[tuple[str, TreeEntry]]:
-        """Yield what one side has that the other does not have with the same content."""
+        """Yield paths and entries of one commit that the other commit lacks or has differently."""
         tree = side.repository.tree(side.commit)
         before = other.repository.tree(other.commit) if other else ""
         return walk(side.repository, tree, most=_MOST_ENTRIES, other=before)
@@ -426,7 +426,7 @@ class _Review:
     def _places(
         self, base: tuple[list[Path], Fleet | None], head: tuple[list[Path], Fleet]
     ) -> tuple[int, Content] | None:
-        """Return the step result on robots whose keys go to another place, or in another way."""
+        """Return the step on robots whose keys go to another place, or by another way."""
         lines: list[tuple[str, str]] = []
         robots = base[1].robots if base[1] else {}
         for name, new in head[1].robots.items():
@@ -448,7 +448,7 @@ class _Review:
         return (self._new_access, Facts(tuple(lines))) if lines else None
 
     def _others(self, reviewed: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content] | None:
-        """Return the step result on changed policy files that are not reviewed, or were renamed."""
+        """Return the step on policy files that changed but are not reviewed, or were renamed."""
         assert self.base
         lines: list[tuple[str, str]] = []
         status = _OK
@@ -488,7 +488,7 @@ class _Review:
         reviewed: Sequence[Path],
         fleet: Fleet | None,
     ) -> Iterator[str]:
-        """Yield policies of which the reviewed ones, or a keystore, have the file, but not all."""
+        """Yield policies that reviewed policies or keystores include only in part."""
         named = {str(path.relative_to(self.head.folder)) for path in reviewed}
         content = self.request.repository.content
         known = {
@@ -515,7 +515,7 @@ class _Review:
     def _parts_used_in_part(
         self, parts: Mapping[str, bytes], named: Iterable[str]
     ) -> Iterator[str]:
-        """Yield files for includes of which the reviewed policies do not use all."""
+        """Yield files for includes that the reviewed policies use only in part."""
         files = self.head.files
 
         def content(path: str) -> bytes | None:
@@ -533,7 +533,7 @@ class _Review:
             yield path
 
     def _not_reviewed_users(self, changed: Iterable[tuple[str, TreeEntry]]) -> list[str]:
-        """Return policies that are not reviewed, and have a file that a reviewed one has, too.
+        """Return policies that are not reviewed and share an include with reviewed policies.
 
         A policy includes only what is in its own folder and below.
         """
@@ -567,7 +567,7 @@ class _Review:
         return sorted(e for e in users if e not in files and is_whole_policy(there[e]))
 
     def _unseen(self, path: str, entry: TreeEntry) -> str:
-        """Return what at a path of HEAD may lead to policies that are not reviewed, or ""."""
+        """Return what at a path of HEAD could hide policies from the review, or ""."""
         apart = (*self.request.left_out, *self.request.keystores)
         if entry.mode not in (LINK, SUBMODULE) or _is_below(path, apart):
             return ""
@@ -592,7 +592,7 @@ class _Review:
     def _policies_among(
         self, entries: Iterable[tuple[str, TreeEntry]], side: CommitFiles, *, known: bool = True
     ) -> list[str]:
-        """Return the paths of entries that are, or could be, parts of policies."""
+        """Return the paths of entries that could be policies or parts of policies."""
         wanted = {
             path: entry
             for path, entry in entries
@@ -611,7 +611,7 @@ class _Review:
         return sorted(path for path, digits in small.items() if digits in of_policies)
 
     def left_out(self) -> Iterator[str]:
-        """Yield clauses on the parts that the review leaves out."""
+        """Yield clauses on the parts that were not reviewed."""
         asked = self.request
         if not asked.policies:
             yield "no policy is named"
@@ -681,7 +681,7 @@ class _Review:
     def _read_requirements(
         self, side: CommitFiles
     ) -> Generator[ReviewStep, None, list[Requirement]]:
-        """Return the requirements of a side."""
+        """Return the requirements in BASE or HEAD."""
         requirements: list[Requirement] = []
         for path in self.request.requirements:
             try:
@@ -774,17 +774,17 @@ class _Review:
 
 
 def _decisive_first(where: str) -> tuple[bool, str]:
-    """Return the key that sorts variables of Ansible and of the plays before who has them."""
+    """Return a sort key: variables of Ansible and of plays before the hosts that have them."""
     return not any(part in where for part in ("ansible_", "sros_")), where
 
 
 def _place(robot: Robot) -> str:
-    """Return text on the place where a robot gets its keys."""
+    """Return the place of a robot's keys as text."""
     return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
 
 
 def _holders(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | None]:
-    """Map the enclaves of policies to the robot that gets their keys; None for those of none."""
+    """Map enclaves of policies to the robot that gets their keys; None for enclaves of no robot."""
     if fleet is None:
         return {enclave.path: None for file in files for enclave in read_policy(file).enclaves}
     policies = (FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files)
@@ -809,7 +809,7 @@ def _decided(requirements: Sequence[Requirement], system: System) -> tuple[int, 
 
 
 def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
-    """Return the policies of one robot, or one fleet, as one.
+    """Return the policies of one robot or one fleet, joined into one.
 
     Raises:
         PolicyError: there is none, or two have the same enclave.

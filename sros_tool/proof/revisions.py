@@ -16,12 +16,12 @@ _MOST_FILES = 300  # of a folder
 _MOST_BYTES = 64 * 1024 * 1024  # of its files
 _MOST_ENTRIES = 100_000
 _NOWHERE = Path("/dev/null/git")
-"""No file can be there, so that no link or file of the disk is taken for one of a revision."""
+"""A path that never exists, so that no file on disk is taken for a file of a revision."""
 
 
 @dataclass(frozen=True, slots=True)
 class Revision:
-    """A file or folder of a revision: ``path`` is relative to the top of the repository.
+    """A file or folder of a git revision; ``path`` is relative to the top of the repository.
 
     ``commit`` is the full id that ``name`` stood for when it was read.
     """
@@ -36,11 +36,11 @@ class Revision:
 
     @property
     def place(self) -> Path:
-        """A path for the policy reader that does not exist on disk."""
+        """A path for the policy reader; it does not exist on disk."""
         return _NOWHERE / self.path
 
     def policies(self) -> tuple[Revision, ...]:
-        """Return the policies in this folder and below it, or this file.
+        """Return the policies in this folder and below, or this file.
 
         Raises:
             DocumentError: what is there is perhaps a policy (`policy_files`), a link, or
@@ -78,7 +78,7 @@ class Revision:
         return tuple(sorted(policies, key=lambda revision: revision.path))
 
     def read(self, file: Path) -> bytes:
-        """Return the content of a file that has a `place` in this revision.
+        """Return the content of a file of this revision; ``file`` is a path below `place`.
 
         Raises:
             MissingFileError: the revision has no such file.
@@ -96,18 +96,18 @@ class Revision:
         return self.repository.content(entry.id)
 
     def shown(self, text: str) -> str:
-        """Return a text with the paths of this revision as ``git:REVISION:PATH``."""
+        """Return a text in which the revision's paths read ``git:REVISION:PATH``."""
         return text.replace(f"{_NOWHERE}/", f"{PREFIX}{self.name}:").replace(
             str(_NOWHERE), f"{PREFIX}{self.name}:"
         )
 
     def source(self, source: Source) -> Source:
-        """Return a source with its path as ``git:REVISION:PATH``."""
+        """Return a source whose path reads ``git:REVISION:PATH``."""
         return Source(self.shown(source.file), source.line)
 
 
 def find_revision(text: str) -> Revision:
-    """Return the revision of ``git:REVISION:PATH`` in the repository of the working directory.
+    """Return the revision that ``git:REVISION:PATH`` names in the current repository.
 
     As for git, ``PATH`` is relative to the top of the repository, or to the working directory if it
     begins with ``./`` or ``../``.
