@@ -317,7 +317,7 @@ class Names:
         return found
 
     def _that_may_meet(self, expression: str) -> Sequence[int]:
-        """Return the numbers of the expressions that could overlap with ``expression``, unordered."""
+        """Return the numbers of expressions that could overlap with ``expression``."""
         if len(self._names) <= _FEW:
             return range(len(self._names))
         begin, end = literal_prefix(expression), _END.sub("", expression)[::-1]

@@ -1,4 +1,4 @@
-"""The picture of one source, or the overlay of two, made from rights and governance.
+"""The picture of one source, or the overlay of two sources, from rights and governance.
 
 A wildcard is replaced by the known names that it matches, and denials override permissions.  Known
 names are the exact names in the rights of all sources.  An action is shown as one name, also for a
@@ -53,7 +53,7 @@ _OVERLAYS = {
     "drift": Overlay("drift", "only in the policy", "only in what was signed"),
     "worlds": Overlay("worlds", "not in the rules of Zenoh", "only in the rules of Zenoh"),
 }
-"""Every kind of overlay."""
+"""The kinds of overlays, by name."""
 _ONE_WAY = ("publish", "subscribe")
 
 
@@ -228,7 +228,7 @@ def _picture(
 
 
 def _sides(edges: Iterable[Edge]) -> Mapping[tuple[str, str], list[bool]]:
-    """Map names to whether an enclave may send to them, and whether one may receive from them."""
+    """Map names to two flags: an enclave may send to the name; an enclave may receive from it."""
     sides: dict[tuple[str, str], list[bool]] = defaultdict(lambda: [False, False])
     for edge in edges:
         if edge.qualifier is ALLOW:
@@ -239,7 +239,7 @@ def _sides(edges: Iterable[Edge]) -> Mapping[tuple[str, str], list[bool]]:
 
 
 def _lack(protection: Protection, sends: bool, receives: bool) -> Lack:
-    """Return the side of a name that nobody may take."""
+    """Return the side of a name (send or receive) that no enclave may take."""
     if sends and not receives and protection.read_control:
         return Lack.RECEIVER
     if receives and not sends and protection.write_control:
@@ -248,7 +248,7 @@ def _lack(protection: Protection, sends: bool, receives: bool) -> Lack:
 
 
 def edge_order(edge: Edge) -> tuple[str, int, str, str, tuple[str, ...], str]:
-    """Return the sort key of the edges of a picture."""
+    """Return the sort key of an edge."""
     right = RIGHT_ORDER[edge.right]
     return edge.enclave, right, edge.name, edge.qualifier, edge.parts, edge.mark
 
@@ -300,7 +300,7 @@ def namespace_of(name: str) -> str:
 
 
 def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) -> list[Edge]:
-    """Return the edges of both sides, each marked with its side.
+    """Return the edges of both sources, marked with the side that has the edge.
 
     An edge on both sides keeps its wildcards only if both sides have it by wildcards.  With
     ``allowed_by``, only the first side counts: an observed right always has an exact name.
@@ -320,7 +320,7 @@ def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) 
 
 
 def _neutral(edge: Edge, unseen: frozenset[str]) -> Edge:
-    """Return ``edge``, marked BOTH if it is a denial or its enclave is ``unseen``."""
+    """Return ``edge``, marked BOTH if it is a denial or its enclave was not observed."""
     neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
     return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
 
@@ -345,7 +345,7 @@ def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[Overlay
 
 
 def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
-    """Return the rights that were allowed but never observed, or observed but not allowed.
+    """Return rights that were allowed but never observed, or observed but not allowed.
 
     Rights that every node needs are left out.  The names that a wildcard matches are only counted:
     there are too many for a recorder of all topics.
@@ -373,7 +373,7 @@ def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
 
 
 class Known:
-    """The exact names in rights: topics, services, and actions."""
+    """The known exact names of topics, services and actions in rights."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
         rights = frozenset(rights)
@@ -395,7 +395,7 @@ class Known:
         self._open = {kind: _Wild(names) for kind, names in wild.items()}
 
     def reached(self, kind: str, name: str) -> tuple[str, ...]:
-        """Return the known names that a wildcard matches; for an exact name, only that name."""
+        """Return the known names that an expression matches."""
         if not is_expression(name):
             return (name,)
         key = (kind, name)
@@ -429,14 +429,14 @@ class Known:
 
 
 class _Wild:
-    """Wildcards without known names."""
+    """Wildcards that match no known name."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = Names(names)
         self._drawn: dict[tuple[Qualifier, str], tuple[str, ...]] = {}
 
     def drawn(self, qualifier: Qualifier, name: str) -> tuple[str, ...]:
-        """Return those that an ALLOW of a wildcard overlaps with, or that a DENY of it covers."""
+        """Return the wildcards to draw: overlapping ones for an ALLOW, covered ones for a DENY."""
         key = (qualifier, name)
         if key not in self._drawn:
             meeting = self._names.meeting(name)
@@ -458,7 +458,7 @@ _Found = dict[Qualifier, set[str]]
 
 
 def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = ()) -> list[Edge]:
-    """Return an unsorted edge for each right or denial and each name that it matches.
+    """Return the edges, unsorted: one for each right or denial and each name that it matches.
 
     A wildcard that matches no known name is drawn as a name.  ``common`` are the rights that every
     node of any enclave needs.
@@ -521,7 +521,7 @@ def _action_edges(
 
 
 def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
-    """Return the expressions in ``names``, or () if "", the mark of an exact name, is there."""
+    """Return the expressions in ``names``; () if "" is among them, which marks an exact name."""
     if "" in names:
         return ()
     return tuple(
@@ -537,7 +537,7 @@ def _is_common(name: str, common: Sequence[str]) -> bool:
 
 
 def protection_of(governance: Governance | None, kind: str, name: str) -> Protection:
-    """Return the weakest protection of the DDS topics of a name, by the first domain rule.
+    """Return the weakest protection among the DDS topics of a name, by the first domain rule.
 
     The protection of whole RTPS messages protects every topic in them.  A topic without a rule
     counts as not protected: vendors refuse it.  Access counts as controlled if all domain rules
@@ -572,7 +572,7 @@ _ORDER = list(WireLevel)
 
 
 class _Demanded:
-    """The protection that a policy demands, for pictures without a governance."""
+    """The protection that a policy requires, for pictures without governance."""
 
     def __init__(self, stated: Iterable[StatedProtection]) -> None:
         topics_of: dict[WireLevel, list[str]] = defaultdict(list)
@@ -582,7 +582,7 @@ class _Demanded:
         self._names = {level: Names(topics) for level, topics in topics_of.items()}
 
     def protection(self, kind: str, name: str) -> Protection | None:
-        """Return the least that is demanded of all topics of a name, or None."""
+        """Return the weakest protection required for the topics of a name, or None."""
         levels = [self._level(topic) for topic in _topics(kind, name)] if self._names else []
         least = min(levels, key=_ORDER.index, default=WireLevel.UNKNOWN)
         return None if least is WireLevel.UNKNOWN else Protection(least)
@@ -604,7 +604,7 @@ def _topics(kind: str, name: str) -> tuple[str, ...]:
 
 
 def _rules_of(domain: DomainRule, topic: str) -> Iterator[TopicRule]:
-    """Yield the rule of a topic; for a wildcard, all rules that may apply to its topics."""
+    """Yield the governance rule of a topic; for a wildcard, all rules that can apply."""
     for rule in domain.topic_access_rules:
         if overlap(rule.topic_expression, topic):
             yield rule

@@ -1,4 +1,4 @@
-"""A picture of one name or enclave: what leads to it over several hops, and what it leads to.
+"""The picture of one name or enclave with the enclaves that influence it, or that it influences.
 
 Who may use a name, and who influences whom, is decided by `sros_tool.reach` for all names that
 rights and governance allow, known or not.  What is drawn between two enclaves are the known names
@@ -67,14 +67,14 @@ _VERBS = {
     "actions": ("call action", "caller", "execute"),
     "dds": ("write DDS topic", "writer", "read"),
 }
-"""By kind of name: what senders do, what they are, and what receivers do."""
+"""Words by kind of name: verb of senders, noun for senders, verb of receivers."""
 _ONE_WAY = ("publish", "subscribe")
 _COMMANDS = ("send_goal", "cancel_goal")
 _NAMED = 3  # enclaves that a sentence names; of more it says the number
 
 
 def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[str]) -> Picture:
-    """Return the part of a picture that leads to the names or enclaves in ``words``, or from them.
+    """Return the part of a picture connected to the names or enclaves in ``words``.
 
     Args:
         picture: a picture of ``sources``, one or two.
@@ -106,7 +106,7 @@ def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[
 
 @dataclass(frozen=True, slots=True)
 class FocusFlow:
-    """The stages of the flow of information to the names of a focus, and from them.
+    """The flow of information to and from the names in a focus, in stages.
 
     ``own`` are the enclaves and ``targets`` the names (kind and name) in the focus.  ``before``
     maps enclaves to their number of hops to these names, 1 for one that may send, and for one in
@@ -160,7 +160,7 @@ class FocusFlow:
         return replace(flow, stages={key: stage for key, stage in stages.items() if stage})
 
     def ends(self, edge: Edge, stage: int) -> tuple[bool, bool]:
-        """Return whether an edge leads to its name, and whether it leads from it, at a stage."""
+        """Return whether an edge leads to its name at a stage, and whether it leads away."""
         if stage not in self.stages.get((edge.kind, edge.name), ()):
             return False, False
         before, after = self._stages(edge)
@@ -173,7 +173,7 @@ class FocusFlow:
         )
 
     def _stages(self, edge: Edge) -> tuple[set[int], set[int]]:
-        """Return the stages of the name at which its enclave could write it, and read it."""
+        """Return the stages of a name at which an enclave could write the name, and read it."""
         writes: set[int] = set()
         reads: set[int] = set()
         before, after = self.before.get(edge.enclave, 0), self.after.get(edge.enclave, 0)
@@ -235,7 +235,7 @@ class _System:
         self._paths: list[HopPath] = []
 
     def meant(self, word: str) -> Iterator[tuple[str, str]]:
-        """Yield the kind and name of everything that is called ``word``.
+        """Yield kind and name of every name or enclave that ``word`` can mean.
 
         An exact name that no right states can be meant if a wildcard matches it.
         """
@@ -258,7 +258,7 @@ class _System:
             yield kind, word
 
     def focus(self, kind: str, name: str) -> Focus:
-        """Return who may use a name, and who influences these; or the same for an enclave."""
+        """Return the answer for a name (its users and who influences them), or for an enclave."""
         if kind == _ENCLAVE:
             influencing = self._influences(self._network.influencing({name}))
             influenced = self._influences(self._network.influenced({name}), 0)
@@ -291,7 +291,7 @@ class _System:
         return tuple(sorted(influences, key=lambda influence: (influence.hops, influence.enclave)))
 
     def with_shortest_paths(self, picture: Picture) -> Picture:
-        """Return a picture with all hops of shortest paths, also where no known name has it."""
+        """Return a picture with all hops of shortest paths, also hops without a known name."""
         allowed = [edge for edge in picture.edges if edge.qualifier is ALLOW]
         drawn = {
             (edge.enclave, edge.kind, edge.name, fits)
@@ -320,7 +320,7 @@ class _System:
         )
 
     def _by_wildcards(self, kind: str, name: str) -> Iterator[Edge]:
-        """Yield the edges of a name that no right states itself."""
+        """Yield the edges of a name that only wildcards match."""
         if (kind, name) in self._known:
             return
         by_right: dict[tuple[str, str], list[Right]] = defaultdict(list)
@@ -342,7 +342,7 @@ def _meets(right: Right, kind: str, word: str) -> bool:
 
 
 def _commands(kind: str, name: str) -> Iterator[str]:
-    """Yield the DDS topics by which a sender commands: requests that ask for a result do not."""
+    """Yield DDS topics by which a sender can command, without requests that only ask."""
     if kind == "dds":
         yield name
     elif kind == "actions":
@@ -360,7 +360,7 @@ def _sentence(
     influencing: Sequence[Influence],
     open_to_all: bool,
 ) -> str:
-    """Return who may use a name, and how many influence its senders."""
+    """Return a sentence on who may use a name, and how many enclaves influence its senders."""
     sends, sender, receives = _VERBS[kind]
     who = "every enclave" if open_to_all else _who(senders)
     text = f"{who} may {sends} {name}"
@@ -378,14 +378,14 @@ def _sentence(
 
 
 def _several(influences: Sequence[Influence], direct: int) -> str:
-    """Return a number of enclaves, and how many of them by one hop."""
+    """Return a number of enclaves as text, and how many of them are one hop away."""
     near = sum(influence.hops == direct for influence in influences)
     text = counted(len(influences), "enclave") if influences else "no enclave"
     return text if near == len(influences) else f"{text} ({near} directly)"
 
 
 def _who(enclaves: Collection[str]) -> str:
-    """Return few enclaves by name, and more by their number."""
+    """Return a few enclaves by name, or many enclaves by their number."""
     if not enclaves:
         return "no enclave"
     if len(enclaves) > _NAMED:
@@ -394,16 +394,16 @@ def _who(enclaves: Collection[str]) -> str:
 
 
 HOPS = 2
-"""The hops that are drawn unless a number is chosen."""
+"""Default number of hops to draw."""
 _MOST_ENCLAVES = 24  # with more in a column, groups are drawn; with as many groups, one card
 _MOST_BUNDLES = 40  # with more at one stage, names with the same senders are joined
 _GUTTER, _LETTER, _SMALL_LETTER = 76, 7.4, 6.2
 _ROOM = {"names": 66, "enclave": 24, "group": 24}
-"""The space on a card beside its text, in pixels."""
+"""Width on a card that its text does not use, in pixels."""
 
 
 def flow_scene(picture: Picture, hops: int = HOPS, *, placed: bool = True) -> Scene:
-    """Return the scene of a picture with a focus; without ``placed``, no y and no frames.
+    """Return the scene of a picture with a focus; without ``placed``, without y and frames.
 
     Args:
         picture: a picture with a focus.
@@ -441,7 +441,7 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, placed: bool = True) -> Sc
 
 
 class _Stage(NamedTuple):
-    """Bundles of names in ``column``, with the ties of each to the left and to the right."""
+    """Bundles of names in one ``column``, with their ties to the left and to the right."""
 
     column: int
     bundles: tuple[tuple[Bundle, tuple[Tie, ...], tuple[Tie, ...]], ...]
@@ -470,7 +470,7 @@ class _Draft:
         return middle + (1 - 2 * hop if before else 2 * hop - 1)
 
     def _folded(self) -> Mapping[tuple[bool, str], str]:
-        """Map each drawn enclave, before or after the focus, to the node that represents it."""
+        """Map each enclave before or after the focus to the node that is drawn for the enclave."""
         nodes = {}
         for before, side in ((True, self._flow.before), (False, self._flow.after)):
             columns: dict[int, list[str]] = defaultdict(list)
@@ -517,14 +517,14 @@ class _Draft:
         )
 
     def _node(self, side: int, stage: int, enclave: str) -> str:
-        """Return the id of the card of an enclave on a side (0: left) of the names of a stage."""
+        """Return the card id of an enclave on one side of a stage's names (0: left)."""
         before = stage > 0 or (stage == 0 and side == 0)
         return f"{'s' if before else 'l'}{self._nodes[before, enclave]}"
 
     # ── cards ──────────────────────────────────────────────────────────────────────────────
 
     def in_columns(self) -> dict[str, Card]:
-        """Return all cards by id, with x and width."""
+        """Return all cards by id, with x and width but without y."""
         cards = [*self._side_cards(), *self._further_cards(), *self._names_cards()]
         widths = [0] * self.columns
         for card in cards:
@@ -595,7 +595,7 @@ class _Draft:
     # ── links and heads ────────────────────────────────────────────────────────────────────
 
     def links(self, cards: Mapping[str, Card]) -> list[Link]:
-        """Return all links, without the places of their ends."""
+        """Return all links, without the positions of their ends."""
         groups: dict[tuple[str, str, str, bool, str, bool, bool], set[str]] = defaultdict(set)
         for stage in self._stages:
             for number, (_, left, right) in enumerate(stage.bundles):
@@ -630,7 +630,7 @@ class _Draft:
         return [*links, *self._further_links(cards)]
 
     def _further_links(self, cards: Mapping[str, Card]) -> Iterator[Link]:
-        """Yield a link for each card at the last hop, if a further enclave influences it."""
+        """Yield a link for each card at the last hop that an enclave beyond influences."""
         for before, paths in zip((True, False), self._further, strict=True):
             if not paths:
                 continue
@@ -647,12 +647,12 @@ class _Draft:
         return self._flow.before if before else self._flow.after
 
     def _next_to(self, before: bool) -> set[str]:
-        """Return the enclaves at the last hop with an edge to or from the enclaves beyond."""
+        """Return the enclaves at the last drawn hop that share an edge with enclaves beyond."""
         stage = self._hops if before else -self._hops
         return {e.enclave for e in self._picture.edges if any(self._flow.ends(e, stage))}
 
     def heads(self, cards: Mapping[str, Card]) -> Iterator[Head]:
-        """Yield what each column has."""
+        """Yield the heading of each column."""
         enclaves = any(focus.kind == _ENCLAVE for focus in self._picture.focus)
         texts = {
             self._column_of(before, hop): text
@@ -673,7 +673,7 @@ _BOTH = OverlaySide.BOTH
 
 
 def _width(card: Card) -> int:
-    """Return the width that the text on a card needs, in pixels."""
+    """Return the width of a card for its text, in pixels."""
     widest = max((len(line) for line in card.lines), default=0) * _LETTER
     small = max((len(note) for note in card.notes), default=0) * _SMALL_LETTER
     return max(96, round(max(widest, small) + _ROOM[card.role]))

@@ -1,4 +1,4 @@
-"""Equal robots, namespaces and enclaves of a picture, drawn as one.
+"""Draw equal robots, namespaces and enclaves of a picture as one.
 
 Units are the robots of a fleet; without one, namespaces or enclaves next to each other that hold
 the same enclaves, or nearly.  They are equal if all that is drawn of them is equal but for their
@@ -45,18 +45,18 @@ from sros_tool.report.picture import (
 from sros_tool.wording import counted
 
 _MARKS = "{}…"
-"""The letters of labels, which no ROS name has; a picture with them is drawn as it is."""
+"""Characters of labels; no ROS name has them. A picture that has them is not folded."""
 _WORD = re.compile(r"[A-Za-z0-9_]+")
 _MOST_PIECES = 16
-"""Most pieces of a word between underscores in which names of units are looked for."""
+"""Most pieces of a word (split at underscores) that are searched for names of units."""
 _SELF = -1
 _TITLE_LETTERS = 30
-"""Longest title of a frame; it is as wide as a card of enclaves."""
+"""Longest title of a frame, in characters; a frame is as wide as a card of enclaves."""
 _ENCLAVE = "enclave"
 
 
 class Folding(NamedTuple):
-    """A picture in which equal units are one, and what its enclaves and names stand for."""
+    """A picture with equal units drawn as one, and the real names behind its labels."""
 
     picture: Picture
     equal: tuple[EqualUnits, ...]
@@ -75,7 +75,7 @@ class Folding(NamedTuple):
         return _Draft(picture, robots or {}).folding()
 
     def scenes(self, *, placed: bool = True, hops: int = 0) -> tuple[Scene, ...]:
-        """Return the scenes, whose cards have the real enclaves and names.
+        """Return the scenes, whose cards list the real enclaves and names.
 
         Args:
             placed: for formats that place cards themselves, False: without y and frames.
@@ -123,35 +123,35 @@ class _Unit(NamedTuple):
 
     @property
     def alone(self) -> bool:
-        """Whether it is one enclave, and not a robot."""
+        """Whether the unit is a single enclave, not a robot or namespace."""
         return self.what == _ENCLAVE
 
 
 @dataclass(frozen=True)
 class _Text:
-    """A text in parts, between which units are named, each with the number of its value."""
+    """A text split where units are named; a unit is stored with the number of its value."""
 
     parts: tuple[str, ...]
     named: tuple[tuple[int, int], ...] = ()
 
     @cached_property
     def units(self) -> tuple[int, ...]:
-        """The units that are named, in their order."""
+        """The units named in the text, in order."""
         return tuple(unit for unit, _ in self.named)
 
     @cached_property
     def form(self) -> tuple[object, ...]:
-        """What is left without the units: the same for texts that differ in units alone."""
+        """The text without the units: equal for texts that differ in units alone."""
         return self.parts, tuple(number for _, number in self.named)
 
     def fill(self, word: Callable[[int, int], str]) -> str:
-        """Return the text with a word for each unit and number of a value."""
+        """Return the text with units replaced: ``word`` gets unit and value number."""
         named = (word(*each) for each in self.named)
         first, *rest = self.parts
         return first + "".join(value + part for value, part in zip(named, rest, strict=True))
 
     def only(self, unit: int | None, word: Callable[[int, int], str]) -> _Text:
-        """Return the text in which no other unit is named: their words are a part of it."""
+        """Return the text in which units other than ``unit`` are plain text."""
         parts, named = [self.parts[0]], []
         for each, part in zip(self.named, self.parts[1:], strict=True):
             if each[0] == unit:
@@ -163,7 +163,7 @@ class _Text:
 
 
 class _Draft:
-    """The builder of a folding: first the units, then their classes, then the picture."""
+    """The builder of a folding: first units, then classes of equal units, then the picture."""
 
     def __init__(self, picture: Picture, robots: Mapping[str, Robot]) -> None:
         self._picture = picture
@@ -172,7 +172,7 @@ class _Draft:
         self._find_words()
 
     def _find_words(self) -> None:
-        """Find by which words units are named, and all of their enclaves.
+        """Find the words that name units, and the enclaves of all units.
 
         An enclave belongs to the only unit that its path names, also outside of its namespace.  A
         unit that is not named in the path of each of its enclaves cannot be folded.
@@ -204,7 +204,7 @@ class _Draft:
                     self._of[enclave.path] = found.pop()
 
     def folding(self) -> Folding:
-        """Return the folding, with the picture as it is if nothing can be folded."""
+        """Return the folding; its picture is unchanged if nothing can be folded."""
         if self._of and not self._has_marks():
             self._kinds: dict[object, int] = {}
             self._seen = tuple(self._sightings())
@@ -234,7 +234,7 @@ class _Draft:
         return found
 
     def _read(self, text: str) -> _Text:
-        """Return a text with the units that are named in it, as words or between underscores."""
+        """Return a text split at the units that it names, as words or between underscores."""
         parts, named = [""], []
         end = 0
         for match in _WORD.finditer(text):
@@ -255,7 +255,7 @@ class _Draft:
         return _Text(tuple(parts), tuple(named))
 
     def _longest(self, pieces: Sequence[str], at: int) -> tuple[tuple[int, int] | None, int]:
-        """Return the unit that the pieces from ``at`` name, and how many pieces these are."""
+        """Return the unit with the longest name from piece ``at``, and its number of pieces."""
         for size in range(min(len(pieces) - at, _MOST_PIECES), 0, -1):
             found = self._words.get("_".join(pieces[at : at + size]))
             if found:
@@ -266,11 +266,11 @@ class _Draft:
         return self._units[unit].values[position]
 
     def _owner(self, enclave: str) -> _Text:
-        """Return the path of an enclave, in which only its own unit is named."""
+        """Return the path of an enclave, split at its own unit only."""
         return self._text(enclave).only(self._of.get(enclave), self._word)
 
     def _sightings(self) -> Iterator[tuple[int, tuple[int, ...], Edge | str]]:
-        """Yield all that is drawn of units: its kind as a number, the units, the edge or enclave.
+        """Yield everything drawn of units: a number for the kind, the units, the edge or enclave.
 
         Two that have the same kind are the same but for the units.
         """
@@ -307,7 +307,7 @@ class _Draft:
         return self._kinds.setdefault(drawn, len(self._kinds))
 
     def _find_classes(self) -> dict[int, list[int]]:
-        """Return the units of each class of equal ones, in the order of their names.
+        """Return the classes of equal units, sorted by name.
 
         First, units of a family are told apart only by what is their own.  Those that are unlike
         the rest of their family, or that most of it names (such as a leader), are then told apart
@@ -340,7 +340,7 @@ class _Draft:
         }
 
     def _by_name(self, unit: int) -> tuple[object, ...]:
-        """Return a sort key by which r2 comes before r10."""
+        """Return a natural sort key: r2 comes before r10."""
         parts = re.split(r"(\d+)", self._units[unit].name)
         return tuple(
             (len(part.lstrip("0")), part) if number % 2 else part
@@ -348,7 +348,7 @@ class _Draft:
         )
 
     def _views(self) -> list[Counter[object]]:
-        """Return what is seen of each unit, in which others of its family are the same."""
+        """Return what is drawn of each unit, with other units of its family made the same."""
         found: list[Counter[object]] = [Counter() for _ in self._units]
         for kind, units, _what in self._seen:
             for unit in set(units):
@@ -398,7 +398,7 @@ class _Draft:
         return Folding(picture, tuple(units), different, self._enclaves, self._names)
 
     def _apart(self, unit: int) -> bool:
-        """Return whether units like this one are never drawn together."""
+        """Return whether a unit may not be drawn together with others."""
         symbol = self._symbols[unit]
         return not any(
             len({each for each in units if self._symbols[each] == symbol}) > 1
@@ -406,18 +406,18 @@ class _Draft:
         )
 
     def _label(self, unit: int, position: int = 0) -> str:
-        """Return what stands for all units that are equal to this one; itself, if none is."""
+        """Return the label of a unit's class, or the unit's own word if no other unit is equal."""
         if unit not in self._inside:
             return self._word(unit, position)
         first, *_, last = self._classes[self._inside[unit]]
         return f"{{{self._word(first, position)}…{self._word(last, position)}}}"
 
     def _is_drawn(self, unit: int) -> bool:
-        """Return whether a unit is drawn: not those that are equal to the first of their class."""
+        """Return whether a unit is drawn: only the first of a class of equal units is."""
         return unit not in self._inside or self._classes[self._inside[unit]][0] == unit
 
     def _path(self, enclave: str) -> str:
-        """Return the path under which an enclave is drawn."""
+        """Return the path that is drawn for an enclave."""
         text, unit = self._owner(enclave), self._of.get(enclave)
         path = text.fill(self._label)
         if unit in self._inside and path not in self._enclaves:
@@ -425,7 +425,7 @@ class _Draft:
         return path
 
     def _each(self, text: _Text, colour: int) -> Iterator[str]:
-        """Yield a text that names one unit of a class for each unit of it."""
+        """Yield a text once for each unit of the class that it names."""
         for unit in self._classes[colour]:
             yield text.fill(partial(self._instead, unit))
 
@@ -433,7 +433,7 @@ class _Draft:
         return self._word(unit, position)
 
     def _edges(self, odd: Set[Edge | str]) -> Iterator[Edge]:
-        """Yield the edges of the units that are drawn, and of all other enclaves."""
+        """Yield the edges to draw: of the drawn units, and of all enclaves outside of units."""
         others = self._others()
         for edge in self._picture.edges:
             unit = self._of.get(edge.enclave)
@@ -454,13 +454,13 @@ class _Draft:
             yield replace(edge, enclave=path, name=shown, by=by, differs=edge in odd)
 
     def _is_counted(self, unit: int, each: int) -> bool:
-        """Return whether of a unit that another one names, only the number is drawn."""
+        """Return whether other units that a unit names are drawn only as a number."""
         if each == unit or self._symbols[each] < 0:
             return False
         return each in self._inside or unit in self._inside
 
     def _others(self) -> Callable[[Edge, int, int, int], str]:
-        """Return what is written for units that another one names: how many of them."""
+        """Return the text for other units that a unit names: their number."""
         number: dict[object, set[int]] = defaultdict(set)
         families: dict[int, list[int]] = defaultdict(list)
         for n in sorted(set(self._of.values()), key=self._by_name):
@@ -492,7 +492,7 @@ class _Draft:
         return several
 
     def _named(self, kind: str, name: _Text) -> Iterable[str]:
-        """Return the names that are drawn as one with this one."""
+        """Return the real names behind a drawn name."""
         if len(name.named) == 1:
             return self._each(name, self._inside[name.units[0]])
         if self._alike is None:
@@ -543,7 +543,7 @@ class _Draft:
     # ── what differs ───────────────────────────────────────────────────────────────────────
 
     def _differing(self) -> tuple[tuple[DifferentUnit, ...], Set[Edge | str]]:
-        """Return the units that differ a little from most of their family, and by what."""
+        """Return the units that differ slightly from most of their family, with the differences."""
         near = {
             n: usual
             for n in set(self._of.values())
@@ -577,7 +577,7 @@ class _Draft:
     def _said(
         self, found: Sequence[Edge | str], unit: int, instead: int | None = None
     ) -> Iterator[str]:
-        """Yield enclaves and rights in words, as those of ``unit``, which has none of them."""
+        """Yield enclaves and rights in words, as ``unit`` would have them."""
 
         def word(each: int, position: int) -> str:
             return self._label(unit if each == instead else each, position)
@@ -593,7 +593,7 @@ class _Draft:
 
 
 def _classes(views: Sequence[Counter[object]], before: Sequence[int]) -> dict[int, list[int]]:
-    """Return the units whose views are equal, and that were in the same class before."""
+    """Return classes of units with equal views, as a subdivision of the earlier classes."""
     numbers: dict[object, int] = {}
     found: dict[int, list[int]] = defaultdict(list)
     for unit, view in enumerate(views):
@@ -604,7 +604,7 @@ def _classes(views: Sequence[Counter[object]], before: Sequence[int]) -> dict[in
 
 
 def _alike(one: Collection[object], other: Collection[object]) -> bool:
-    """Return whether two views have at least half in common."""
+    """Return whether two views have at least half of their content in common."""
     return 2 * len(set(one).intersection(other)) >= max(len(one), len(other))
 
 
@@ -616,7 +616,7 @@ def _as_it_is(picture: Picture) -> Folding:
 
 
 def _robots(picture: Picture, robots: Mapping[str, Robot]) -> Iterator[_Unit]:
-    """Yield the robots of a fleet, with those of their enclaves that are in the picture."""
+    """Yield the robots of a fleet, with their enclaves in the picture."""
     enclaves: dict[str, list[str]] = defaultdict(list)
     named = {}
     for enclave in picture.enclaves:
@@ -630,7 +630,7 @@ def _robots(picture: Picture, robots: Mapping[str, Robot]) -> Iterator[_Unit]:
 
 
 def _guessed(picture: Picture) -> Iterator[_Unit]:
-    """Yield namespaces or enclaves next to each other that hold the same enclaves, or nearly."""
+    """Yield sibling namespaces or enclaves that contain nearly the same enclaves."""
     waiting = [_by_first((enclave.path[1:], enclave.path) for enclave in picture.enclaves)]
     family = 0
     while waiting:
@@ -652,7 +652,7 @@ def _guessed(picture: Picture) -> Iterator[_Unit]:
 
 
 def _by_first(paths: Iterable[tuple[str, str]]) -> dict[str, dict[str, str]]:
-    """Map the first parts of paths to their rests, which map to the enclaves."""
+    """Group paths by their first part: map it to the rest of the path and to the enclave."""
     found: dict[str, dict[str, str]] = defaultdict(dict)
     for path, enclave in paths:
         first, _, rest = path.partition("/")
@@ -661,7 +661,7 @@ def _by_first(paths: Iterable[tuple[str, str]]) -> dict[str, dict[str, str]]:
 
 
 def _roles(picture: Picture) -> Mapping[str, tuple[object, ...]]:
-    """Map enclaves to what they are in the focus of a picture."""
+    """Map enclaves to their roles in the focus of a picture."""
     found: dict[str, list[object]] = defaultdict(list)
     for number, focus in enumerate(picture.focus):
         found[focus.name].append((number, "focus"))

@@ -1,4 +1,4 @@
-"""A scene as text: an SVG file of its own, or DOT or Mermaid, which place the cards themselves."""
+"""Render a scene as SVG; or as DOT or Mermaid, whose tools place the cards themselves."""
 
 from __future__ import annotations
 
@@ -93,13 +93,13 @@ _GLYPHS = {
     "actions": "M6.5 1a5.5 5.5 0 1 0 .01 0zM6.5 4.5a2 2 0 1 0 .01 0z",
     "dds": "M6.5 1L12 6.5L6.5 12L1 6.5z",
 }
-"""The symbol of each kind of name, 13 by 13 pixels: lines, two arrows, a target, a rhombus."""
+"""SVG shapes of the symbols for kinds of names, 13 by 13 pixels."""
 _LOCKS = {
     WireLevel.ENCRYPT: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 5 0V6M6.5 8.3v2",
     WireLevel.SIGN: "M1.5 12h10M2.5 9.5l1-2.6L9.3 1.2l1.8 1.8L5.2 8.7z",
     WireLevel.NONE: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 4.8-1",
 }
-"""The symbol of each level of protection, 13 by 13 pixels: a lock, a pen, an open lock."""
+"""SVG shapes of the symbols for protection levels (lock, pen, open lock), 13 by 13 pixels."""
 
 
 def render_svg(picture: Picture, scene: Scene) -> str:
@@ -156,7 +156,7 @@ def _summary(picture: Picture, scene: Scene) -> str:
 
 
 def _lines(text: str, width: int) -> list[str]:
-    """Return a sentence in lines that fit into a picture of this width."""
+    """Split a sentence into lines that fit into a picture of this width."""
     return wrap(text, max(20, (width - 28) // 7), break_on_hyphens=False)
 
 
@@ -237,7 +237,7 @@ def _card(card: Card) -> Iterable[str]:
 
 
 def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
-    """Yield the lines of the legend for the symbols in this scene."""
+    """Yield the lines of the legend for the symbols in a scene."""
     kinds = sorted({card.kind for card in scene.cards if card.kind}, key=list(_GLYPHS).index)
     yield _row(
         (
@@ -283,7 +283,7 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
 
 
 def _card_legend(picture: Picture, scene: Scene) -> Iterable[str]:
-    """Yield the lines of the legend for cards that are marked, and for labels of equal ones."""
+    """Yield the lines of the legend for marked cards, and for labels of equal units."""
     rows = []
     if any(card.chosen for card in scene.cards):
         rows.append((_BOX.format("chosen"), "in focus: information goes to it from the left"))
@@ -377,7 +377,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
 
 
 def _graphviz_svg(dot: str) -> str:
-    """Return the SVG that Graphviz draws from DOT text; `UnavailableError` without Graphviz."""
+    """Return the SVG that Graphviz draws from DOT text, or raise `UnavailableError`."""
     try:
         done = subprocess.run(
             ["dot", "-Tsvg"],
@@ -405,7 +405,7 @@ def _title(picture: Picture) -> str:
 
 
 def _once(scene: Scene) -> Mapping[str, Card]:
-    """Map node ids to cards; the two cards of an enclave in a scene are one node here."""
+    """Map node ids to cards; the two cards of an enclave become one node."""
     found: dict[str, Card] = {}
     for card in sorted(scene.cards, key=lambda each: (each.role, each.members, each.column)):
         found.setdefault(_key(card.id), card)
@@ -413,7 +413,7 @@ def _once(scene: Scene) -> Mapping[str, Card]:
 
 
 def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
-    """Map groups to node ids of their enclaves; empty if there is only one group."""
+    """Map groups to the node ids of their enclaves; empty if there is only one group."""
     found: dict[str, list[str]] = defaultdict(list)
     for key, card in cards.items():
         if card.role == "enclave":
@@ -422,7 +422,7 @@ def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
 
 
 def _key(card: str) -> str:
-    """Return the node id for a card id: "e" and the enclave, or "n" and the number of the card."""
+    """Return the node id for a card: "e" and the enclave, or "n" and the card's number."""
     return card if card[0] == "n" else f"e{card[1:]}"
 
 
@@ -505,7 +505,7 @@ def _end(card: str) -> str:
 
 
 def _id(key: str) -> str:
-    """Return an identifier of ASCII letters and digits, unique for each key."""
+    """Return a unique identifier of ASCII letters and digits for a key."""
     plain = "".join(
         each if each.isalnum() and each.isascii() else f"_{ord(each):x}_" for each in key
     )
@@ -513,7 +513,7 @@ def _id(key: str) -> str:
 
 
 def _entities(text: str) -> str:
-    """Return ``text`` with all possible markup escaped as Mermaid's numbered entities."""
+    """Return ``text`` with all markup characters escaped as Mermaid's numbered entities."""
     return re.sub(r"[^A-Za-z0-9 /_.,:+-]", lambda found: f"#{ord(found[0])};", visible_line(text))
 
 
@@ -531,7 +531,7 @@ def render(
     graphviz: bool = False,
     hops: int | None = None,
 ) -> str:
-    """Return a picture as text in a form: html, svg, dot or mermaid.
+    """Render a picture as text in one of the formats html, svg, dot and mermaid.
 
     Args:
         picture: the picture.

@@ -34,7 +34,7 @@ from sros_tool.wording import counted
 
 _SIDE_WIDTH, _NAMES_WIDTH, _GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14
-"""The height of a line of text, the padding of a card, and the height of a line of a note."""
+"""Height of a text line, padding of a card, and height of a note line, in pixels."""
 _GAP, _LEAD, _TOP, MARGIN = 9.0, 24.0, 34.0, 14
 SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters per line on a card
 _ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # onlookers have more bundles than both limits
@@ -73,7 +73,7 @@ _COMMON = {
     "actions": "used by every node",
     "dds": "used by every node",
 }
-"""The note on a card of names that every node may use, if those rights are not drawn."""
+"""The note on cards of names that every node may use, where these rights are not drawn."""
 OWN, OTHERS = "own:", ("other of", "others of")
 """Words on cards that the legend explains."""
 SENDERS, LISTENERS = "may send", "may receive"
@@ -81,7 +81,7 @@ _NAMES = "topics, services, actions"
 
 
 class Head(NamedTuple):
-    """What a column has; ``anchor`` is where ``x`` is in the text: start, middle or end."""
+    """The heading of a column; ``anchor`` says which part of the text is at ``x``."""
 
     x: int
     anchor: str
@@ -161,7 +161,7 @@ class Link:
 
 
 class Onlooker(NamedTuple):
-    """An enclave with so many names that their cards show its letter (``tag``) instead of lines."""
+    """An enclave with many names, whose cards show its letter (``tag``) instead of lines."""
 
     tag: str
     enclave: str
@@ -180,13 +180,13 @@ class Frame:
 
 
 DrawnAs = Mapping[tuple[str, str], Sequence[str]]
-"""The real names behind the kind and the text of names that are drawn as one."""
+"""Maps kind and text of a drawn name to the real names behind it."""
 
 
 def scenes_of(
     picture: Picture, *, placed: bool = True, drawn_as: DrawnAs | None = None
 ) -> tuple[Scene, ...]:
-    """Return the scenes of a picture, starting with the overview.
+    """Return the scenes of a picture, the overview first.
 
     With few enclaves, the first scene leaves out the rights that every node needs, and the second
     one has everything.  With many enclaves, the first scene has the groups and the links between
@@ -248,7 +248,7 @@ def _scene(
 
 
 def _real(names: Iterable[tuple[str, str]], drawn_as: DrawnAs) -> int:
-    """Return the number of names that are drawn, each once."""
+    """Return the number of distinct real names behind drawn names."""
     return len(
         {(kind, real) for kind, name in names for real in drawn_as.get((kind, name), (name,))}
     )
@@ -297,11 +297,11 @@ class _Draft:
                     self._ties[*ends, tie.qualifier, bool(tie.by), *marks].add(tie.right)
 
     def _looks(self, tie: Tie) -> bool:
-        """Return whether the tie is shown as a letter instead of a line."""
+        """Return whether a tie is drawn as a letter instead of a line."""
         return is_plain(tie) and (tie.node, tie.right) in self._looking
 
     def _alone(self, bundle: Bundle) -> str:
-        """Return the node with ties to these names if only one, except onlookers; otherwise ""."""
+        """Return the only node, except onlookers, with ties to these names, or ""."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
         if not all(map(is_plain, bundle.ties)):
@@ -311,7 +311,7 @@ class _Draft:
         return nodes.pop() if len(nodes) == 1 else ""
 
     def scene(self, name: str, title: str) -> Scene:
-        """Return the scene without positions (every y is 0), frames and number of names."""
+        """Return the scene without positions (y is 0), frames and number of names."""
         cards = {card.id: card for card in self._cards()}
         width = 2 * (MARGIN + _SIDE_WIDTH + _GUTTER) + _NAMES_WIDTH
         return Scene(
@@ -362,7 +362,7 @@ class _Draft:
             yield self._names_card(number, bundle)
 
     def _side_card(self, side: str, *, first: bool) -> Card:
-        """Return a card of an enclave or group; its ``first`` card counts its private names."""
+        """Return the card of an enclave or group; its ``first`` card counts the private names."""
         node, sends = side[1:], side[0] == "s"
         members = tuple(self._members[node])
         is_group = node.startswith(":")
@@ -431,7 +431,7 @@ class _Draft:
 
 
 def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
-    """Map each onlooker (node and right) to the number of its names.
+    """Map onlookers (node and right) to the number of their names.
 
     An onlooker, such as ("/recorder", "subscribe"), has wildcards that match so many names that its
     lines would hide all other lines.
@@ -469,7 +469,7 @@ def _own_text(own: Iterable[Bundle]) -> list[str]:
 
 
 def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the lines (names, or wildcards that match them) and the notes of a bundle's card."""
+    """Return the text lines and notes on the card of a bundle of names."""
     kind, names = KIND_NAMES[bundle.kind], bundle.names
     if bundle.partial:
         return (f"{_common_namespace(names)}/…",), (
@@ -484,7 +484,7 @@ def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def enclave_notes(picture: Picture) -> Mapping[str, tuple[str, ...]]:
-    """Map enclaves to what is noted on their cards."""
+    """Map enclaves to the notes on their cards."""
     return {
         enclave.path: (enclave.note,) * bool(enclave.note)
         + ("never observed",) * (not enclave.observed)
@@ -493,7 +493,7 @@ def enclave_notes(picture: Picture) -> Mapping[str, tuple[str, ...]]:
 
 
 def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = ()) -> Card:
-    """Return the card of a bundle, without x, y and width; ``more`` are further notes."""
+    """Return the card of a bundle, without x, y and width; ``more`` are additional notes."""
     titles, notes = _names_title(bundle)
     lines = tuple(line for title in titles for line in wrapped(title, _NAMES_LETTERS))
     notes += more
@@ -517,12 +517,12 @@ def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = (
 
 
 def height_of(lines: Sequence[str], notes: Sequence[str]) -> int:
-    """Return the height of a card with these lines and notes."""
+    """Return the height of a card with these text lines and notes, in pixels."""
     return 2 * PAD + LINE * len(lines) + SMALL * len(notes)
 
 
 def _common_namespace(names: Sequence[str]) -> str:
-    """Return the innermost namespace that contains all names, "" for the root."""
+    """Return the innermost namespace that contains all names; "" for the root."""
     found = []
     for parts in zip(*(name.split("/")[:-1] for name in names), strict=False):
         if len(set(parts)) > 1:
@@ -532,7 +532,7 @@ def _common_namespace(names: Sequence[str]) -> str:
 
 
 def wrapped(text: str, letters: int) -> tuple[str, ...]:
-    """Return ``text`` in lines of at most ``letters``, split at slashes or underscores."""
+    """Split ``text`` at slashes or underscores into lines of at most ``letters`` characters."""
     lines = []
     while len(text) > letters:
         cut = max(
@@ -552,7 +552,7 @@ def wrapped(text: str, letters: int) -> tuple[str, ...]:
 def stacked(
     cards: Iterable[Card], lines: Sequence[tuple[str, str]], columns: int
 ) -> dict[str, Card]:
-    """Return cards by id, each with its y, ordered by column and y.
+    """Return the cards with their y, by id, ordered by column and y.
 
     Cards of names are in odd columns; ``lines`` are pairs of ids in neighbouring columns.
     """
@@ -570,12 +570,12 @@ def stacked(
 
 
 def bottom_of(cards: Iterable[Card]) -> int:
-    """Return the height of a scene with these cards."""
+    """Return the height of a scene with these cards, in pixels."""
     return max((card.y + card.height for card in cards), default=0) + MARGIN
 
 
 def linked(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]:
-    """Return links with their ends spread over the edges of the cards."""
+    """Return the links with their ends spread along the edges of the cards."""
     ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
     for number, link in enumerate(links):
         for here, there, out in (
@@ -599,7 +599,7 @@ def linked(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]
 def _tops(
     columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
 ) -> dict[str, float]:
-    """Map cards to their y; the tallest column is packed, the other columns aligned to it."""
+    """Map cards to their y; the tallest column is packed, other columns are aligned with it."""
     extent = [_extent(column) for column in columns]
     tallest = max(range(len(columns)), key=lambda number: (extent[number], number % 2 == 1))
     tops: dict[str, float] = {}
@@ -624,7 +624,7 @@ def _extent(column: Sequence[ColumnItem]) -> float:
 
 
 def frames_of(cards: Iterable[Card]) -> Iterable[Frame]:
-    """Yield a frame for the cards of each group in a column of enclaves."""
+    """Yield a frame around the cards of each group in a column of enclaves."""
     groups: dict[tuple[int, str], list[Card]] = defaultdict(list)
     for card in cards:
         if card.role != "names":
@@ -636,7 +636,7 @@ def frames_of(cards: Iterable[Card]) -> Iterable[Frame]:
 
 
 class ColumnItem(NamedTuple):
-    """An item of a column, with a height; the items of a ``group`` stay together."""
+    """An item of a column with its height; items of one ``group`` stay together."""
 
     id: str
     height: float
@@ -668,7 +668,7 @@ def order_columns(
 
 
 def _places(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, float]:
-    """Map each item to its position in its column, from 0 to 1."""
+    """Map items to their relative position in their column, from 0 to 1."""
     return {
         item.id: (number + 0.5) / len(column)
         for column in columns
@@ -697,7 +697,7 @@ def _by_barycentre(
 
 
 def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]) -> int:
-    """Return the number of crossings of lines between neighbouring columns."""
+    """Return the number of line crossings between neighbouring columns."""
     side = {item.id: number for number, column in enumerate(columns) for item in column}
     place = {item.id: n for column in columns for n, item in enumerate(column)}
     total = 0
@@ -713,7 +713,7 @@ def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[st
 
 
 def _inversions(ends: Sequence[int], size: int) -> int:
-    """Return the number of pairs in the wrong order, with a Fenwick tree."""
+    """Return the number of inverted pairs, computed with a Fenwick tree."""
     tree = [0] * (size + 1)
     crossings = 0
     for seen, end in enumerate(ends):
@@ -736,7 +736,7 @@ def place_column(
     top: float,
     lead: float = 0,
 ) -> dict[str, float]:
-    """Map each item to a y so that its centre is near the ``wanted`` y, without overlaps.
+    """Map items to y positions near their ``wanted`` y, without overlaps.
 
     Items keep their order, with ``gap`` between them, and are not above ``top``; there is ``lead``
     more space above the first item of each group.

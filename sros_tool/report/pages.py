@@ -1,4 +1,4 @@
-"""The HTML pages of a picture, of a demo, and of a fleet, which contain all that they need.
+"""HTML pages of a picture, a demo and a fleet; they load nothing else.
 
 The content security policy allows only the script and style in the file, by their digests.  The
 data is JSON in which every character that could end its element is escaped, and the script inserts
@@ -36,7 +36,7 @@ _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 def render_page(
     picture: Picture, scenes: tuple[Scene, ...], now: datetime, drawn: Picture | None = None
 ) -> str:
-    """Return the HTML page of a picture with its scenes.
+    """Return the HTML page of a picture and its scenes.
 
     ``now`` is the date of its findings, ``drawn`` the picture in which equal units are one.
     """
@@ -53,7 +53,7 @@ def render_page(
 
 
 def escape(text: str) -> str:
-    """Return ``text`` as the content of an element or the value of an attribute.
+    """Escape ``text`` for the content of an HTML element or an attribute value.
 
     What no XML document can have, and what could steer a terminal that shows the file or begin a
     line in it, becomes a visible escape.
@@ -62,12 +62,12 @@ def escape(text: str) -> str:
 
 
 def _asset(name: str) -> str:
-    """Return the content of a file in assets/, which web/package.json builds from web/."""
+    """Return the text of a file in assets/, which is built from web/ by web/package.json."""
     return (_ASSETS / name).read_text("utf-8")
 
 
 def _document(title: str, body: str, style: str, script: str = "", data: object = None) -> str:
-    """Return a self-contained HTML document; ``body`` is HTML, ``data`` the script's input."""
+    """Return a self-contained HTML document; ``body`` is HTML, ``data`` is for the script."""
     policy = f"default-src 'none'; style-src {_digest(style)}; base-uri 'none'; form-action 'none'"
     if script:
         policy += f"; script-src {_digest(script)}"
@@ -92,7 +92,7 @@ def _document(title: str, body: str, style: str, script: str = "", data: object 
 
 
 def _safe_json(value: object) -> str:
-    """Return JSON for a script element: < > & and line separators are escaped."""
+    """Return JSON for a script element, with < > & and line separators escaped."""
     text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
     return visible_json(text.translate(_ESCAPES))
 
@@ -106,7 +106,7 @@ def _digest(text: str) -> str:
 
 
 def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[str, Any]:
-    """Return the script's data: bundles of names, which need much less space than edges."""
+    """Return the script's data: bundles of names, which take less space than edges."""
     return {
         "headlines": picture.headlines,
         "overlay": as_plain(picture.overlay),
@@ -123,7 +123,7 @@ def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[s
 
 
 def _enclave(enclave: PicturedEnclave) -> dict[str, Any]:
-    """Return an enclave as JSON, with only those statements that have wildcards."""
+    """Return an enclave as JSON; of its statements, only those with wildcards."""
     wild = [
         _with_deny(as_plain(statement))
         for statement in enclave.statements
@@ -153,7 +153,7 @@ def _bundle(bundle: Bundle) -> dict[str, Any]:
 
 
 def _row(bundle: Bundle) -> dict[str, Any]:
-    """Return a row of the table of names: who may send, who may receive, and who is denied."""
+    """Return one table row for a name: who may send, who may receive, who is denied."""
     ties = [tie for tie in bundle.ties if tie.qualifier is ALLOW]
     return {
         "kind": bundle.kind,
@@ -175,7 +175,7 @@ def _scene(scene: Scene) -> dict[str, Any]:
 
 
 def _table(rows: list[dict[str, Any]]) -> list[list[Any]]:
-    """Return rows with the same keys as lists: first the keys, then the values of each row."""
+    """Return rows with equal keys in compact form: the keys, then a list of values for each row."""
     if not rows:
         return []
     keys = list(rows[0])
@@ -189,14 +189,14 @@ _SKIPPED = "skipped"
 
 
 def render_demo_page(result: Json) -> str:
-    """Return the result of a demo as an HTML document."""
+    """Return the HTML page of a demo's result."""
     body = "\n".join((_demo_head(result), *map(_demo_scenario, result["scenarios"])))
     title = f"sros demo on {result['dds']}"
     return _document(title, f"<main>{body}</main>", _asset("demo.css"))
 
 
 def without_folders(value: Any, folders: Sequence[str]) -> Any:
-    """Return a JSON value with these folder paths replaced by "…" in all texts."""
+    """Return a JSON value with these folder paths replaced by "…" in all its texts."""
     if isinstance(value, str):
         for folder in sorted(folders, key=len, reverse=True):
             value = value.replace(folder, "…") if len(folder) > 1 else value
@@ -255,12 +255,12 @@ def _demo_head(result: Json) -> str:
 
 
 def _good(rows: Sequence[Json]) -> int:
-    """Return the number of rows that were tried and are as expected."""
+    """Return the number of rows that were run and are as expected."""
     return sum(bool(row["as_expected"]) and row["observed"] != _SKIPPED for row in rows)
 
 
 def _not_tried(scenario: Json) -> Sequence[str]:
-    """Return what would have to be tried to prove a user's keystore sound, and was not."""
+    """Return what a proof of a user's keystore needs but the demo did not try."""
     keystore = scenario.get("keystore")
     return keystore["not_tried"] if keystore else ()
 
@@ -349,7 +349,7 @@ _OUT_OF_DATE = ("earlier", "different", "missing", "never")
 
 
 def render_fleet_page(status: Json) -> str:
-    """Return the state of a fleet as an HTML document."""
+    """Return the HTML page of a fleet's status."""
     body = f"{_fleet_head(status)}<section>{_fleet_table(status)}</section>"
     return _document(f"Fleet of {status['keystore']}", f"<main>{body}</main>", _asset("demo.css"))
 

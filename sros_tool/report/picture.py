@@ -1,4 +1,4 @@
-"""The picture of a robot's rights as plain values, the input of every output format.
+"""The picture of a robot's rights as plain values: the input of all output formats.
 
 Everything is sorted and contains neither paths of the machine nor a time of creation, so the same
 sources always give the same picture.
@@ -21,15 +21,15 @@ from sros_tool.wording import counted, first_few
 SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
     ("subscribe", "reply", "execute"), False
 )
-"""Whether the arrow of a right points to the name, because the enclave sends first."""
+"""Whether a right's arrow points to the name, because the enclave sends first."""
 
 _ASKED = tuple(f"/{name}" for name in READING_SERVICES)
 _KINDS = (*RIGHTS, "dds")
-"""The kinds of names in display order; dds is a topic without a ROS name."""
+"""Kinds of names in display order; ``dds`` is a topic without a ROS name."""
 
 
 class OverlaySide(StrEnum):
-    """The side of an overlay that has a right; always BOTH without an overlay."""
+    """The side of an overlay that has a right; BOTH for a picture without overlay."""
 
     BOTH = "both"
     FIRST = "first"
@@ -37,7 +37,7 @@ class OverlaySide(StrEnum):
 
 
 class WireLevel(StrEnum):
-    """The minimum protection of messages on the wire, from the weakest to the strongest."""
+    """Minimum protection of messages on the wire, from weakest to strongest."""
 
     UNKNOWN = "unknown"
     NONE = "none"
@@ -47,7 +47,7 @@ class WireLevel(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Protection:
-    """The protection of a name by governance: the weakest of all its DDS topics.
+    """Protection of a name by governance: the weakest among its DDS topics.
 
     ``data``, ``metadata`` and ``rtps`` are protection kinds of DDS-Security 1.1.  Without
     ``read_control``, every authenticated participant may read, whatever its permissions; without
@@ -55,21 +55,21 @@ class Protection:
     """
 
     level: WireLevel
-    """The least protection on the wire."""
+    """The minimum protection of messages on the wire."""
     data: str = ""
-    """Protection of the payload, or an empty string."""
+    """Protection kind of the payload, or an empty string."""
     metadata: str = ""
-    """Protection of submessages."""
+    """Protection kind of submessages, or an empty string."""
     rtps: str = ""
-    """Protection of RTPS messages."""
+    """Protection kind of RTPS messages, or an empty string."""
     read_control: bool = True
-    """Whether permissions decide who may read."""
+    """Whether permissions control who may read."""
     write_control: bool = True
-    """Whether permissions decide who may write."""
+    """Whether permissions control who may write."""
 
 
 UNKNOWN = Protection(WireLevel.UNKNOWN)
-"""The protection if no governance is known, such as for a policy alone."""
+"""The protection without a known governance, such as for a policy alone."""
 
 
 @shows(
@@ -87,40 +87,40 @@ class Edge:
     """
 
     enclave: str
-    """The enclave."""
+    """Path of the enclave."""
     kind: str
-    """The kind of the name."""
+    """Kind of the name, such as ``topics``."""
     name: str
-    """The name."""
+    """The absolute ROS name, or the wildcard."""
     right: str
-    """The right."""
+    """The right, such as ``publish``."""
     qualifier: Qualifier
-    """Whether it is a right or a denial."""
+    """Whether the rule allows or denies the right."""
     by: tuple[str, ...] = ()
-    """The wildcards that give it."""
+    """Wildcards that give the right; empty if the rule has the exact name."""
     parts: tuple[str, ...] = ()
-    """The parts of an action, if it is not for the whole."""
+    """Parts of the action that the right is for; empty for the whole action."""
     mark: OverlaySide = OverlaySide.BOTH
-    """The side that has it, in a comparison."""
+    """The side of the comparison that has the right."""
     common: bool = False
-    """Whether every node needs it."""
+    """Whether every node needs the right to start."""
     violates: bool = False
-    """Whether a requirement does not hold because of it."""
+    """Whether the right breaks a requirement."""
     differs: bool = False
 
     @property
     def sends(self) -> bool:
-        """Whether the arrow points from the enclave to the name."""
+        """Whether the enclave sends to the name."""
         return SENDS[self.right]
 
     @property
     def direction(self) -> Annotated[str, Words(("to the name", "from the name"))]:
-        """Where the arrow points."""
+        """Direction of the arrow."""
         return "to the name" if self.sends else "from the name"
 
 
 class Lack(StrEnum):
-    """The side of a name that no enclave may take, although one may take the other side."""
+    """The side of a name that no enclave may take, although an enclave may take the other side."""
 
     NOTHING = ""
     SENDER = "sender"
@@ -135,17 +135,17 @@ class Name:
     """
 
     kind: str
-    """Its kind."""
+    """Kind of the name: topics, services, actions, or ``dds``."""
     name: str
-    """The name."""
+    """The absolute name."""
     namespace: str
-    """Its namespace."""
+    """Namespace of the name."""
     protection: Protection
-    """Protection by the governance."""
+    """Protection of the name by the governance."""
     wildcard: bool = False
     """Whether it is a wildcard that matches no known name."""
     lacks: Lack = Lack.NOTHING
-    """The side that no enclave may take, though one may take the other, or an empty string; who
+    """The side (sending or receiving) that no enclave may take; the server of a service receives.
     serves a service is its receiver."""
 
 
@@ -158,7 +158,7 @@ _LACKING = {
 
 
 def lack_text(kind: str, lacks: Lack) -> str:
-    """Return what nobody may do with a name of this kind, such as ``nobody may publish``."""
+    """Return what no enclave may do with a name, such as ``nobody may publish``."""
     sends, receives = _LACKING[kind]
     return f"nobody may {sends if lacks is Lack.SENDER else receives}"
 
@@ -169,20 +169,20 @@ def asks(name: Name | Edge) -> bool:
 
 
 class Statement(NamedTuple):
-    """A right as written in the source, and the number of known names that it matches."""
+    """A right as written in the source, with the number of known names that it matches."""
 
     qualifier: Qualifier
-    """Whether it is a right or a denial."""
+    """Whether the rule allows or denies the right."""
     right: str
-    """The right."""
+    """The right, such as ``publish``."""
     kind: str
-    """The kind of the name."""
+    """Kind of the name, such as ``topics``."""
     name: str
-    """The name, perhaps with wildcards."""
+    """The absolute ROS name, perhaps with wildcards."""
     reaches: int
-    """Number of known names that it matches."""
+    """Number of known names that the right matches."""
     mark: OverlaySide = OverlaySide.BOTH
-    """The side that has it, in a comparison."""
+    """The side of the comparison that has the right."""
 
 
 @shows(
@@ -199,70 +199,70 @@ class PicturedEnclave:
     """
 
     path: str
-    """The enclave."""
+    """Path of the enclave."""
     group: str
-    """Its host, or its namespace."""
+    """Host of the enclave, or its namespace if the host is not known."""
     nodes: tuple[str, ...] = ()
-    """Its nodes."""
+    """Names of the enclave's nodes."""
     statements: tuple[Statement, ...] = ()
-    """Its rights, as written in the source."""
+    """Rights of the enclave, as written in the source."""
     subject: str = ""
-    """Subject of its certificate, or an empty string; so for the next three."""
+    """Subject name of the enclave's certificate, or an empty string."""
     issuer: str = ""
-    """Its issuer."""
+    """Issuer name of the certificate, or an empty string."""
     serial: str = ""
-    """Its serial number, in hexadecimal."""
+    """Serial number of the certificate in hexadecimal, or an empty string."""
     key: str = ""
-    """The kind of its key."""
+    """Kind of the certificate's key, or an empty string."""
     problems: tuple[str, ...] = ()
-    """What keeps a process from using it."""
+    """Faults that keep a process from using the enclave."""
     observed: bool = True
-    """With ``--observed``: whether it was observed."""
+    """With ``--observed``: whether the enclave was observed."""
     note: str = ""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Validity:
-    """The validity of a certificate, a CA, a permissions document, or a CRL.
+    """Validity period of a certificate, a CA, a permissions document, or a CRL.
 
     ``not_before`` and ``not_after`` are CCYY-MM-DDThh:mm:ssZ in UTC.
     """
 
     not_after: str
-    """Its end, in UTC."""
+    """End of the validity, in UTC."""
     not_before: str
-    """Its begin, in UTC."""
+    """Start of the validity, in UTC."""
     kind: str
-    """What is valid."""
+    """Kind of what is valid, such as ``permissions`` or ``revocation list``."""
     title: str
-    """Its name."""
+    """Title of the document."""
     enclave: str = ""
-    """The enclave, or an empty string."""
+    """Path of the enclave, or an empty string for CAs and CRLs."""
 
 
 @dataclass(frozen=True, slots=True)
 class PicturedFinding:
-    """A fault or weakness; ``severity`` is error, warning or note."""
+    """A finding of ``sros check``; ``severity`` is error, warning or note."""
 
     id: str
-    """The kind of finding."""
+    """Identifier of the kind of finding."""
     severity: Annotated[str, Words(("error", "warning", "note"))]
-    """Its severity."""
+    """Severity: error, warning or note."""
     text: str
-    """What was found."""
+    """Text of the finding."""
     remedy: str = ""
-    """What to do."""
+    """What to do about the finding."""
     enclave: str = ""
-    """The enclave, or another subject."""
+    """Path of the enclave, or another subject."""
 
 
 class SourceTitle(NamedTuple):
-    """The title of a source in the picture: its base name, and its kind."""
+    """Title of a source in the picture: its file name, and its kind."""
 
     title: str
-    """Its base name."""
+    """File name of the source, without folders."""
     kind: str
-    """What it is, such as ``policy``."""
+    """Kind of the source, such as ``policy``."""
 
 
 class Overlay(NamedTuple):
@@ -274,11 +274,11 @@ class Overlay(NamedTuple):
     """
 
     kind: Annotated[str, Words(("use", "change", "drift", "worlds"))]
-    """What is compared."""
+    """Kind of the comparison: use, change, drift or worlds."""
     first: str
-    """What only the first side has, in words."""
+    """Label of rights that only the first source has."""
     second: str
-    """What only the second side has, in words."""
+    """Label of rights that only the second source has."""
 
 
 class OverlayDifference(NamedTuple):
@@ -289,28 +289,28 @@ class OverlayDifference(NamedTuple):
     """
 
     mark: OverlaySide
-    """The side that has it, in a comparison."""
+    """The side that has the right."""
     text: str
-    """The right."""
+    """The right, as text."""
     notes: tuple[str, ...] = ()
-    """Notes on it."""
+    """Notes on the right."""
 
 
 @dataclass(frozen=True, slots=True)
 class Influence:
-    """An enclave that influences, or is influenced, over ``hops``, by a shortest ``path``."""
+    """An enclave that influences, or is influenced, with the number of hops and a shortest path."""
 
     enclave: str
-    """The enclave."""
+    """Path of the influencing or influenced enclave."""
     hops: int
-    """Number of hops: names on the way."""
+    """Number of hops: the names on the path."""
     path: str
-    """A shortest way."""
+    """A shortest path."""
 
 
 @dataclass(frozen=True, slots=True)
 class Focus:
-    """The answer about one name or enclave, which is true for all names, known or not.
+    """The answer about one name or enclave; it is true for all names, known or not.
 
     ``kind`` is the kind of the name, or enclave.  ``senders`` and ``receivers`` may use the name.
     ``influencing`` influence the senders, or the enclave: with two hops, a sender directly.
@@ -318,43 +318,43 @@ class Focus:
     """
 
     kind: Annotated[str, Words((*_KINDS, "enclave"))]
-    """The kind of the name, or ``enclave``."""
+    """Kind of the name, or ``enclave``."""
     name: str
-    """The name, or the enclave."""
+    """The name, or the path of the enclave."""
     sentence: str
     """The answer in one sentence."""
     senders: tuple[str, ...]
-    """Enclaves that may publish, call or write it."""
+    """Enclaves that may publish, call or write to the name."""
     receivers: tuple[str, ...]
-    """Enclaves that may subscribe, serve, execute or read it."""
+    """Enclaves that may subscribe to, serve, execute or read the name."""
     influencing: tuple[Influence, ...]
-    """Enclaves that influence the senders, or the enclave; with 2 hops directly."""
+    """Enclaves that influence the senders, or the enclave; direct influence has 2 hops."""
     influenced: tuple[Influence, ...] = ()
-    """Enclaves that the enclave influences; with 1 hop directly."""
+    """Enclaves that the enclave influences; direct influence has 1 hop."""
 
 
 class PicturedUse(NamedTuple):
     """A use of a name that breaks a requirement; ``by`` is the wildcard that allows it, or ""."""
 
     enclave: str
-    """The enclave."""
+    """Path of the enclave."""
     right: str
-    """Its right."""
+    """The right of the enclave, such as ``publish``."""
     kind: str
-    """The kind of the name."""
+    """Kind of the name, such as ``topics``."""
     name: str
-    """The name."""
+    """The absolute ROS name."""
     by: str = ""
     """The wildcard that allows it, or an empty string."""
 
 
 class PicturedViolation(NamedTuple):
-    """A requirement that does not hold, in words, and the uses that break it."""
+    """A requirement that does not hold, with the uses of names that break it."""
 
     text: str
-    """What breaks it, and what it demands."""
+    """What breaks the requirement, and what the requirement demands."""
     uses: tuple[PicturedUse, ...]
-    """The uses of names that break it."""
+    """Uses of names that break the requirement."""
 
 
 _SAID = 5  # violations, and units that differ, that the headlines say; JSON has all
@@ -362,7 +362,7 @@ _SHOWN = 2  # rights that they say of one unit
 
 
 class Requirements(NamedTuple):
-    """The number of requirements that hold, and those that do not.
+    """The results of requirements: how many hold, and which do not.
 
     ``assumed`` are those that hold by an assumption, in words.
     """
@@ -370,12 +370,12 @@ class Requirements(NamedTuple):
     hold: int
     """Number of requirements that hold."""
     violations: tuple[PicturedViolation, ...] = ()
-    """Those that do not."""
+    """Requirements that do not hold."""
     assumed: tuple[str, ...] = ()
-    """Those that hold by an assumption, in words."""
+    """Requirements that hold only under an assumption, in words."""
 
     def sentences(self) -> tuple[str, ...]:
-        """Return the result in sentences without a full stop."""
+        """Return the results as sentences without a full stop."""
         holds = f"{counted(self.hold, 'requirement')} hold{'s' if self.hold == 1 else ''}"
         if self.assumed:
             holds += f", {len(self.assumed)} of them by an assumption: {self.assumed[0]}"
@@ -388,42 +388,42 @@ class Requirements(NamedTuple):
 
 
 class EqualUnits(NamedTuple):
-    """Robots, namespaces or enclaves (``what``) that are equal but for their names.
+    """Robots, namespaces or enclaves (``what``) that are equal except for their names.
 
     ``label`` stands for each of them in the paths and names that are drawn, like ``{r01…r50}``.
     """
 
     label: str
-    """What stands for each of them in the picture, such as ``{r01…r50}``."""
+    """Label drawn for the units, such as ``{r01…r50}``."""
     what: Annotated[str, Words(("robot", "namespace", "enclave"))]
-    """What they are."""
+    """Kind of the units: robot, namespace or enclave."""
     members: tuple[str, ...]
-    """Their names."""
+    """Names of the units."""
 
     @property
     def title(self) -> str:
-        """The units in words, like ``r01 … r50: 50 equal robots``."""
+        """The units in words, such as ``r01 … r50: 50 equal robots``."""
         first, last = self.members[0], self.members[-1]
         return f"{first} … {last}: {len(self.members)} equal {self.what}s"
 
 
 class DifferentUnit(NamedTuple):
-    """A unit, or the label of several, that is nearly equal to those of the label ``usual``.
+    """A unit, or the label of several units, that is nearly equal to the units of ``usual``.
 
     ``more`` and ``fewer`` are the enclaves and rights that it has and lacks, in words.
     """
 
     unit: str
-    """Its name, or a label in ``equal``."""
+    """Name of the unit, or a label in ``equal``."""
     usual: str
-    """The label of those that it differs from."""
+    """Label of the equal units from which this unit differs."""
     more: tuple[str, ...]
-    """Enclaves and rights that only it has."""
+    """Enclaves and rights that only this unit has."""
     fewer: tuple[str, ...]
-    """Enclaves and rights that it lacks."""
+    """Enclaves and rights that this unit lacks."""
 
     def sentence(self) -> str:
-        """Return what differs in a sentence without a full stop."""
+        """Return the difference as a sentence without a full stop."""
         parts = []
         for has, found in (("it has", self.more), ("it lacks", self.fewer)):
             parts += [f"{has} {first_few(found, _SHOWN, '; ')}"] if found else []
@@ -433,41 +433,41 @@ class DifferentUnit(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The rights in a system, with their protection, validity and findings.
+    """The rights in a system, with protection, validity and findings.
 
     With a ``focus``, only what leads to it and from it.
     """
 
     title: str
-    """Its title."""
+    """Title of the picture."""
     origins: tuple[SourceTitle, ...]
-    """The sources."""
+    """The sources of the picture."""
     enclaves: tuple[PicturedEnclave, ...]
-    """The enclaves."""
+    """The enclaves in the picture."""
     names: tuple[Name, ...]
-    """The topics, services and actions."""
+    """Topics, services and actions in the picture."""
     edges: tuple[Edge, ...]
-    """The rights, one for each enclave and name."""
+    """Rights and denials, one entry for each enclave, name and right."""
     overlay: Overlay | None = None
-    """The comparison, or null."""
+    """The kind of comparison, or null for a single source."""
     differences: tuple[OverlayDifference, ...] = ()
-    """Rights that only one side has."""
+    """Rights that only one source has."""
     validities: tuple[Validity, ...] = ()
-    """Validity of certificates, CAs, permissions and revocation lists."""
+    """Validity of certificates, CAs, permissions documents and revocation lists."""
     findings: tuple[PicturedFinding, ...] = ()
     """Findings of ``sros check``."""
     focus: tuple[Focus, ...] = ()
-    """With ``--focus``: an answer for each name and enclave."""
+    """With ``--focus``: an answer for each chosen name and enclave."""
     requirements: Requirements | None = None
-    """With ``--requirements``: what holds and what does not; else null."""
+    """With ``--requirements``: which requirements hold; else null."""
     equal: tuple[EqualUnits, ...] = ()
-    """Robots, namespaces or enclaves that are equal but for their names, drawn as one."""
+    """Robots, namespaces or enclaves that are equal except for their names, drawn as one."""
     different: tuple[DifferentUnit, ...] = ()
-    """Those that differ a little from equal ones."""
+    """Units that differ slightly from equal ones."""
 
     @property
     def headlines(self) -> tuple[str, ...]:
-        """The answers that the picture gives, as sentences without a full stop."""
+        """The answers of the picture, as sentences without a full stop."""
         found = self.requirements.sentences() if self.requirements else ()
         equal = (f"{units.title} are drawn as one" for units in self.equal)
         more = len(self.different) - _SAID
@@ -478,7 +478,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Tie:
-    """A right or denial of one enclave, or one group of enclaves, for all names of a bundle."""
+    """A right or denial of an enclave, or group of enclaves, for all names of a bundle."""
 
     node: str
     right: str
@@ -497,7 +497,7 @@ class Tie:
 
 
 def is_plain(tie: Tie) -> bool:
-    """Return whether a tie is neither denied, nor different, nor against a requirement."""
+    """Return whether a tie is no denial, no difference, and breaks no requirement."""
     same = tie.mark is OverlaySide.BOTH and not tie.differs
     return tie.qualifier is ALLOW and same and not tie.violates
 
@@ -526,7 +526,7 @@ def fold(
     *,
     apart: bool = False,
 ) -> tuple[Bundle, ...]:
-    """Return the names that have an edge in bundles, sorted by kind and first name.
+    """Group the names that have an edge into bundles, sorted by kind and first name.
 
     ``owner`` maps an enclave to the node that represents it: itself, or its group.  With ``apart``,
     services whose requests change nothing have bundles of their own.

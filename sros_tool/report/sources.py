@@ -1,4 +1,4 @@
-"""What pictures are drawn of: policies, permissions, keystores and observations.
+"""Read the sources of pictures: policies, permissions, keystores and observations.
 
 A picture shows only the base name of a source, because paths of this machine are private.
 Enclave keys are read only to report faults such as a key that does not fit its certificate.
@@ -84,7 +84,7 @@ _AUTHORITY_FILES = "*_ca.cert.pem"
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """What is to be drawn: one source, or two that are compared.
+    """The request for a picture: one source, or two to compare, and options.
 
     ``observed`` are observations of a single source; ``template`` is the keystore template whose
     protection policies get; ``hosts`` are texts ``HOST=ENCLAVE``; ``fleets`` has the robots for the
@@ -106,7 +106,7 @@ class Drawing:
 
 
 def draw(drawing: Drawing) -> tuple[Picture, Folding]:
-    """Return the picture of a drawing, and the same picture with equal units as one.
+    """Return a picture, and the same picture with equal units drawn as one.
 
     Raises:
         UsageError: there are too many sources, or a choice does not fit them.
@@ -146,7 +146,7 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
 
 
 def _compared(read: Sequence[PictureSource], context: Context, *, use: bool) -> Picture:
-    """Return the picture of a source, or of two: of ``use``, a change, two worlds or drift."""
+    """Return the picture of one source, or a comparison: use, change, worlds or drift."""
     if len(read) == 1:
         return compose(read[0], context)
     first, second = read
@@ -164,7 +164,7 @@ def _compared(read: Sequence[PictureSource], context: Context, *, use: bool) -> 
 
 
 def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
-    """Return a source, with the findings of ``sros check`` unless it cannot be checked."""
+    """Read a source, with the findings of ``sros check`` where these can be computed."""
     source = read_source(path, now=drawing.now, fleet=fleet)
     if not drawing.checked:
         return source
@@ -194,7 +194,7 @@ def drawn_difference(
     letters: int,
     arrows: int,
 ) -> str | None:
-    """Return what differs, with who else uses these names, in Mermaid; "" if it cannot be drawn.
+    """Draw a difference, with other users of its names, in Mermaid; "" if that is impossible.
 
     Returns None if the picture has more than so many ``letters`` or ``arrows``.
     """
@@ -222,7 +222,7 @@ def drawn_difference(
 
 
 def _check_no_governance(sources: Sequence[Path], read: Sequence[PictureSource]) -> None:
-    """Raise `UsageError` if a source has its own signed governance, so that no template applies."""
+    """Raise `UsageError` if a source has its own signed governance, so no template applies."""
     for path, source in zip(sources, read, strict=True):
         kind = source.origin.kind
         if kind in ("keystore", "enclave"):
@@ -250,7 +250,7 @@ def _hosts(words: Iterable[str]) -> dict[str, str]:
 
 
 def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str, Robot]:
-    """Map the enclaves of a source to their robots, by which they are grouped."""
+    """Map the enclaves of a source to their robots, for grouping."""
     if source.keystore:
         fleet = load_fleet(source.keystore)
     elif fleet and source.origin.kind == "policy":
@@ -265,7 +265,7 @@ def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str,
 def _with_requirements(
     picture: Picture, file: Path, drawing: Drawing, opened: Keystore | None
 ) -> Picture:
-    """Return the picture with what breaks requirements, decided as ``sros check`` does."""
+    """Return the picture with violations of requirements, decided as ``sros check`` does."""
     from sros_tool.proof.findings import assumption_text, decide_all, decided_findings
     from sros_tool.proof.requirements import demand, read_requirements
     from sros_tool.proof.system import load_system
@@ -305,7 +305,7 @@ def _with_requirements(
 
 
 def _pictured(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
-    """Return a finding for the picture; its subject is in the text unless it is an enclave."""
+    """Return a finding for the picture; a subject that is no enclave goes into the text."""
     known = finding.subject in enclaves
     about = "" if known or finding.subject == finding.file else finding.subject
     text = _finding_text(finding, about)
@@ -314,7 +314,7 @@ def _pictured(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
 
 
 def _finding_text(finding: Finding, about: str = "") -> str:
-    """Return the text of a finding ``about`` something, with the base name of file and the line."""
+    """Return the text of a finding, with its subject, file name and line."""
     place = f"{Path(finding.file).name}:{finding.line}" if finding.line else ""
     return ": ".join(filter(None, (place, about, finding.text)))
 
@@ -362,7 +362,7 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
 def _with_findings(
     source: PictureSource, path: Path, findings: Iterable[PicturedFinding]
 ) -> PictureSource:
-    """Return ``source``, read from ``path``, with more findings, without the path in their texts.
+    """Return ``source`` with more findings, whose texts do not contain its ``path``.
 
     A finding keeps its enclave only if the source has an enclave of that name.
     """
@@ -375,7 +375,7 @@ def _with_findings(
 
 
 def _base_name(path: Path) -> str:
-    """Return the base name of a source, in characters that every format supports."""
+    """Return the file name of a source, in characters that all formats support."""
     name = path.absolute().name or "/"
     return "".join(
         letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in name
@@ -389,7 +389,7 @@ def common_rights() -> tuple[Right, ...]:
 
 
 def _template_governance(choice: str, stated: Sequence[StatedProtection] = ()) -> Governance:
-    """Return the governance of a keystore made from the template ``choice`` and a policy.
+    """Return the governance of a keystore made from a template and a policy.
 
     ``stated`` is what the policy says about the protection of names.
     """
@@ -502,7 +502,7 @@ def _certificate(certificate: x509.Certificate, kind: str, title: str, name: str
 
 
 def _authorities(keystore: Keystore) -> Iterator[Validity]:
-    """Yield the validity of every CA certificate and revocation list."""
+    """Yield the validity of all CA certificates and revocation lists."""
     roles: dict[x509.Certificate, list[str]] = defaultdict(list)
     for path in sorted((keystore.root / PUBLIC).glob(_AUTHORITY_FILES)):
         role = path.name.removesuffix("_ca.cert.pem")
@@ -532,13 +532,13 @@ def _without_paths(finding: PicturedFinding, places: Mapping[str, str]) -> Pictu
 
 
 def _places(path: Path) -> Mapping[str, str]:
-    """Map every form of the path of a source to its base name, the longest first."""
+    """Map all forms of a source's path to its file name, the longest first."""
     places = sorted({str(path), str(path.absolute()), os.path.realpath(path)}, key=len)
     return {place: _base_name(path) for place in reversed(places) if "/" in place and place != "/"}
 
 
 def _without_path(text: str, places: Mapping[str, str]) -> str:
-    """Return ``text`` with the base name of the source instead of its path."""
+    """Return ``text`` with the file name of the source instead of its path."""
     for place, name in places.items():
         text = text.replace(place, name)
     return _LINK.sub(r"\1", text)
