@@ -1,4 +1,4 @@
-"""What the demo's nodes run on: rclpy if an RMW enforces security, else Cyclone DDS; or Zenoh.
+"""The library that runs the demo's nodes: rclpy, Cyclone DDS, or Zenoh.
 
 A single node can also be run by hand, in the environment that is there, such as that of
 ``sros run``, until it is stopped.
@@ -54,14 +54,14 @@ _NO_RCLPY = (
 )
 _PYTHON = (sys.executable, "-P")  # never import modules from the current folder
 _LEAN_PYTHON = (*_PYTHON, "-S")
-"""Without the site packages: their start-up files, as rclpy has one, take longer than a node."""
+"""Python without site packages: their start-up files can take longer than a node."""
 _ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-"""The variable that keeps Fast DDS from sending messages through shared memory."""
+"""The environment variable that keeps Fast DDS from using shared memory."""
 
 
 @cache
 def _modules() -> Mapping[str, str]:
-    """Return the variable with which `_LEAN_PYTHON` finds what nodes import."""
+    """Return the environment variable with which `_LEAN_PYTHON` finds the nodes' modules."""
     modules = map(importlib.util.find_spec, ("sros_tool", "lxml", "zenoh"))
     folders = (Path(module.origin).parents[1] for module in modules if module and module.origin)
     return {"PYTHONPATH": os.pathsep.join(dict.fromkeys(map(str, folders)))}
@@ -83,27 +83,27 @@ class Backend:
 
     @property
     def rows_at_once(self) -> int:
-        """The number of rows to run in parallel; an rclpy node needs some 0.6 s of CPU to start."""
+        """The number of rows to run in parallel; an rclpy node takes about 0.6 s of CPU to start."""
         return {RCLPY: 4, ZENOH: 8}.get(self.name, 16)
 
     @property
     def on_zenoh(self) -> bool:
-        """Whether the nodes run on Zenoh, and not on a DDS."""
+        """Whether the nodes run on Zenoh instead of a DDS."""
         return self.name == ZENOH
 
     def wire_name(self, topic: str, domain: int) -> str:
-        """Return the name of a ROS topic in packets."""
+        """Return the name of a ROS topic as it stands in packets."""
         return f"{domain}{topic}/" if self.on_zenoh else f"rt{topic}"
 
     @property
     def vendor(self) -> Condition | None:
-        """The DDS vendor as a condition for expected statuses, or None for another vendor."""
+        """The DDS vendor as a condition for expected statuses; None for other vendors."""
         if self.dds.startswith("Cyclone DDS"):
             return Condition.CYCLONE
         return Condition.FAST if self.dds.startswith("Fast DDS") else None
 
     def library(self, role: Role, *, secured: bool = False) -> str:
-        """Return the library that a node of that role uses."""
+        """Return the library that a node in a role uses."""
         if self.name == RCLPY or (role is Role.OBSERVER and self.ros_observer and not secured):
             return RCLPY
         return self.dds
@@ -111,7 +111,7 @@ class Backend:
     def command(
         self, role: Role, options: Sequence[str], names: Sequence[str], *, secured: bool = False
     ) -> list[str]:
-        """Return the command line of a process of that role.
+        """Return the command line of a process in a role.
 
         ``names`` are the absolute names of the role's ROS nodes, from `node_names`.
         """
@@ -121,7 +121,7 @@ class Backend:
         return [*_LEAN_PYTHON, "-m", "sros_tool.demo.cyclone_node", role.value, *options]
 
     def zenoh_command(self, role: Role, options: Sequence[str], enclave: str) -> list[str]:
-        """Return the command line of a process on Zenoh, and the enclave that it announces."""
+        """Return the command line of a process on Zenoh, with the enclave that it announces."""
         named = ["--ros-args", "--enclave", enclave, "--"] if enclave else []
         program = [*_LEAN_PYTHON, "-m", "sros_tool.demo.zenoh_node", role.value]
         return [*program, *options, *named]
@@ -129,7 +129,7 @@ class Backend:
     def environment(
         self, role: Role, *, wire: bool = False, denied: bool = False, secured: bool = False
     ) -> Mapping[str, str]:
-        """Return the variables that a node needs in addition to its security variables.
+        """Return the environment variables that a node needs besides its security variables.
 
         ``wire`` keeps its messages out of shared memory; ``denied`` makes it log why it is denied.
         """
@@ -171,7 +171,7 @@ def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:
 
 
 _OLDEST_ZENOH = (1, 10)
-"""The oldest version whose logs were seen: rows take them as evidence."""
+"""The oldest supported version: rows rely on its log texts."""
 
 
 def zenoh_backend() -> Backend:
@@ -280,17 +280,17 @@ def _checks_signers(dds: str) -> bool:
 
 
 _SILENCE = 5.0
-"""Seconds after which a node says that it heard nothing, or is not connected."""
+"""Seconds without a message or connection after which a node reports silence."""
 
 _LIBRARIES = {CYCLONE: "Cyclone DDS", RCLPY: "rclpy", ZENOH: "Zenoh"}
 _MODULES = {CYCLONE: "cyclone", RCLPY: "ros", ZENOH: "zenoh"}
 _LONGEST_LINE = 1 << 20
-"""Bytes of an event; whoever sends longer messages is not listened to any further."""
+"""Size limit of an event in bytes; a process that sends a longer one is ignored from then on."""
 
 
 @dataclass(frozen=True)
 class HandNode:
-    """A node to run by hand; ``topic`` is absolute."""
+    """A node to run by hand; ``topic`` is an absolute ROS name."""
 
     role: Role
     backend: str
@@ -306,7 +306,7 @@ class HandNode:
 
 
 def security_of(node: HandNode, environment: Mapping[str, str]) -> str:
-    """Return in one line what the node runs on, and whether it is secured.
+    """Return one line that says what the node runs on, and whether it is secured.
 
     Raises:
         SrosError: The environment demands security, and the enclave cannot be loaded.
@@ -366,7 +366,7 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
 
 
 def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> None:
-    """Say what the node reports, until it ends."""
+    """Pass the node's reports to ``say`` until the node ends."""
     data = b""
     connected = node.backend != ZENOH
     while len(data) < _LONGEST_LINE:

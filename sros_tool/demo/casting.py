@@ -1,4 +1,4 @@
-"""Casting: choose enclaves for the parts of a scenario, by what their signed permissions allow.
+"""Choose enclaves for the parts of a scenario, by their signed permissions.
 
 The choice depends on the files of all enclaves.  An enclave that may only do what a part needs
 shows best whether more is denied, so it is preferred; and the enclave that may do most without
@@ -74,20 +74,20 @@ _RIGHTS = {
     Role.CLIENT: "request",
 }
 _MOST_FAULTY = 8
-"""The largest number of enclaves with faulty or revoked files that get a row."""
+"""The most enclaves with faulty or revoked files that get a row."""
 
 
 class CastMember(NamedTuple):
-    """A part."""
+    """An enclave that plays a part in a scenario."""
 
     part: str
-    """The part."""
+    """Name of the part, such as ``talker``."""
     enclave: str
-    """The enclave."""
+    """Path of the enclave."""
     nodes: tuple[str, ...] = ()
-    """Its ROS nodes."""
+    """Names of the enclave's ROS nodes."""
     why: str = ""
-    """Why this enclave was chosen, or empty."""
+    """Why this enclave was chosen, or an empty string."""
 
 
 class UserKeystore(NamedTuple):
@@ -121,7 +121,7 @@ class UserKeystore(NamedTuple):
         shutil.copytree(self.root, target, symlinks=True, ignore=_all_but(self.root, folders))
 
     def keyring(self) -> Keyring:
-        """Return the keyring of the CA keys: in the keystore if there, else as its settings say."""
+        """Return the keyring of the CA keys: in the keystore, else where its settings say."""
         inside = {role: self.root.absolute() / ca_key(role) for role in ROLES}
         places = {role: f"file:{path}" for role, path in inside.items() if path.exists()}
         return Keyring(places=places)
@@ -132,7 +132,7 @@ class UserKeystore(NamedTuple):
         return (self.service or SERVICE) if name == SERVICE else name
 
     def rightful(self, row: Row) -> str:
-        """Return the enclave of a row whose attacker is the very enclave that it competes with."""
+        """Return the enclave if attacker and permitted party of a row are the same, else ""."""
         attackers, others = (
             {
                 (party.role, self.cast.get(party.identity.enclave, ""))
@@ -144,7 +144,7 @@ class UserKeystore(NamedTuple):
         return next((enclave for _, enclave in attackers & others), "")
 
     def opened(self, row: Row, topic: str) -> Row:
-        """Return a row that expects the attack to succeed if the attacker's permissions allow it.
+        """Return a row that expects success if the attacker's permissions allow the attack.
 
         ``topic`` is the attacked ROS topic.  Nobody else takes part then: the success proves
         itself, and a second server would answer in the attacker's place.
@@ -179,7 +179,7 @@ class UserKeystore(NamedTuple):
 
 
 def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime) -> UserKeystore:
-    """Read a keystore and cast its enclaves for the ROS topic ``topic`` ("": any).
+    """Read a keystore, and choose enclaves for the ROS topic ``topic`` ("": any topic).
 
     Raises:
         KeystoreError: ``root`` is not a keystore, or no two enclaves may talk to each other.
@@ -225,7 +225,7 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
 
 
 class _Enclaves(NamedTuple):
-    """The enclaves of a keystore, by what their files allow the demo to do with them.
+    """The enclaves of a keystore, sorted by what their files allow the demo to do.
 
     ``rights`` are the grants of sound enclaves.  ``faulty`` has the first fault of each enclave
     that the others do not accept, ``revoked`` whether its own list names a revoked enclave.
@@ -249,7 +249,7 @@ class _Enclaves(NamedTuple):
         yield from rows[:_MOST_FAULTY]
 
     def not_tried(self, cast: Mapping[str, str]) -> Iterator[str]:
-        """Yield what would have to be tried in a cast, and cannot be."""
+        """Yield what a proof of the keystore needs and this cast cannot try."""
         more = len(self.revoked) + len(self.faulty) - _MOST_FAULTY
         if more > 0:
             yield f"{more} more enclaves with faulty or revoked files"
@@ -261,14 +261,14 @@ class _Enclaves(NamedTuple):
             yield f"{first_few(sorted(self.other_governance), 1)} with a governance of its own"
 
     def faults_text(self) -> str:
-        """Return a sentence on the first enclave that is left out for its files, or ""."""
+        """Return a sentence on the first enclave left out because of its files, or ""."""
         for name, why in self.faulty.items():
             return f" {name} is left out: {why}."
         return ""
 
 
 def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
-    """Read the files of all enclaves; ``domain`` is the domain in which they meet."""
+    """Read the files of all enclaves; ``domain`` is the domain in which the enclaves meet."""
     rights: dict[str, Grant] = {}
     faulty: dict[str, str] = {}
     revoked: dict[str, bool] = {}
@@ -314,14 +314,14 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
 
 
 def _revoked_serials(keystore: Keystore) -> frozenset[int]:
-    """Return the serial numbers that the ledger or the revocation list names as revoked."""
+    """Return the serial numbers that the ledger or the CRL lists as revoked."""
     entries = (entry for entry in keystore.ledger.entries if entry.what == "revocation")
     listed = keystore.revocation_list.revoked if keystore.revocation_list else ()
     return frozenset({*(int(entry.serial, 16) for entry in entries), *(e.serial for e in listed)})
 
 
 def _content(path: Path) -> bytes:
-    """Return the content of a file; nothing if it is not there, or cannot be read."""
+    """Return the content of a file; empty if the file is missing or cannot be read."""
     try:
         return read_bytes(path, "revocation list") if path.exists() else b""
     except SrosError:
@@ -329,7 +329,7 @@ def _content(path: Path) -> bytes:
 
 
 def _strange_authority(keystore: Keystore, state: OpenedEnclave) -> str:
-    """Return which CA file of an enclave has no CA of the keystore, or ""."""
+    """Return the name of an enclave's CA file that has no CA of the keystore, or ""."""
     for file, role in ((IDENTITY_CA_FILE, IDENTITY), (PERMISSIONS_CA_FILE, PERMISSIONS)):
         known = {digest(certificate) for certificate in keystore.authority(role)}
         if fingerprints(state.files[file]).isdisjoint(known):
@@ -388,7 +388,7 @@ def _best_cast(
 def _best_first(
     rights: Mapping[str, Grant], right: str, chosen: set[str], others: set[str], topic: str
 ) -> list[str]:
-    """Return ``chosen``, first those not in ``others``, and of them those that name the topic.
+    """Return ``chosen`` sorted: first enclaves not in ``others``, then enclaves naming the topic.
 
     Last are those that a rule denies the other direction: Cyclone DDS 0.10 denies them both.
     """
@@ -403,7 +403,7 @@ def _best_first(
 
 
 def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
-    """Return server and client of one service, if any.
+    """Return the cast of a server and a client of one service; empty if there is none.
 
     A client that may not serve is preferred, and one that names the service.
     """
@@ -426,7 +426,7 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
 
 
 def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
-    """Return the service that the server of a cast offers and its client calls."""
+    """Return the service that the server of a cast offers and the client calls."""
     for topic in _application_topics(rights[cast["server"]], "publish"):
         name, begin = service_of(topic)
         requests = dds_names("request", name).publish[0]
@@ -438,7 +438,7 @@ def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
 def _widest(
     rights: Mapping[str, Grant], cast: Mapping[str, str], topic: str, service: str
 ) -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield the part, the enclave and the reason for each enclave with the widest permissions.
+    """Yield part, enclave and reason for the enclaves with the widest permissions.
 
     An enclave that names the topic or service was given it, and counts only if it may also use what
     nobody named.  No part is for an enclave that another row tries with the same attack.
@@ -470,7 +470,7 @@ def _widest(
 
 
 def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
-    """Return whether a grant allows a right on a name, and on one that nobody named, and its size.
+    """Return how wide a grant is, as a tuple to compare: the greatest tuple is the widest.
 
     Tuples compare as the grants do: the greatest is the widest.
     """
@@ -492,7 +492,7 @@ def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
 
 
 def _within(short: str, long: str) -> bool:
-    """Return whether ``long`` has all path components of ``short``, and more."""
+    """Return whether the path ``long`` is below the path ``short``."""
     return set(short.strip("/").split("/")) < set(long.strip("/").split("/"))
 
 
@@ -501,7 +501,7 @@ def _topics(rights: Mapping[str, Grant]) -> set[str]:
 
 
 def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[str]]:
-    """Return the ``ignore`` of `shutil.copytree` that skips CA keys and other enclaves."""
+    """Return an ``ignore`` function for `shutil.copytree` that skips CA keys and other enclaves."""
     wanted = {root / folder for folder in folders}
     kept = {parent for folder in wanted for parent in folder.parents} | wanted
 
@@ -537,7 +537,7 @@ def allows(grant: Grant, verb: str, topic: str) -> bool:
 
 
 def _allowing(grant: Grant, verb: str, topic: str) -> str:
-    """Return the expression by which a grant allows ``verb`` on a DDS topic; "" if it denies that.
+    """Return the expression by which a grant allows ``verb`` on a DDS topic; "" if denied.
 
     The first rule that names the topic decides, as with the vendors; of its expressions the topic's
     own name comes first.  A topic that no rule names is denied.
@@ -552,7 +552,7 @@ def _allowing(grant: Grant, verb: str, topic: str) -> str:
 
 
 def _is_denied(grant: Grant, topic: str) -> bool:
-    """Return whether a rule denies publishing or subscribing a DDS topic."""
+    """Return whether a rule denies publishing or subscribing to a DDS topic."""
     return any(
         matches(expression, topic)
         for rule in grant.rules
@@ -571,7 +571,7 @@ def _expressions_of(grant: Grant, right: str, name: str) -> tuple[str, ...]:
 
 
 def _may(grant: Grant, right: str, name: str, *, named: bool = False) -> bool:
-    """Return whether a grant allows a right on a ROS name; with ``named``, without wildcards."""
+    """Return whether a grant allows a right on a ROS name; with ``named``, by exact name only."""
     return all(
         expression and not (named and _is_wild(expression))
         for expression in _expressions_of(grant, right, name)
@@ -579,12 +579,12 @@ def _may(grant: Grant, right: str, name: str, *, named: bool = False) -> bool:
 
 
 def _is_wild(expression: str) -> bool:
-    """Return whether an expression has wildcards, and so can match topics that nobody named."""
+    """Return whether an expression has wildcards."""
     return bool(set(expression) & _WILD)
 
 
 def _application_topics(grant: Grant, verb: str) -> Iterator[str]:
-    """Yield the application's DDS topics that a grant allows by a name without wildcards.
+    """Yield the application's DDS topics that a grant allows by exact name.
 
     Topics of every node, hidden topics and topics of actions are left out.
     """
@@ -595,7 +595,7 @@ def _application_topics(grant: Grant, verb: str) -> Iterator[str]:
 
 
 def _named_topics(grant: Grant, verb: str) -> Iterator[str]:
-    """Yield the DDS topics that a grant allows by a name without wildcards."""
+    """Yield the DDS topics that a grant allows by exact name."""
     for rule in grant.rules:
         for topic in _expressions(rule, verb) if rule.allow else ():
             if not _is_wild(topic):
@@ -613,7 +613,7 @@ _NODE_MARK = ("rr", f"/{NODE_SERVICES[0]}Reply")
 
 
 def is_node_allowed(grant: Grant, node: str) -> bool:
-    """Return whether a grant allows all standard services of the node ``node`` (absolute)."""
+    """Return whether a grant allows all standard services of ``node``, an absolute name."""
     names = (dds_names("reply", f"{node}/{service}") for service in NODE_SERVICES)
     return all(
         all(allows(grant, "publish", topic) for topic in name.publish)
@@ -623,7 +623,7 @@ def is_node_allowed(grant: Grant, node: str) -> bool:
 
 
 def nodes_named(grant: Grant) -> Iterator[str]:
-    """Yield the absolute names of the nodes whose standard services a grant names and allows."""
+    """Yield the absolute names of the nodes whose standard services a grant allows by name."""
     kind, service = _NODE_MARK
     for topic in _named_topics(grant, "publish"):
         if topic.startswith(kind) and topic.endswith(service):
@@ -642,11 +642,11 @@ DEFAULT_NODE_NAMES: Mapping[Role, tuple[str, ...]] = {
     Role.ACTION_CLIENT: ("action_client",),
     Role.COMPOSED: ("talker", "listener", "server"),
 }
-"""The default names of the nodes of each role, in the namespace /."""
+"""Default node names of the roles, in the namespace "/"."""
 
 
 def node_names(role: Role, grant: Grant | None) -> tuple[str, ...]:
-    """Return the absolute names of a role's nodes under a grant (None: without security).
+    """Return the absolute names of a role's nodes under a grant (None: unsecured).
 
     A node keeps its default name if the grant allows it.  Otherwise it gets the most similar node
     name in the grant; if there is no such name, it keeps its default name.
@@ -676,7 +676,7 @@ def _names(
 
 
 def naming_arguments(role: Role, names: Sequence[str]) -> list[str]:
-    """Return the ``--ros-args`` that give the nodes of a role these absolute names."""
+    """Return ``--ros-args`` that give the nodes of a role these absolute names."""
     rules: list[str] = []
     for default, name in zip(DEFAULT_NODE_NAMES[role], names, strict=True):
         namespace, _, node = name.rpartition("/")

@@ -1,4 +1,4 @@
-"""The nodes of the demo on Cyclone DDS: ``python -m sros_tool.demo.cyclone_node ROLE``.
+"""The demo's nodes on Cyclone DDS: ``python -m sros_tool.demo.cyclone_node ROLE``.
 
 They read the environment of a ROS 2 node and use the DDS topics and types of its messages, so that
 rclpy nodes receive them, and a launcher can start both kinds of nodes in the same way.
@@ -28,7 +28,7 @@ _POLL_SECONDS = 0.02
 
 
 class _CycloneNode:
-    """A node in a participant; `poll` passes on what it received."""
+    """A node in a DDS participant; `poll` hands over received messages."""
 
     def __init__(self, participant: Participant) -> None:
         self._participant = participant
@@ -40,11 +40,11 @@ class _CycloneNode:
         return self._participant.writer(self.wire_name(name)).write
 
     def subscribe(self, name: str, hear: Hear) -> None:
-        """Subscribe to a topic; ``hear`` gets each text."""
+        """Subscribe to a topic; ``hear`` is called with every text received."""
         self._readers.append((self._participant.reader(self.wire_name(name)), hear))
 
     def serve(self, name: str, answer: Callable[[str], str]) -> None:
-        """Offer a service; ``answer`` gets each request and returns the reply."""
+        """Offer a service; ``answer`` is called with a request and returns the reply."""
         (requests,), (replies,) = dds_names("request", name)
         reader, writer = self._participant.reader(requests), self._participant.writer(replies)
 
@@ -55,7 +55,7 @@ class _CycloneNode:
         self._readers.append((reader, reply))
 
     def client(self, name: str) -> Call:
-        """Return a function that sends a request to a service, and passes on each reply."""
+        """Return a function that sends a request to a service, and hands over every reply."""
         (requests,), (replies,) = dds_names("request", name)
         reader, writer = self._participant.reader(replies), self._participant.writer(requests)
         waiting: list[Hear] = []
@@ -73,10 +73,10 @@ class _CycloneNode:
         return call
 
     def watch(self) -> None:
-        """Begin to discover publishers: every participant does."""
+        """Start to discover publishers; a no-op, because every participant discovers them."""
 
     def publications(self) -> Sequence[str]:
-        """Return the DDS topics of the publishers that are there."""
+        """Return the DDS topics of the discovered publishers."""
         return [publication.topic for publication in self._participant.publications()]
 
     def wire_name(self, topic: str) -> str:
@@ -84,7 +84,7 @@ class _CycloneNode:
         return f"rt/{topic.removeprefix('/')}"
 
     def poll(self) -> None:
-        """Pass on what was received."""
+        """Hand received messages to their receivers."""
         for reader, hear in self._readers:
             for text in reader.take():
                 hear(text)
@@ -94,11 +94,11 @@ _ROLES = tuple(role for role in ROLES if role not in ("relay", "router"))
 
 
 class _Stopped(Exception):  # noqa: N818 - not an error
-    """A request to stop, by Ctrl-C or SIGTERM."""
+    """Raised to stop on Ctrl-C or SIGTERM."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a role until stopped; return the exit status."""
+    """Run a node in a role until it is stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parse_options("sros_tool.demo.cyclone_node", _ROLES, arguments)
     _stop_on_signals()

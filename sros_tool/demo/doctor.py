@@ -1,4 +1,4 @@
-"""What `sros doctor` finds: which DDS enforces security here, and whose `ros2 security` runs.
+"""Find out which DDS enforces security here, and which package provides `ros2 security`.
 
 ros2cli takes the last of the packages that have the command.  Source: ros2cli 0.32,
 ``entry_points.py``: entry points by name, in the order of ``sys.path``.
@@ -48,7 +48,7 @@ class Diagnosis(NamedTuple):
     """The stacks of this machine, and advice if none enforces security."""
 
     stacks: tuple[Stack, ...]
-    """What was tried."""
+    """The DDS stacks that were tried, with their results."""
 
     @property
     def enforces(self) -> bool:
@@ -57,24 +57,24 @@ class Diagnosis(NamedTuple):
 
     @property
     def ros(self) -> Stack | None:
-        """The RMW that ROS nodes use here, or None if no RMW is installed."""
+        """The RMW that ROS nodes use here; None if no RMW is installed."""
         return next((stack for stack in self.stacks if stack.kind == "rmw" and stack.present), None)
 
     @property
     def ros_enforces(self) -> bool | None:
-        """Whether the RMW that ROS nodes use here enforces security; null if there is none, or if
+        """Whether the RMW of ROS nodes enforces security; null without an RMW or a result.
         it could not be tried.
         """
         return self.ros.enforces if self.ros else None
 
     @property
     def sound(self) -> bool:
-        """Whether ROS nodes here are secured by their RMW; without an RMW, whether any DDS is."""
+        """Whether ROS nodes are secured by their RMW; without an RMW, whether any DDS is."""
         return self.enforces if self.ros is None else self.ros.enforces is True
 
     @property
     def conclusion(self) -> str:
-        """What enforces security here and what does not, as sentences."""
+        """What enforces security here and what does not, in sentences."""
         if not self.enforces:
             return f"Nothing here enforces DDS Security. {self.advice}"
         named = " and ".join(stack.name for stack in self.stacks if stack.enforces)
@@ -107,7 +107,7 @@ def examine(now: datetime) -> Diagnosis:
 
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
-    """Return the diagnosis as text: a line per stack, then the evidence and what to do."""
+    """Return the diagnosis as text: one line for each stack, then evidence and advice."""
     width = max(len(stack.name) for stack in diagnosis.stacks)
     lines: list[str] = []
     for stack in diagnosis.stacks:
@@ -131,7 +131,7 @@ def _indented(texts: Sequence[str]) -> list[str]:
 
 
 _OURS = ("sros_tool", "sros_ros2_security")
-"""The distributions that have the command of sros; the second one is that of a workspace."""
+"""Python distributions that provide sros's command; the second one is for workspaces."""
 _SECONDS = 60.0
 _ASK = """
 import sys
@@ -144,16 +144,16 @@ print(json.dumps([entry.dist.name for entry in entries if entry.dist]))
 
 @dataclass(frozen=True, slots=True)
 class SecurityProvider:
-    """The distribution whose `ros2 security` runs, and those whose command it hides."""
+    """The Python package whose `ros2 security` runs, and the packages that it hides."""
 
     provider: str
-    """The Python package whose command runs: ``sros_tool`` or ``sros_ros2_security`` are sros."""
+    """The package whose command runs; ``sros_tool`` and ``sros_ros2_security`` are sros."""
     hidden: tuple[str, ...]
-    """Other packages that have the command, which does not run."""
+    """Other packages with the command; theirs does not run."""
 
     @property
     def ours(self) -> bool:
-        """Whether it is that of sros."""
+        """Whether the command that runs is sros's."""
         return self.provider in _OURS
 
     def __str__(self) -> str:
@@ -166,7 +166,7 @@ class SecurityProvider:
 
 
 def security_provider(environment: Mapping[str, str]) -> SecurityProvider | None:
-    """Ask the Python of the program ``ros2``; None without the program, a command, or an answer."""
+    """Return who provides `ros2 security`, or None if that cannot be found out."""
     program = shutil.which("ros2", path=environment.get("PATH"))
     words = _interpreter(Path(program)) if program else []
     if not words:
@@ -189,7 +189,7 @@ def security_provider(environment: Mapping[str, str]) -> SecurityProvider | None
 
 
 def _interpreter(script: Path) -> list[str]:
-    """Return the words behind ``#!`` in the first line of a script, if they name a Python."""
+    """Return the words behind ``#!`` in a script's first line, if they name a Python."""
     with suppress(OSError, ValueError), script.open("rb") as file:
         first = file.readline(512)
         if first.startswith(b"#!") and b"python" in first:
@@ -217,7 +217,7 @@ _KNOWN_VALUES: Mapping[str, frozenset[str] | re.Pattern[str]] = {
         )
     ),
 }
-"""Variables whose values say nothing about their user, if they are among these."""
+"""Environment variables with their values that are safe to show; other values are private."""
 _PRESENT = (
     "AMENT_PREFIX_PATH",
     "CYCLONEDDS_URI",
@@ -232,7 +232,7 @@ _PRESENT = (
     "ZENOH_ROUTER_CONFIG_URI",
     "ZENOH_SESSION_CONFIG_URI",
 )
-"""Variables of which it is reported only whether they are set."""
+"""Environment variables of which only the presence is reported."""
 _PACKAGES = (
     "click",
     "cryptography",
@@ -303,7 +303,7 @@ def _environment(environment: Mapping[str, str]) -> list[str]:
 
 
 class _Neutral:
-    """Take out of a text what it says about its user; it stays readable."""
+    """Remover of private data from texts: secrets, keys, tokens, hosts, users, and paths."""
 
     def __init__(self, environment: Mapping[str, str], secrets: Iterable[str]) -> None:
         user = pwd.getpwuid(getuid()) if _has_entry() else None
@@ -318,7 +318,7 @@ class _Neutral:
         self._words = {word: instead for word, instead in words.items() if word not in ("", "root")}
 
     def __call__(self, text: str) -> str:
-        """Return the text on one line, without them."""
+        """Return the text on one line, without private data."""
         text = re.sub(r"-----BEGIN.*?(-----END[^-]*-----|\Z)", "KEY", text, flags=re.DOTALL)
         for word in sorted(self._words, key=len, reverse=True):
             instead = self._words[word]
@@ -337,7 +337,7 @@ class _Neutral:
 
 
 def _has_entry() -> bool:
-    """Return whether this user has an entry in the list of users; in containers some have none."""
+    """Return whether the user is in the user database; in containers some users are not."""
     try:
         pwd.getpwuid(getuid())
     except KeyError:

@@ -1,4 +1,4 @@
-"""Forgeries: functions that change a keystore as an attacker would, or remove a defence.
+"""Forgeries: change a keystore as an attacker would, or remove a defence.
 
 Rows of scenarios refer to these functions.  A function alone changes a copy of the keystore, with
 all defences in place.  In `Undefended`, it changes a new keystore without one of the defences, to
@@ -63,7 +63,7 @@ _DAY, _MINUTE = timedelta(days=1), timedelta(minutes=1)
 _NOBODY = 65534
 
 STOLEN = "/stolen"
-"""The enclave with a copy of a revoked enclave, made before the revocation."""
+"""Name of the copy of a revoked enclave, made before its revocation."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class KeystoreCopy:
         return f"rt{self.topic}"
 
     def enclave(self, part: str) -> str:
-        """Return the name of the enclave that plays a part.
+        """Return the path of the enclave that plays a part.
 
         Raises:
             KeystoreError: no enclave plays the part.
@@ -108,7 +108,7 @@ class KeystoreCopy:
         return enclave_path(self.root, self.enclave(part))
 
     def authorities(self, root: Path | None = None) -> Authorities:
-        """Return the CAs, with their keys, of the copy or of another keystore.
+        """Return the CAs with their keys, of this keystore or of the foreign one.
 
         Raises:
             SrosError: a key of a CA cannot be loaded.
@@ -164,14 +164,14 @@ class KeystoreCopy:
         return render_permissions(Permissions(grants))
 
     def sign(self, document: bytes, root: Path | None = None) -> bytes:
-        """Sign a document with the permissions CA of this keystore, or of another one."""
+        """Sign a document with the permissions CA of this keystore, or of the foreign one."""
         authority = self.authorities(root).permissions
         return smime.sign(document, authority.certificate, authority.key)
 
     def reissue(
         self, part: str, validity: Window, *, new_key: bool = False, subject_of: str = ""
     ) -> None:
-        """Give an enclave another certificate, and perhaps a new key.
+        """Issue another certificate for an enclave, and perhaps a new key.
 
         Its subject stays, or becomes the subject of the part ``subject_of``.
         """
@@ -184,7 +184,7 @@ class KeystoreCopy:
 
 
 class UncastError(KeystoreError):
-    """A forgery that the keystore has no enclave for."""
+    """The keystore has no enclave that the forgery needs."""
 
 
 Forge = Callable[[KeystoreCopy], None]
@@ -201,14 +201,14 @@ def _same_template(template: Template) -> Template:
 
 
 class Undefended(NamedTuple):
-    """A new keystore without a defence: made from a changed template, and then forged."""
+    """A new keystore without a defence: made from a changed template, then forged."""
 
     forge: Forge = _unchanged
     template: Callable[[Template], Template] = _same_template
 
 
 def name_of(forgery: Forge | Undefended) -> str:
-    """Return the folder name for the keystore of a forgery, unique for each forgery."""
+    """Return the folder name for a forgery's keystore, unique among forgeries."""
     if isinstance(forgery, Undefended):
         return f"undefended_{forgery.template.__name__}_{forgery.forge.__name__}"
     return forgery.__name__
@@ -231,7 +231,7 @@ def _widened(criteria: tuple[Criteria, ...], topics: Sequence[str]) -> tuple[Cri
 
 
 def _weak_governance(copy: KeystoreCopy) -> bytes:
-    """Return the governance as XML, changed to admit everybody and protect nothing."""
+    """Return the governance as XML, changed to admit every participant and protect nothing."""
     governance = parse_governance(copy.governance())
     return render_governance(
         Governance(
@@ -270,7 +270,7 @@ def governance_of_another_ca(copy: KeystoreCopy) -> None:
 
 
 def weaker_governance(copy: KeystoreCopy) -> None:
-    """Give talker and listener a weak governance signed by the CA, as if from an earlier time."""
+    """Give talker and listener a weak governance signed by the CA, like an old document."""
     signed = copy.sign(_weak_governance(copy))
     for part in ("talker", "listener"):
         copy.put(part, GOVERNANCE_FILE, signed)
@@ -369,7 +369,7 @@ def borrowed_permissions_and_subject(copy: KeystoreCopy) -> None:
 
 
 def permissions_signed_by_the_ca(copy: KeystoreCopy) -> None:
-    """Give the guest permissions with one more topic, signed by the CA as if earlier."""
+    """Give the guest permissions with one more topic, signed by the CA, like an old document."""
     copy.put("guest", PERMISSIONS_FILE, copy.sign(_wider_permissions(copy)))
 
 
@@ -431,7 +431,7 @@ def identity_in_date(copy: KeystoreCopy) -> None:
 
 
 def expired_identity(copy: KeystoreCopy) -> None:
-    """Issue the talker's certificate for the first minute of its CA's validity only."""
+    """Issue the talker's certificate again, valid only for the first minute of its CA."""
     start = validity_of(copy.authorities().identity.certificate).not_before
     copy.reissue("talker", Window(start, start + _MINUTE))
 
@@ -447,7 +447,7 @@ def key_of_another_enclave(copy: KeystoreCopy) -> None:
 
 
 def _revoke(copy: KeystoreCopy, part: str) -> None:
-    """Revoke an enclave, then give it a new key and certificate for the same subject."""
+    """Revoke an enclave, then issue a new key and certificate for the same subject."""
     folder = copy.folder(part)
     before = {name: copy.read(part, name) for name in REQUIRED_FILES}
     lists = _outdated_lists(copy)
@@ -465,7 +465,7 @@ def _revoke(copy: KeystoreCopy, part: str) -> None:
 
 
 def _outdated_lists(copy: KeystoreCopy) -> dict[Path, bytes]:
-    """Return the revocation lists (empty: none) of enclaves that lack their keystore's list.
+    """Return the CRLs (empty: none) of enclaves that lack the keystore's current CRL.
 
     Who did not get the last list will not get the next one, either.
     """
@@ -480,17 +480,17 @@ def _outdated_lists(copy: KeystoreCopy) -> dict[Path, bytes]:
 
 
 def talker_revoked(copy: KeystoreCopy) -> None:
-    """Revoke the talker, then give it a new key and certificate."""
+    """Revoke the talker, then issue a new key and certificate for the talker."""
     _revoke(copy, "talker")
 
 
 def guest_revoked(copy: KeystoreCopy) -> None:
-    """Revoke the guest, then give it a new key and certificate."""
+    """Revoke the guest, then issue a new key and certificate for the guest."""
     _revoke(copy, "guest")
 
 
 def talker_revocation_not_delivered(copy: KeystoreCopy) -> None:
-    """Revoke the talker, keep a copy of it in `STOLEN`, and remove the listener's CRL."""
+    """Revoke the talker, keep a copy in `STOLEN`, and remove the listener's CRL."""
     _revocation_not_delivered(copy, "talker")
 
 
@@ -516,7 +516,7 @@ def _revocation_not_delivered(copy: KeystoreCopy, part: str) -> None:
 
 
 def identity_copied_by_another_user(copy: KeystoreCopy) -> None:
-    """Keep only the files of the talker that another user of the machine can read.
+    """Keep only those of the talker's files that another user of the machine can read.
 
     Raises:
         UnavailableError: this process does not run as root.
@@ -535,7 +535,7 @@ def identity_copied_by_another_user(copy: KeystoreCopy) -> None:
 
 
 def _read_as_nobody(root: Path, files: list[str]) -> list[bytes | None]:
-    """Return the content of files as the user nobody reads them; None if unreadable."""
+    """Read files as the user nobody; the content is None for unreadable files."""
     kept: list[bytes | None] = []
     place = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -573,37 +573,37 @@ def files_readable_for_all(copy: KeystoreCopy) -> None:
 
 
 def one_ca(template: Template) -> Template:
-    """Return the template with one CA for identity and permissions."""
+    """Return the template changed to one CA for identity and permissions."""
     return replace(template, separate_authorities=False)
 
 
 def shared_subjects(template: Template) -> Template:
-    """Return the template without unique subjects."""
+    """Return the template changed to allow shared subject names."""
     return replace(template, unique_subject=False)
 
 
 def open_default(template: Template) -> Template:
-    """Return the template with all permissions for an enclave without a policy."""
+    """Return the template changed to give enclaves without a policy all permissions."""
     return replace(template, default_permissions=EVERYTHING)
 
 
 def unprotected(template: Template) -> Template:
-    """Return the template with access control and unprotected messages."""
+    """Return the template changed to access control and unprotected messages."""
     return _protected(template, Level.NONE)
 
 
 def signed(template: Template) -> Template:
-    """Return the template with access control and signed, unencrypted messages."""
+    """Return the template changed to access control and signed, unencrypted messages."""
     return _protected(template, Level.SIGN)
 
 
 def encrypted(template: Template) -> Template:
-    """Return the template with access control and encrypted messages."""
+    """Return the template changed to access control and encrypted messages."""
     return _protected(template, Level.ENCRYPT)
 
 
 def _protected(template: Template, level: Level) -> Template:
-    """Return the template with the same protection level for every topic.
+    """Return the template changed to the same protection level for all topics.
 
     A payload is signed as part of its submessage: Fast DDS loses messages with a signed payload
     (`governance.signed-payload`).

@@ -1,4 +1,4 @@
-"""The keystores of a scenario: the scenario's own, a foreign one with another CA, and forged ones.
+"""Create the keystores of a scenario: its own, a foreign one with another CA, and forged ones.
 
 A keystore of the user is only read.  The keys of its CAs are not copied: a forgery that needs a
 signature of a CA uses the key in place, and is skipped if the key cannot be loaded.
@@ -47,7 +47,7 @@ from sros_tool.zenoh.configuration import Mode
 
 @dataclass(frozen=True)
 class KeystoreSpec:
-    """The input for creating keystores: an absolute ROS topic, domains, a template, the time.
+    """The input for creating keystores: absolute ROS topic, domains, template, and time.
 
     ``endpoint`` is where a Zenoh router listens.
     """
@@ -83,7 +83,7 @@ class KeystoreSet:
         return f"{name}_in_the_open" if party.other_topic else name
 
     def enclave(self, identity: Identity) -> str:
-        """Return the enclave of an identity.
+        """Return the enclave that an identity uses.
 
         Raises:
             KeyError: no enclave is cast for the identity's part.
@@ -103,13 +103,13 @@ class KeystoreSet:
         return secured_environment(root, name, domain) | dict(identity.variables)
 
     def announced(self, party: Party) -> str:
-        """Return the enclave that a party names to others, or ""."""
+        """Return the enclave that a party announces to others, or ""."""
         if party.announced:
             return self.enclave(Identity(OWN, party.announced))
         return self.enclave(party.identity) if party.identity.keystore is not None else ""
 
     def shorten(self, identity: Identity, lifetime: int, elapsed: float) -> float:
-        """Give the enclave of an identity a certificate that expires in ``lifetime`` seconds.
+        """Issue a certificate for an identity's enclave that expires in ``lifetime`` seconds.
 
         ``elapsed`` is the time since the keystores were made.  Returns in how many seconds the
         certificate expires: a certificate has whole seconds.
@@ -122,16 +122,16 @@ class KeystoreSet:
         return (expiry - now).total_seconds()
 
     def change(self, identity: Identity, forge: Forge) -> None:
-        """Change the keystore of an identity."""
+        """Apply ``forge`` to the keystore of an identity."""
         assert identity.keystore is not None
         forge(self.copies[identity.keystore])
 
     def node_names(self, party: Party) -> tuple[str, ...]:
-        """Return absolute names for a party's ROS nodes, chosen so that its enclave allows them."""
+        """Return absolute names for a party's ROS nodes that the party's enclave allows."""
         return node_names(party.role, self._grant(party.identity))
 
     def members(self, rows: Iterable[Row], *, on_ros: bool) -> tuple[CastMember, ...]:
-        """Return the cast members that these rows use from the own keystore, in cast order."""
+        """Return the cast members of the scenario's own keystore that these rows use, in order."""
         cast = self._cast(Identity(OWN))
         nodes: dict[str, set[str]] = {}
         for row in rows:
@@ -147,12 +147,12 @@ class KeystoreSet:
         )
 
     def probe(self, topic: str, domain: int) -> ProbeEnclave:
-        """Return the probe that shows whether a DDS enforces security."""
+        """Return a probe that finds out whether a DDS enforces security."""
         environment = self.environment(Identity(OWN, "talker"), domain)
         return ProbeEnclave(environment, topic, DENIED_TOPIC)
 
     def inapplicable(self, row: Row) -> str:
-        """Return why a row has nothing to try in this keystore (nobody plays a part), or ""."""
+        """Return why a row does not apply to this keystore (no enclave plays a part), or ""."""
         for party in row.parties:
             identity = party.identity
             part = identity.enclave
@@ -169,7 +169,7 @@ class KeystoreSet:
         return ""
 
     def problem(self, row: Row) -> str:
-        """Return why a row cannot run, because a keystore could not be made, or ""."""
+        """Return why a row cannot run (a keystore could not be made), or ""."""
         return next((str(e) for party in row.parties if (e := self._missing(party))), "")
 
     def _missing(self, party: Party) -> Exception | None:
@@ -182,7 +182,7 @@ class KeystoreSet:
         return enclave_grant(self.keystores[identity.keystore], self.enclave(identity))
 
     def _user_of(self, identity: Identity) -> UserKeystore | None:
-        """Return the user's keystore if the identity's keystore is a copy of it."""
+        """Return the user's keystore if the identity's keystore is a copy, else None."""
         created_new = isinstance(identity.keystore, Undefended)
         if identity.keystore in (None, FOREIGN) or created_new:
             return None
@@ -196,7 +196,7 @@ class KeystoreSet:
 def create_keystores(
     folder: Path, scenario: Scenario, spec: KeystoreSpec, user: UserKeystore | None = None
 ) -> KeystoreSet:
-    """Create the own, foreign and forged keystores of a scenario in ``folder``.
+    """Create all keystores of a scenario in ``folder``, and return them.
 
     The own keystore is a copy of the ``user`` keystore, if given.  If a forgery cannot be made,
     only the rows that use it are skipped.
@@ -225,7 +225,7 @@ def create_keystores(
 
 
 def create_scenario_keystore(root: Path, scenario: Scenario, spec: KeystoreSpec) -> None:
-    """Create a keystore with the enclaves of a scenario."""
+    """Create a keystore with the enclaves of a scenario, and return its path."""
     create_keystore(root, template=spec.template, domains=spec.domains, now=spec.now)
     if scenario.policy is not None:
         generate_artifacts(root, policies=[scenario.policy(spec.topic)], now=spec.now)
@@ -236,7 +236,7 @@ def create_scenario_keystore(root: Path, scenario: Scenario, spec: KeystoreSpec)
 
 
 def _forgeries_of(scenario: Scenario) -> list[Forge | Undefended]:
-    """Return the distinct forgeries that the rows of a scenario use."""
+    """Return the forgeries that the rows of a scenario use, without duplicates."""
     used: list[KeystoreChoice | None] = [
         party.identity.keystore for row in scenario.rows for party in row.parties
     ]
@@ -252,7 +252,7 @@ def _forge(
     spec: KeystoreSpec,
     user: UserKeystore | None,
 ) -> KeystoreCopy:
-    """Make one forged keystore in ``root``, and return it."""
+    """Create one forged keystore in ``root``, and return it."""
     cast, keyring = scenario.cast, IN_KEYSTORE
     if isinstance(choice, Undefended):
         weakened = replace(spec, template=choice.template(spec.template))

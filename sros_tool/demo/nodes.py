@@ -1,4 +1,4 @@
-"""What the demo's nodes share: their command line, and their roles on Cyclone DDS and Zenoh.
+"""Command line and roles of the demo's nodes, shared by Cyclone DDS and Zenoh.
 
 Services and actions have the names and rights of ROS 2, but send strings: a request is text that
 ends with ``: FIRST + SECOND``, its answer text that ends with ``: FIRST + SECOND = SUM``.
@@ -21,7 +21,7 @@ from sros_tool.runtime.events import EventKind, EventWriter
 _COMPOSED_SERVICE = "/add_two_ints"
 
 FIBONACCI_ORDER = 5
-"""The order of the sequence that an action client requests in each goal."""
+"""Order of the Fibonacci sequence that an action client requests."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +47,12 @@ class NodeOptions:
 
     @property
     def service(self) -> str:
-        """The ROS service of the role; for a container, a fixed name."""
+        """The ROS service of the role; fixed for a container."""
         return self.topic if self.role in ("server", "client") else _COMPOSED_SERVICE
 
 
 def parse_options(module: str, roles: Collection[str], arguments: Sequence[str]) -> NodeOptions:
-    """Return the options on the command line of ``python -m module``, without ``--ros-args``.
+    """Parse the command line of ``python -m module``, without its ``--ros-args``.
 
     Exits with status 2 on an error.
     """
@@ -150,32 +150,32 @@ Call = Callable[[str, Hear], None]
 
 
 class Node(Protocol):
-    """A node on one of the libraries; names are absolute ROS names."""
+    """Interface of a node on any library; names are absolute ROS names."""
 
     def publisher(self, name: str) -> Hear:
         """Return a function that publishes a text."""
 
     def subscribe(self, name: str, hear: Hear) -> None:
-        """Subscribe to a topic; ``hear`` gets each text."""
+        """Subscribe to a topic; ``hear`` is called with every text received."""
 
     def serve(self, name: str, answer: Callable[[str], str]) -> None:
-        """Offer a service; ``answer`` gets each request and returns the reply."""
+        """Offer a service; ``answer`` is called with a request and returns the reply."""
 
     def client(self, name: str) -> Call:
-        """Return a function that sends a request to a service, and passes on each reply."""
+        """Return a function that sends a request to a service, and hands over every reply."""
 
     def watch(self) -> None:
-        """Begin to discover publishers."""
+        """Start to discover publishers."""
 
     def publications(self) -> Sequence[str]:
-        """Return the topics of the publishers that are there, by their names on the wire."""
+        """Return the topics of the discovered publishers, as named on the wire."""
 
     def wire_name(self, topic: str) -> str:
         """Return the name of a ROS topic on the wire."""
 
 
 class NodeRole:
-    """What a node does; ``step`` is called again and again, and does what is due."""
+    """The behaviour of a node in a role; call ``step`` repeatedly to do due work."""
 
     def __init__(self, node: Node, options: NodeOptions, events: EventWriter) -> None:
         self._node, self._options, self._events = node, options, events
@@ -184,13 +184,13 @@ class NodeRole:
         self.prepare()
 
     def prepare(self) -> None:
-        """Declare what the node offers and hears."""
+        """Create the node's publishers, subscriptions, services and clients."""
 
     def act(self) -> None:
-        """Do what the node does once in each period."""
+        """Do the node's periodic work once."""
 
     def step(self) -> None:
-        """Act if it is time."""
+        """Do the periodic work if a period has passed."""
         if time.monotonic() >= self._due:
             self._due = max(self._due + self._options.period, time.monotonic())
             self.act()
@@ -207,7 +207,7 @@ class NodeRole:
 
 
 class _Talker(NodeRole):
-    """A talker that publishes its text and a number."""
+    """A talker that publishes its text with a running number."""
 
     def prepare(self) -> None:
         self._publish = self._node.publisher(self._options.topic)
@@ -219,7 +219,7 @@ class _Talker(NodeRole):
 
 
 class _Listener(NodeRole):
-    """A listener that reports each message."""
+    """A listener that reports every message."""
 
     def prepare(self) -> None:
         self._node.subscribe(self._options.topic, self.heard)
@@ -247,7 +247,7 @@ class _Observer(NodeRole):
 
 
 class _Server(NodeRole):
-    """A server that adds two numbers, and reports the requests that it executes."""
+    """A server that adds two numbers, and reports the requests that it answers."""
 
     def prepare(self) -> None:
         self._node.serve(self._options.service, self._answer)
@@ -265,7 +265,7 @@ class _Server(NodeRole):
 
 
 class _Client(NodeRole):
-    """A client that requests sums, each a different one, and reports the right answers."""
+    """A client that requests different sums, and reports correct answers."""
 
     def prepare(self) -> None:
         self._call = self._node.client(self._options.service)
@@ -308,7 +308,7 @@ class _ActionServer(NodeRole):
 
 
 class _ActionClient(NodeRole):
-    """An action client that reports right results of goals with all their feedback."""
+    """An action client that reports correct results with complete feedback."""
 
     def prepare(self) -> None:
         action = f"{self._options.topic}/_action"
@@ -330,7 +330,7 @@ class _ActionClient(NodeRole):
         )
 
     def step(self) -> None:
-        """Send a goal if it is time, and fetch the results of those that are done."""
+        """Send a goal if a period has passed, and fetch the results of finished goals."""
         super().step()
         for goal in [goal for goal in self._accepted if self._is_done(goal)]:
             self._accepted.remove(goal)
@@ -353,13 +353,13 @@ class _Composed(NodeRole):
         self._parts = [kind(self._node, self._options, self._events) for kind in kinds]
 
     def step(self) -> None:
-        """Do a step of each part."""
+        """Run one step of the talker, the listener and the server."""
         for part in self._parts:
             part.step()
 
 
 class _Router(NodeRole):
-    """A router, which passes on what others say."""
+    """A router, which forwards messages of other processes."""
 
 
 ROLES: Mapping[str, type[NodeRole]] = {

@@ -42,23 +42,23 @@ from sros_tool.runtime.netns import Isolation, Progress, run_isolated, try_isola
 from sros_tool.values import versioned
 
 _DEFAULT_DOMAIN = 80
-"""The first domain of the rows: below 102, where Linux assigns no ports by itself."""
+"""First ROS domain of the rows; below 102, so that Linux does not assign its ports."""
 
 _DEFAULT_TEMPLATE = "production"
 
 _ENDPOINT = "localhost:7447"
-"""Where Zenoh routers listen, each in a network of its own."""
+"""Endpoint of the Zenoh routers; every router has a network of its own."""
 
 _ZENOH_WINDOW = 2.0
-"""Seconds in which a row on Zenoh observes silence."""
+"""Length of a row's observation on Zenoh, in seconds."""
 
 _HOST = "host"
-"""The value of --network for the network of this machine."""
+"""Value of --network that stands for the network of this machine."""
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """The options of a demo; ``keep`` is the folder for all files, None to delete them.
+    """The options of a demo; ``keep`` is the folder for all files (None: deleted at the end).
 
     ``keystore`` is a keystore of the user, a copy of which is attacked.  The default ``template``
     is the template of that keystore, or production; the default ``topic`` is one that the cast may
@@ -80,7 +80,7 @@ class DemoOptions:
 
 
 def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoResult:
-    """Run the demo and return its result; ``progress`` gets lines while it runs.
+    """Run the demo and return its result; ``progress`` is called with lines while it runs.
 
     Raises:
         UsageError: an option is wrong; nothing was created.
@@ -183,7 +183,7 @@ def _result_of(
 
 
 def _parted(scenarios: Sequence[Scenario], rows: Sequence[RowResult]) -> Iterator[ScenarioResult]:
-    """Yield the results of scenarios whose rows ran together, in order."""
+    """Split results of rows that ran together by scenario; yield the scenarios in order."""
     left = iter(rows)
     for scenario in scenarios:
         own = itertools.islice(left, len(scenario.rows))
@@ -191,19 +191,19 @@ def _parted(scenarios: Sequence[Scenario], rows: Sequence[RowResult]) -> Iterato
 
 
 def _expected(row: Row, backend: Backend, template: Template, topic: str) -> Row:
-    """Return the row with the status that is expected of a keystore from a template."""
+    """Return the row with the status that a keystore from a template should give."""
     return row.under(conditions(backend, template, _dds_topic(row, topic)))
 
 
 def _gated(row: Row, strong: Row, options: DemoOptions) -> Row:
-    """Mark a row that is accepted, or open while ``strong``, with the default template, is not."""
+    """Return the row, marked if it is accepted, or open despite the default template."""
     opened = bool(row.open_because) and not strong.open_because
     accepted = row.name in options.accept_open
     return replace(row, accepted=accepted, unaccepted=opened and not accepted)
 
 
 def _check_accepted(options: DemoOptions) -> None:
-    """Check the names of the rows that may be open.
+    """Raise if --accept-open names rows that do not exist.
 
     Raises:
         UsageError: there is no keystore of the user, or no row with such a name.
@@ -225,7 +225,7 @@ def _check_accepted(options: DemoOptions) -> None:
 
 
 def find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend:
-    """Return a backend that enforces security, tried with a temporary keystore."""
+    """Return a backend that enforces security; a temporary keystore is used to try."""
     with TemporaryDirectory(dir=folder, prefix="probe-") as probed:
         domains = DomainSet.of((_DEFAULT_DOMAIN, _DEFAULT_DOMAIN))
         spec = KeystoreSpec(topic, domains, load_template(_DEFAULT_TEMPLATE), now)
@@ -234,7 +234,7 @@ def find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend:
 
 
 def _user_keystore(options: DemoOptions, now: datetime) -> UserKeystore | None:
-    """Return the user's keystore, if one is given.
+    """Return the user's keystore; None if no keystore is given.
 
     Raises:
         UsageError: a scenario cannot use the user's keystore.
@@ -253,12 +253,12 @@ def _user_keystore(options: DemoOptions, now: datetime) -> UserKeystore | None:
 
 
 def _with_rows_of(user: UserKeystore, scenario: Scenario) -> Scenario:
-    """Return the scenario with the rows that only this keystore of the user needs."""
+    """Return the scenario with additional rows for the user's keystore."""
     return replace(scenario, rows=(*scenario.rows, *user.rows))
 
 
 def _with_chosen_rows(options: DemoOptions) -> tuple[Scenario, ...]:
-    """Return the scenarios with only the rows that --only selects.
+    """Return the scenarios reduced to the rows that --only selects.
 
     Raises:
         UsageError: --only selects no row.
@@ -280,7 +280,7 @@ def _with_chosen_rows(options: DemoOptions) -> tuple[Scenario, ...]:
 
 
 def _dds_topic(row: Row, topic: str) -> str:
-    """Return the DDS topic whose protection matters for a row; of a service, the request topic."""
+    """Return the DDS topic whose protection matters for a row; for a service, its request topic."""
     return dds_names("request", row.ros_name).publish[0] if row.ros_name else f"rt{topic}"
 
 
@@ -291,7 +291,7 @@ def _is_selected(row: Row, options: DemoOptions) -> bool:
 def _domains(
     scenario: Scenario, options: DemoOptions, user: UserKeystore | None, isolation: Isolation
 ) -> tuple[int, ...]:
-    """Return a domain for each row; with a user's keystore, its first domain for all rows."""
+    """Return a domain for each row; with a user's keystore, always its first domain."""
     if user is not None:
         if not isolation.isolated:
             raise UnavailableError(
@@ -365,7 +365,7 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 def _free_port() -> int:
-    """Return a TCP port of this host that nobody uses now."""
+    """Return an unused TCP port of this host."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port: int = free.getsockname()[1]

@@ -1,4 +1,4 @@
-"""The result of a demo: what each row showed, as a table, in Markdown, and for ``--json``.
+"""The result of a demo: the outcome of every row, as a table, Markdown and JSON.
 
 A row is judged from the reports of its processes.  A crash is not a refusal.  Silence counts only
 if both sides were ready, the talker sent messages, and the controls held; a refusal counts only if
@@ -41,7 +41,7 @@ from sros_tool.values import Words, shows
 
 @dataclass(frozen=True)
 class PartyRecord:
-    """The record of one process after its end.
+    """The record of a process that has ended.
 
     ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``through`` names the
     library it used; ``output`` is what it printed; ``status`` is its exit status (negative for a
@@ -58,7 +58,7 @@ class PartyRecord:
 
 @dataclass(frozen=True)
 class RowRecord:
-    """The record of a row after its end.
+    """The record of a row that has ended.
 
     ``window`` has start and end of the observation (CLOCK_MONOTONIC, s), or None if a party was not
     ready in time.  ``injected`` counts the packets that were sent again or changed; ``skipped`` is
@@ -80,7 +80,7 @@ class RowRecord:
 
     @property
     def seconds(self) -> float:
-        """The length of the observation."""
+        """Length of the observation in seconds."""
         return self.window[1] - self.window[0] if self.window else 0.0
 
 
@@ -91,45 +91,45 @@ class RowRecord:
 )
 @dataclass(frozen=True)
 class RowResult:
-    """A row of the result."""
+    """The result of one row."""
 
     name: str
-    """What was tried."""
+    """What the row tries."""
     expected: RowStatus
     """The expected outcome."""
     observed: RowStatus
     """The observed outcome."""
     mechanism: str
-    """Why that is expected."""
+    """Why this outcome is expected."""
     detail: str
     """What was observed, with counts."""
     domain: int
-    """The ROS domain."""
+    """ROS domain of the row."""
     seconds: float = 0.0
-    """How long it was observed."""
+    """Length of the observation in seconds."""
     attack: str = ""
-    """The attack, or an empty string."""
+    """Name of the attack, or an empty string for ordinary communication."""
     removed: str = ""
     open_because: str = ""
     """Why the attack is known to succeed, or an empty string."""
     remedy: str = ""
-    """What helps against it, or an empty string."""
+    """What a user can do against the attack, or an empty string."""
     accepted: bool = False
-    """Whether `--accept-open` names it."""
+    """Whether `--accept-open` names the row."""
     unaccepted: bool = False
     applies: bool = True
-    """Whether the keystore has an enclave for each part; if not, it was skipped."""
+    """Whether the keystore has an enclave for each part; if not, the row was skipped."""
     scenario: str = ""
-    """The scenario."""
+    """Name of the scenario."""
 
     @property
     def defence_removed(self) -> str:
-        """The defence that is missing in this row, or an empty string."""
+        """Defence that the row removes, or an empty string."""
         return self.removed
 
     @property
     def as_expected(self) -> bool:
-        """Whether they are the same, or it was skipped or accepted."""
+        """Whether the row was observed as expected, skipped or accepted."""
         expected = self.observed in (self.expected, RowStatus.SKIPPED) and not self.open_here
         return expected or self.known_open
 
@@ -142,12 +142,12 @@ class RowResult:
 
     @property
     def open_here(self) -> bool:
-        """Whether it succeeds because of the keystore, and was not accepted."""
+        """Whether the attack succeeds because of the keystore, and the user did not accept that."""
         return self.unaccepted and self.observed is self.expected
 
     @property
     def untried(self) -> bool:
-        """Whether an attack that has to fail was not tried, and may succeed unseen.
+        """Whether an attack that has to fail was not tried, so that it may succeed unseen.
 
         A row without its defence, or of an attack that is known to succeed or was accepted, proves
         nothing of a keystore; and what does not apply to it cannot succeed.
@@ -158,7 +158,7 @@ class RowResult:
 
 
 class _Finding(NamedTuple):
-    """The observed status of one claim, with the evidence."""
+    """The observed status of a claim, with the evidence."""
 
     status: RowStatus
     detail: str
@@ -169,7 +169,7 @@ def _undecided(why: str) -> _Finding:
 
 
 def judge_row(record: RowRecord) -> RowResult:
-    """Return the result of a row from its record."""
+    """Judge a row by the record of its processes, and return its result."""
     finding = _observe(record)
     row = record.row
     return RowResult(
@@ -215,7 +215,7 @@ def _observe(record: RowRecord) -> _Finding:
 
 
 def _lost_import(party: Party, record: PartyRecord) -> str:
-    """Return why a node could not import rclpy or an interface, or ""."""
+    """Return why a node could not import rclpy or a ROS interface, or ""."""
     if party.role in (Role.TALKER, Role.LISTENER):
         return ""
     failed = (
@@ -228,7 +228,7 @@ def _lost_import(party: Party, record: PartyRecord) -> str:
 
 
 class _Case:
-    """A claim with the records of its row and of the two parties that it is about."""
+    """A claim with the records of its row and of its two parties."""
 
     def __init__(self, claim: Claim, record: RowRecord) -> None:
         self.claim, self.record = claim, record
@@ -236,15 +236,15 @@ class _Case:
         self.talker = record.parties.get(claim.talker, self.subject)
 
     def result(self, holds: bool, detail: str) -> _Finding:
-        """Return what was observed: that the claim holds, or that it does not."""
+        """Return the status for the claim's relation being observed, or not."""
         return _Finding(STATUS_OF[self.claim.relation, holds], detail)
 
     def sent(self, party: PartyRecord) -> list[Event]:
-        """Return what a party sent in the window."""
+        """Return the messages that a party sent during the observation."""
         return [e for e in party.events if e.kind is EventKind.SENT and _in_window(e, self.record)]
 
     def heard(self) -> list[Event]:
-        """Return the messages of the talker that the subject heard, at any time."""
+        """Return the talker's messages that the subject heard, at any time."""
         return _heard_of(self.talker, self.subject)
 
 
@@ -285,7 +285,7 @@ def _judge_answers(case: _Case) -> _Finding:
 
 
 def _judge_execution(case: _Case) -> _Finding:
-    """Judge by the requests that reached the server: a reply may be lost after that."""
+    """Judge a call by the requests that the server executed: its reply may be lost afterwards."""
     claim, asked = case.claim, case.sent(case.talker)
     if not asked:
         return _undecided(f"{claim.talker} sent no request in the window")
@@ -295,7 +295,7 @@ def _judge_execution(case: _Case) -> _Finding:
 
 
 _ON_ITS_WAY = 1.0
-"""Seconds after an expiry in which a message may still arrive: certificates have whole seconds."""
+"""Seconds after expiry in which messages may still arrive: certificates have whole seconds."""
 
 
 def _judge_expiry(case: _Case) -> _Finding:
@@ -315,7 +315,7 @@ def _judge_expiry(case: _Case) -> _Finding:
 
 
 def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Finding:
-    """Return a refusal with the logged line that is its evidence, if the claim names one.
+    """Return a refusal with the log line that proves it, if the claim names a log text.
 
     A process that merely gets no connection may be slow.
     """
@@ -333,7 +333,7 @@ def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Findi
 
 
 def _message_of(line: str) -> str:
-    """Return the message of a line of Zenoh's log, without time, level, module and hint."""
+    """Return the message in a line of Zenoh's log, without time, level, module and hint."""
     message = line.partition(": ")[2].partition(" Hint: ")[0]
     return " ".join(message.split()).rstrip(".") or line.strip()
 
@@ -422,7 +422,7 @@ _JUDGES: Mapping[Relation, Callable[[_Case], _Finding]] = {
 
 
 def _why_not_running(name: str, record: PartyRecord) -> _Finding | None:
-    """Return why a party did not run until the end of the row, or None if it did."""
+    """Return why a party did not run until the end of the row, or None if it ran."""
     ready = any(event.kind is EventKind.READY for event in record.events)
     for event in record.events:
         if event.kind is EventKind.REFUSED:
@@ -452,13 +452,13 @@ def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
 
 
 def _own_denial(record: PartyRecord, reported: str) -> str:
-    """Return the message in which DDS Security denies the party's own topic, or ""."""
+    """Return the log message in which DDS Security denies the party's own topic, or ""."""
     lines = f"{record.output}\n{reported}".splitlines()
     return endpoint_refusal("\n".join(line for line in lines if _is_about(line, record.topic)))
 
 
 def _is_about(line: str, topic: str) -> bool:
-    """Return whether a log line names that topic, or a service or action of that name."""
+    """Return whether a log line is about a topic, or a service or action of the same name."""
     name = rf"r[tqr]{re.escape(topic)}(?:/_action/\w+)?(?:Request|Reply)?(?!\w|/)"
     return bool(re.search(name, line)) or "not allowed by security" in line.lower()
 
@@ -486,44 +486,44 @@ def _in_window(event: Event, record: RowRecord) -> bool:
 
 
 class KeystoreSummary(NamedTuple):
-    """What of a keystore was tried."""
+    """How much of a user's keystore the demo tried."""
 
     enclaves: int
-    """Number of its enclaves."""
+    """Number of enclaves in the keystore."""
     elsewhere: int = 0
-    """Number of enclaves whose key is elsewhere: they were not tried."""
+    """Number of enclaves whose key is elsewhere; the demo did not try them."""
     not_tried: tuple[str, ...] = ()
-    """What would have to be tried for a proof, and was not: then the exit status is not 0."""
+    """What a proof needs and the demo did not try; if not empty, the exit status is not 0."""
 
 
 @shows("name", "title", "as_expected", "cast", "keystore", "rows", "cost")
 @dataclass(frozen=True)
 class ScenarioResult:
-    """A scenario."""
+    """The result of a scenario."""
 
     name: str
-    """Its name."""
+    """Name of the scenario."""
     title: str
-    """Its title."""
+    """Title of the scenario."""
     rows: tuple[RowResult, ...]
-    """Its rows."""
+    """Results of the scenario's rows."""
     cast: tuple[CastMember, ...] = ()
     """With `--keystore`: the enclaves that played a part."""
     attacked: KeystoreSummary | None = None
 
     @property
     def wrong(self) -> tuple[RowResult, ...]:
-        """The rows that are not as expected."""
+        """Rows that are not as expected."""
         return tuple(row for row in self.rows if not row.as_expected)
 
     @property
     def keystore(self) -> KeystoreSummary | None:
-        """With `--keystore`: what of it was tried."""
+        """With `--keystore`: how much of the keystore was tried."""
         return self.attacked and self.attacked._replace(not_tried=self.not_tried)
 
     @property
     def not_tried(self) -> tuple[str, ...]:
-        """What would have to be tried to prove a user's keystore sound, and was not.
+        """What a proof of the user's keystore needs and the demo did not try.
 
         The demo's own keystores are to show what works, and prove nothing of other ones.
         """
@@ -533,7 +533,7 @@ class ScenarioResult:
 
     @property
     def as_expected(self) -> bool:
-        """Whether its rows are as expected."""
+        """Whether all rows are as expected."""
         return not self.wrong and not self.not_tried
 
     @property
@@ -547,26 +547,26 @@ class ScenarioResult:
 )
 @dataclass(frozen=True)
 class DemoResult:
-    """The result."""
+    """The result of a demo."""
 
     backend: Annotated[str, Words((RCLPY, CYCLONE, ZENOH))]
-    """What the nodes ran on."""
+    """Name of the backend that ran the nodes."""
     dds: str
-    """The DDS, or Zenoh, and its version."""
+    """Name and version of the DDS, or of Zenoh."""
     why: str
     """Why this backend was chosen."""
     template: str
-    """The template of the keystores."""
+    """Template of the keystores."""
     topic: str
-    """The topic."""
+    """The ROS topic of the demo."""
     own_network: bool
-    """Whether it ran in a network namespace."""
+    """Whether the demo ran in a network namespace of its own."""
     network_reason: str
-    """If not, why."""
+    """Why the demo had no network namespace of its own, or an empty string."""
     scenarios: tuple[ScenarioResult, ...]
-    """The scenarios."""
+    """Results of the scenarios."""
     left_out: int = 0
-    """Number of rows that `--only` did not choose."""
+    """Number of rows that `--only` left out."""
 
     @property
     def rows(self) -> tuple[RowResult, ...]:
@@ -575,37 +575,37 @@ class DemoResult:
 
     @property
     def as_expected(self) -> bool:
-        """Whether every row is as expected, and a keystore of yours proved: the exit status is
+        """Whether all rows are as expected, and a user's keystore is proved: then exit status is 0.
         0.
         """
         return all(scenario.as_expected for scenario in self.scenarios)
 
     @property
     def exit_status(self) -> int:
-        """0: as expected; 1: a row is not; `NOT_DONE`: a keystore could not be proved sound."""
+        """Exit status: 0 as expected, 1 a row is not, `NOT_DONE` a keystore could not be proved."""
         if any(scenario.wrong for scenario in self.scenarios):
             return 1
         return 0 if self.as_expected else NOT_DONE
 
 
 class ListedScenario(NamedTuple):
-    """A scenario."""
+    """A scenario of the demo."""
 
     name: str
-    """Its name."""
+    """Name of the scenario."""
     title: str
-    """Its title."""
+    """Title of the scenario."""
     rows: int
-    """Number of its rows."""
+    """Number of rows in the scenario."""
     zenoh: bool
-    """Whether it runs with `--backend zenoh`, and else on a DDS."""
+    """Whether the scenario runs with `--backend zenoh`; otherwise it runs on a DDS."""
 
 
 class ScenarioList(NamedTuple):
-    """The scenarios."""
+    """The scenarios of the demo."""
 
     scenarios: Sequence[ListedScenario]
-    """The scenarios."""
+    """All scenarios, in order."""
 
 
 # ── as text ──────────────────────────────────────────────────────────────────────────────────────
@@ -614,7 +614,7 @@ _INDENT = " " * 6
 
 
 def demo_table(result: DemoResult) -> str:
-    """Return the result as a table, with the backend above and a summary line below."""
+    """Return the result as a text table: the backend above, a summary line below."""
     network = (
         "a separate network namespace"
         if result.own_network
@@ -634,7 +634,7 @@ def demo_table(result: DemoResult) -> str:
 
 
 def _cast_lines(members: Sequence[CastMember]) -> list[str]:
-    """Return lines with the enclave of each part of a user's keystore."""
+    """Return lines that name the enclave of each part, for a user's keystore."""
     width = max((len(member.part) for member in members), default=0)
     lines = [
         f"{_INDENT}{member.part:<{width}}  {member.enclave}"
@@ -687,7 +687,7 @@ def _mark(row: RowResult) -> str:
 
 
 def _summary(result: DemoResult) -> str:
-    """Return the last sentence: what was as expected, and in it all that was not tried."""
+    """Return the last sentence: how many rows were as expected, and what was not tried."""
     rows = result.rows
     opened = sum(1 for row in rows if row.open_here)
     wrong = sum(1 for row in rows if not row.as_expected)
@@ -704,7 +704,7 @@ def _summary(result: DemoResult) -> str:
 
 
 def _left_out(result: DemoResult) -> Iterator[str]:
-    """Yield clauses on what was not tried, also on enclaves of the user's keystore."""
+    """Yield clauses on rows and enclaves that were not tried."""
     skipped = [row for row in result.rows if row.observed is RowStatus.SKIPPED]
     if others := sum(1 for row in skipped if row.applies):
         yield f"{others} skipped"
@@ -725,7 +725,7 @@ def _left_out(result: DemoResult) -> Iterator[str]:
 
 
 def summary_page(result: DemoResult, now: datetime) -> str:
-    """Return a summary for a reviewer, in Markdown; ``now`` is the time of the demo."""
+    """Return a summary for reviewers in Markdown; ``now`` is the time of the demo."""
     attacks = [row for row in result.rows if row.attack and not row.removed]
     others = [row for row in result.rows if not row.attack]
     wrong = [row for row in result.rows if not row.as_expected]

@@ -1,4 +1,4 @@
-"""The nodes of the demo on rclpy: ``python -m sros_tool.demo.ros_node ROLE [--ros-args ...]``.
+"""The demo's nodes on rclpy: ``python -m sros_tool.demo.ros_node ROLE [--ros-args ...]``.
 
 They are ordinary ROS 2 nodes.  rclpy and the ROS interfaces are imported when a role starts, so
 that this module can be imported without ROS.
@@ -18,19 +18,19 @@ from sros_tool.demo.nodes import FIBONACCI_ORDER, NodeOptions, fibonacci, parse_
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _LOG_FLUSH_SECONDS = 0.3
-"""Time for the logging thread of Fast DDS: if a process exits at once, its log line is lost."""
+"""Seconds for the log thread of Fast DDS: its lines are lost if the process exits at once."""
 
 _TICK_SECONDS = 0.1
-"""Time between two looks at whether a signal came."""
+"""Seconds between two checks for a signal."""
 _QUEUE_DEPTH = 10
 _FIBONACCI_PACKAGES = ("example_interfaces", "test_msgs", "action_tutorials_interfaces")
 
 _Build = Callable[[Any, NodeOptions, EventWriter], Sequence[Any] | None]
-"""A function that adds the endpoints of a role to a node, and returns additional nodes."""
+"""A function that adds a role's endpoints to a node, and returns additional nodes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a node in a role until stopped; return the exit status."""
+    """Run a node in a role until it is stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parse_options("sros_tool.demo.ros_node", _ROLES, arguments)
     return _run_role(_ROLES[options.role], options, [sys.argv[0], *arguments])
@@ -87,7 +87,7 @@ def _spin(nodes: Sequence[Any], ended: Callable[[], bool]) -> None:
 
 
 def _until_signalled() -> Callable[[], bool]:
-    """Return a function that says whether SIGINT or SIGTERM came, which from now on do no more.
+    """Handle SIGINT and SIGTERM; return a function that says whether one of them came.
 
     Not rclpy's handlers: they shut its context down in the middle of a callback, or just before a
     wait without end, and a KeyboardInterrupt inside its C++ becomes another error there ("Unable to
@@ -112,7 +112,7 @@ def _fail(name: str, error: Exception, stage: ProcessStage, events: EventWriter)
 
 
 def _talker(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Publish the text and a number periodically."""
+    """Publish the text with a running number, periodically."""
     from std_msgs.msg import String
 
     publisher = node.create_publisher(String, options.topic, _QUEUE_DEPTH)
@@ -130,7 +130,7 @@ def _talker(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
 
 def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Log and report each message."""
+    """Log and report every message."""
     from std_msgs.msg import String
 
     heard = 0
@@ -163,7 +163,7 @@ def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
 
 def _server(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Answer each request with the negated truth value.
+    """Answer every request with the negated truth value.
 
     Every ROS 2 installation has the type std_srvs/SetBool, and DDS Security checks only the name of
     a service.
@@ -185,7 +185,7 @@ def _server(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
 
 def _client(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Send requests periodically, and report the right answers."""
+    """Send requests periodically, and report correct answers."""
     from std_srvs.srv import SetBool
 
     client = node.create_client(SetBool, options.service)
@@ -213,7 +213,7 @@ def _client(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
 
 def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Compute the Fibonacci sequence for each goal, with feedback."""
+    """Compute the Fibonacci sequence for every goal, with feedback."""
     from rclpy.action import ActionServer
 
     action = _fibonacci_action()
@@ -238,7 +238,7 @@ def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None
 
 
 def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Send goals periodically, and report right results with complete feedback.
+    """Send goals periodically, and report correct results with complete feedback.
 
     A result does not name its server, so ``options.server`` names the only one.
     """
@@ -294,7 +294,7 @@ def _fibonacci_action() -> Any:
 
 
 def _sequence_of(message: Any) -> list[int]:
-    """Return the numbers of a result or of feedback; packages name the field differently."""
+    """Return the numbers in a result or feedback; the field's name depends on the package."""
     return list(getattr(message, "sequence", None) or getattr(message, "partial_sequence", []))
 
 

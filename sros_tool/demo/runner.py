@@ -1,4 +1,4 @@
-"""Run rows: start the processes of each row, watch them, and end them.
+"""Run rows: start the processes of a row, watch them, and end them.
 
 A row's window starts when all its processes are ready, also on a busy machine.  It has the same
 length for expected silence and expected messages; only a brief row that expects no silence ends
@@ -59,14 +59,14 @@ from sros_tool.runtime.vendor_log import plain_text
 _LOG = logging.getLogger(__name__)
 
 _TICK = 0.05
-"""Seconds between two reads of the reports of the processes."""
+"""Seconds between two reads of the processes' reports."""
 
 _GRACE = 0.3
-"""Seconds for messages that are on their way when a window closes."""
+"""Seconds in which messages on the wire may still arrive after a window closes."""
 
 
 class _Patience(NamedTuple):
-    """Seconds that a slow machine may need; a row that stays undecided is tried with more.
+    """Time limits in seconds for slow machines; an undecided row is tried again with more.
 
     ``lifetime`` is that of a short-lived certificate, ``connect`` how long a process tries to
     connect that is expected to be refused.
@@ -79,7 +79,7 @@ class _Patience(NamedTuple):
 _PATIENCE = (_Patience(8, 2.0), _Patience(20, 8.0), _Patience(60, 30.0))
 
 _AFTER_EXPIRY = 2.0
-"""Seconds for which a row goes on after a certificate expired."""
+"""Seconds that a row continues after a certificate's expiry."""
 
 _ENOUGH_MESSAGES = 3
 _AFTER_ENOUGH = 2.0
@@ -104,7 +104,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """The rows to run, and all that is needed to run them.
+    """The rows to run, and the settings to run them with.
 
     ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.  With
     ``own_networks``, each row gets a separate network namespace.
@@ -123,18 +123,18 @@ class RunPlan:
 
     @property
     def rows_at_once(self) -> int:
-        """The number of worlds to run in parallel."""
+        """The number of worlds (groups of rows that share processes) to run in parallel."""
         # Routers of one machine listen at the same port.
         return 1 if self.backend.on_zenoh and not self.own_networks else self.backend.rows_at_once
 
 
 def run_rows(plan: RunPlan, progress: Progress) -> list[RowResult]:
-    """Run the rows of a plan; return their results.  ``progress`` gets a line for each row."""
+    """Run the rows of a plan; return their results in order."""
     return asyncio.run(_Runner(plan, progress).run())
 
 
 class _Runner:
-    """A runner of the rows of a plan, as many in parallel as the backend allows."""
+    """A runner of a plan's rows, as many in parallel as the backend allows."""
 
     def __init__(self, plan: RunPlan, progress: Progress) -> None:
         self._plan = plan
@@ -159,11 +159,11 @@ class _Runner:
         return [results[index] for index in range(len(plan.rows))]
 
     def _text(self, index: int, party: Party) -> str:
-        """Return the text of a talker, which is unique among all rows."""
+        """Return a talker's text, unique among all rows."""
         return f"Hello World from the {party.name} {self._mark}-{index}"
 
     async def _run(self, group: Sequence[int]) -> dict[int, RowResult]:
-        """Run rows that share their processes; return their results by their places."""
+        """Run rows that share their processes; return their results by index."""
         rows, domain = [self._plan.rows[index] for index in group], self._plan.domains[group[0]]
         skipped = {row.name: why for row in rows if (why := self._why_skipped(row))}
         inapplicable = {row.name for row in rows if self._plan.keystores.inapplicable(row)}
@@ -364,7 +364,7 @@ class _Runner:
         return start, now
 
     def _is_met(self, claim: Claim, processes: Mapping[str, _PartyProcess]) -> bool:
-        """Return whether a claim that something happens was observed often enough."""
+        """Return whether an event that a claim expects was observed often enough."""
         events = processes[claim.subject].look()
         if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED, Relation.EXECUTES):
             mark = f"{processes[claim.talker].text}: "
@@ -377,13 +377,13 @@ class _Runner:
 
 
 def _is_hopeless(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
-    """Return whether a claim can no longer be met: an intruder of it was refused, or has ended."""
+    """Return whether a claim cannot be met any more: its intruder was refused, or has ended."""
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
     return not all(processes[name].running for name in names)
 
 
 def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
-    """Return whether a claim needs the whole window: it expects silence that could still end."""
+    """Return whether a claim expects silence that could still end, so needs the whole window."""
     if claim.holds or claim.relation in (Relation.HEARS_AGAIN, Relation.BELIEVES):
         return False
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
@@ -391,7 +391,7 @@ def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProces
 
 
 def worlds(rows: Sequence[Row]) -> list[list[int]]:
-    """Return the places of the rows, those that share a world together."""
+    """Group rows that share a world; return the indexes of the rows."""
     groups: dict[object, list[int]] = {}
     for index, row in enumerate(rows):
         groups.setdefault(row.world or index, []).append(index)
@@ -403,13 +403,13 @@ def _in_memory(row: Row) -> bool:
 
 
 def _is_needed(party: Party, row: Row) -> bool:
-    """Return whether a row can only go on while a party runs: no claim expects its refusal."""
+    """Return whether a row needs a party to run: no claim expects the party's refusal."""
     refused = {claim.subject for claim in row.claims if claim.relation is Relation.IS_REFUSED}
     return not party.intruder and party.name not in refused
 
 
 def _is_refused(party: Party, row: Row) -> bool:
-    """Return whether a row expects that a party gets no connection."""
+    """Return whether a row expects that a party's connection is refused."""
     return any(
         claim.denied and party.intruder and party.name in (claim.subject, claim.talker)
         for claim in row.claims
@@ -422,7 +422,7 @@ def _is_decided_by_start(row: Row) -> bool:
 
 
 async def _end_softly(processes: Collection[_PartyProcess]) -> None:
-    """Send SIGTERM, and wait for at most `_SECONDS_TO_END` while the processes log and report."""
+    """Send SIGTERM, and wait up to `_SECONDS_TO_END` for last log lines and reports."""
     for process in processes:
         process.ask_to_end()
     latest = time.monotonic() + _SECONDS_TO_END
@@ -434,13 +434,13 @@ _AFTER_REPLAY = 2.0
 _LONGEST_PAUSE = 0.5
 _REPLAY_ROUNDS = 2
 _LAST_PACKETS = 20
-"""Of these last packets of a talker, some have messages."""
+"""Number of a talker's last packets to send again; some of them contain messages."""
 _CHANGED_PLACES = 8
 _AFTER_FORGERY = 1.0
 
 
 async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
-    """End a talker, then send its captured packets again with their timing (pauses shortened)."""
+    """End a talker, then send its captured packets again, with pauses shortened."""
     packets = tap.packets(talker.ports())
     await _end_softly([talker])
     await asyncio.sleep(_GRACE)
@@ -455,7 +455,7 @@ async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
 
 
 async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
-    """Suspend a talker, then send changed copies of its last packet of each length.
+    """Suspend a talker, then send changed copies of its last packet of every length.
 
     Which of them has a message, and where, an attacker need not know: every sequence number comes
     with a bit changed in each place, since a reader drops what the change made malformed.
@@ -514,7 +514,7 @@ def base_environment(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 class _PartyProcess:
-    """A running process of a row; ``folder`` gets its report and its log under ``name``."""
+    """A running process of a row; report and log are in ``folder`` under ``name``."""
 
     def __init__(
         self,
@@ -552,7 +552,7 @@ class _PartyProcess:
         _LOG.info("started process %d, %s: %s", self._process.pid, name, shlex.join(command))
 
     def look(self) -> list[Event]:
-        """Return everything that the process has reported so far, oldest first."""
+        """Return all reports of the process so far, oldest first."""
         ended = self._process.poll()
         self._events += self._reader.new_events()
         if ended is not None and self._own_status is None and not self._asked:
@@ -580,7 +580,7 @@ class _PartyProcess:
         return self._own_status is not None
 
     def ports(self) -> frozenset[int]:
-        """Return the ports that the process has bound, or had bound at the last call."""
+        """Return the ports that the process has bound; after its end, the last known ones."""
         self._ports = bound_ports(self._process.pid) or self._ports
         return self._ports
 
@@ -589,7 +589,7 @@ class _PartyProcess:
         return mapped_segments(self._process.pid)
 
     def ask_to_end(self) -> None:
-        """Send SIGTERM; if the process ends after that, it does not count as ended by itself."""
+        """Send SIGTERM; an end after that does not count as `ended`."""
         self.look()
         self._asked = True
         with suppress(ProcessLookupError):
@@ -597,13 +597,13 @@ class _PartyProcess:
             self._process.send_signal(signal.SIGCONT)
 
     def hold(self) -> None:
-        """Suspend the process; `end` still ends it."""
+        """Suspend the process; `end` can still kill it."""
         with suppress(ProcessLookupError):
             self._process.send_signal(signal.SIGSTOP)
 
     @property
     def gone(self) -> bool:
-        """Whether the process has ended, by itself or because it was asked to."""
+        """Whether the process has ended, for any reason."""
         return self._process.poll() is not None
 
     def end(self) -> None:

@@ -30,11 +30,11 @@ _PROTECTED_SUBMESSAGES = range(0x30, 0x35)
 
 
 _TLS_DATA = b"\x17\x03\x03"
-"""The begin of a record with application data (RFC 8446 §5.1)."""
+"""First bytes of a TLS record with application data (RFC 8446 §5.1)."""
 
 
 class _CapturedPacket(NamedTuple):
-    """A captured IPv4 packet, when it was read (CLOCK_MONOTONIC, s), and its UDP source port."""
+    """A captured IPv4 packet, its capture time (CLOCK_MONOTONIC, s), and its UDP source port."""
 
     time: float
     source: int
@@ -42,7 +42,7 @@ class _CapturedPacket(NamedTuple):
 
 
 class PacketCounter:
-    """A counter of packets that show one of ``marks``, and of protected packets.
+    """A counter of protected packets, and of packets that contain one of ``marks``.
 
     ``plain`` counts by mark, ``protected`` by port, for both ports of a packet.  With
     ``keep``, the RTPS packets themselves are in ``kept``, in order.
@@ -56,7 +56,7 @@ class PacketCounter:
         self.kept: list[_CapturedPacket] = []
 
     def count(self, packet: bytes) -> None:
-        """Count one packet; ignore it if it is neither UDP over IPv4, nor TCP."""
+        """Count one packet; packets other than UDP over IPv4 and TCP are ignored."""
         transport, start = _transport(packet)
         if len(packet) < start + 8 or transport not in (_UDP, _TCP):
             return
@@ -116,7 +116,7 @@ _IPV6_HEADER = 40
 
 
 def _transport(packet: bytes) -> tuple[int, int]:
-    """Return the transport protocol of an IP packet, and where it begins; (0, 0) if there is none.
+    """Return transport protocol and its offset in an IP packet; (0, 0) for other packets.
 
     UDP counts only over IPv4, and TCP over IPv6 only without extension headers.
     """
@@ -146,7 +146,7 @@ def _is_protected(payload: bytes) -> bool:
 
 
 def bound_ports(process: int) -> frozenset[int]:
-    """Return the UDP and TCP ports that a process has (from /proc); none if it has ended."""
+    """Return the UDP and TCP ports of a process (from /proc); empty if it has ended."""
     folder = Path(f"/proc/{process}")
     try:
         links = list((folder / "fd").iterdir())
@@ -176,7 +176,7 @@ _LARGEST_SEGMENT = 1 << 28
 
 
 def mapped_segments(process: int) -> frozenset[Path]:
-    """Return the segments of shared memory that a process maps; none if it has ended."""
+    """Return the shared memory segments that a process maps; empty if it has ended."""
     try:
         lines = Path(f"/proc/{process}/maps").read_text("utf-8", "surrogateescape").splitlines()
     except OSError:
@@ -186,7 +186,7 @@ def mapped_segments(process: int) -> frozenset[Path]:
 
 
 def shared_memory(texts: Mapping[str, str], segments: Collection[Path]) -> dict[str, int]:
-    """Return how many of the segments show the text of each party."""
+    """Return how many of the segments contain the text of each party."""
     return {
         name: sum(_shows(path, text) for path in segments) if text else 0
         for name, text in texts.items()
@@ -208,7 +208,7 @@ def _shows(path: Path, text: str) -> bool:
 _Order = Literal["little", "big"]
 _DATA = 0x15
 _SEQUENCE_NUMBER = 20
-"""Bytes from the start of a DATA submessage to the low half of its sequence number."""
+"""Offset of the sequence number's low half from the start of a DATA submessage, in bytes."""
 
 
 class _Injector:
@@ -224,7 +224,7 @@ class _Injector:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
 
     def send(self, packet: bytes) -> None:
-        """Send one packet without UDP checksum: the kernel fills in none for loopback packets."""
+        """Send one packet without UDP checksum: the kernel adds none to loopback packets."""
         self._socket.sendto(without_checksum(packet), (socket.inet_ntoa(packet[16:20]), 0))
 
     def close(self) -> None:
@@ -238,7 +238,7 @@ def packets_of(kept: Sequence[_CapturedPacket], ports: Collection[int]) -> list[
 
 
 def with_changed_bit(packet: bytes, later: int, place: int, places: int) -> bytes | None:
-    """Return an RTPS packet with one bit changed, at one of ``places`` spread over its content.
+    """Return a copy of an RTPS packet with one bit changed, or None if it has no content.
 
     The change does not depend on what can be read: an attacker without keys can do as much to an
     encrypted packet.  The sequence number of a readable DATA submessage is raised by ``later``, so
@@ -306,7 +306,7 @@ class Wiretap:
         asyncio.get_running_loop().add_reader(self._capture.fileno(), self._capture.drain)
 
     def count(self, ports: Collection[int]) -> dict[str, WireCount]:
-        """Return the counts so far, by party; only protected packets of ``ports`` count."""
+        """Return the counts by party so far; protected packets count only for ``ports``."""
         if self._capture is None:
             return {}
         self._capture.drain()
@@ -340,7 +340,7 @@ class Wiretap:
 
 
 class WireCount(NamedTuple):
-    """The numbers of packets that show a talker's text, and of protected packets of its row.
+    """The numbers of packets that contain a talker's text, and of its row's protected packets.
 
     ``topics`` and ``certificates`` count the packets of the row that show the topic name, and a
     certificate.

@@ -1,4 +1,4 @@
-"""The scenario of all known attacks on DDS, each with a control, and again without its defence.
+"""The scenario of all known attacks on DDS; every attack has a control and a row without defence.
 
 The attacker is the intruder of the row.  A row that expects the attack to fail has a control: the
 same listener must hear the permitted talker at the same time.  A row with ``removed`` shows that
@@ -98,7 +98,7 @@ def _injection(
 
 
 def _tampered(name: str, expected: RowStatus, mechanism: str, victims: KeystoreChoice) -> Row:
-    """Return a row in which an unsecured attacker tries a listener whose files were changed.
+    """Return a row in which an unsecured attacker talks to a listener with changed files.
 
     The listener may fail to start; the control is another listener with unchanged files.
     """
@@ -116,7 +116,7 @@ def _tampered(name: str, expected: RowStatus, mechanism: str, victims: KeystoreC
 def _succeeds(
     name: str, attacker: Identity, removed: str, victims: KeystoreChoice | None = None
 ) -> Row:
-    """Return a row in which the same attacker is heard, because its files are valid."""
+    """Return a row in which the listener hears the attacker, whose files are valid."""
     mechanism = "an attacker with valid files is heard"
     return _injection(name, attacker, RowStatus.HEARD, mechanism, removed=removed, victims=victims)
 
@@ -184,14 +184,14 @@ def _discovering(
 
 
 def _on_service(role: Role, identity: Identity, name: str = "") -> Party:
-    """Return a client or server of the service; the attacker has another name than its role."""
+    """Return a client or server of the service; the attacker's name is not its role."""
     return Party(name or role.value, role, identity, SERVICE, intruder=bool(name))
 
 
 def _calling(
     name: str, attacker: Identity, expected: RowStatus, mechanism: str, *, removed: str = ""
 ) -> Row:
-    """Return a row that shows whether the attacker gets answers from a service."""
+    """Return a row that shows whether a service answers the attacker."""
     victims = _victims(attacker, removed)
     return Row(
         name,
@@ -213,7 +213,7 @@ def _calling(
 def _posing_as_server(
     name: str, attacker: Identity, expected: RowStatus, mechanism: str, *, removed: str = ""
 ) -> Row:
-    """Return a row that shows whether a client accepts answers from an attacker as server."""
+    """Return a row that shows whether a client accepts answers from an attacker."""
     victims = _victims(attacker, removed)
     rightful = _on_service(Role.SERVER, Identity(victims, "server"))
     return Row(
@@ -265,7 +265,7 @@ def _eavesdropping(
 def _forged_packets(
     name: str, relation: Relation, expected: RowStatus, mechanism: str, keystore: KeystoreChoice
 ) -> Row:
-    """Return a row in which packets of a talker are sent again, as they were or changed."""
+    """Return a row in which a talker's packets are sent again, unchanged or changed."""
     again = relation is Relation.HEARS_AGAIN
     return Row(
         name,
@@ -479,7 +479,7 @@ def _trespass(
     forge: Forge,
     opened: str,
 ) -> tuple[Row, ...]:
-    """Return the rows of an enclave that tries what it may not, and of one with wide permissions.
+    """Return rows of an enclave that exceeds its rights, and of one with wide permissions.
 
     ``forge`` gives the enclave in that ``part`` the permissions, and ``opened`` says what they
     allow.
@@ -612,11 +612,11 @@ WIDEST: dict[str, Row] = {
         kind(f"the widest enclave {does}", Identity(OWN, part), RowStatus.REFUSED, mechanism),
     )
 }
-"""The attack of the enclave with the widest permissions, by its part, in a keystore of a user."""
+"""The attack of the enclave with the widest permissions in a user's keystore, by part."""
 
 
 def joining(enclave: str, fault: str) -> Row:
-    """Return a row that shows whether an enclave with a ``fault`` in its files joins the others.
+    """Return a row that shows whether an enclave with faulty files can join the others.
 
     Endpoints are announced to whom the talker's DDS has authenticated, and to nobody else.
     """
@@ -625,7 +625,7 @@ def joining(enclave: str, fault: str) -> Row:
 
 
 def revoked_joining(enclave: str, own: bool) -> Row:
-    """Return a row that shows whether a revoked enclave joins the others.
+    """Return a row that shows whether a revoked enclave can join the others.
 
     ``own`` says whether the enclave itself has the list that revokes it.
     """
@@ -1043,7 +1043,7 @@ def _misconfigured(
 
 
 def _misspelt(name: str, keystore: KeystoreChoice, variable: str, value: str, why: str) -> Row:
-    """Return a row in which a value is misspelt, and the talker runs unsecured."""
+    """Return a row with a misspelt setting: the talker then runs unsecured."""
     identity = Identity(keystore, "talker", ((variable, value),))
     mechanism = f"{why}: the talker runs unsecured"
     return known_open(

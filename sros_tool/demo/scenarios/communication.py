@@ -43,7 +43,7 @@ TALKER_DENIED = Identity(OWN, "talker without permission")
 
 
 def _refused(name: str, mechanism: str, intruder: Party, rightful: Party) -> Row:
-    """Return a row in which one process is refused, and the same program in another enclave not."""
+    """Return a row that refuses a process, while the same program runs in another enclave."""
     return Row(
         name,
         RowStatus.REFUSED,
@@ -194,11 +194,11 @@ class _Interface(NamedTuple):
     answers: str
 
     def party(self, name: str, role: Role, identity: Identity = UNSECURED) -> Party:
-        """Return a party of this service or action."""
+        """Return a party that uses this service or action."""
         return Party(name, role, identity, self.name)
 
     def pair(self, *, secured: bool) -> tuple[Party, Party]:
-        """Return a client and a server, either with the rights that they need or unsecured."""
+        """Return a client and a server, with the rights that they need, or unsecured."""
         own = (Identity(OWN, "client"), Identity(OWN, "server")) if secured else (UNSECURED,) * 2
         before = "" if secured else "unsecured "
         return (
@@ -208,7 +208,7 @@ class _Interface(NamedTuple):
 
 
 def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
-    """Return the rows of a service or action; ``both`` is the mechanism of the secured pair."""
+    """Return the rows of a service or action; ``both`` explains the secured pair."""
     client, server = kind.pair(secured=True)
     open_client, open_server = kind.pair(secured=False)
     posing = kind.party("client as a server", kind.server_role, Identity(OWN, "client"))
@@ -393,11 +393,11 @@ _KINDS = {
     "sign": Undefended(template=forger.signed),
     "encrypt": Undefended(template=forger.encrypted),
 }
-"""The keystore of each protection kind."""
+"""Maps protection kinds to their keystores."""
 
 
 def _protected(name: str, kind: str, expected: RowStatus, mechanism: str) -> Row:
-    """Return a row that looks for the payload of messages with a kind of protection."""
+    """Return a row that looks for payload in packets with a protection kind."""
     return Row(
         f"{name} under {kind}",
         expected,
@@ -411,7 +411,7 @@ def _protected(name: str, kind: str, expected: RowStatus, mechanism: str) -> Row
 
 
 def _changed(kind: str, expected: RowStatus, mechanism: str) -> Row:
-    """Return a row that changes packets with a kind of protection."""
+    """Return a row that changes packets with a protection kind."""
     return replace(
         _protected("changed packets", kind, RowStatus.READABLE, mechanism),
         expected=expected,

@@ -31,14 +31,14 @@ class Role(StrEnum):
     RELAY = "relay"
     """A talker and a listener in one node."""
     FLOODER = "flooder"
-    """A program that makes useless connections to the router."""
+    """A program that opens useless connections to the router."""
 
 
 SPEAKING = frozenset({Role.TALKER, Role.RELAY, Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED})
-"""The roles that send a text that identifies them."""
+"""Roles whose messages contain a text that identifies the process."""
 
 CALLING = frozenset({Role.CLIENT, Role.ACTION_CLIENT})
-"""The roles whose requests have a text that identifies them, on Zenoh."""
+"""Roles whose requests, on Zenoh, contain a text that identifies the process."""
 
 
 class RowStatus(StrEnum):
@@ -72,11 +72,11 @@ class RowStatus(StrEnum):
 
 
 DENIALS = (RowStatus.REFUSED, RowStatus.NOT_LET_IN)
-"""The statuses of a denial: of a topic, or of the whole process."""
+"""Statuses of a denial: of a topic, or of the whole process."""
 
 
 class Relation(StrEnum):
-    """A statement about one party, or about two."""
+    """A relation between two parties, or a state of one party."""
 
     HEARS = "hears"
     HEARS_AGAIN = "hears replayed packets of"
@@ -119,11 +119,11 @@ SUCCESSES = frozenset(
     for (relation, holds), status in STATUS_OF.items()
     if holds and relation not in (Relation.IS_REFUSED, Relation.STARTS)
 )
-"""The statuses of an attack that succeeded."""
+"""Statuses of an attack that succeeded."""
 
 
 class Wire(StrEnum):
-    """A text to look for in the packets of a party, or in shared memory."""
+    """A text to look for in a party's packets, or in shared memory."""
 
     TEXT = "text"
     TOPIC = "topic name"
@@ -136,13 +136,13 @@ class SoundKeystore(StrEnum):
 
     OWN = "own"
     FOREIGN = "foreign"
-    """A keystore of another CA, with the same enclaves."""
+    """A keystore from another CA, with the same enclaves."""
 
 
 OWN, FOREIGN = SoundKeystore.OWN, SoundKeystore.FOREIGN
 
 KeystoreChoice = SoundKeystore | Forge | Undefended
-"""A keystore that is not forged, or the forgery that makes the keystore.
+"""A keystore without forgery, or the forgery that makes the keystore.
 
 A `Forge` changes a copy of the scenario's own keystore, `Undefended` changes a new keystore.
 """
@@ -190,7 +190,7 @@ class Party:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim that ``relation`` holds between ``subject`` and ``talker``, or does not (``holds``).
+    """A claim that ``relation`` holds between ``subject`` and ``talker``, or not (``holds``).
 
     ``denied`` is the denial that must be the reason, a status in `DENIALS`; None: any reason.
     ``evidence`` is a text that a party of the row must have logged about a process that was not let
@@ -207,11 +207,11 @@ class Claim:
 
     @property
     def expected(self) -> RowStatus:
-        """The status that this claim expects."""
+        """The status that the claim expects."""
         return self.denied or STATUS_OF[self.relation, self.holds]
 
     def expecting(self, status: RowStatus) -> Claim:
-        """Return the same claim with another expected status.
+        """Return the claim with another expected status.
 
         Raises:
             ValueError: the relation cannot have that status.
@@ -225,7 +225,7 @@ class Claim:
 
 
 class Condition(StrEnum):
-    """A property of the keystore template or the vendor on which an expected status depends."""
+    """A condition on keystore template or vendor that changes an expected status."""
 
     ONE_CA = "one CA for identity and permissions"
     SHARED_SUBJECTS = "subject names without a unique part"
@@ -243,7 +243,7 @@ class Condition(StrEnum):
 
 @dataclass(frozen=True)
 class Variant:
-    """The expected status of a row if all ``conditions`` hold.
+    """The expected status of a row if all ``conditions`` are true.
 
     ``open_because`` is the reason why an attack then succeeds ("": it fails), ``remedy`` what a
     user can do.  ``instead`` is a row to run instead, for a vendor that implements the defence
@@ -260,7 +260,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the demo's table.
+    """One line of the demo's table: processes, claims about them, and controls.
 
     ``mechanism`` is the reason for the expected status, as a clause; ``wire`` requests a capture of
     the packets; ``replay`` names the party whose packets are sent again after it has left,
@@ -298,11 +298,11 @@ class Row:
 
     @property
     def tapped(self) -> bool:
-        """Whether the packets of the row are captured."""
+        """Whether the row's packets are captured."""
         return bool(self.wire or self.replay or self.impersonate)
 
     def party(self, name: str) -> Party:
-        """Return the party of that name.
+        """Return the party with this name.
 
         Raises:
             KeyError: the row has no such party.
@@ -311,7 +311,7 @@ class Row:
 
     @property
     def ros_name(self) -> str:
-        """The topic, service or action of the first claim ("": the topic of the demo)."""
+        """The topic, service or action of the first claim ("": the demo's topic)."""
         return self.party(self.claims[0].subject).topic
 
     @property
@@ -320,7 +320,7 @@ class Row:
         return self.party(self.claims[0].talker)
 
     def under(self, conditions: frozenset[Condition]) -> Row:
-        """Return the row with the status that is expected under these conditions."""
+        """Return the row with the status that is expected under ``conditions``."""
         for variant in self.variants:
             if conditions.issuperset(variant.conditions):
                 if variant.instead is not None:
@@ -342,7 +342,7 @@ class Row:
 
 
 def together(rows: Sequence[Row]) -> Row:
-    """Return one row with the parties, claims and controls of all rows, which share a world.
+    """Join rows of one world to one row with all parties, claims and controls.
 
     Raises:
         ValueError: two parties of one name differ.
@@ -363,7 +363,7 @@ def together(rows: Sequence[Row]) -> Row:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Rows that belong together, and the policy of their enclaves.
+    """Rows that belong together, and the policy for their enclaves.
 
     ``cast`` has the enclave of each part.  ``policy`` returns the policy for the topic of the demo;
     the enclaves ``unpermitted`` have no policy.  With a ``router``, the name of an enclave, its
@@ -382,7 +382,7 @@ class Scenario:
 
 
 def joined(scenarios: Sequence[Scenario]) -> Scenario:
-    """Return one scenario with the rows of several, which have the same enclaves and policy.
+    """Join scenarios with the same enclaves and policy to one scenario with all rows.
 
     Raises:
         ValueError: their enclaves or policies differ.
@@ -404,7 +404,7 @@ def hears(listener: str, talker: str, *, holds: bool = True) -> Claim:
 
 
 def answered(client: str, server: str, *, holds: bool = True) -> Claim:
-    """Return the claim that a client is answered by a server, or is not."""
+    """Return the claim that a server answers a client, or does not."""
     return Claim(Relation.IS_ANSWERED, client, server, holds=holds)
 
 
@@ -417,12 +417,12 @@ def talker_and_listener(keystore: KeystoreChoice) -> tuple[Party, Party]:
 
 
 def known_open(row: Row, because: str, remedy: str) -> Row:
-    """Return the row of an attack that is known to succeed, with the reason and what to do."""
+    """Return the row of an attack that is known to succeed, with the reason and a remedy."""
     return replace(row, open_because=because, remedy=remedy)
 
 
 def tries(attack: str, *rows: Row) -> tuple[Row, ...]:
-    """Return rows as tries of one attack, also those that a vendor needs instead."""
+    """Return rows as attempts of one attack, including replacement rows for vendors."""
     return tuple(
         replace(
             row,

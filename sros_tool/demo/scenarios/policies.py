@@ -1,4 +1,4 @@
-"""The policies of the demo's enclaves: shipped policies, changed to the demo's topic."""
+"""The policies of the demo's enclaves: shipped policies with the demo's topic."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _TOPICS_OF_EVERY_NODE = ("/rosout", "/parameter_events", "/clock", DENIED_TOPIC)
 
 
 def check_topic(topic: str) -> str:
-    """Return the absolute form of a topic name for the demo.
+    """Return the absolute form of a ROS topic name for the demo.
 
     Raises:
         UsageError: the demo cannot use it.
@@ -58,7 +58,7 @@ def _shipped_policy(file: str) -> Policy:
 
 
 def talking_policy(topic: str) -> Policy:
-    """Return the shipped talker and listener on ``topic``, and one of each that may not use it."""
+    """Return the shipped talker and listener on ``topic``, and one of each without that right."""
     shipped = _shipped_policy(_POLICY_FILE)
     by_path = {enclave.path: enclave for enclave in shipped.enclaves}
     talker, listener = by_path[_TALKER], by_path[_LISTENER]
@@ -74,7 +74,7 @@ def talking_policy(topic: str) -> Policy:
 
 
 def attacked_policy(topic: str) -> Policy:
-    """Return a policy for a talker and a listener on ``topic``, a service, a guest and an admin.
+    """Return a policy with talker, listener, a service, a guest and an admin.
 
     The guest may use neither the topic nor the service.  The admin may publish the topic, and its
     enclave name contains the guest's.
@@ -117,7 +117,7 @@ def shipped_action_policy(_topic: str) -> Policy:
 
 
 def composed_policy(topic: str) -> Policy:
-    """Return the shipped policies of a container, and of the nodes outside that it talks to."""
+    """Return the shipped policies of a container, and of the nodes that it talks to."""
     talking = talking_policy(topic)
     container = (
         _with_topic(enclave, topic) for enclave in _shipped_policy("composition.xml").enclaves
@@ -127,7 +127,7 @@ def composed_policy(topic: str) -> Policy:
 
 
 def _with_topic(enclave: Enclave, topic: str | None, before: str = _POLICY_TOPIC) -> Enclave:
-    """Return the enclave with ``topic`` instead of ``before`` (None: with neither)."""
+    """Return the enclave with ``topic`` in place of ``before`` (None: remove ``before``)."""
 
     def of_group(group: Group) -> Group | None:
         if group.kind != "topics" or before not in group.names:
