@@ -83,7 +83,7 @@ class Backend:
 
     @property
     def rows_at_once(self) -> int:
-        """The number of rows to run in parallel; an rclpy node takes about 0.6 s of CPU to start."""
+        """The number of rows to run in parallel; starting an rclpy node takes 0.6 s of CPU."""
         return {RCLPY: 4, ZENOH: 8}.get(self.name, 16)
 
     @property

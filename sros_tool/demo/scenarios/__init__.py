@@ -1,6 +1,6 @@
-"""The scenarios that ship with sros, and those of users.
+"""The scenarios that ship with sros, and the format of users' scenario files.
 
-The latter are a TOML file with parties and rows, and the policy of their enclaves.
+A scenario file is TOML: parties, rows, and the policy of their enclaves.
 
 ::
 
@@ -86,7 +86,7 @@ _PARTIES: Mapping[Relation, tuple[str, ...]] = {
     Relation.IS_REFUSED: ("party",),
     Relation.STARTS: ("party",),
 }
-"""The keys that name the parties of a claim: first its subject, then the other party."""
+"""The keys that name a claim's parties: the subject first, then the other party."""
 
 _CLAIMS: Mapping[str, tuple[Relation, bool]] = {
     "heard": (Relation.HEARS, True),
@@ -110,15 +110,15 @@ _FITTING: Mapping[str, tuple[Role, ...]] = {
     "server": (Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED),
     "party": tuple(Role),
 }
-"""The roles of a party that a key of a claim can name."""
+"""Roles that a claim's key accepts for its party."""
 
 _NAMED = (Role.SERVER, Role.CLIENT, Role.ACTION_SERVER, Role.ACTION_CLIENT)
-"""The roles that need the name of their service or action."""
+"""Roles whose parties must name their service or action."""
 
 _VARIABLES = (DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY)
-"""The variables that a party can have: others, such as LD_PRELOAD, could run code of the author."""
+"""Environment variables that a party may set; others, such as LD_PRELOAD, could run code."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
-"""The names of parties: those of files in one folder."""
+"""Pattern of party names; they become file names in one folder."""
 
 _KEYS = {
     "": {"title", "policy", "party", "row"},
@@ -128,7 +128,7 @@ _KEYS = {
 
 
 def read_scenario(path: Path) -> Scenario:
-    """Read a scenario file.
+    """Read a scenario from a TOML file.
 
     Raises:
         DocumentError: the file is not a valid scenario; the message has the line.
@@ -139,9 +139,9 @@ def read_scenario(path: Path) -> Scenario:
 
 
 class _Table(NamedTuple):
-    """A table of a scenario file: its ``kind`` ("party"; "": top level), and its ``place``.
+    """A table of a scenario file: its ``kind`` ("party"; "": top level), and its index.
 
-    The place is its index among the tables of that kind, to find the line for an error.
+    ``place`` is the index among the tables of that kind, to find the line for an error.
     """
 
     path: Path
@@ -151,7 +151,7 @@ class _Table(NamedTuple):
     data: Mapping[str, Any]
 
     def tables(self, kind: str) -> Iterator[_Table]:
-        """Yield the tables of a kind, of which there is at least one."""
+        """Yield the tables of a kind; raise if there is none."""
         tables = self.data.get(kind)
         if (
             not isinstance(tables, list)
@@ -166,7 +166,7 @@ class _Table(NamedTuple):
             yield table
 
     def check_keys(self) -> None:
-        """Check that the table has no key that means nothing."""
+        """Raise if the table has an unknown key."""
         for key in self.data:
             if key in ("claims", "controls"):
                 problem = f"{key!r} is not a key here; write tables [[row.{key[:-1]}]]"
@@ -176,7 +176,7 @@ class _Table(NamedTuple):
                 raise self.error(key, f"{key!r} is not a key here; use one of {known}")
 
     def text(self, key: str, default: str | None = None) -> str:
-        """Return a text of the table."""
+        """Return the string value of a key."""
         value = self.data.get(key, default)
         if not isinstance(value, str) or (default is None and not value):
             lacks = f"the {self.kind or 'scenario'} has no {key}"
@@ -185,13 +185,13 @@ class _Table(NamedTuple):
         return value
 
     def error(self, key: str, problem: str, remedy: str = "") -> DocumentError:
-        """Return the error about a key of the table."""
+        """Return an error about a key of the table, with its line."""
         return DocumentError(
             f"the scenario '{self.path}', line {self._line(key)}: {problem}", "", remedy
         )
 
     def _line(self, key: str) -> int:
-        """Return the line number of a key, or of the head of the table if it lacks the key."""
+        """Return the line number of a key; for a missing key, the line of the table's header."""
         head = rf"\s*\[\[{self.kind}\]\]"
         heads = [number for number, text in enumerate(self.lines) if re.match(head, text)]
         start = heads[self.place] if self.kind and self.place < len(heads) else 0
@@ -332,7 +332,7 @@ def _claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party]) ->
 
 
 def _check_controls(table: _Table, claims: Sequence[Claim], controls: Sequence[Claim]) -> None:
-    """Check that something works meanwhile in a row that expects silence."""
+    """Raise unless a row that expects silence also has a claim that something works."""
     happening = [claim for claim in (*claims, *controls) if _happens(claim)]
     for claim in claims:
         heard = claim.relation is Relation.HEARS
@@ -364,7 +364,7 @@ ALL = "all"
 
 
 def choose_scenarios(names: Sequence[str], *, on_zenoh: bool = False) -> tuple[Scenario, ...]:
-    """Return the scenarios with these names or TOML files, in order.
+    """Return the scenarios with these names, or in these TOML files, in order.
 
     Without names, it is the default scenario on DDS, and all of them ``on_zenoh``.
 
