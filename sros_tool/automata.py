@@ -144,7 +144,7 @@ class Automaton:
         size, more = self.size, len(begin)
         edges = [(i, Letters.of(letter), i + 1) for i, letter in enumerate(begin)]
         edges += [(at + more, letters, to + more) for at, letters, to in self.edges]
-        ends = frozenset(each + more for each in self.ends)
+        ends = frozenset(state + more for state in self.ends)
         for i, letter in enumerate(end):
             edges += [(at, Letters.of(letter), more + size + i) for at in sorted(ends)]
             ends = frozenset((more + size + i,))
@@ -205,7 +205,7 @@ class Automaton:
     def endless_bits(self) -> int:
         """The positions from which every text is accepted, as a bit mask."""
         loops = {at for at, letters, to in self.edges if at == to and letters == ANY_LETTER}
-        return sum(1 << each for each in self.ends & loops)
+        return sum(1 << state for state in self.ends & loops)
 
     @cached_property
     def size(self) -> int:
@@ -222,7 +222,7 @@ class Automaton:
         levels: list[int] = []
         known, row = self.ends, self.ends
         while row:
-            levels.append(sum(1 << each for each in row))
+            levels.append(sum(1 << state for state in row))
             row = frozenset(at for to in row for at in before.get(to, ())) - known
             known |= row
         return tuple(enumerate(levels))
@@ -588,9 +588,9 @@ def _between(node: _Node, begin: str, end: str) -> _Node:
         case _Some():
             size = len(begin) + len(end)
             exact = frozenset(
-                each[len(begin) : len(each) - len(end)]
-                for each in node.exact
-                if len(each) >= size and each.startswith(begin) and each.endswith(end)
+                name[len(begin) : len(name) - len(end)]
+                for name in node.exact
+                if len(name) >= size and name.startswith(begin) and name.endswith(end)
             )
             return _Some(
                 exact, frozenset(automaton.between(begin, end) for automaton in node.automata)

@@ -371,12 +371,12 @@ def make_folders(path: Path) -> list[Path]:
         OSError: one of them cannot be made; nothing is left of the others.
     """
     paths: list[Path] = []
-    missing = [each for each in (path, *path.parents) if not each.exists()]
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
-        for each in reversed(missing):
+        for folder in reversed(missing):
             with contextlib.suppress(FileExistsError):  # another process created it meanwhile
-                each.mkdir()
-                paths.insert(0, each)
+                folder.mkdir()
+                paths.insert(0, folder)
     except BaseException:
         remove_folders(paths)
         raise

@@ -42,10 +42,10 @@ def replaceable_on_the_way(path: Path, trusted: frozenset[int]) -> Iterator[tupl
     A folder in which only the owner of a file can rename it (sticky, as ``/tmp``) counts only if
     others own what is in it on the way.
     """
-    for each, state in _way(path):
+    for step, state in _way(path):
         kept = state.st_mode & stat.S_ISVTX and state.st_uid in trusted
         if not kept and (why := other_writers(state, trusted)):
-            yield each, why
+            yield step, why
 
 
 def file_of_root(path: Path) -> Path | None:

@@ -210,8 +210,8 @@ class Network:
         for (enclave, direction), topics in sorted(allowed.items()):
             outside = sorted(denied[enclave, direction].union(ignored))
             for topic in sorted(topics, key=_plain_first):
-                met = tuple(each for each in outside if overlap(each, topic))
-                if not any(each == topic or covers(each, topic) for each in met):
+                met = tuple(name for name in outside if overlap(name, topic))
+                if not any(name == topic or covers(name, topic) for name in met):
                     ends[direction].append(_Access(enclave, topic, met))
         for each, enclave in product(dict.fromkeys(unguarded), everybody):
             outside = sorted({*each.without, *ignored})
@@ -301,7 +301,7 @@ def _shared(access: _Access, other: _Access) -> str:
     exact = next((end.topic for end in (access, other) if not is_expression(end.topic)), "")
     outside = set(access.without + other.without)
     if exact:
-        return "" if any(matches(each, exact) for each in outside) else exact
+        return "" if any(matches(excluded, exact) for excluded in outside) else exact
     return _shared_by_wildcards(*sorted((access.topic, other.topic)), tuple(sorted(outside)))
 
 
@@ -309,11 +309,11 @@ def _shared(access: _Access, other: _Access) -> str:
 def _shared_by_wildcards(one: str, other: str, outside: tuple[str, ...]) -> str:
     for prefix, (_, _, end) in _WRITER_RIGHTS.items():
         # In ROS terms first, so that the result is a valid ROS name.
-        inner = [_ros_part(each, prefix, end) for each in (one, other)]
-        outer = [_ros_part(each, prefix, end) for each in outside]
+        inner = [_ros_part(side, prefix, end) for side in (one, other)]
+        outer = [_ros_part(excluded, prefix, end) for excluded in outside]
         name = common_name(inner, filter(None, outer)) if all(inner) else ""
         topic = f"{prefix}{name}{end}"
-        if name and not any(matches(each, topic) for each in outside):
+        if name and not any(matches(excluded, topic) for excluded in outside):
             return topic
     return common_name((one, other), outside, absolute=False) or ""
 

@@ -87,7 +87,7 @@ class _Topics:
         return not (self.publish or self.subscribe)
 
     def text_bytes(self) -> int:
-        return sum(TOPIC_LINE_BYTES + len(each) for each in (*self.publish, *self.subscribe))
+        return sum(TOPIC_LINE_BYTES + len(topic) for topic in (*self.publish, *self.subscribe))
 
     def shorten(self) -> None:
         self.publish = needed_expressions(self.publish)
@@ -147,12 +147,12 @@ def hidden_protections(protection: DomainProtection) -> list[tuple[str, str]]:
     for named in protection.named:
         own = protected_topics(named.kind, named.name)
         by = [
-            next((at for one, at in earlier if covers(one, each) and covers(each, one)), "")
-            for each in own
+            next((at for one, at in earlier if covers(one, name) and covers(name, one)), "")
+            for name in own
         ]
         if all(by):
             found.append((str(named), by[0]))
-        earlier += [(each, str(named)) for each in own]
+        earlier += [(name, str(named)) for name in own]
     return found
 
 

@@ -331,9 +331,9 @@ def _never(name: str) -> str:
     return "a part of it begins with a digit" if _DIGIT_FIRST.search(name) else ""
 
 
-def _belongs(each: _Statement) -> str:
+def _belongs(statement: _Statement) -> str:
     """Return the kind, "topics" or "services", of a ROS 2 name; "" if the rule has that kind."""
-    kind, name = each.right.kind, each.name
+    kind, name = statement.right.kind, statement.name
     if kind != "services":
         is_service = (
             name.rpartition("/")[2] in NODE_SERVICES or action_part(name)[1] in ACTION_SERVICES
@@ -342,24 +342,24 @@ def _belongs(each: _Statement) -> str:
     return "topics" if name in _GLOBAL_TOPICS or action_part(name)[1] in ACTION_TOPICS else ""
 
 
-def _breadth(each: _Statement) -> Iterator[Finding]:
-    name, right = each.name, each.right.right
+def _breadth(statement: _Statement) -> Iterator[Finding]:
+    name, right = statement.name, statement.right.right
     if right == "publish" and name == "/clock":
-        yield each.found(SETS_CLOCK, f"{each.right.enclave} may publish /clock")
+        yield statement.found(SETS_CLOCK, f"{statement.right.enclave} may publish /clock")
     if not is_expression(name):
         return
-    text = each.right.describe()
+    text = statement.right.describe()
     if _ALL.match(name):
         kind = READS_EVERYTHING if right == "subscribe" else EVERYTHING
-        yield each.found(kind, f"{text} matches every name")
+        yield statement.found(kind, f"{text} matches every name")
     elif literal_prefix(name).count("/") < 2 and is_expression(name.rpartition("/")[2]):
         kind = READS_EVERYTHING if right == "subscribe" else WIDE
-        yield each.found(
+        yield statement.found(
             kind,
             f"{text} does not begin with a whole namespace, and does not end with a whole name",
         )
     elif right == "request" and covers(name, "/*/set_parameters"):
-        yield each.found(SETS_PARAMETERS, f"{text} matches every node")
+        yield statement.found(SETS_PARAMETERS, f"{text} matches every node")
 
 
 _INCLUDE = (
@@ -776,23 +776,23 @@ def _check_rules(checked: _CheckedPolicy) -> Iterator[Finding]:
     yield from _redundant(checked)
 
 
-def _permission(each: _Statement, rules: Rules) -> Iterator[Finding]:
-    denial = each.right._replace(qualifier=DENY)
+def _permission(statement: _Statement, rules: Rules) -> Iterator[Finding]:
+    denial = statement.right._replace(qualifier=DENY)
     if denials := rules.covering(denial):
         same = set(parts(denial)) == set(denials)
         shown = ", ".join(sorted({f"{by.right} {by.name}" for by in denials}))
         if same:
-            text = f"{each.right.describe()} is allowed here and denied in the same enclave"
-            yield each.found(CONTRADICTION, text)
+            text = f"{statement.right.describe()} is allowed here and denied in the same enclave"
+            yield statement.found(CONTRADICTION, text)
         else:
-            yield each.found(UNREACHABLE, f"{each.right.describe()} is denied by {shown}")
+            yield statement.found(UNREACHABLE, f"{statement.right.describe()} is denied by {shown}")
         return
-    if each.name.endswith(GOAL) and each.right.right in WHOLE:
-        action = each.name.removesuffix(GOAL)
-        whole = WHOLE[each.right.right]
-        if not rules.allow(each.right.enclave, whole, action):
-            text = f"{each.name} is allowed, but not everything needed to {whole} {action}"
-            yield each.found(HALF_ACTION, text)
+    if statement.name.endswith(GOAL) and statement.right.right in WHOLE:
+        action = statement.name.removesuffix(GOAL)
+        whole = WHOLE[statement.right.right]
+        if not rules.allow(statement.right.enclave, whole, action):
+            text = f"{statement.name} is allowed, but not everything needed to {whole} {action}"
+            yield statement.found(HALF_ACTION, text)
 
 
 def _redundant(checked: _CheckedPolicy) -> Iterator[Finding]:
@@ -1005,8 +1005,8 @@ class NearNames:
         removed, replaced or swapped with its neighbour; or only in capitals and separators.
         Parts that differ in digits, or are shorter than four letters, are not similar.
         """
-        found = {each for key in set(_keys(name)) for each in self._by_key.get(key, ())}
-        return sorted(each for each in found if each != name and _is_near(name, each))
+        found = {candidate for key in set(_keys(name)) for candidate in self._by_key.get(key, ())}
+        return sorted(other for other in found if other != name and _is_near(name, other))
 
 
 def _keys(name: str) -> Iterator[str]:

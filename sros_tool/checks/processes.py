@@ -181,11 +181,11 @@ def _newer(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
         files += (process.configuration,) if process.configuration else ()
     newer = [e.name for e in files if e.changed and e.changed > process.started]
     gone = [each for each in enclave.lacking if any(each == file.name for file in files)]
-    yield from (_plain_path(each) for each in newer)
-    yield from (f"{each} (removed)" for each in gone)
+    yield from (_plain_path(file) for file in newer)
+    yield from (f"{file} (removed)" for file in gone)
     if not newer and not gone:
         moved = [path for path, moment in enclave.moved.items() if moment > process.started]
-        yield from (f"'{_plain_path(each)}' (moved, or its mode)" for each in moved[:1])
+        yield from (f"'{_plain_path(file)}' (moved, or its mode)" for file in moved[:1])
 
 
 def _unread_files(process: Process, enclave: ProcessEnclave) -> Iterator[Finding]:
@@ -214,7 +214,7 @@ class _Loaded:
 def _loaded(enclave: ProcessEnclave, newer: Sequence[str], started: datetime) -> _Loaded:
     """Return what a process loaded, from unchanged files, or from the ledger for changed files."""
     windows: dict[str, Window] = {}
-    changed = {each.split()[0] for each in newer}
+    changed = {file.split()[0] for file in newer}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)
     entries, unknown = _entries(enclave)
     before = [entry for entry in entries if entry.time <= iso(started)]
@@ -328,8 +328,8 @@ def _local_time(
     if begin is None or end is None or begin <= int(now.timestamp()) <= end:
         return
     read = " to ".join(
-        iso(datetime.fromtimestamp(each, UTC)) if isfinite(each) else "never"
-        for each in (begin, end)
+        iso(datetime.fromtimestamp(moment, UTC)) if isfinite(moment) else "never"
+        for moment in (begin, end)
     )
     text = f"they are valid from {grant.not_before} to {grant.not_after}, which it reads as {read}"
     yield PROCESS_LOCAL_TIME.found(process.label, text)
@@ -375,7 +375,9 @@ def _unsecured_because(process: Process) -> str:
 
 def _plain_path(text: str) -> str:
     """Return a path from another process without the characters that could fake a message."""
-    return "".join(each if each.isprintable() else "?" for each in text[:_LONGEST_PATH])
+    return "".join(
+        character if character.isprintable() else "?" for character in text[:_LONGEST_PATH]
+    )
 
 
 _LONGEST_PATH = 300
@@ -828,7 +830,7 @@ def runtime_metrics(
         Metric(
             "sros_processes",
             "Number of processes that speak ROS 2 by their security (secured, open or unknown).",
-            tuple(Sample(security[each], {"security": each.value}) for each in Security),
+            tuple(Sample(security[level], {"security": level.value}) for level in Security),
         ),
         Metric(
             "sros_processes_not_seen",

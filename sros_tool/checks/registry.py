@@ -34,9 +34,9 @@ _MODULES = (
 def _declared(module: ModuleType) -> Iterator[FindingKind]:
     """Yield the kinds that a module defines, as constants or as values of dictionaries."""
     for value in vars(module).values():
-        for each in value.values() if isinstance(value, dict) else (value,):
-            if isinstance(each, FindingKind):
-                yield each
+        for part in value.values() if isinstance(value, dict) else (value,):
+            if isinstance(part, FindingKind):
+                yield part
 
 
 @cache
@@ -84,12 +84,12 @@ class FindingFilter:
 
     def wants(self, kind: FindingKind) -> bool:
         """Return whether the filter selects this kind, whatever its severity."""
-        included = not self.include or any(_matches(kind, each) for each in self.include)
+        included = not self.include or any(_matches(kind, pattern) for pattern in self.include)
         if self.vendor and kind.vendors and self.vendor not in kind.vendors:
             return False
         if self.vendor and kind.id == _DIFFERENCES:
             return False
-        return included and not any(_matches(kind, each) for each in self.exclude)
+        return included and not any(_matches(kind, pattern) for pattern in self.exclude)
 
     def _shows(self, finding: Finding) -> bool:
         level = WARNING if finding.kind.prominent else NOTE

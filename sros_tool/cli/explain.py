@@ -751,7 +751,7 @@ def _show_reach(
         _echo(_followed_lines(followed))
     print_notes(followed.notes)
     if not infrastructure and not as_json:
-        topics = ", ".join(each for each in followed.left_out if not each.startswith("*"))
+        topics = ", ".join(topic for topic in followed.left_out if not topic.startswith("*"))
         text = f"left out: {topics}, which every node writes and reads, and requests "
         text += "that only ask nodes about themselves, such as get_parameters and get_state"
         echo(f"{text} (include them with --infrastructure)", err=True)

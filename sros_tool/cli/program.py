@@ -149,9 +149,9 @@ class _Program(click.Group):
         module = importlib.import_module(f"sros_tool.cli.{_VERBS[name].module}")
         command = getattr(module, _VERBS[name].attribute or name)
         assert isinstance(command, click.Command)
-        for each in (command, *getattr(command, "commands", {}).values()):
-            if _VERBOSE not in each.params:
-                each.params.append(_VERBOSE)
+        for subcommand in (command, *getattr(command, "commands", {}).values()):
+            if _VERBOSE not in subcommand.params:
+                subcommand.params.append(_VERBOSE)
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:

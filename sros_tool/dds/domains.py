@@ -127,7 +127,9 @@ class DomainSet:
             for border in sorted(borders)
             if any(border in domain_set for domain_set in listed)
         ]
-        kinds = {tuple(each in domain_set for domain_set in sets): each for each in reversed(known)}
+        kinds = {
+            tuple(domain in domain_set for domain_set in sets): domain for domain in reversed(known)
+        }
         return tuple(sorted(kinds.values()))
 
     def preferred(self) -> int:

@@ -374,7 +374,8 @@ def outside(
             for rule in grant.rules
             for criteria in (*rule.publish, *rule.subscribe)
             for topic in criteria.topics
-            if len(topic.encode()) > _LONGEST_TOPIC and not any(each in topic for each in "*?[")
+            if len(topic.encode()) > _LONGEST_TOPIC
+            and not any(character in topic for character in "*?[")
         ]
         if long:
             yield "portable.long-name", f"{long[0][:60]}... has {len(long[0].encode())} bytes"

@@ -332,7 +332,9 @@ def _broken(process: str, line: str, rest: str, following: str) -> str:
         return ""
     if denied_topic(line) or denied_topic(following) or SECURITY_DIRECTORY.search(following):
         return ""
-    return next((each for each in (rest + end, f"{rest} {end}") if log_text(each)), "")
+    return next(
+        (candidate for candidate in (rest + end, f"{rest} {end}") if log_text(candidate)), ""
+    )
 
 
 def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
@@ -530,7 +532,7 @@ class _Examiner:
         """Return the finding with causes and remedies from the enclaves of the peers in the log."""
         shown = dict.fromkeys(hit.fields["peer"] for hit in hits if hit.fields.get("peer"))
         names = (
-            [self._keystore.peer(each) for each in islice(shown, _MOST_PEERS)]
+            [self._keystore.peer(peer) for peer in islice(shown, _MOST_PEERS)]
             if self._keystore
             else []
         )
@@ -544,7 +546,7 @@ class _Examiner:
             answer = self._answer(peer, finding.dds or Vendor.FAST, ask("join"))
             causes = list(self._causes(peer, answer, ()))
             known += [f"the peer is enclave {name}: {cause}" for cause, _ in causes]
-            remedies += [f"{each} Then restart its processes." for _, each in causes if each]
+            remedies += [f"{cause} Then restart its processes." for _, cause in causes if cause]
             if not causes:
                 known.append(f"the peer is enclave {name}, whose present files have no fault")
                 if not (rotating and finding.id in _OF_ROTATION):

@@ -128,7 +128,7 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
     fitting = [each for each in TYPES if (word, each) in _RIGHTS]
     chosen = kind or fitting[0]
     if chosen not in fitting:
-        others = " or ".join(verb for verb, each in _RIGHTS if each == chosen)
+        others = " or ".join(verb for verb, right in _RIGHTS if right == chosen)
         raise UsageError(
             f"nobody can {word} {_a(chosen)}",
             f"A node can {word} {' or '.join(map(_a, fitting))}, and {others} {_a(chosen)}.",

@@ -353,7 +353,9 @@ def _short_lived_changes(old: Template, new: Template) -> Iterator[SettingChange
             continue
         longer = after is None or (before is not None and after > before)
         effect = Effect.LOOSER if longer else Effect.TIGHTER
-        one, other = (duration_text(each) if each else "as others" for each in (before, after))
+        one, other = (
+            duration_text(lifetime) if lifetime else "as others" for lifetime in (before, after)
+        )
         meaning = f"what is issued for {name} expires {'later' if longer else 'earlier'}"
         yield SettingChange(effect, f"enclaves {name}.validity", one, other, meaning)
 
@@ -376,8 +378,10 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
         before, after = getattr(old, key), getattr(new, key)
         if before != after:
             one, other = (
-                ",".join(map(str, each)) or "(as usual)" if isinstance(each, tuple) else str(each)
-                for each in (before, after)
+                ",".join(map(str, setting)) or "(as usual)"
+                if isinstance(setting, tuple)
+                else str(setting)
+                for setting in (before, after)
             )
             yield SettingChange(Effect.LATER, f"zenoh.{key}", one, other, meaning)
 

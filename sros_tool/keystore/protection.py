@@ -141,21 +141,21 @@ class _Raising:
         Entries for a part of the names are raised to the stated level.
         """
         wide: list[str] = []
-        for each in self._topics.meeting(topic):
-            number = self._owner[each]
-            if covers(each, topic):
-                wide.append(each)
-            elif covers(topic, each):
+        for name in self._topics.meeting(topic):
+            number = self._owner[name]
+            if covers(name, topic):
+                wide.append(name)
+            elif covers(topic, name):
                 value = self._raised(self._value(number), stated.level)
                 self._named[number] = replace(self._named[number], protection=value)
             elif self._raised(self._value(number), stated.level) != self._value(number):
-                raise self._parted(each, stated)
+                raise self._parted(name, stated)
         return self._owner[min(wide, key=self._rank.__getitem__)] if wide else None
 
     def _refuse_parted(self, topic: str, stated: StatedProtection) -> None:
-        for each in self._topics.meeting(topic):
-            if not covers(each, topic) and not covers(topic, each):
-                raise self._parted(each, stated)
+        for name in self._topics.meeting(topic):
+            if not covers(name, topic) and not covers(topic, name):
+                raise self._parted(name, stated)
 
     def _parted(self, topic: str, stated: StatedProtection) -> PolicyError:
         other = self._named[self._owner[topic]]
@@ -229,7 +229,7 @@ class _DomainRules:
     def levels(self, topic: str) -> Iterator[Level]:
         """Yield the levels of all rules that decide on some name of a topic expression."""
         for _, rule in sorted(
-            (self._rules[each] for each in self._names.meeting(topic)), key=lambda pair: pair[0]
+            (self._rules[name] for name in self._names.meeting(topic)), key=lambda pair: pair[0]
         ):
             kinds: tuple[ProtectionKind, ...] = (
                 rule.data_protection_kind,

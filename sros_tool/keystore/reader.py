@@ -677,7 +677,7 @@ class OpenedEnclave:
         if governed is None or self.grant is None:
             return governed
         allowed = self.grant.domains()
-        common = DomainSet.of(*((each, each) for each in governed if each in allowed))
+        common = DomainSet.of(*((domain, domain) for domain in governed if domain in allowed))
         return common if common.ranges else governed
 
     def valid_until(self) -> datetime | None:

@@ -260,10 +260,10 @@ def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
     end = "/" + name.strip("/").lower()
     if end == "/":
         return ()
-    lower = {each: each.lower() for each in there}
-    found = [each for each in there if lower[each].endswith(end)]
+    lower = {enclave: enclave.lower() for enclave in there}
+    found = [enclave for enclave in there if lower[enclave].endswith(end)]
     if not found:
-        last = {each: text.rpartition("/")[2] for each, text in lower.items()}
+        last = {enclave: text.rpartition("/")[2] for enclave, text in lower.items()}
         found = _alike(end.rpartition("/")[2], last, _ALIKE)
     return tuple(sorted(found or _alike(end, lower, _WHOLE_ALIKE))[:3])
 
@@ -273,4 +273,4 @@ def _alike(text: str, texts: Mapping[str, str], least: float) -> list[str]:
     import difflib
 
     alike = difflib.get_close_matches(text, set(texts.values()), n=3, cutoff=least)
-    return [each for each, written in texts.items() if written in alike]
+    return [enclave for enclave, written in texts.items() if written in alike]

@@ -125,9 +125,9 @@ def _controlling(governance: Governance | None, more: DomainSet) -> Governance |
         )
 
     rules = tuple(map(controlling, governance.domain_access_rules))
-    missing = [each for each in more if each not in governance.domains().closed()]
+    missing = [domain for domain in more if domain not in governance.domains().closed()]
     if missing:
-        rules += (replace(strict, domains=DomainSet.of(*((each, each) for each in missing))),)
+        rules += (replace(strict, domains=DomainSet.of(*((domain, domain) for domain in missing))),)
     return Governance(rules)
 
 

@@ -431,7 +431,7 @@ def _both(requirement: NotBoth, world: World, limit: SearchLimit) -> Witness | N
     sides = [
         _first_uses(rights, world, limit) for rights in (requirement.first, requirement.second)
     ]
-    pairs = {each: (use, sides[1][each]) for each, use in sides[0].items() if each in sides[1]}
+    pairs = {name: (use, sides[1][name]) for name, use in sides[0].items() if name in sides[1]}
     if not pairs:
         return None
     best = min(pairs, key=lambda each: [_better(use) for use in pairs[each]])
@@ -480,8 +480,8 @@ def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness 
     """Return a chain with the fewest hops from a source to a target, past ``through``."""
     through = {enclave for enclave in world.enclaves if _match(requirement.through, enclave)}
     inside = [enclave for enclave in world.enclaves if enclave not in through]
-    sources = [each for each in inside if _match(requirement.sources, each)]
-    targets = {each for each in inside if _match(requirement.targets, each)}
+    sources = [name for name in inside if _match(requirement.sources, name)]
+    targets = {name for name in inside if _match(requirement.targets, name)}
     chain = _shortest_chain(world, sources, targets, through, limit)
     if not chain:
         return None
@@ -556,8 +556,8 @@ def _always(requirement: Requirement, world: World) -> str:
             left = [
                 enclave for enclave in world.enclaves if not _match(requirement.through, enclave)
             ]
-            sources = {each for each in left if _match(requirement.sources, each)}
-            targets = {each for each in left if _match(requirement.targets, each)}
+            sources = {name for name in left if _match(requirement.sources, name)}
+            targets = {name for name in left if _match(requirement.targets, name)}
             if not any(sources - {target} for target in targets):
                 return "no two enclaves are left that it keeps apart"
     return ""

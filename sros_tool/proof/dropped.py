@@ -218,15 +218,15 @@ def _right_within(part: OfRights, wide: OfRights) -> bool:
 
 def _all_within(narrow: Iterable[str], wide: Sequence[str]) -> bool:
     """Return whether some pattern of ``wide`` covers each pattern of ``narrow``."""
-    return all(any(covers(one, each) for one in wide) for each in narrow)
+    return all(any(covers(one, name) for one in wide) for name in narrow)
 
 
 def _enclaves_within(narrow: Sequence[str], wide: Sequence[str]) -> bool:
     """Return whether a list of enclaves has no enclave that another list does not have."""
-    ours, others = ([each[1:] for each in of if each.startswith(EXCEPT)] for of in (narrow, wide))
-    some = [each for each in narrow if not each.startswith(EXCEPT)]
-    more = [each for each in wide if not each.startswith(EXCEPT)]
-    free = (e for e in others if any(overlap(e, each) for each in some))
+    ours, others = ([name[1:] for name in of if name.startswith(EXCEPT)] for of in (narrow, wide))
+    some = [name for name in narrow if not name.startswith(EXCEPT)]
+    more = [name for name in wide if not name.startswith(EXCEPT)]
+    free = (e for e in others if any(overlap(e, name) for name in some))
     return _all_within(some, more) and _all_within(free, ours)
 
 

@@ -158,7 +158,7 @@ def _step(use: Use, world: World, system: System) -> Step:
 def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
     """Yield clauses that say why a requirement, or a part of it, cannot fail in any world."""
     first, *others = verdicts
-    empty = [each for each in first.empty if all(each in other.empty for other in others)]
+    empty = [name for name in first.empty if all(name in other.empty for other in others)]
     if empty:
         yield f"nothing has {_listed(empty)}"
     if all(verdict.always for verdict in verdicts):

@@ -484,7 +484,7 @@ def _of_rights(side: AccessSource, robots: Mapping[str, int]) -> Callable[[str, 
 
         def decide(verb: AccessVerb, topic: str) -> bool:
             def any_of(some: Iterable[str]) -> bool:
-                return any(matches(Style.FNMATCH, each, topic) for each in some)
+                return any(matches(Style.FNMATCH, pattern, topic) for pattern in some)
 
             return any_of(allowed[verb]) and not any_of(denied[verb])
 
@@ -531,7 +531,7 @@ def _gains(
     for gain, seen, domains in gains.values():
         one = replace(
             gain,
-            worlds=tuple(each for each in order if each in seen),
+            worlds=tuple(world for world in order if world in seen),
             domains=tuple(sorted(domains)),
         )
         # What the governance gives, it gives to many.
@@ -774,7 +774,7 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
     for source, of in after.items():
         for target, hop in of.items():
             backwards[target][source] = hop
-    sources = changed.union(*(_reached(backwards, each) for each in sorted(changed)))
+    sources = changed.union(*(_reached(backwards, name) for name in sorted(changed)))
     for source in sorted(sources):
         known = _reached(before, source).keys()
         reached = _reached(after, source)

@@ -117,10 +117,10 @@ def less_protection(
         least = _demanded_governance(old.protections or (), new.governance.domains().closed())
         yield from _looser_governance(least, _of_payloads(new.governance), limit)
     if old.authorities is not None and new.authorities is not None:
-        for role, each in sorted(new.authorities - old.authorities):
+        for role, fingerprint in sorted(new.authorities - old.authorities):
             yield SettingChange(
                 Effect.LOOSER,
-                f"{role} CA {each[:16]}...",
+                f"{role} CA {fingerprint[:16]}...",
                 "unknown",
                 "trusted",
                 "whoever has its key can become any enclave"

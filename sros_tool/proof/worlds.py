@@ -139,7 +139,7 @@ class Side:
             for automaton in around.automata:
                 self._wild[automaton].append(enclave)
         self._topics = sorted(self.exact)
-        self._backwards = sorted(each[::-1] for each in self.exact)
+        self._backwards = sorted(name[::-1] for name in self.exact)
 
     def meeting(self, topics: Topics, limit: SearchLimit) -> list[Meeting]:
         """Return the enclaves that perhaps may use some of the topics, sorted.
@@ -279,7 +279,9 @@ class World:
         self._shared: dict[tuple[str, str], str | None] = {}
 
     def _with_lent(self, name: str, access: Mapping[str, TopicAccess]) -> TopicAccess:
-        every = [access[each] for each in (name, *self.lenders.get(name, ())) if each in access]
+        every = [
+            access[lender] for lender in (name, *self.lenders.get(name, ())) if lender in access
+        ]
         if len(every) == 1:
             return every[0]
         writes, reads = ([e.writes for e in every], [e.reads for e in every])
@@ -288,7 +290,7 @@ class World:
     def confirm(self, enclave: str, writes: bool, topic: str) -> bool:
         """Return whether an enclave may write (or else read) a topic, as the engine decides."""
         able = (enclave, *self.lenders.get(enclave, ()))
-        return any(self.confirm_own(each, writes, topic) for each in able)
+        return any(self.confirm_own(name, writes, topic) for name in able)
 
     def lender(self, enclave: str, writes: bool, topic: str) -> str:
         """Return the enclave without whose permissions another one may not use a topic, or ""."""
@@ -338,7 +340,7 @@ class World:
         }
         valid = valid_topics(topics.begin, topics.end)
         return (
-            shortest(each for each in known if each in valid)
+            shortest(domain for domain in known if domain in valid)
             or (names & topics.valid()).example(limit, longest=self.longest)
             or shortest(known)
             or example
@@ -500,13 +502,13 @@ def domains_of(
                 wild |= "*" in begin
                 if _DOMAIN.match(begin):
                     rules.setdefault(int(begin), set()).add((*what, rest))
-    unnamed = next(each for each in count() if each not in rules)
+    unnamed = next(domain for domain in count() if domain not in rules)
     known = {*rules, *(range(MAX_DOMAIN + 1) if others else ()), *([unnamed] if wild else ())}
     kinds: dict[object, int] = {}
-    for each in sorted(known, reverse=True):
-        inside = tuple(each in domain_set for domain_set in others)
-        if each in rules or any(inside) or wild:
-            kinds[frozenset(rules.get(each, ())), inside] = each
+    for domain in sorted(known, reverse=True):
+        inside = tuple(domain in domain_set for domain_set in others)
+        if domain in rules or any(inside) or wild:
+            kinds[frozenset(rules.get(domain, ())), inside] = domain
     return tuple(sorted(kinds.values()))
 
 

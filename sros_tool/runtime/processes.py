@@ -101,7 +101,7 @@ class Process:
         """The RMW of the middleware that the process has mapped, or else the RMW that it names."""
         named = self.environment.get(RMW, "")
         mapped = {rmw for library, rmw in _RMW_OF.items() if library in self.libraries}
-        if len(mapped) == 1 and not any(named.startswith(each) for each in mapped):
+        if len(mapped) == 1 and not any(named.startswith(path) for path in mapped):
             return f"{mapped.pop()}_cpp"
         return named or DEFAULT_RMW
 
@@ -217,7 +217,7 @@ class ProcessTable:
         before, self._looked = self._looked, {}
         processes: list[Process] = []
         closed: list[UnseenProcess] = []
-        pids = [int(each) for each in os.listdir(self._proc) if each.isdigit()]
+        pids = [int(entry) for entry in os.listdir(self._proc) if entry.isdigit()]
         for pid in sorted(pids):
             if pid == os.getpid():
                 continue
@@ -344,7 +344,7 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
         if mark:
             environment.setdefault(name, value)  # getenv(3) takes the first one
     maps = _read(folder, "maps", _MOST_MAPS)
-    libraries = frozenset(each.decode() for each in _LIBRARIES.findall(maps))
+    libraries = frozenset(library.decode() for library in _LIBRARIES.findall(maps))
     if not libraries and not _may_speak(command):
         return None
     network = os.readlink("ns/net", dir_fd=folder)
@@ -570,7 +570,7 @@ class ProcessRoot:
         with self._opened(path) as (_, way):
             if not stat.S_ISDIR(way[-1][1].st_mode):
                 raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
-            return {each: state for each, state in way if stat.S_ISDIR(state.st_mode)}
+            return {step: state for step, state in way if stat.S_ISDIR(state.st_mode)}
 
     @contextmanager
     def _opened(self, path: str) -> Iterator[tuple[int, list[tuple[str, os.stat_result]]]]:
@@ -660,8 +660,8 @@ def _loaded_enclave(
         keystore,
         name,
         tuple(
-            root.load(each, f"{place}/{each}", read=each not in _UNREAD)
-            for each in (*ENCLAVE_FILES, _KEY_ON_TOKEN, _CRL)
+            root.load(file, f"{place}/{file}", read=file not in _UNREAD)
+            for file in (*ENCLAVE_FILES, _KEY_ON_TOKEN, _CRL)
         ),
         is_there=True,
         moved={

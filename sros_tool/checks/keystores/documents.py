@@ -303,8 +303,8 @@ def _times(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding
         return
     text = f"they are valid from {grant.not_before} to {grant.not_after}"
     begin, end = (
-        read_moment(Moments.LOCAL, each, enclave.keystore.zone)
-        for each in (grant.not_before, grant.not_after)
+        read_moment(Moments.LOCAL, moment, enclave.keystore.zone)
+        for moment in (grant.not_before, grant.not_after)
     )
     if begin is None or end is None:
         return  # TIME_FORMAT reports it
@@ -424,7 +424,7 @@ def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Findi
         yield DOMAINS.found(enclave.name, f"{text}its robot is in domain {wanted}", file)
         return
     text += f"the governance for {governed}"
-    fewer = bool(allowed.ranges) and all(each in governed for each in allowed)
+    fewer = bool(allowed.ranges) and all(domain in governed for domain in allowed)
     # On a robot nothing says what was meant, and no node talks in a domain that it should not.
     kind = FEWER_DOMAINS if fewer and not enclave.keystore.is_home else DOMAINS
     yield kind.found(enclave.name, text, file)
@@ -698,8 +698,8 @@ def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
 
 
 def _domain_rule(rule: DomainRule, asked: Sequence[Vendor]) -> Iterator[tuple[FindingKind, str]]:
-    for each, text in _open_attributes(rule):
-        kind = _OPEN[each]
+    for attribute, text in _open_attributes(rule):
+        kind = _OPEN[attribute]
         if kind is UNAUTHENTICATED:
             kind, reach = _unauthenticated(rule, asked)
             text = f"{text}: {reach}"
@@ -722,7 +722,7 @@ def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
         of_ros = all(any(covers(expression, one) for expression in expressions) for one in _OF_ROS)
         yield NO_OTHER_TOPIC_RULE if of_ros else NO_TOPIC_RULE, "there is no rule for *"
     names = Names(expressions)
-    first = {each: index for index, each in reversed([*enumerate(expressions)])}
+    first = {expression: index for index, expression in reversed([*enumerate(expressions)])}
     for index, topic in enumerate(rule.topic_access_rules):
         yield from _topic_rule(rule, topic)
         same = topic.topic_expression
@@ -758,8 +758,8 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[FindingKin
         yield NO_ENCRYPTION, f"messages of {name} are only signed"
     if topic.data_protection_kind in _SIGNING:
         yield SIGNED_PAYLOAD, f"data_protection_kind is {topic.data_protection_kind} for {name}"
-    for each, text in _open_attributes(topic):
-        yield _OPEN[each], f"{text} for {name}"
+    for attribute, text in _open_attributes(topic):
+        yield _OPEN[attribute], f"{text} for {name}"
 
 
 def governance_copy_findings(keystore: CheckedKeystore) -> Iterator[Finding]:

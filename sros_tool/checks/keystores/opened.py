@@ -174,7 +174,7 @@ class CheckedKeystore:
     @property
     def can_issue(self) -> bool:
         """Whether the keystore has its CAs, so that sros commands can issue and sign in it."""
-        return self.is_home and any((self.root / each).exists() for each in (PUBLIC, SETTINGS))
+        return self.is_home and any((self.root / folder).exists() for folder in (PUBLIC, SETTINGS))
 
     def accepts(self, kind: FindingKind, chosen: Callable[[Template], bool]) -> str:
         """Return text naming the template or keystore that accepts a weakness; "" if none does.

@@ -73,11 +73,11 @@ _SHOWN = 3
 def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
     """Yield findings about topic names in the rules of a grant."""
     if not is_for_ros(grant):
-        names = [repr(each) for each in dict.fromkeys(_stated(grant, allow=True))]
+        names = [repr(topic) for topic in dict.fromkeys(_stated(grant, allow=True))]
         yield NOT_FOR_ROS.found(enclave.name, f"they name only {some_names(names)}", file)
         return
     named = dict.fromkeys((*_stated(grant, allow=True), *_stated(grant, allow=False)))
-    problems = [text for each in named if (text := ros_name_problem(each))]
+    problems = [text for name in named if (text := ros_name_problem(name))]
     if problems:
         text = first_few(problems, _SHOWN, "; ", "; and ")
         yield NO_ROS_NAME.found(enclave.name, text, file)
@@ -104,15 +104,15 @@ def check_capitals(enclaves: Mapping[str, frozenset[str]]) -> Iterator[Finding]:
 
 def names_without_wildcards(grant: Grant) -> frozenset[str]:
     """Return the topics that the rules of a grant allow by name, without wildcards."""
-    return frozenset(each for each in _stated(grant, allow=True) if not is_expression(each))
+    return frozenset(topic for topic in _stated(grant, allow=True) if not is_expression(topic))
 
 
 def is_for_ros(grant: Grant) -> bool:
     """Return whether a grant allows a ROS name, or has no allow rule with a name at all."""
     named = tuple(_stated(grant, allow=True))
     return not named or any(
-        overlap(wanted, each.strip())
-        for each in named
+        overlap(wanted, name.strip())
+        for name in named
         for wanted in (ROS_DISCOVERY_TOPIC, *(f"{prefix}/*" for prefix in _PREFIXES))
     )
 
@@ -129,7 +129,7 @@ def ros_name_problem(text: str) -> str:
     if has_foreign_letters(name):
         return _foreign_problem(name)
     if is_expression(name):
-        possible = "//" not in name and any(overlap(name, each) for each in _OF_ROS)
+        possible = "//" not in name and any(overlap(name, known) for known in _OF_ROS)
         return "" if possible else f"{name!r} matches no name of ROS{_meant(name)}"
     if _TYPE.match(name):
         return f"{name!r} is the name of a type: write the name of the topic"
@@ -163,7 +163,7 @@ def _foreign_problem(name: str) -> str:
 def _meant(name: str) -> str:
     """Return a hint with the probably intended name, such as ``: write rt/chatter``, or ""."""
     begin, slash, rest = name.partition("/")
-    parts = [each for each in (rest if begin in _PREFIXES else name).split("/") if each]
+    parts = [part for part in (rest if begin in _PREFIXES else name).split("/") if part]
     prefix = begin if slash and begin in _PREFIXES else "rt"
     meant = "/".join((prefix, *parts))
     end = _ENDS.get(f"{prefix}/", "")

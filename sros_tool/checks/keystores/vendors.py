@@ -449,9 +449,9 @@ def _states_all(grant: Grant) -> bool:
         and ROS_DISCOVERY_TOPIC in subscribed
         and any(
             names.subscribe[0] in subscribed
-            for each in published
-            if each.endswith(f"/{_TYPES}Reply") and not is_expression(each)
-            for names in (dds_names("reply", service_of(each)[0]),)
+            for topic in published
+            if topic.endswith(f"/{_TYPES}Reply") and not is_expression(topic)
+            for names in (dds_names("reply", service_of(topic)[0]),)
         )
     )
 

@@ -416,7 +416,7 @@ def _grant(node: _Node) -> Grant:
     end = validity.last("not_after") if validity else None
     if not (subject and subject.text and begin and begin.text and end and end.text):
         raise UnreadableError("a <grant> lacks its <subject_name> or its <validity>")
-    rules = tuple(_rule(each) for each in node.all("allow_rule", "deny_rule"))
+    rules = tuple(_rule(child) for child in node.all("allow_rule", "deny_rule"))
     default = node.last("default")
     word = None if default is None else default.text
     return Grant(
@@ -432,7 +432,7 @@ def _grant(node: _Node) -> Grant:
 
 def _rule(node: _Node) -> Rule:
     publish, subscribe = (
-        tuple(_criteria(each) for each in node.all(verb)) for verb in ("publish", "subscribe")
+        tuple(_criteria(child) for child in node.all(verb)) for verb in ("publish", "subscribe")
     )
     allow = node.tag == "allow_rule"
     return Rule(allow, _domains(node.last("domains")), publish, subscribe)
@@ -441,9 +441,9 @@ def _rule(node: _Node) -> Rule:
 def _criteria(node: _Node) -> Criteria:
     topics, partitions = node.last("topics"), node.last("partitions")
     return Criteria(
-        tuple(each.text for each in topics.all("topic")) if topics else (),
+        tuple(topic.text for topic in topics.all("topic")) if topics else (),
         # An empty list of partitions does not mean the default partition: it contains none.
-        tuple(each.text for each in partitions.all("partition")) or (_NOTHING,)
+        tuple(partition.text for partition in partitions.all("partition")) or (_NOTHING,)
         if partitions
         else (),
     )

@@ -149,7 +149,9 @@ def _check(element: etree._Element, name: str, grammar: dict[str, str]) -> None:
         raise UnreadableError(f"its root is not <{name}>")
     children = [child for child in element if isinstance(child.tag, str)]
     text = "".join([element.text or "", *(child.tail or "" for child in element)])
-    attributes = [str(each) for each in element.attrib if not str(each).startswith(_EVERYWHERE)]
+    attributes = [
+        str(attribute) for attribute in element.attrib if not str(attribute).startswith(_EVERYWHERE)
+    ]
     if attributes != (["name"] if name == "grant" else []):
         raise UnreadableError(f"<{name}> does not have the expected attributes")
     if name not in grammar:

@@ -66,7 +66,8 @@ def names_of(style: Style, expressions: Iterable[str]) -> NameSet:
     """Return the names that any of the expressions matches."""
     made = {expression: _automaton(style, expression) for expression in expressions}
     return NameSet(
-        (each for each, wild in made.items() if wild is None), filter(None, made.values())
+        (expression for expression, wild in made.items() if wild is None),
+        filter(None, made.values()),
     )
 
 

@@ -44,7 +44,9 @@ def also_fitting(
         return {}
     having: dict[str, set[str]] = {}
     for name, subjects in granted.items():
-        for part in {each for subject in subjects for each in _SEPARATORS.split(subject.strip())}:
+        for part in {
+            attribute for subject in subjects for attribute in _SEPARATORS.split(subject.strip())
+        }:
             having.setdefault(part, set()).add(name)
     lenders = {}
     for name, subject in certified.items():

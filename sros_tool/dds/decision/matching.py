@@ -54,7 +54,7 @@ def _joined(segments: list[str]) -> str:
     if not rest:
         return first
     *middle, last = rest
-    return first + "".join(f"(?>.*?{each})" for each in middle) + ".*" + last
+    return first + "".join(f"(?>.*?{part})" for part in middle) + ".*" + last
 
 
 def matches(style: Style, expression: str, name: str) -> bool:

@@ -269,8 +269,8 @@ def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
     overlapping expression; and for each ROS prefix a topic that no expression matches.
     """
     known = sorted(set(expressions))
-    wild = [each for each in known if is_expression(each)]
-    found: set[str | None] = {each for each in known if not is_expression(each)}
+    wild = [expression for expression in known if is_expression(expression)]
+    found: set[str | None] = {name for name in known if not is_expression(name)}
     for index, one in enumerate(wild):
         found.add(_only(one, known))
         found.add(_matched(one))
@@ -279,7 +279,7 @@ def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
                 found.add(common_name([one, other], absolute=False))
     for prefix in ("rt/*", "rq/*Request", "rr/*Reply", "*"):
         found.add(_only(prefix, known))
-    return tuple(sorted(each for each in found if each))
+    return tuple(sorted(topic for topic in found if topic))
 
 
 def _matched(expression: str) -> str | None:

@@ -137,7 +137,7 @@ def read_rotation(keystore: Keystore) -> Rotation:
         return Rotation()
     try:
         read = parse_json(keystore.read(path, "file of the rotation"))
-        replacements = tuple(_replacement(each) for each in read["replacements"])
+        replacements = tuple(_replacement(replacement) for replacement in read["replacements"])
         rotation = Rotation(RotationStage(read["stage"]), replacements)
         for replacement in replacements:
             issuing = (
@@ -163,7 +163,7 @@ def _replacement(read: dict[str, str]) -> Replacement:
     Raises:
         ValueError, TypeError: ``read`` does not describe a replacement.
     """
-    if not all(isinstance(each, str) for each in read.values()) or "/" in read.get("file", ""):
+    if not all(isinstance(value, str) for value in read.values()) or "/" in read.get("file", ""):
         raise ValueError
     return Replacement(**read)
 

@@ -187,7 +187,7 @@ def _read_manifest(folder: Folder) -> tuple[Move, ...]:
         read = json.loads(folder.read(f"{STAGE}/{MANIFEST}"))
         if read["version"] != _VERSION:
             raise ValueError(f"its version is not {_VERSION}")
-        return tuple(_move(*each) for each in read["moves"])
+        return tuple(_move(*move) for move in read["moves"])
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise _unknown(
             folder, f"Its list of files, {MANIFEST}, cannot be read: {error}."
@@ -195,9 +195,9 @@ def _read_manifest(folder: Folder) -> tuple[Move, ...]:
 
 
 def _move(path: str, before: str | None, after: str | None) -> Move:
-    for each in (before, after):
-        if each is not None and not isinstance(each, str):
-            raise ValueError(f"{each!r} is not the state of a path")
+    for state in (before, after):
+        if state is not None and not isinstance(state, str):
+            raise ValueError(f"{state!r} is not the state of a path")
     if not isinstance(path, str) or not is_layout_path(path):
         raise ValueError(f"{path!r} is not a file of a keystore")
     if after and not _stays_inside(path, after):
