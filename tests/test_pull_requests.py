@@ -222,7 +222,7 @@ def test_the_action_compares_with_what_is_merged_into(origin: Origin, tmp_path: 
     assert f"compared with `{origin.base}`" in said
     words = ("--base", began, "--fetch", "origin", "--policy", POLICY)
     older = sros("review", *words, cwd=clone)
-    assert (older.status, "have lost since BASE" in older.out) == (0, True), "asked by its id"
+    assert (older.status, "lost since BASE" in older.out) == (0, True), "asked by its id"
 
 
 def test_only_a_merge_says_what_it_is_merged_into(origin: Origin) -> None:

@@ -158,10 +158,10 @@ class SecurityProvider:
 
     def __str__(self) -> str:
         if self.ours:
-            return "`ros2 security` is that of sros."
+            return "`ros2 security` comes from sros."
         return (
-            f"`ros2 security` is that of {self.provider}, not of sros: ros2cli takes the one that "
-            "Python finds last. `sros` itself is not concerned."
+            f"`ros2 security` comes from {self.provider}, not from sros: ros2cli takes the package "
+            "that Python finds last. The command `sros` is not affected."
         )
 
 

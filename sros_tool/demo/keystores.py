@@ -165,7 +165,7 @@ class KeystoreSet:
             if isinstance(error := self._missing(party), UncastError):
                 return str(error)
         if self.user is not None and (enclave := self.user.rightful(row)):
-            return f"the keystore has no other enclave than {enclave}, which may rightfully do it"
+            return f"the keystore has no other enclave than {enclave}, which is permitted to do it"
         return ""
 
     def problem(self, row: Row) -> str:

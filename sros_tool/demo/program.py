@@ -211,7 +211,7 @@ def _check_accepted(options: DemoOptions) -> None:
     if options.accept_open and options.keystore is None:
         raise UsageError(
             "--accept-open is given without --keystore",
-            "Only what a keystore of yours opens needs to be accepted.",
+            "Only attacks that your own keystore allows can be accepted.",
             "Leave it out, or name the keystore.",
         )
     rows = {row.name for scenario in options.scenarios for row in scenario.rows if not row.removed}
@@ -220,7 +220,7 @@ def _check_accepted(options: DemoOptions) -> None:
             raise UsageError(
                 f"no row of an attack is named {name!r}",
                 "",
-                "Take the whole name from the demo's table.",
+                "Copy the whole name from the demo's table.",
             )
 
 

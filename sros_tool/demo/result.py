@@ -327,7 +327,7 @@ def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Findi
     lines = ((name, line) for name, output in outputs for line in output.splitlines())
     logged = next(((name, line) for name, line in lines if claim.evidence in line), None)
     if logged is None:
-        return _undecided(f"{finding.detail}, but nobody logged {claim.evidence!r}")
+        return _undecided(f"{finding.detail}, but no process logged {claim.evidence!r}")
     name, line = logged
     return _Finding(finding.status, f"{finding.detail}; {name}: {_message_of(line)}")
 
@@ -721,7 +721,7 @@ def _left_out(result: DemoResult) -> Iterator[str]:
             yield f"{scenario.keystore.elsewhere} with their key elsewhere"
         if scenario.not_tried:
             names = "; ".join(scenario.not_tried)
-            yield f"not proved for want of what was not tried ({names})"
+            yield f"not proved, because something was not tried ({names})"
 
 
 def summary_page(result: DemoResult, now: datetime) -> str:

@@ -166,7 +166,7 @@ def _builder(
         raise PkiError(
             f"no certificate can have the subject {subject_text(subject)}",
             "It has characters that its types of text do not allow.",
-            "Create the enclave anew, with another subject.",
+            "Create the enclave again, with another subject.",
         )
     return x509.CertificateBuilder(
         issuer_name=issuer,
@@ -282,7 +282,7 @@ def _certificate_in(
         certificate, rest = der.split(block.content)
         if not rest or settings is Settings.IGNORED or _permits(rest, settings):
             return _load_der(certificate)
-    why = "It is a TRUSTED CERTIFICATE, and this use is not among those that it is trusted for."
+    why = "It is a TRUSTED CERTIFICATE that is not trusted for this use."
     raise PkiError(what, why, "Write it with the label CERTIFICATE.")
 
 

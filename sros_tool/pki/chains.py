@@ -250,7 +250,7 @@ def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
         faults.append(f"the nsCertType of {name} cannot be read")
     for found in certificate.extensions:
         if found.oid == _PROXY:
-            faults.append(f"{name} has proxyCertInfo, so it is no certificate of its own")
+            faults.append(f"{name} has proxyCertInfo, so it is a proxy certificate")
         elif found.critical and found.oid not in _CRITICAL and found.oid not in _NETWORKS:
             oid = found.oid.dotted_string
             faults.append(f"{name} has the unknown critical extension {oid}")
@@ -385,7 +385,7 @@ def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         constraints = extension(certificate, x509.BasicConstraints)
         version = tolerant.version_of(certificate)
         if version < _WITH_EXTENSIONS and list(certificate.extensions):
-            yield f"{name} has extensions, which its version has not"
+            yield f"{name} has extensions, which its X.509 version does not allow"
         if constraints and constraints.ca:
             if ExtensionOID.BASIC_CONSTRAINTS not in _critical(certificate):
                 yield f"the basicConstraints of {name} are not critical"

@@ -253,7 +253,7 @@ def refusal_of(crl: x509.CertificateRevocationList) -> str:
         if each.critical and each.oid not in _READ_IF_CRITICAL:
             return f"it has the unknown critical extension {each.oid.dotted_string}"
         if each.oid == ExtensionOID.DELTA_CRL_INDICATOR:
-            return "it has only the changes of another list"
+            return "it is a delta CRL: only the changes to another list"
         if isinstance(each.value, x509.IssuingDistributionPoint) and each.value != _OF_USERS:
             return "it is not for all certificates of its CA"
     for entry in crl:
@@ -341,7 +341,7 @@ def list_refusal(
     found = _best(chain, lists, at)
     if found is None:
         name = subject_text(certificate.issuer)
-        text = f"there is no revocation list of {name}, for which OpenSSL asks where it has another"
+        text = f"the revocation list of {name} is missing, and OpenSSL has another CA's list"
         return ListRefusal(Obstacle.MISSING, None, text)
     crl, issuer, score = found
     name = subject_text(issuer.subject)
@@ -363,7 +363,7 @@ def list_refusal(
     if _revokes(crl, certificate):
         return ListRefusal(Obstacle.REVOKED, crl, "it is revoked")
     if not _all_reasons(certificate, crl):
-        text = "the certificate names lists for some reasons only"
+        text = "the certificate names lists only for some revocation reasons"
         return ListRefusal(Obstacle.SCOPE, crl, text)
     return None
 

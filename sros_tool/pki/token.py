@@ -473,7 +473,7 @@ def read_token_file(data: bytes) -> TokenUri:
         named = _attributes(path.split(";"), _OF_FILE[0])
         _attributes(query.split("&"), _OF_FILE[1])
         if not (named.get("token") and named.get("object")):
-            raise UsageError("it names no token, or no object of one")
+            raise UsageError("it does not name both a token and an object")
         return parse_enclave_uri(text, "")
     except UsageError as error:
         raise PkiError(error.what, error.what) from error

@@ -318,7 +318,7 @@ def _check_instructions(root: etree._Element, file: Path) -> None:
         if not named and (instruction.target or "").lower() == _INSTRUCTION:
             raise PolicyError(
                 f"{file}:{instruction.sourceline}: <?{_INSTRUCTION} ...?> is not in a name",
-                "Protection is said for a topic, service or action, in its element.",
+                "Protection can be stated only in the element of a topic, service or action.",
                 _EXAMPLE,
             )
 
@@ -381,7 +381,7 @@ def refuse_fallbacks(policy: Policy) -> None:
     for source, file in policy.fallbacks:
         raise PolicyError(
             f"{source}: the fallback of the include is used, because '{file}' is absent",
-            "What is decided of this policy would hold only where that file is absent, too.",
+            "Decisions on this policy would hold only on machines that lack the file, too.",
             "Add the file, or put the rights of the fallback in the place of the include.",
         )
 
@@ -835,7 +835,7 @@ def copy_policies(source: Path, target: Path, *, dry_run: bool = False) -> list[
         if not path.is_file() or read_bytes(path, "file") != files[name]:
             raise UsageError(
                 f"'{path}' differs from the file that ships with sros",
-                "What exists is not replaced, and nothing was copied.",
+                "Existing files are not replaced, and nothing was copied.",
                 "Name another folder, or move the file away.",
             )
     missing = {name: data for name, data in files.items() if name not in present}

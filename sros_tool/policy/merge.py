@@ -425,12 +425,12 @@ def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
     for protection in stated_protections(additions.enclaves):
         own = present.get((protection.kind, protection.name))
         if own is None or own.level is not protection.level:
-            says = f'says protect="{own.word}" at {own.source}' if own else "does not say it"
+            says = f'says protect="{own.word}" at {own.source}' if own else "does not state it"
             raise PolicyError(
                 f'{protection.source}: {protection} has protect="{protection.word}", and '
                 f"'{path}' {says}",
-                "A merge adds rights, and changes no name that is there.",
-                "Say the same of the name in both files, and merge again.",
+                "A merge adds rights, and does not change existing names.",
+                "State the same protection in both files, and merge again.",
             )
 
 

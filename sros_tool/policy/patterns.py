@@ -220,7 +220,7 @@ class ComparisonLimit:
         self._left -= characters
         if self._left < 0:
             raise DocumentError(
-                "the names with wildcards are too many and too much alike to be compared",
+                "there are too many similar names with wildcards to compare",
                 "Almost every one of them has to be compared with every other one.",
                 "Replace wildcards by the names that they stand for, or by fewer wildcards, or "
                 "divide the rules between several enclaves.",

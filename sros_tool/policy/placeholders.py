@@ -65,9 +65,9 @@ def parts_of(text: str) -> Parts:
     parts.append(text[end:])
     kept = tuple(part for part in parts if part != "")
     if any(isinstance(part, str) and has_placeholder(part) for part in kept):
-        raise ValueError("It has a brace that is not of a placeholder such as {robot}.")
+        raise ValueError("It has a brace outside of a placeholder such as {robot}.")
     if len({each.group for each in placeholders_of(kept) if each.plural}) > 1:
-        raise ValueError("It has the robots of several groups, so it is unclear which go together.")
+        raise ValueError("It names robots of several groups, so it is unclear how to combine them.")
     return kept
 
 
@@ -107,7 +107,7 @@ def check_path(path: Parts) -> None:
     found = placeholders_of(path)
     if plural := next((part for part in found if part.plural), None):
         one = plural._replace(plural=False)
-        raise ValueError(f"{plural} is all robots, and a path is of one enclave: write {one}.")
+        raise ValueError(f"{plural} names all robots, a path names one enclave: write {one}.")
     if len({part.group for part in found}) > 1:
         raise ValueError("Its placeholders are of different groups.")
 
@@ -127,11 +127,11 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
     for placeholder in placeholders_of(name):
         if placeholder.plural:
             if not several:
-                raise ValueError(f"{placeholder} is a name for each robot, and here is only one.")
+                raise ValueError(f"{placeholder} is several names, and only one can be here.")
         elif not owner:
             instead = f" For a name for each robot write {placeholder._replace(plural=True)}."
             raise ValueError(
-                f"{placeholder} is one robot, and the path of the enclave does not say which one."
+                f"{placeholder} is one robot, and the enclave's path does not say which one."
                 f"{instead if several else ''}"
             )
         elif placeholder.group not in ("", owner[0].group):

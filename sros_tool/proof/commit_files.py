@@ -127,7 +127,7 @@ class CommitFiles:
             raise DocumentError(f"'{path}' has more than {_MOST_WRITTEN} bytes")
         for where, link in links.items():  # before they are read: many are too large together
             if not 0 < sizes.get(link.id, 1) <= _LONGEST_TARGET:
-                raise DocumentError(f"'{where}' is a link that no file system can have")
+                raise DocumentError(f"'{where}' is a link with an impossible target")
         places: dict[str, list[str]] = {}
         for where, tree_entry in plain.items():
             places.setdefault(tree_entry.id, []).append(where)
@@ -138,7 +138,7 @@ class CommitFiles:
         contents = self.repository.contents(link.id for link in links.values())
         for where, link in links.items():
             if b"\0" in contents[link.id]:
-                raise DocumentError(f"'{where}' is a link that no file system can have")
+                raise DocumentError(f"'{where}' is a link with an impossible target")
         top = self.folder / path
         with Folder(self.folder) as folder:
             _make_folders(folder, path)

@@ -160,7 +160,7 @@ class Repository:
             if candidates and wanted not in candidates:
                 raise DocumentError(
                     f"'{name}' is {_either(candidates)}, but no branch of the remote '{remote}'",
-                    "Who may push tags or branches can give one this name.",
+                    "Anybody who may push tags or branches can create one with this name.",
                     f"Fetch '{wanted}', or write in full what you mean.",
                 )
         described = name.rpartition("-g")[2]
@@ -477,7 +477,7 @@ class Repository:
             why = said.removeprefix("fatal: ") or f"it ended with status {done.returncode}"
             raise DocumentError(f"git cannot read it: {why}")
         if said and not done.returncode and environment is None:
-            raise DocumentError(f"git warns: {said}", "What it read is not certain.")
+            raise DocumentError(f"git warns: {said}", "Its answer may be incomplete.")
         return done.stdout
 
 
@@ -594,7 +594,7 @@ def _entries(data: bytes, length: int) -> dict[str, TreeEntry]:
         if name in entries or name in ("", ".", "..") or "/" in name or name.lower() == ".git":
             raise DocumentError(
                 f"a folder of the commit has '{name}' twice, or no file can have this name",
-                "Programs differ in what they take for it.",
+                "Programs interpret such a folder in different ways.",
             )
         entries[name] = TreeEntry(_checked_out(mode), rest[:length].hex())
     return entries
@@ -613,7 +613,7 @@ def _checked_out(mode: bytes) -> str:
         DocumentError: the mode is not an octal number.
     """
     if not _OCTAL.fullmatch(mode):
-        raise DocumentError("an object of the repository is malformed", "It has a mode of no type.")
+        raise DocumentError("an object of the repository is malformed", "Its file mode is unknown.")
     bits = int(mode, 8)
     file = FILES[bool(bits & _EXECUTABLE)]
     kinds = {0o100000: file, 0o120000: LINK, 0o040000: FOLDER}

@@ -239,8 +239,8 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
         if not plain or len(requirements) != len(lines):
             raise DocumentError(
                 f"{file}: {kind} is not written as tables",
-                "Each requirement begins with a line of its own, so that findings can name it.",
-                f"Write [[{kind}]] before each one, and no such line within a text.",
+                "Every requirement needs a header line, whose number findings state.",
+                f"Write [[{kind}]] before every requirement, and no such line in a text.",
             )
         tables += [
             (line, _Table(kind, table, Source(file, line), keys))
@@ -264,7 +264,7 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
             raise DocumentError(
                 f"{requirement.source}: there are more than {_MOST_PAIRS} pairs of two names "
                 "up to here",
-                "Each name of one list counts with each one of the other.",
+                "Every name of one list is compared with every name of the other.",
                 "Write patterns in place of names, or divide the file.",
             )
     return requirements
@@ -412,7 +412,7 @@ def _must(table: _Table) -> Must:
     enclave = table.text("enclave")
     problem = expression_problem(enclave)
     if is_expression(enclave):
-        problem = "It has a wildcard: each enclave that must be able to has a table of its own."
+        problem = "It has a wildcard: write a table for every enclave that must have the rights."
     if enclave != "/" and (problem or not enclave.startswith("/")):
         raise table.error(
             "enclave",

@@ -431,7 +431,7 @@ class _Review:
         robots = base[1].robots if base[1] else {}
         for name, new in head[1].robots.items():
             if name in robots and _place(robots[name]) != _place(new):
-                lines.append((f"gets its keys at another place, {_place(new)}", name))
+                lines.append((f"gets its keys at another address: {_place(new)}", name))
         earlier = _holders(*base)
         for enclave, robot in _holders(*head).items():
             old = earlier.get(enclave, robot)
@@ -457,10 +457,10 @@ class _Review:
             raise DocumentError(f"the change has more than {_MOST_CHANGED} files")
         names = {entry.id: name for name, entry in changed}
         for path in self._policies_among(changed, self.head):
-            lines.append(("changes and is not reviewed, as no policy that is uses it", path))
+            lines.append(("changes and is not reviewed: no reviewed policy uses it", path))
             status = self._new_access
         for path in self._used_in_part(changed, reviewed, fleet):
-            lines.append(("changes and is used only in part, and the rest is not reviewed", path))
+            lines.append(("changes and is used only in part: the rest is not reviewed", path))
             status = self._new_access
         for path in self._not_reviewed_users(changed):
             lines.append(("is not reviewed, and includes a file that changes", path))
@@ -468,7 +468,7 @@ class _Review:
         sizes = self.request.repository.sizes(names)
         for path, entry in changed:
             if sizes.get(entry.id, 0) > _MOST_OUTSIDE and entry.mode in FILES:
-                lines.append(("changes and is too large to be looked at", path))
+                lines.append(("changes and is too large to be reviewed", path))
             if said := self._unseen(path, entry):
                 lines.append((f"changes and is not reviewed: it is {said}", path))
                 status = self._new_access
@@ -622,24 +622,24 @@ class _Review:
         if asked.allow_new_access:
             yield "new access does not fail the review, as asked"
         for path in asked.left_out:
-            yield f"policies below '{path}' are not looked at, as asked"
+            yield f"policies below '{path}' are not reviewed, as asked"
         if asked.keystores:
-            yield "private keys of keystores are not looked at"
+            yield "private keys of keystores are not reviewed"
         for side in (self.head, self.base):
             for path in dict.fromkeys(side.fell_back if side else ()):
                 assert side
-                yield f"'{path}' is not in {side.name}, so that a fallback counts in its place"
+                yield f"'{path}' is not in {side.name}, so the fallback of its include is used"
         parents = asked.repository.parents(asked.head)
         if asked.base and len(parents) > 1 and asked.base not in parents:
-            yield "what branches that HEAD merges have lost since BASE, and the merge brings back"
+            yield "access that a merged branch lost since BASE, and that the merge restores"
         top = asked.repository.top()
         if not top:
             return
         if asked.repository.commit(_HEAD) != asked.head:
-            yield "the commit that is checked out is another one than the one that is reviewed"
+            yield "the commit that is checked out is not the reviewed commit"
         elif differing := self.head.differing(top):
             files = first_few([f"'{path}'" for path in differing], 3)
-            yield f"the checkout has other content than the commit that is reviewed: {files}"
+            yield f"the checkout differs from the reviewed commit: {files}"
 
     # ── policies ───────────────────────────────────────────────────────────────────────────
 
@@ -815,7 +815,7 @@ def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
         PolicyError: there is none, or two have the same enclave.
     """
     if not files:
-        raise PolicyError("requirements are decided of policies, and there is none to read")
+        raise PolicyError("requirements need a policy, and there is none to read")
     policies = [read_policy_for(file, fleet) for file in files]
     first, *others = policies
     enclaves = {enclave.path: enclave for enclave in first.enclaves}

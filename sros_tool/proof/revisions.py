@@ -135,6 +135,6 @@ def find_revision(text: str) -> Revision:
         raise DocumentError(
             f"'{PREFIX}{name}:{path}' does not exist",
             "",
-            "A path is from the top of the repository, or from here with ./ before it.",
+            "Paths start at the top of the repository; with ./ at the working directory.",
         )
     return Revision(repository, name, commit, path)

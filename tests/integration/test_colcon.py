@@ -1,4 +1,4 @@
-"""colcon builds sros in a ROS workspace, whose `ros2 security` is that of sros."""
+"""colcon builds sros in a ROS workspace, whose `ros2 security` comes from sros."""
 
 from __future__ import annotations
 

@@ -495,7 +495,7 @@ def test_a_path_of_a_revision_is_from_its_top(repository: Path) -> None:
     words = ("diff_policy", "--no-new-access", "git:main:robot.xml", "robot.xml")
     ended = sros(*words, cwd=repository / "policies")
     assert ended.status == 2
-    assert "'git:main:robot.xml' does not exist. A path is from the top of the" in ended.err
+    assert "'git:main:robot.xml' does not exist. Paths start at the top of the" in ended.err
 
 
 @pytest.mark.parametrize("name", ["robots/evil.xml", "evil.XML", "robots/evil.inc", "robots/link"])
