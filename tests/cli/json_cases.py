@@ -170,6 +170,10 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks/enclaves/governance.p7s"),
         Case("ks/enclaves/governance.xml"),
         Case("closed"),
+        Case(
+            "zenoh",
+            before=("zenoh zenoh --endpoint a:1 --router /r1/router=b:1 --cross /x",),
+        ),
         Case("zenoh/enclaves/a", before=("zenoh zenoh",)),
         Case("zenoh/enclaves/a/session.json5", before=("zenoh zenoh",)),
         Case("zenoh/enclaves/router/router.p7s", before=("zenoh zenoh --mode peer",)),
@@ -198,6 +202,7 @@ CASES: dict[str, tuple[Case, ...]] = {
     "zenoh": (
         Case("zenoh"),
         Case("zenoh --dry-run --mode peer"),
+        Case("zenoh --endpoint a:7447 --router /r1/router=r1.local:7447 --cross /x"),
         Case("zenoh --check", 1),
         Case("zenoh --check", before=("zenoh zenoh",)),
         Case("--from closed/enclaves/router/router.json5 -o found.xml"),
