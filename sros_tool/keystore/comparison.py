@@ -374,6 +374,8 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
         ("listen", "the router listens on these endpoints"),
         ("mode", "how sessions reach each other"),
         ("domains", "ROS domains of the network, within those of the governance"),
+        ("routers", "further routers, to which the sessions of their enclaves connect"),
+        ("crossing", "names that pass from one router to another"),
     ):
         before, after = getattr(old, key), getattr(new, key)
         if before != after:

@@ -54,6 +54,11 @@ class ZenohRouter:
     listen: tuple[str, ...] = ()
     enclaves: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        """Return text like ``/r1/router at r1.local:7447 for /r1/*``."""
+        served = f" for {' '.join(self.enclaves)}" if self.enclaves else ""
+        return f"{self.name} at {' '.join(self.endpoints)}{served}"
+
     def listening(self) -> tuple[str, ...]:
         """Return where it listens."""
         ports = dict.fromkeys(endpoint.rpartition(":")[2] for endpoint in self.endpoints)

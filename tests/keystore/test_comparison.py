@@ -28,7 +28,7 @@ from sros_tool.keystore.template import (
 )
 from sros_tool.policy.model import Level
 from sros_tool.translate import governance_for, protection_for
-from sros_tool.zenoh.configuration import Mode, ZenohNetwork
+from sros_tool.zenoh.configuration import Mode, ZenohNetwork, ZenohRouter
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 ZERO = DomainSet.of((0, 0))
@@ -268,8 +268,12 @@ def test_what_was_rendered_is_read_again() -> None:
 
 def test_each_choice_of_a_zenoh_network_is_compared() -> None:
     here = replace(PRODUCTION, zenoh=ZenohNetwork())
-    there = ZenohNetwork("/way", ("robot:1",), ("[::]:1",), Mode.PEER, (0,))
+    further = ZenohRouter("/r1/router", ("r1:1",), enclaves=("/r1/*",))
+    there = ZenohNetwork(
+        "/way", ("robot:1",), ("[::]:1",), Mode.PEER, (0,), (further,), ("/chatter",)
+    )
     changes = compare_settings(here, replace(here, zenoh=there), NOW)
+    assert "/r1/router at r1:1 for /r1/*" in {change.after for change in changes}
     assert [each.key for each in changes] == [f"zenoh.{each.name}" for each in fields(ZenohNetwork)]
     (change,) = compare_settings(PRODUCTION, here, NOW)
     assert (change.key, change.before, change.after) == ("zenoh", "none", "client")
