@@ -62,7 +62,8 @@ def test_the_page_of_templates_has_the_keys_and_values_of_the_program() -> None:
     known = {key.path for key in KEYS}
     for table in ("enclaves", "protection.topic"):  # the program writes their names into the key
         known.remove(f"{table}.names")
-    assert known == {re.sub(r" [^ ]+\.", ".", each) for each in written}
+    stated = {re.sub(r" [^ ]+\.", ".", key) for key in written}
+    assert known == {re.sub(r"\.(/[^.]+)\.", r'."\1".', key) for key in stated}
     template = load_template("production")
     for key in KEYS:
         if key.table in ("[authorities]", "[permissions]", "[protection]", "[protection.default]"):

@@ -78,7 +78,7 @@ profiles = st.builds(
     st.sampled_from(("n", "m", "*")),
     st.lists(groups(), max_size=3).map(tuple),
 )
-blocks = st.builds(Profiles, st.lists(profiles, min_size=1, max_size=2).map(tuple))
+blocks = st.lists(profiles, min_size=1, max_size=2).map(lambda made: Profiles(tuple(made)))
 enclaves = st.builds(Enclave, st.just("/e"), st.lists(blocks, min_size=1, max_size=2).map(tuple))
 
 

@@ -99,11 +99,11 @@ def test_a_report_replaces_no_file_unasked(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("installed", "provider", "said"),
     [
-        (("sros_tool",), "sros_tool", "that of sros."),
-        (("sros_tool", "sros2"), "sros2", "that of sros2, not of sros"),
-        (("sros2", "sros_tool"), "sros_tool", "that of sros."),
-        (("sros_tool", "sros2", "sros_ros2_security"), "sros_ros2_security", "that of sros."),
-        (("s\x1b[2J",), "s\x1b[2J", "not of sros"),
+        (("sros_tool",), "sros_tool", "comes from sros."),
+        (("sros_tool", "sros2"), "sros2", "from sros2, not from sros"),
+        (("sros2", "sros_tool"), "sros_tool", "comes from sros."),
+        (("sros_tool", "sros2", "sros_ros2_security"), "sros_ros2_security", "comes from sros."),
+        (("s\x1b[2J",), "s\x1b[2J", "not from sros"),
         ((), None, ""),
     ],
 )

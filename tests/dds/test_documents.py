@@ -54,7 +54,8 @@ texts = st.text(
 )
 lists = st.lists(texts, min_size=1, max_size=3).map(tuple)
 none_or_some = st.lists(texts, max_size=2).map(tuple)
-criteria = st.lists(st.builds(Criteria, lists, none_or_some), max_size=2).map(tuple)
+# Hypothesis draws also those fields of a named tuple that have a default and are not given.
+criteria = st.lists(st.builds(Criteria, lists, none_or_some, st.just(())), max_size=2).map(tuple)
 tagged = st.builds(
     Criteria, lists, none_or_some, st.lists(st.tuples(texts, texts), max_size=2).map(tuple)
 )
@@ -63,7 +64,8 @@ rules = st.lists(st.builds(Rule, st.booleans(), domains, criteria, criteria, rel
 dates = st.sampled_from(
     ["2024-01-01T00:00:00Z", "2034-01-01T00:00:00", "2034-01-01T00:00:00+09:00"]
 )
-grants = st.builds(Grant, texts, texts, dates, dates, rules.map(tuple), st.booleans())
+never = st.just(False)
+grants = st.builds(Grant, texts, texts, dates, dates, rules.map(tuple), st.booleans(), never, never)
 permissions = st.lists(grants, min_size=1, max_size=2).map(lambda each: Permissions(tuple(each)))
 
 

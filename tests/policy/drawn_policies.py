@@ -50,7 +50,7 @@ def policies(
         st.sampled_from(("n", "m")),
         st.lists(groups(name, qualifier), max_size=3).map(tuple),
     )
-    block = st.builds(Profiles, st.lists(profile, min_size=1, max_size=2).map(tuple))
+    block = st.lists(profile, min_size=1, max_size=2).map(lambda made: Profiles(tuple(made)))
     enclave = st.builds(
         Enclave, st.sampled_from(("/a", "/b")), st.lists(block, min_size=1, max_size=2).map(tuple)
     )
