@@ -43,7 +43,7 @@ def node_of_service(service: str) -> str:
 
 
 def nodes_served(rights: Iterable[tuple[str, str]]) -> tuple[str, ...]:
-    """Return the full names of the nodes whose standard services these (right, name) allow."""
+    """Return the full names of the nodes whose standard services these (right, name) offer."""
     nodes = {node_of_service(name) for right, name in rights if right == "reply"}
     return tuple(sorted(nodes - {""}))
 

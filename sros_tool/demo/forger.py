@@ -588,7 +588,7 @@ def open_default(template: Template) -> Template:
 
 
 def unprotected(template: Template) -> Template:
-    """Return the template changed to access control and unprotected messages."""
+    """Return the template with access control on and message protection off."""
     return _protected(template, Level.NONE)
 
 

@@ -251,7 +251,7 @@ _IN_A_ROW = 50
 That takes a third less time than to read one enclave after the other, and little memory.
 """
 _MOST_DOMAINS = 16
-"""Most ROS domains of a network: every right is stated once for each."""
+"""Maximum number of ROS domains in a network: every right is written once per domain."""
 
 
 Result = TypeVar("Result")

@@ -567,7 +567,7 @@ class _Review:
         return sorted(e for e in users if e not in files and is_whole_policy(there[e]))
 
     def _unseen(self, path: str, entry: TreeEntry) -> str:
-        """Return what at a path of HEAD could hide policies from the review, or ""."""
+        """Name the link or submodule at a path of HEAD that may hide policies, or return ""."""
         apart = (*self.request.left_out, *self.request.keystores)
         if entry.mode not in (LINK, SUBMODULE) or _is_below(path, apart):
             return ""
@@ -779,7 +779,7 @@ def _decisive_first(where: str) -> tuple[bool, str]:
 
 
 def _place(robot: Robot) -> str:
-    """Return the place of a robot's keys as text."""
+    """Return where the keys of a robot go, as text: its address with the user, or its name."""
     return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
 
 

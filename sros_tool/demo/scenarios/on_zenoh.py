@@ -83,7 +83,7 @@ def _attacker(
     *,
     lawless: bool = True,
 ) -> Party:
-    """Return an attacker in an enclave that has not the right, or with files that are not valid."""
+    """Return an attacker whose enclave lacks the right, or whose files are invalid."""
     identity = Identity(keystore, part, lawless=lawless)
     return Party(name, role, identity, topic or _TOPIC_OF.get(role, ""), intruder=True, turn=2)
 
