@@ -30,8 +30,8 @@ from sros_tool.runtime.cyclone import INSTALL_ADVICE
 from sros_tool.runtime.events import Event, EventKind, parse_event
 from sros_tool.runtime.netns import end_with_starter
 from sros_tool.runtime.rmw import (
-    CYCLONE_EXPLAINS,
     RMW,
+    cyclone_explains,
     middleware_of,
     rmw_implementations,
     vendor_of,
@@ -142,7 +142,8 @@ class Backend:
         if on_ros and wire:
             variables |= _ON_THE_WIRE
         if denied and not on_ros:
-            variables |= CYCLONE_EXPLAINS
+            # Its C library's stderr is the log of `CycloneLog`.
+            variables |= cyclone_explains("stdout")
         elif denied and (below := middleware_of(self.rmw)):
             variables |= below.explains
         return variables

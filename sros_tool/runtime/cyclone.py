@@ -1,11 +1,11 @@
-"""Cyclone DDS 0.10 from Python: participants, writers and readers of strings, with DDS Security.
+"""Cyclone DDS from Python: participants, writers and readers of strings, with DDS Security.
 
 A refusal by DDS Security raises a `SecurityRefusedError`; every other failure raises a `DdsError`,
 so that a crash is never mistaken for a refusal.  One process must not have two participants with
 different enclaves in one domain: in Cyclone 0.10 the second one gets the permissions of the first.
 
 libddsc is not loaded at import: `load_cyclone` finds and loads it on the first call.  The functions
-that sros calls are declared here as in ``dds/dds.h`` and ``dds/ddsrt/log.h`` of Cyclone DDS 0.10.
+that sros calls are declared here as in ``dds/dds.h`` of Cyclone DDS 0.10 and 11.0, which agree.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import ctypes
 import functools
 import os
 import re
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,8 +31,11 @@ FOLDER_VARIABLE = "SROS_CYCLONEDDS_DIR"
 The folder may also be one into which Debian's packages were unpacked.
 """
 
-_SYSTEM_NAMES = ("libddsc.so.0debian", "libddsc.so.0t64", "libddsc.so.0")
-"""The shared object names of Debian 12, of Debian 13, and of an installation from source or ROS."""
+_SYSTEM_NAMES = ("libddsc.so.0debian", "libddsc.so.0t64", "libddsc.so.0", "libddsc.so.11")
+"""The shared object names of Debian 12, of Debian 13, and of an installation from source or ROS.
+
+The last is that of ROS 2 Lyrical.
+"""
 
 INSTALL_ADVICE = (
     "Install Cyclone DDS with `apt-get install libddsc0debian` (Debian 12; newer releases call it"
@@ -41,9 +43,11 @@ INSTALL_ADVICE = (
     f" in {FOLDER_VARIABLE}."
 )
 
-_SUPPORTED = "0.10."
+_SUPPORTED = ("0.10", "11.0")
 _NEEDED_FIRST = ("_platform", "_hoofs", "_posh.", "_posh_roudi", "_posh", "_binding_c")
-_KEPT_LOG_LINES = 200
+_KEPT_LOG_MESSAGES = 200
+_LOG_HEADER = re.compile(r"^ *\d+\.\d{6} \[\d*\] .*?: ", re.MULTILINE)
+"""Time, domain and thread, which libddsc writes before a message."""
 
 STRING_TYPE = "std_msgs::msg::dds_::String_"
 
@@ -145,7 +149,7 @@ class Participant:
     @property
     def log(self) -> tuple[str, ...]:
         """The newest warnings and errors that Cyclone DDS logged in this process."""
-        return tuple(self._library.log)
+        return self._library.log.messages()
 
     def close(self) -> None:
         """Leave the domain; writers and readers of this participant are closed with it."""
@@ -193,10 +197,10 @@ class Participant:
     def _failure(self, code: int, what: str, *, secured: bool = False) -> DdsError:
         from sros_tool.runtime.vendor_log import participant_refusal
 
-        lines = tuple(self._library.log)
-        reason = ". ".join([_describe_return(self._library, code), *lines[-3:]])
+        messages = self._library.log.messages()
+        reason = ". ".join([_describe_return(self._library, code), *messages[-3:]])
         refused = code == _NOT_ALLOWED_BY_SECURITY or (
-            secured and bool(participant_refusal("\n".join(lines)))
+            secured and bool(participant_refusal("\n".join(messages)))
         )
         return SecurityRefusedError(what, reason) if refused else DdsError(what, reason)
 
@@ -343,16 +347,40 @@ class CycloneLibrary(NamedTuple):
     """A loaded libddsc: its functions, its file, and its log.
 
     ``version`` is as in its file name ("0.10.2"); ``plugins`` is the folder of its security
-    plugins, None if they are missing.  ``log`` keeps the newest warnings and errors of all
-    participants of this process, oldest first.
+    plugins, None if they are missing.
     """
 
     api: Any
     path: Path
     version: str
     plugins: Path | None
-    log: deque[str]
-    sink: Any
+    log: CycloneLog
+
+
+class CycloneLog:
+    """The warnings and errors of all participants of this process.
+
+    libddsc writes them to ``stderr`` of the C library; Cyclone DDS 11 exports no function with
+    which to receive them.  So that stream becomes a file in memory, for all C libraries of this
+    process; Python's ``sys.stderr`` and the file descriptor 2 stay as they are.
+    """
+
+    def __init__(self) -> None:
+        """Redirect the stream.  libddsc keeps the stream that it sees at its first participant."""
+        self._file = os.memfd_create("cyclonedds")
+        libc = ctypes.CDLL(None)
+        libc.fdopen.restype = ctypes.c_void_p
+        ctypes.c_void_p.in_dll(libc, "stderr").value = libc.fdopen(self._file, b"a")
+
+    def clear(self) -> None:
+        """Forget the messages."""
+        os.ftruncate(self._file, 0)
+
+    def messages(self) -> tuple[str, ...]:
+        """Return the newest messages since `clear`, oldest first."""
+        written = os.pread(self._file, os.fstat(self._file).st_size, 0).decode("utf-8", "replace")
+        messages = (message.rstrip() for message in _LOG_HEADER.split(written))
+        return tuple(filter(None, messages))[-_KEPT_LOG_MESSAGES:]
 
 
 def _describe_return(library: CycloneLibrary, code: int) -> str:
@@ -362,32 +390,24 @@ def _describe_return(library: CycloneLibrary, code: int) -> str:
 
 @functools.cache
 def load_cyclone() -> CycloneLibrary:
-    """Load libddsc 0.10.x, once per process.
+    """Load libddsc 0.10 or 11.0, once per process.
 
     Raises:
         UnavailableError: there is no libddsc, or only one with another C interface.
     """
     api, path = _load_first()
     version = version_of(path)
-    if not version.startswith(_SUPPORTED):
+    if not version.startswith(tuple(f"{release}." for release in _SUPPORTED)):
         raise UnavailableError(
             f"cannot use {path}: it is Cyclone DDS {version}",
-            f"sros supports only the C interface of Cyclone DDS {_SUPPORTED}x.",
+            f"sros supports only the C interface of Cyclone DDS {' and '.join(_SUPPORTED)}.",
             INSTALL_ADVICE,
         )
     for name, (result, arguments) in _SIGNATURES.items():
         function = getattr(api, name)
         function.restype = result
         function.argtypes = arguments
-    log: deque[str] = deque(maxlen=_KEPT_LOG_LINES)
-
-    def keep(_argument: int | None, line: Any) -> None:
-        data = line.contents
-        log.append(ctypes.string_at(data.message, data.size).decode("utf-8", "replace").rstrip())
-
-    sink = _LOG_SINK(keep)
-    api.dds_set_log_sink(sink, None)
-    return CycloneLibrary(api, path, version, plugins_next_to(path), log, sink)
+    return CycloneLibrary(api, path, version, plugins_next_to(path), CycloneLog())
 
 
 def _load_first() -> tuple[Any, Path]:
@@ -405,7 +425,7 @@ def _load_first() -> tuple[Any, Path]:
         except OSError as error:
             reasons.append(str(error))
     raise UnavailableError(
-        "cannot find Cyclone DDS (libddsc 0.10)",
+        f"cannot find Cyclone DDS (libddsc {' or '.join(_SUPPORTED)})",
         f"The dynamic loader says: {reasons[0]}.",
         INSTALL_ADVICE,
     )
@@ -416,7 +436,7 @@ def _load_from_folder(folder: Path) -> tuple[Any, Path]:
     if not files:
         raise UnavailableError(
             f"cannot find Cyclone DDS in {folder}",
-            "The folder has no libddsc.so.0*, neither directly nor under lib or usr/lib.",
+            "The folder has no libddsc.so.*, neither directly nor under lib or usr/lib.",
             f"Correct or unset {FOLDER_VARIABLE}. {INSTALL_ADVICE}",
         )
     path = files[0]
@@ -436,7 +456,7 @@ def _library_files(folder: Path) -> list[Path]:
     return [
         file
         for pattern in patterns
-        for file in sorted(folder.glob(f"{pattern}/libddsc.so.0*".lstrip("/")))
+        for file in sorted(folder.glob(f"{pattern}/libddsc.so.[0-9]*".lstrip("/")))
         if file.is_file()
     ]
 
@@ -558,23 +578,6 @@ class _EndpointSample(ctypes.Structure):
     ]
 
 
-class _LogLine(ctypes.Structure):
-    """The C struct ``dds_log_data_t`` of Cyclone DDS."""
-
-    _fields_ = [
-        ("priority", ctypes.c_uint32),
-        ("domain", ctypes.c_uint32),
-        ("file", ctypes.c_char_p),
-        ("line", ctypes.c_uint32),
-        ("function", ctypes.c_char_p),
-        ("message", ctypes.POINTER(ctypes.c_char)),
-        ("size", ctypes.c_size_t),
-        ("header_size", ctypes.c_size_t),
-    ]
-
-
-_LOG_SINK = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.POINTER(_LogLine))
-
 _ENTITY = ctypes.c_int32
 _QOS = ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
@@ -626,5 +629,4 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
         [_ENTITY, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int64],
     ),
     "dds_delete": (ctypes.c_int32, [_ENTITY]),
-    "dds_set_log_sink": (None, [_LOG_SINK, ctypes.c_void_p]),
 }

@@ -22,11 +22,14 @@ RMW = "RMW_IMPLEMENTATION"
 DEFAULT_RMW = "rmw_fastrtps_cpp"
 """The RMW that ROS 2 Jazzy uses if the variable is not set."""
 
-CYCLONE_EXPLAINS = {
-    "CYCLONEDDS_URI": "<CycloneDDS><Domain><Tracing><Category>fatal,error,warning,trace</Category>"
-    "<OutputFile>stderr</OutputFile></Tracing></Domain></CycloneDDS>"
-}
-"""Variables that make Cyclone DDS log, in its trace, why it denies a topic."""
+
+def cyclone_explains(stream: str) -> dict[str, str]:
+    """Return variables that make Cyclone DDS trace, to stderr or stdout, why it denies a topic."""
+    return {
+        "CYCLONEDDS_URI": "<CycloneDDS><Domain><Tracing>"
+        "<Category>fatal,error,warning,trace</Category>"
+        f"<OutputFile>{stream}</OutputFile></Tracing></Domain></CycloneDDS>"
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +50,9 @@ class Middleware:
 
 MIDDLEWARE = (
     Middleware("Fast DDS", "rmw_fastrtps", ("libfastdds.so", "libfastrtps.so"), Vendor.FAST),
-    Middleware("Cyclone DDS", "rmw_cyclonedds", ("libddsc",), Vendor.CYCLONE, CYCLONE_EXPLAINS),
+    Middleware(
+        "Cyclone DDS", "rmw_cyclonedds", ("libddsc",), Vendor.CYCLONE, cyclone_explains("stderr")
+    ),
     Middleware("Connext", "rmw_connext", ("libnddsc.so",), Vendor.CONNEXT),
     Middleware("OpenDDS", "rmw_opendds", (), Vendor.OPENDDS),
     Middleware("Zenoh", "rmw_zenoh", ("libzenohc.so",)),

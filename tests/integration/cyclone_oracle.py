@@ -190,7 +190,7 @@ def take_part(library: CycloneLibrary, case: Case, say: Callable[[Report], None]
             api.dds_qset_prop(qos, name.encode(), value.encode())
         participant = api.dds_create_participant(case["domain"], qos, None)
     if participant < 0:
-        say({"end": "refused", "answers": [], "log": "; ".join(library.log)})
+        say({"end": "refused", "answers": [], "log": "; ".join(library.log.messages())})
         return
     topics: dict[str, int] = {}
     ends = [
@@ -198,7 +198,7 @@ def take_part(library: CycloneLibrary, case: Case, say: Callable[[Report], None]
         for verb, topic, partitions in case["questions"]
     ]
     answers = ["created" if end >= 0 else REFUSALS.get(end, f"error {end}") for _, end in ends]
-    say({"end": "joined", "answers": answers, "log": "; ".join(library.log)})
+    say({"end": "joined", "answers": answers, "log": "; ".join(library.log.messages())})
     if case["peer"]:
         made = [(asked, [end]) for asked, (_, end) in zip(case["questions"], ends, strict=True)]
         made = [each for each in made if each[1][0] >= 0]
