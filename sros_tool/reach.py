@@ -17,8 +17,8 @@ from collections import defaultdict, deque
 from collections.abc import Collection, Container, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
-from typing import NamedTuple
+from itertools import combinations, product
+from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dds.governance import Governance
 from sros_tool.names import ACTION_SEPARATOR, READING_SERVICES, SERVICE_ENDS, is_expression
@@ -26,6 +26,9 @@ from sros_tool.policy.model import DENY
 from sros_tool.policy.patterns import common_name, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import Right
 from sros_tool.values import shows
+
+if TYPE_CHECKING:
+    from sros_tool.translate_zenoh.rights import RouterLinks
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +180,7 @@ def _starting(ordered: list[str], prefix: str) -> Iterator[str]:
         yield ordered[index]
 
 
-_Used = set[tuple[str, tuple[str, ...]]]
+_Used = set[tuple[str, tuple[str, ...], str]]
 
 
 class Network:
@@ -185,7 +188,8 @@ class Network:
 
     ``without`` are topics (ROS names) to ignore, ``questions`` are services (names or wildcards)
     whose requests are ignored.  All enclaves in ``everybody`` may use the
-    ``unguarded`` topics, independently of their rights.
+    ``unguarded`` topics, independently of their rights.  ``links`` are those of several routers:
+    enclaves of different ones are connected only by what passes from one to the other.
     """
 
     def __init__(
@@ -196,29 +200,22 @@ class Network:
         questions: Collection[str] = (),
         unguarded: Iterable[Unguarded] = (),
         everybody: Iterable[str] = (),
+        links: RouterLinks | None = None,
     ) -> None:
-        ends: dict[str, list[_Access]] = {"publish": [], "subscribe": []}
-        denied: dict[tuple[str, str], set[str]] = defaultdict(set)
-        allowed: dict[tuple[str, str], set[str]] = defaultdict(set)
-        for right in rights:
-            into = denied if right.qualifier is DENY else allowed
-            for direction, topics in right.topics._asdict().items():
-                if topics:
-                    into[right.enclave, direction].update(topics)
         ignored = ["rt" + name for name in without]
         ignored += [f"rq/{name.lstrip('/')}{SERVICE_ENDS['rq']}" for name in questions]
-        for (enclave, direction), topics in sorted(allowed.items()):
-            outside = sorted(denied[enclave, direction].union(ignored))
-            for topic in sorted(topics, key=_plain_first):
-                met = tuple(name for name in outside if overlap(name, topic))
-                if not any(name == topic or covers(name, topic) for name in met):
-                    ends[direction].append(_Access(enclave, topic, met))
+        ends = _ends(rights, ignored)
         for each, enclave in product(dict.fromkeys(unguarded), everybody):
             outside = sorted({*each.without, *ignored})
             met = tuple(other for other in outside if overlap(other, each.topic))
             if each.topic not in met:
                 ends[each.direction].append(_Access(enclave, each.topic, met))
         self._sides = {direction: _Direction(accesses) for direction, accesses in ends.items()}
+        self._router_of = links.router_of if links else {}
+        self._passing = {
+            router: _Direction(_ends(given, ignored)["publish"])
+            for router, given in (links.passing.items() if links else ())
+        }
 
     @property
     def enclaves(self) -> tuple[str, ...]:
@@ -273,13 +270,44 @@ class Network:
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own, others = (self._sides[direction] for direction in directions)
         for end in own.of.get(enclave, ()):
-            like = (end.topic, end.without)
+            like = (end.topic, end.without, self._router_of.get(enclave, ""))
             if like in used:
                 continue
             used.add(like)
             for other in others.meeting(end.topic):
-                if other.enclave not in known and (name := _shared(end, other)):
-                    yield _hop(end, other, name) if forward else _hop(other, end, name)
+                if other.enclave in known:
+                    continue
+                writer, reader = (end, other) if forward else (other, end)
+                if name := self._carrying(writer, reader):
+                    yield _hop(writer, reader, name)
+
+    def _carrying(self, writer: _Access, reader: _Access) -> str:
+        """Return a DDS topic that gets from a writer to a reader, or ""."""
+        sending, receiving = (self._router_of.get(end.enclave, "") for end in (writer, reader))
+        if sending == receiving:
+            return _shared(writer, reader)
+        passing = self._passing[receiving].meeting(writer.topic)
+        names = (_shared(writer, reader, given) for given in passing if given.enclave == sending)
+        return next(filter(None, names), "")
+
+
+def _ends(rights: Iterable[Right], ignored: Collection[str]) -> dict[str, list[_Access]]:
+    """Return what rights let enclaves write (publish) and read (subscribe), but for the ignored."""
+    ends: dict[str, list[_Access]] = {"publish": [], "subscribe": []}
+    denied: dict[tuple[str, str], set[str]] = defaultdict(set)
+    allowed: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for right in rights:
+        into = denied if right.qualifier is DENY else allowed
+        for direction, topics in right.topics._asdict().items():
+            if topics:
+                into[right.enclave, direction].update(topics)
+    for (enclave, direction), topics in sorted(allowed.items()):
+        outside = sorted(denied[enclave, direction].union(ignored))
+        for topic in sorted(topics, key=_plain_first):
+            met = tuple(name for name in outside if overlap(name, topic))
+            if not any(name == topic or covers(name, topic) for name in met):
+                ends[direction].append(_Access(enclave, topic, met))
+    return ends
 
 
 def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
@@ -294,28 +322,29 @@ def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
     )
 
 
-def _shared(access: _Access, other: _Access) -> str:
-    """Return a DDS topic that both accesses allow, or ""."""
-    if not overlap(access.topic, other.topic):
+def _shared(*accesses: _Access) -> str:
+    """Return a DDS topic that all accesses allow, or ""."""
+    topics = sorted({access.topic for access in accesses})
+    if not all(overlap(one, other) for one, other in combinations(topics, 2)):
         return ""
-    exact = next((end.topic for end in (access, other) if not is_expression(end.topic)), "")
-    outside = set(access.without + other.without)
+    exact = next((topic for topic in topics if not is_expression(topic)), "")
+    outside = {excluded for access in accesses for excluded in access.without}
     if exact:
         return "" if any(matches(excluded, exact) for excluded in outside) else exact
-    return _shared_by_wildcards(*sorted((access.topic, other.topic)), tuple(sorted(outside)))
+    return _shared_by_wildcards(tuple(topics), tuple(sorted(outside)))
 
 
 @lru_cache(maxsize=4096)
-def _shared_by_wildcards(one: str, other: str, outside: tuple[str, ...]) -> str:
+def _shared_by_wildcards(topics: tuple[str, ...], outside: tuple[str, ...]) -> str:
     for prefix, (_, _, end) in _WRITER_RIGHTS.items():
         # In ROS terms first, so that the result is a valid ROS name.
-        inner = [_ros_part(side, prefix, end) for side in (one, other)]
+        inner = [_ros_part(topic, prefix, end) for topic in topics]
         outer = [_ros_part(excluded, prefix, end) for excluded in outside]
         name = common_name(inner, filter(None, outer)) if all(inner) else ""
         topic = f"{prefix}{name}{end}"
         if name and not any(matches(excluded, topic) for excluded in outside):
             return topic
-    return common_name((one, other), outside, absolute=False) or ""
+    return common_name(topics, outside, absolute=False) or ""
 
 
 def _ros_part(topic: str, prefix: str, end: str) -> str:

@@ -15,6 +15,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource
 from sros_tool.keystore.selection import likely_names, no_such_enclave
 from sros_tool.policy.model import ALLOW
+from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, Reach, unguarded
 from sros_tool.values import shows
 
@@ -197,14 +198,14 @@ def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) ->
     without, questions = ((), ()) if infrastructure else (OF_EVERY_NODE, QUESTIONS)
     rights = source.rights
     if enclave in source.routers:
-        # It may say and hear what passes through it: the other end of everybody's rights.
-        rights |= {right.opposite(enclave) for right in rights if right.qualifier is ALLOW}
+        rights |= set(_rights_of_router(source, enclave))
     network = Network(
         rights,
         without=without,
         questions=questions,
         unguarded=unguarded(Keystore(source.path).governance) if of_keystore else (),
         everybody=names if of_keystore else (),
+        links=source.links,
     )
     if names and enclave not in names:
         raise no_such_enclave(Keystore(source.path), enclave, names)
@@ -217,3 +218,20 @@ def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) ->
         )
     reach = network.reach(enclave)
     return FollowedReach(source.path, (*without, *questions), reach, source.fleet, source.notes)
+
+
+def _rights_of_router(source: RightsSource, router: str) -> Iterator[Right]:
+    """Yield what a router may say and hear.
+
+    That is the other end of the rights of its enclaves, and what other routers let it say and hear.
+    """
+    links = source.links
+    for right in source.rights:
+        if right.qualifier is ALLOW and (
+            links is None or links.router_of.get(right.enclave) == router
+        ):
+            yield right.opposite(router)
+    for passing in links.passing.values() if links else ():
+        for right in passing:
+            if right.qualifier is ALLOW and right.enclave == router:
+                yield right

@@ -50,6 +50,7 @@ from sros_tool.values import Words, shows
 from sros_tool.xml import parse, read_bytes
 
 if TYPE_CHECKING:
+    from sros_tool.translate_zenoh.rights import RouterLinks
     from sros_tool.zenoh.access import Enforcement
     from sros_tool.zenoh.document import ConfigurationDocument
 
@@ -70,8 +71,9 @@ class RightsSource:
     ``fleet`` is the fleet that it is for, or None.  ``protections`` are a policy's statements about
     the protection of names; None for anything else.  ``documents`` are the permissions of enclaves,
     ``enforcers`` the access control of each Zenoh process that checks others; ``routers`` are the
-    enclaves of a keystore's routers.  ``configurations`` are the Zenoh configurations that
-    were read, also those of clients.  ``policy`` is the policy in a policy file.
+    enclaves of a keystore's routers, and ``links`` is what passes between several.
+    ``configurations`` are the Zenoh configurations that were read, also those of clients.
+    ``policy`` is the policy in a policy file.
     """
 
     path: Path
@@ -89,6 +91,7 @@ class RightsSource:
     documents: Mapping[str, Permissions] = field(default_factory=dict)
     enforcers: tuple[Enforcement, ...] = ()
     routers: tuple[str, ...] = ()
+    links: RouterLinks | None = None
     configurations: Mapping[Path, ConfigurationDocument] = field(default_factory=dict)
     policy: Policy | None = None
 
@@ -199,8 +202,30 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
         tuple(dict.fromkeys(note for source in sources for note in source.notes)),
         enforcers=tuple(item for source in sources for item in source.enforcers),
         routers=tuple(routers),
+        links=_links({each.path.parent: each for each in sources}, files, routers),
         configurations=configurations,
     )
+
+
+def _links(
+    sources: Mapping[Path, RightsSource], files: Mapping[str, Path], routers: Sequence[str]
+) -> RouterLinks | None:
+    """Return what passes between several routers, and which of them has rules for an enclave.
+
+    ``files`` are the folders of the enclaves, and ``sources`` what the configurations in them give.
+    """
+    from sros_tool.translate_zenoh.rights import RouterLinks
+
+    if len(routers) == 1:
+        return None
+    router_of = dict(zip(routers, routers, strict=True))
+    passing = {}
+    for router in routers:
+        rights = sources[files[router]].rights
+        passing[router] = frozenset(right for right in rights if right.enclave in routers)
+        for right in rights:
+            router_of.setdefault(right.enclave, router)
+    return RouterLinks(router_of, passing)
 
 
 def check_routers(root: Path, known: Mapping[str, Collection[str]]) -> None:

@@ -10,7 +10,7 @@ a name is given only if the rules allow every key that it stands for.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -453,6 +453,17 @@ class RightsInRules:
     rights: frozenset[Right]
     enclaves: frozenset[str]
     left_out: tuple[str, ...]
+
+
+class RouterLinks(NamedTuple):
+    """The routers of a Zenoh network with several, and what passes from one to another.
+
+    ``router_of`` maps enclaves to the routers that they connect to, and each router to itself.
+    ``passing`` maps each router to the rights that it gives the other routers.
+    """
+
+    router_of: Mapping[str, str]
+    passing: Mapping[str, Collection[Right]]
 
 
 def rights_in_rules(access: Enforcement) -> RightsInRules:

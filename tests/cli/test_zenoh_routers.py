@@ -113,6 +113,40 @@ def test_all_verbs_know_several_routers(keystore: Path) -> None:
     ]
 
 
+def reached(root: Path, enclave: str) -> list[list[tuple[str, str, str]]]:
+    """Whom an enclave influences (by the last hop) and learns from (by the first one)."""
+    asked = sros("explain", root, "--reach", enclave, "--vendor", "zenoh", "--json").ok()
+    answer = json.loads(asked.out)
+    return [
+        [
+            (to["enclave"], to["path"][place]["right"], to["path"][place]["name"])
+            for to in answer[of]
+        ]
+        for of, place in (("influences", -1), ("learns_from", 0))
+    ]
+
+
+def test_a_routers_key_reaches_its_own_enclaves_and_others_by_what_passes(
+    keystore: Path,
+) -> None:
+    inner = ("publish", "/inner")
+    chatter = ("publish", "/chatter")
+    near, desk, listener = "/r1/near", "/desk", "/r2/listener"
+    talker = [("/r1/talker", *chatter)]
+    everybody = [(desk, *chatter), (near, *inner), (listener, *chatter)]
+    assert reached(keystore, "/r1/router") == [everybody, talker]
+    # Nobody behind it says anything: of what passes, it hears everything.
+    assert reached(keystore, "/r2/router") == [[(listener, *chatter)], talker]
+    sros("zenoh", keystore, "--cross", "/inner").ok()
+    passing = [(desk, *inner), (near, *inner), (listener, *inner)]
+    assert reached(keystore, "/r1/router") == [passing, talker]
+    assert reached(keystore, "/r2/router")[1] == [("/r1/talker", *inner)]
+    sros("zenoh", keystore, "--cross", "/elsewhere").ok()
+    assert reached(keystore, "/r1/router") == [[(near, *inner)], talker]
+    assert reached(keystore, "/r2/router") == [[(listener, *chatter)], []]
+    assert reached(keystore, "/r1/talker") == [[(near, *inner)], []]
+
+
 def test_settings_are_read_as_they_were_written(keystore: Path) -> None:
     template = parse_template((keystore / "sros.toml").read_text(), "")
     assert template.zenoh
