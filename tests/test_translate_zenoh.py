@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from datetime import UTC, datetime
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -19,9 +20,9 @@ from sros_tool.policy.model import ALLOW, Enclave, Group, Profile, Profiles, Qua
 from sros_tool.policy.model import DENY as DENY_
 from sros_tool.policy.model import RIGHTS as RIGHTS_OF
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.rights import NodeName, Right, Rules, nodes_of_rights
+from sros_tool.policy.rights import OWN_SERVICES, NodeName, Right, Rules, nodes_of_rights
 from sros_tool.translate import permissions_for
-from sros_tool.translate_zenoh.graph import nodes_in_rules
+from sros_tool.translate_zenoh.graph import example_token, graph_rules, nodes_in_rules
 from sros_tool.translate_zenoh.rights import (
     StatedRight,
     as_router,
@@ -31,7 +32,7 @@ from sros_tool.translate_zenoh.rights import (
     stated_rights,
 )
 from sros_tool.validity import Window
-from sros_tool.zenoh.access import AccessControl, Flow, Message
+from sros_tool.zenoh.access import AccessControl, Flow, Message, RemoteRights, RightsBetween
 from sros_tool.zenoh.key_expressions import canonical, includes
 from sros_tool.zenoh.releases import RELEASES
 from tests.support.children import LONG
@@ -465,6 +466,48 @@ def test_services_of_a_node_show_its_name(
         "/e", IN, Message.LIVELINESS_TOKEN, "@ros2_lv/0/z/0/0/NN/%e/%x%y/other"
     ) is (services in (["/*"], ["/add"])), "any node, if none is known"
     assert remote_of("/e", {0: stated}, told) == remote_of("/e", {0: stated})
+
+
+EVERY = [f"/robot/arm/{service}" for service in OWN_SERVICES]
+
+
+@pytest.mark.parametrize(
+    ("allowed", "denied", "may", "may_not"),
+    [
+        (["/*"], ["/robot/*"], ["%/n", "%/robo", "%robots/n"],
+         ["%/robot", "%robot/n", "%robot%arm/n"]),
+        (["/*"], ["/robot*"], ["%/n", "%arm/robot"], ["%/robot", "%/robots", "%robot/n"]),
+        (["/*"], EVERY, ["%/n", "%robot/arms", "%robot%arm/n"], ["%robot/arm"]),
+        (["/*"], EVERY[1:], ["%robot/arm"], []),
+        (["/*/get_parameters"], ["/n/get_parameters"], ["%/m"], ["%/n"]),
+        (["/*"], ["/*/set_parameters"], ["%/n", "%robot/arm"], []),
+        (["/*"], ["/*/arm/*"], ["%/n", "%/arm"], ["%robot/arm", "%robot%arm/n"]),
+        (["/*"], ["/n?/*"], ["%/n"], ["%/n1", "%n1/n"]),
+        (["/n*"], ["/*"], ["%/profile"], ["%/n", "%/n1"]),
+        (["/add"], ["/*"], ["%/profile"], ["%/n"]),
+    ],
+)  # fmt: skip
+def test_denied_services_of_a_node_take_it_away(
+    allowed: list[str], denied: list[str], may: list[str], may_not: list[str]
+) -> None:
+    rights = [Right("/e", ALLOW, "reply", name) for name in allowed]
+    rights += [Right("/e", DENY_, "reply", name) for name in denied]
+    rights.append(Right("/e", ALLOW, "publish", "/chatter"))
+    profiles = [NodeName("/", "profile")]
+    rules = tuple(graph_rules("/e", 0, rights, profiles))
+    assert tuple(graph_rules("/e", 0, rights, nodes_in_rules(rules, "/e"))) == rules
+    own = RemoteRights("/e", rules)
+    peer = RemoteRights("/p", tuple(graph_rules("/p", 0, rights, profiles)))
+    direct = next(r for r in RightsBetween((own, peer)).of_all("/p") if r.common_name == "/e")
+    for remote in (own, direct):
+        control = AccessControl((remote,))
+        for announced in ("NN/%e/{}", "MP/%e/{}/%chatter/t/h/q"):
+            for node in (*may, *may_not):
+                key = f"@ros2_lv/0/z/0/0/{announced.format(node)}"
+                assert control.allows("/e", IN, Message.LIVELINESS_TOKEN, key) is (node in may), key
+        announcing = ("/e", IN, Message.LIVELINESS_TOKEN)
+        passes = partial(control.allows, *announcing)
+        assert passes(example_token(0, "/e", control.allowed_keys(*announcing), passes))
 
 
 def test_many_nodes_with_many_names_announce_them_as_any_node() -> None:

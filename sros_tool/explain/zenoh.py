@@ -43,7 +43,7 @@ from sros_tool.policy.rights import Right, parts
 from sros_tool.translate_zenoh.graph import example_token
 from sros_tool.translate_zenoh.rights import ANY_TYPE, untyped
 from sros_tool.values import shows
-from sros_tool.zenoh.access import Enforcement, Flow, Message, MessageFilter
+from sros_tool.zenoh.access import Enforcement, Flow, Message, MessageFilter, Remote
 from sros_tool.zenoh.configuration import Mode, RenderedReader, SettingsEdition
 from sros_tool.zenoh.delivery import (
     Check,
@@ -534,8 +534,13 @@ class ZenohEvaluator:
         everything = f"@ros2_lv/{self.domain}/**"
         router = self._router_of(own.name).process
         assert router
-        stated = router.access.allowed_keys(own.name, Flow.INGRESS, Message.LIVELINESS_TOKEN)
-        node = example_token(self.domain, own.name, stated)
+        access, announcing = router.access, (Flow.INGRESS, Message.LIVELINESS_TOKEN)
+        node = example_token(
+            self.domain,
+            own.name,
+            access.allowed_keys(own.name, *announcing),
+            lambda key: access.decide(Remote(own.name), *announcing, key).allowed,
+        )
         return token((own, other), node, everything), token((other, own), everything, everything)
 
     def _reached(self, own: ZenohFile, wanted: Sequence[Right]) -> Iterator[Reached]:

@@ -75,7 +75,7 @@ from sros_tool.zenoh.configuration import (
     render_configuration,
     render_rights,
 )
-from sros_tool.zenoh.key_expressions import KeyExpressions, TooManyExpressions
+from sros_tool.zenoh.key_expressions import KeyExpressions, TooManyExpressions, names_of
 
 
 class ZenohFault(Enum):
@@ -722,7 +722,17 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
         more = announced != _to_announce(stated)
         check_meaning(more, False, f"that {enclave} announces names that it has no right to")
         return
-    announcing = _announcing(enclave, control)
+    nodes = _some_nodes(enclave, control)
+    kinds = {right: kind for kind, right in _ANNOUNCED.items()}
+
+    def is_announced(domain: int, right: str, name: str) -> bool:
+        last = (name.replace("/", "%"), "type/hash/qos")
+        tokens = (
+            "/".join((f"@ros2_lv/{domain}/z/0/1", kinds[right], *node, *last)) for node in nodes
+        )
+        announcing = (enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
+        return any(control.allows(*announcing, token) for token in tokens)
+
     for domain, rights in stated.items():
         rules = Rules([each.right for each in rights])
         names = {(e.right.kind, name) for e in rights for name in _examples(e.right.name)}
@@ -731,7 +741,7 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
                 told = passing[right].include(f"{domain}{name}/{ANY_TYPE}")
                 if told != (meant := rules.allow(enclave, right, name)):
                     check_meaning(told, meant, f"the right of {enclave} to {right} {name}")
-                if announcing(domain, right, name) != meant:
+                if nodes and is_announced(domain, right, name) != meant:
                     check_meaning(not meant, meant, f"that {enclave} announces {right} {name}")
 
 
@@ -785,24 +795,23 @@ def _to_announce(stated: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, 
     }
 
 
-def _announcing(enclave: str, control: AccessControl) -> Callable[[int, str, str], bool]:
-    """Return whether rules let some node of an enclave announce the use of a right to a name."""
-    kinds = {right: kind for kind, right in _ANNOUNCED.items()}
-    tokens = control.passing(enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
-    places = {
-        tuple(each.replace("$*", "a").replace("*", "a") for each in key.split("/")[6:9])
-        for key in tokens.all
+def _some_nodes(enclave: str, control: AccessControl) -> set[tuple[str, ...]]:
+    """Return nodes that rules let an enclave announce, for each wildcard one, as tokens have them.
+
+    There are none if its rights deny all of its nodes.
+    """
+    announcing = (enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
+    nodes = [
+        key
+        for key in control.passing(*announcing).all
         if key.startswith("@ros2_lv/") and "/NN/" in key
-    }
-
-    def is_announced(domain: int, right: str, name: str) -> bool:
-        names = [[*place, name.replace("/", "%"), "type/hash/qos"] for place in places]
-        keys = ("/".join((f"@ros2_lv/{domain}/z/0/1", kinds[right], *each)) for each in names)
-        return any(
-            control.allows(enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN, key) for key in keys
-        )
-
-    return is_announced
+    ]
+    if denied := [key for key in control.denied(*announcing).all if key.split("/")[5] == "*"]:
+        gone = names_of(denied)
+        tokens = [token for key in nodes if (token := (names_of([key]) - gone).example())]
+    else:
+        tokens = [key.replace("$*", "a").replace("*", "a") for key in nodes]
+    return {tuple(token.split("/")[6:9]) for token in tokens}
 
 
 def _examples(name: str) -> Iterable[str]:

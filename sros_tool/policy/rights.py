@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
-from sros_tool.names import ACTION_PARTS, GOAL, DdsNames, dds_names, expand
+from sros_tool.names import ACTION_PARTS, GOAL, DdsNames, dds_names, expand, is_expression
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
@@ -25,7 +25,7 @@ from sros_tool.policy.model import (
     Qualifier,
     Source,
 )
-from sros_tool.policy.patterns import ComparisonLimit, Names
+from sros_tool.policy.patterns import ComparisonLimit, Names, covers, matches
 from sros_tool.values import Words, shows
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
@@ -326,16 +326,80 @@ def _shows(group: Group) -> bool:
 
 
 def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
-    """Return the nodes whose standard services the rights of an enclave allow to offer."""
-    found: dict[NodeName, None] = {}
+    """Return the nodes whose standard services the rights of an enclave allow to offer.
+
+    Denials take nodes of wildcards away: `denied_nodes`.
+    """
+    nodes = (
+        node
+        for _, qualifier, right, name in rights
+        if right == "reply" and qualifier is ALLOW
+        for full_name in _full_names(name)
+        for node in _nodes(full_name)
+    )
+    return tuple(dict.fromkeys(nodes))
+
+
+def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
+    """Return the nodes of which the rights allow standard services, and deny all of these again.
+
+    A node with another standard service that it may offer is none of them.  A denial that matches a
+    part of what a wildcard allows counts for all nodes that the denial matches.
+    """
+    allowed: dict[str, None] = {}
+    denied: dict[str, None] = {}
     for _, qualifier, right, name in rights:
-        if right == "reply" and qualifier is ALLOW:
-            base, _, service = name.rpartition("/")
-            bases = [base] if service in OWN_SERVICES else []
-            if name.endswith("*"):
-                bases += [name, name.removesuffix("/*")]
-            found.update(dict.fromkeys(node for base in bases for node in _nodes(base)))
-    return tuple(found)
+        if right == "reply":
+            (allowed if qualifier is ALLOW else denied)[name] = None
+    if not denied:
+        return ()
+    offering = {
+        service: Names(node for name in allowed for node in _full_names(name, service))
+        for service in OWN_SERVICES
+    }
+    never = Names(denied)
+
+    def offers_none(node: str) -> bool:
+        return all(
+            never.cover(f"{node}/{service}")
+            for service, nodes in offering.items()
+            if nodes.meets(node)
+        )
+
+    candidates = {
+        node if covers(without, node) else without: None
+        for service, nodes in offering.items()
+        for name in denied
+        for without in _before(name, f"/{service}")
+        for node in nodes.meeting(without)
+    }
+    gone = filter(offers_none, candidates)
+    return tuple(dict.fromkeys(node for full_name in gone for node in _nodes(full_name)))
+
+
+def _full_names(name: str, service: str = "") -> Iterator[str]:
+    """Yield the full names of nodes, perhaps with wildcards, whose standard services match a name.
+
+    Only those that offer ``service`` by that name, if it is given.
+    """
+    node, _, last = name.rpartition("/")
+    if last in OWN_SERVICES and service in ("", last):
+        yield node
+    if name.endswith("*"):
+        yield name
+        yield name.removesuffix("/*")
+
+
+def _before(name: str, end: str) -> Iterator[str]:
+    """Yield expressions for all texts that, with ``end`` after them, ``name`` matches."""
+    if not is_expression(name):
+        if name.endswith(end):
+            yield name.removesuffix(end)
+        return
+    for at in range(1, len(name)):
+        # A star may match the end of the text and the beginning of ``end``.
+        if matches(name[at:], end):
+            yield name[: at + 1] if name[at] == "*" else name[:at]
 
 
 def _nodes(name: str) -> Iterator[NodeName]:

@@ -12,12 +12,13 @@ a process reads a token with wildcards as it is written, as the name of nobody's
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from string import ascii_lowercase
 
 from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import Names, overlap
-from sros_tool.policy.rights import OWN_SERVICES, NodeName, Right
+from sros_tool.policy.rights import OWN_SERVICES, NodeName, Right, denied_nodes, nodes_of_rights
 from sros_tool.policy.subtraction import CannotSubtract, listed
 from sros_tool.zenoh.access import AccessRule, Flow, Message
 from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical
@@ -31,6 +32,8 @@ _MOST_TOKENS = 4096
 _ANNOUNCING = (Message.LIVELINESS_TOKEN,)
 _ASKING = (Message.LIVELINESS_QUERY, Message.DECLARE_LIVELINESS_SUBSCRIBER)
 _ANY_NODE = NodeName("*", "*")
+_LETTER = "[a-zA-Z0-9_]"
+"""Any character of a ROS name."""
 
 
 def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName, ...]:
@@ -51,12 +54,16 @@ def graph_rules(
 ) -> Iterator[AccessRule]:
     """Yield what a process allows to processes of an enclave, as far as the graph is concerned.
 
-    They may announce ``nodes``, or any if there are none, with what ``rights`` allow, in the name
-    of their own enclave; and see everything.  The right to ask has to be for exactly the expression
-    that rmw_zenoh asks for.  ``rights`` are to topics and services.
+    They may announce ``nodes`` and those whose own services they may offer, or any if there are
+    none, with what ``rights`` allow, in the name of their own enclave; and see everything.  A node
+    all of whose own services are allowed and denied is denied.  The right to ask has to be for
+    exactly the expression that rmw_zenoh asks for.  ``rights`` are to topics and services.
     """
-    tokens = _Tokens(enclave, domain, [*nodes] or [_ANY_NODE])
+    rights = tuple(rights)
+    known = dict.fromkeys((*nodes, *nodes_of_rights(rights)))
+    tokens = _Tokens(enclave, domain, known or [_ANY_NODE])
     allowed, denied = tokens.of(rights)
+    denied += tokens.of_every_kind(denied_nodes(rights))
     everything = f"{GRAPH}/{domain}/{ANY_CHUNKS}"
     yield AccessRule(Flow.INGRESS, _ANNOUNCING, allowed)
     if denied:
@@ -72,14 +79,7 @@ class _Tokens:
     def __init__(self, enclave: str, domain: int, nodes: Iterable[NodeName]) -> None:
         self._begin = f"{GRAPH}/{domain}/*/*/*"
         self._enclave = _part(enclave)
-        named = (
-            NodeName(ns, name)
-            for node in nodes
-            for ns in _listed(node.ns)
-            for name in _listed(node.name)
-            if "/" not in name
-        )
-        self._nodes = tuple(dict.fromkeys(_place(each) for each in named))
+        self._nodes = _places(nodes)
         self._of_names = {
             f"{'' if ns == '%' else ns}%{name}": f"{ns}/{name}"
             for ns, _, name in (each.partition("/") for each in self._nodes)
@@ -110,6 +110,17 @@ class _Tokens:
                 for part in _parts(name)
             ]
         return tuple(allowed), tuple(denied)
+
+    def of_every_kind(self, nodes: Sequence[NodeName]) -> tuple[str, ...]:
+        """Return the key expressions of nodes, and of everything that they could have."""
+        named = (
+            # "$*" may stand for nothing: "/*" must not become the namespace "/", too.
+            NodeName(f"/{_LETTER}*", node.name)
+            if node.ns == "/*" and NodeName("/", node.name) not in nodes
+            else node
+            for node in nodes
+        )
+        return tuple(self._key("*", place, ANY_CHUNKS) for place in _places(named))
 
     def _announced(self, right: str, names: Mapping[str, None]) -> list[str]:
         """Return the tokens of names, each of every node that may have it."""
@@ -149,9 +160,16 @@ def _parts(name: str) -> tuple[str, ...]:
     return (_part(name),)
 
 
-def _place(node: NodeName) -> str:
-    """Return the namespace and the name of a node as tokens have them."""
-    return f"{_part(node.ns)}/{_part(node.name)}"
+def _places(nodes: Iterable[NodeName]) -> tuple[str, ...]:
+    """Return the namespaces and names of nodes as tokens have them."""
+    places = (
+        f"{_part(ns)}/{_part(name)}"
+        for node in nodes
+        for ns in _listed(node.ns)
+        for name in _listed(node.name)
+        if "/" not in name
+    )
+    return tuple(dict.fromkeys(places))
 
 
 def _part(name: str) -> str:
@@ -159,12 +177,30 @@ def _part(name: str) -> str:
     return canonical((name.replace("/", "%").replace("*", ANY_PART) or "%",))
 
 
-def example_token(domain: int, enclave: str, key_expressions: Iterable[str]) -> str:
-    """Return the token of a node of an enclave: if there is one, of those that are allowed."""
+def example_token(
+    domain: int,
+    enclave: str,
+    key_expressions: Iterable[str],
+    passes: Callable[[str], bool] = lambda _: True,
+) -> str:
+    """Return the token of a node of an enclave: if there is one, of those that are allowed.
+
+    Of the tokens that ``key_expressions`` include, it is one that ``passes`` the denials.
+    """
     begin = f"{GRAPH}/{domain}/"
-    for key in key_expressions:
-        chunks = key.split("/")
-        if key.startswith(begin) and chunks[5:7] == [_NODE, _part(enclave)]:
-            names = ("node" if each == "*" else each.replace(ANY_PART, "") for each in chunks[7:])
-            return "/".join((f"{begin}zid/0/0", _NODE, _part(enclave), *names))
-    return f"{begin}zid/0/0/{_NODE}/{_part(enclave)}/%/node"
+    places = [
+        key.split("/")[7:]
+        for key in key_expressions
+        if key.startswith(begin) and key.split("/")[5:7] == [_NODE, _part(enclave)]
+    ]
+    tokens = [
+        "/".join((f"{begin}zid/0/0", _NODE, _part(enclave), _any_as(name, ns), _any_as(name, node)))
+        for name in ("node", *ascii_lowercase)
+        for ns, node in places or [["%", "node"]]
+    ]
+    return next(filter(passes, tokens), tokens[0])
+
+
+def _any_as(name: str, part: str) -> str:
+    """Return a part of a token with a name in place of a wildcard for all of it."""
+    return name if part == "*" else part.replace(ANY_PART, "")

@@ -36,7 +36,6 @@ from sros_tool.policy.rights import (
     Right,
     folded,
     nodes_of,
-    nodes_of_rights,
     parts,
     placed_rights,
 )
@@ -145,7 +144,7 @@ def remote_rights(enclave: Enclave, domain: int) -> RemoteRights:
 def remote_of(
     enclave: str,
     stated: Mapping[int, Sequence[StatedRight]],
-    nodes: Iterable[NodeName] = (),
+    nodes: Collection[NodeName] = (),
 ) -> RemoteRights:
     """Return what a process allows to processes of an enclave with rights ``stated`` by ROS domain.
 
@@ -159,8 +158,7 @@ def remote_of(
     rules: list[AccessRule] = []
     for domain, rights in stated.items():
         of_names = [each.right for each in rights]
-        known = dict.fromkeys((*nodes, *nodes_of_rights(of_names)))
-        rules += graph_rules(enclave, domain, of_names, known)
+        rules += graph_rules(enclave, domain, of_names, nodes)
         for right, keys in _allowed_keys(domain, rights):
             below = tuple([f"{key}/{_ADVANCED}" for key in keys])
             rules += [

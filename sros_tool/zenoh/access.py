@@ -101,13 +101,14 @@ class AccessControl:
         """Return the key expressions that are allowed for a message, to ask about many keys."""
         return self._expressions(common_name, flow, message, allows=True)
 
+    def denied(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
+        """Return the key expressions that are denied for a message, whatever allows them."""
+        return self._expressions(common_name, flow, message, allows=False)
+
     def keys(self, common_name: str, flow: Flow, message: Message) -> NameSet:
         """Return the set of all keys with which a message passes."""
-        allowed, denied = (
-            names_of(self._expressions(common_name, flow, message, allows=each).all)
-            for each in (True, False)
-        )
-        return allowed - denied
+        of = (common_name, flow, message)
+        return names_of(self.passing(*of).all) - names_of(self.denied(*of).all)
 
     def _expressions(
         self, common_name: str, flow: Flow, message: Message, *, allows: bool

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -275,7 +275,7 @@ def test_rules_that_are_not_the_permissions_are_not_written(
     }
 
     def made(
-        enclave: str, stated: Mapping[int, Sequence[StatedRight]], nodes: Iterable[NodeName]
+        enclave: str, stated: Mapping[int, Sequence[StatedRight]], nodes: Collection[NodeName]
     ) -> RemoteRights:
         rights = remote_of(enclave, stated, nodes)
         rules = rights.rules[1:] if wrong == "lost" else (*rights.rules, more[wrong])

@@ -32,6 +32,8 @@ POLICY = policy_text(
         "/listener": subscribe("/chatter", "/secret", "/map"),
         "/server": '<services reply="ALLOW"><service>/add</service></services>',
         "/client": '<services request="ALLOW"><service>/add</service></services>',
+        "/wide": '<services reply="ALLOW"><service>/*</service></services>'
+        '<services reply="DENY"><service>/denied/*</service></services>',
         "/other": publish("/elsewhere") + subscribe("/elsewhere", "/chatter/*"),
     }
 )
@@ -72,8 +74,8 @@ def test_who_may_communicates_and_nobody_else(keystores: Path, mode: str) -> Non
         "overheard": [],
         "executed": ["client"],
         "answered": ["server"],
-        "nodes": ["other", "talker"],
-        "graph": ["other", "server", "talker"],
+        "nodes": ["guest", "other", "talker"],
+        "graph": ["guest", "other", "server", "talker"],
         "announced": ["other MP %elsewhere", "server SS %add"],
         "erased": False,
         "history": ["map"],
@@ -89,7 +91,7 @@ def test_without_the_rules_each_of_these_attacks_succeeds(keystores: Path) -> No
     assert set(observed["overheard"]) >= overheard
     assert "other" in observed["executed"]
     assert "thief" in observed["answered"]
-    assert "spoofed" in observed["nodes"]
+    assert {"spoofed", "denied"} <= {*observed["nodes"]}
     assert {"other MP %chatter", "other SS %add"} <= {*observed["announced"]}
     assert observed["erased"]
 

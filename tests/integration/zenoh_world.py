@@ -44,6 +44,8 @@ FALSE_TOKENS = (
     ("/other", "talker", "MP /elsewhere"),
 )
 """What /other announces falsely: enclave, node, and what the node has."""
+WIDE_TOKENS = ("denied", "guest")
+"""Nodes of /wide, which may serve everything but what the first one of them would have."""
 _SIDES = ("connect", "listen")
 
 
@@ -207,7 +209,7 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
         talker, keeper, listener = (
             at.open(f"/{each}") for each in ("talker", "keeper", "listener")
         )
-        server, client = at.open("/server"), at.open("/client")
+        server, client, wide = (at.open(f"/{each}") for each in ("server", "client", "wide"))
         one, two = at.open("/other"), at.open("/other")
         other = at.open("/other", rules=False)
         heard: set[str] = set()
@@ -230,6 +232,7 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             token(talker, "/talker", "talker"),
             token(server, "/server", "server", "SS /add"),
             *(token(other, *each) for each in FALSE_TOKENS),
+            *(token(wide, "/wide", node) for node in WIDE_TOKENS),
             token(other, "/other", "other"),
         ]
         for each in BUFFERS:
@@ -283,7 +286,7 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
         until(
             lambda: "server" in answered, lambda: answered.update(replies(client, "/add", "client"))
         )
-        until(lambda: seen >= {"talker", "other"}, lambda: seen.update(nodes(listener)))
+        until(lambda: seen >= {"talker", "other", "guest"}, lambda: seen.update(nodes(listener)))
         kept.append(
             zenoh.ext.declare_advanced_subscriber(
                 listener,
