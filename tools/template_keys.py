@@ -233,6 +233,14 @@ KEYS: tuple[Key, ...] = (
         "a list of names of enclaves",
         "the enclaves whose sessions connect to it",
     ),
+    Key(
+        OF_ROUTER,
+        "crossing",
+        '["/fleet/*"]',
+        "a list of names of topics and services",
+        "the names that may pass between it and other routers",
+        "all that `crossing` of `[zenoh]` lets pass",
+    ),
 )
 
 ABOUT = {

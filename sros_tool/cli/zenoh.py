@@ -173,7 +173,7 @@ def zenoh(
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_zenoh
 
-        print_json(shown_zenoh(result, network, changed))
+        print_json(shown_zenoh(result, result.template.zenoh, changed))
     elif dry_run and not only_check:
         print_plan(root, result.changes)
     else:

@@ -56,6 +56,11 @@ def path_for(parts: Parts, robot: Robot) -> str:
     return "".join(map(str, fill(parts, robot.name, robot.namespace)))
 
 
+def router_of(fleet: Fleet, robot: Robot) -> str:
+    """Return the path of the enclave of a robot's Zenoh router, if it has one."""
+    return path_for(parts_of(fleet.routers), robot)
+
+
 def enclaves_of(fleet: Fleet, robot: Robot) -> tuple[str, ...]:
     """Return the paths of the enclaves that a robot has by the patterns of the fleet, sorted."""
     paths = set()

@@ -18,14 +18,23 @@ from typing import Any
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, UnavailableError
 from sros_tool.files import read_toml
-from sros_tool.fleet.enclaves import MAX_PATTERNS, pattern_problem, size_problem
+from sros_tool.fleet.enclaves import (
+    MAX_PATTERNS,
+    pattern_problem,
+    robot_of,
+    router_of,
+    size_problem,
+)
 from sros_tool.fleet.robots import (
     MAX_ROBOTS,
+    ROUTERS,
     Fleet,
     Robot,
     address_problem,
+    crossing_problem,
     name_problem,
     namespace_problem,
+    router_problem,
     user_problem,
 )
 from sros_tool.values import parse_json
@@ -33,12 +42,15 @@ from sros_tool.xml import read_bytes
 
 MAX_BYTES = 4 * 1024 * 1024
 _MOST_GROUPS = 32  # of one robot
+_MOST_CROSSING = 1_000
 _VALUES: Mapping[str, Callable[[str], str]] = {
     "namespace": namespace_problem,
     "address": address_problem,
     "user": user_problem,
+    "router": router_problem,
 }
 """Text settings of a robot, with the function that returns what is wrong with a value."""
+_OF_GROUP = ("domain", *_VALUES, "crossing")
 _OF_ROBOT = "{robot}"
 """The placeholder for a robot's name in the settings of a group."""
 
@@ -107,7 +119,7 @@ class _Reader:
         self._words = words
 
     def fleet(self, table: Mapping[str, Any]) -> Fleet:
-        self._known(table, ("groups", "robots", "enclaves"), "")
+        self._known(table, ("groups", "robots", "enclaves", "routers"), "")
         groups = self._tables(table, "groups")
         robots = self._tables(table, "robots")
         if not robots:
@@ -115,14 +127,20 @@ class _Reader:
         if len(robots) > MAX_ROBOTS:
             raise self._error(f"it has more than {MAX_ROBOTS} robots", "", "Divide the fleet.")
         for name, values in groups.items():
-            self._known(values, ("domain", *_VALUES), f"groups.{name}")
+            self._known(values, _OF_GROUP, f"groups.{name}")
             self._values(values, {key: f"groups.{name}.{key}" for key in values}, "r")
         enclaves = self._texts(table, "enclaves", "", MAX_PATTERNS)
-        for path in enclaves:
-            if problem := pattern_problem(path):
-                raise self._refused("enclaves", path, problem)
+        routers = table.get("routers", ROUTERS)
+        for key, path in (*(("enclaves", path) for path in enclaves), ("routers", routers)):
+            problem = pattern_problem(path) if isinstance(path, str) else "It is not a text."
+            if problem:
+                raise self._refused(key, path, problem)
         read = [self._robot(name, values, groups) for name, values in robots.items()]
-        fleet = Fleet.of(read, groups, enclaves)
+        fleet = Fleet.of(read, groups, enclaves, routers)
+        for robot in read:
+            if robot.router and robot_of(fleet, router_of(fleet, robot)) != robot:
+                text = f"{routers} is not a path of the enclaves of {robot.name}."
+                raise self._refused("routers", routers, text)
         if both := sorted(fleet.robots.keys() & fleet.groups.keys()):
             raise self._error(
                 f"{_short(both[0])} is a robot and a group",
@@ -137,7 +155,7 @@ class _Reader:
         self, name: str, values: Mapping[str, Any], groups: Mapping[str, Mapping[str, Any]]
     ) -> Robot:
         at = f"{self._word('robots')}.{name}"
-        self._known(values, ("groups", "domain", *_VALUES), at)
+        self._known(values, ("groups", *_OF_GROUP), at)
         member = tuple(sorted(set(self._texts(values, "groups", at, _MOST_GROUPS))))
         for group in member:
             if problem := name_problem(group):
@@ -159,7 +177,11 @@ class _Reader:
             own, {key: f"{at}.{self._word(key)}" for key in own}
         )
         usual = {"namespace": f"/{name}", "address": name, "user": "", "domain": None}
-        return Robot(name, groups=member, **(usual | given))
+        robot = Robot(name, groups=member, **(usual | given))
+        if robot.crossing and not robot.router:
+            text = "Nothing passes through a router that the robot does not have."
+            raise self._refused(f"{at}.crossing", list(robot.crossing), text)
+        return robot
 
     def _values(
         self, values: Mapping[str, Any], places: Mapping[str, str], name: str = ""
@@ -173,12 +195,24 @@ class _Reader:
                     raise self._refused(places[key], value, problem)
                 checked[key] = value
                 continue
+            if key == "crossing":
+                checked[key] = self._crossing(value, places[key], name)
+                continue
             if not isinstance(value, str):
                 raise self._refused(places[key], value, "It is not a text.")
             checked[key] = value.replace(_OF_ROBOT, name) if name else value
             if problem := _VALUES[key](checked[key]):
                 raise self._refused(places[key], value, problem)
         return checked
+
+    def _crossing(self, names: Any, place: str, robot: str) -> tuple[str, ...]:
+        at, _, key = place.rpartition(".")
+        filled = []
+        for name in self._texts({key: names}, key, at, _MOST_CROSSING):
+            filled.append(name.replace(_OF_ROBOT, robot) if robot else name)
+            if problem := crossing_problem(filled[-1]):
+                raise self._refused(place, name, problem)
+        return tuple(filled)
 
     def _word(self, key: str) -> str:
         return self._words.get(key, key)
@@ -240,6 +274,8 @@ def _lines(fleet: Fleet) -> Iterator[str]:
         yield "enclaves = ["
         yield from (f"  {json.dumps(pattern)}," for pattern in fleet.enclaves)
         yield "]"
+    if fleet.routers != ROUTERS:
+        yield f"routers = {json.dumps(fleet.routers)}"
     for group in fleet.groups:
         yield f"[groups.{group}]"
     yield "[robots]"
@@ -250,6 +286,8 @@ def _lines(fleet: Fleet) -> Iterator[str]:
             "domain": robot.domain,
             "address": robot.address,
             "user": robot.user,
+            "router": robot.router,
+            "crossing": list(robot.crossing),
         }
         usual: dict[str, object] = {
             "groups": [],
@@ -257,6 +295,8 @@ def _lines(fleet: Fleet) -> Iterator[str]:
             "domain": None,
             "address": robot.name,
             "user": "",
+            "router": "",
+            "crossing": [],
         }
         shown = [
             f"{key} = {json.dumps(value)}" for key, value in values.items() if value != usual[key]
@@ -269,6 +309,8 @@ _VARIABLES = {
     "domain": "sros_domain",
     "address": "ansible_host",
     "user": "ansible_user",
+    "router": "sros_router",
+    "crossing": "sros_crossing",
 }
 """Robot setting → the Ansible host variable that has it."""
 _ROBOT = "sros_robot"
@@ -550,8 +592,10 @@ def _variables(robot: Robot) -> dict[str, Any]:
         "domain": robot.domain,
         "address": robot.address,
         "user": robot.user,
+        "router": robot.router,
+        "crossing": list(robot.crossing),
     }
-    shown = {_VARIABLES[key]: value for key, value in values.items() if value not in (None, "")}
+    shown = {_VARIABLES[key]: value for key, value in values.items() if value not in (None, "", [])}
     return {_ROBOT: robot.name, **shown}
 
 

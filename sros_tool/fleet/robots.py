@@ -15,8 +15,11 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from sros_tool.errors import DocumentError
+from sros_tool.names import expression_problem
 
 MAX_ROBOTS = 10_000
+ROUTERS = "/{robot}/router"
+"""The usual path of the enclaves of robots' Zenoh routers."""
 _MAX_NAME = 64
 """Longest name of a robot or group in characters: longer ones fit into no enclave's name."""
 __MAX_NAMESPACE = 245
@@ -37,7 +40,9 @@ class Robot(NamedTuple):
 
     ``domain`` is its ROS_DOMAIN_ID, or None for every domain of the keystore.  ``address`` is a
     host name or IP address, ``user`` the account there, or "" for that of ssh.  ``groups`` are
-    sorted.
+    sorted.  ``router`` is where sessions and other routers connect to its Zenoh router, as
+    ``HOST:PORT``, or "" if it has none of its own; ``crossing`` are the names that may pass between
+    that router and others, if not all.
     """
 
     name: str
@@ -46,6 +51,8 @@ class Robot(NamedTuple):
     address: str = ""
     user: str = ""
     groups: tuple[str, ...] = ()
+    router: str = ""
+    crossing: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,18 +60,24 @@ class Fleet:
     """Robots by their names, and the names of the robots of each group; both sorted.
 
     ``enclaves`` are paths of enclaves with a placeholder, such as ``/{robot}/base``: they say
-    which robot an enclave belongs to.  ``by_namespace`` has the names of the robots in each
-    namespace.
+    which robot an enclave belongs to.  ``routers`` is the path of the enclaves of the robots' Zenoh
+    routers; it is one of ``enclaves`` if a robot has one.  ``by_namespace`` has the names of the
+    robots in each namespace.
     """
 
     robots: Mapping[str, Robot]
     groups: Mapping[str, tuple[str, ...]]
     enclaves: tuple[str, ...] = ()
+    routers: str = ROUTERS
     by_namespace: Mapping[str, tuple[str, ...]] = field(default_factory=dict, compare=False)
 
     @classmethod
     def of(
-        cls, robots: Iterable[Robot], groups: Iterable[str] = (), enclaves: Sequence[str] = ()
+        cls,
+        robots: Iterable[Robot],
+        groups: Iterable[str] = (),
+        enclaves: Sequence[str] = (),
+        routers: str = ROUTERS,
     ) -> Fleet:
         """Return a fleet of ``robots``; ``groups`` may name groups without robots."""
         named = {robot.name: robot for robot in sorted(robots, key=lambda robot: robot.name)}
@@ -77,9 +90,10 @@ class Fleet:
         return cls(
             MappingProxyType(named),
             MappingProxyType({name: tuple(members[name]) for name in sorted(members)}),
-            tuple(enclaves),
+            (),
+            routers,
             MappingProxyType({name: tuple(spaces[name]) for name in spaces}),
-        )
+        ).with_enclaves(enclaves)
 
     def robot(self, name: str) -> Robot:
         """Return the robot named ``name``; raise `DocumentError` with similar names if none is."""
@@ -102,8 +116,9 @@ class Fleet:
         return tuple(self.robots[name] for name in self.groups[group])
 
     def with_enclaves(self, enclaves: Sequence[str]) -> Fleet:
-        """Return the fleet with other paths of enclaves."""
-        return replace(self, enclaves=tuple(enclaves))
+        """Return the fleet with other paths of enclaves, and that of routers if robots have any."""
+        of_routers = [self.routers] if any(robot.router for robot in self.robots.values()) else []
+        return replace(self, enclaves=tuple(dict.fromkeys((*enclaves, *of_routers))))
 
 
 def _near(name: str, known: Iterable[str]) -> str:
@@ -159,6 +174,20 @@ def address_problem(address: str) -> str:
         return "It is neither a host name nor an IP address, such as r7.example.com or 10.0.7.1."
     # An IPv6 address can have a zone of any characters.
     return "" if "%" not in address else "It has a zone: write the address without it."
+
+
+def router_problem(router: str) -> str:
+    """Return why ``router`` is not where a Zenoh router is reached, as a sentence; "" if it is."""
+    from sros_tool.zenoh.configuration import is_endpoint  # most fleets name no routers
+
+    return "" if is_endpoint(router) else "It is not HOST:PORT, such as r7.example.com:7447."
+
+
+def crossing_problem(name: str) -> str:
+    """Return why ``name`` cannot pass between routers, as a sentence; "" if it can."""
+    if not name.startswith("/"):
+        return "It does not start with '/', as /fleet/* does."
+    return expression_problem(name)
 
 
 def user_problem(user: str) -> str:

@@ -270,11 +270,15 @@ class RouterFacts(NamedTuple):
     """Where it listens, as HOST:PORT."""
     enclaves: Sequence[str]
     """The enclaves whose sessions connect to it, perhaps with wildcards."""
+    crossing: Sequence[str]
+    """Names that may pass between it and other routers, if not all that may pass in the network."""
 
 
 def router_facts(router: ZenohRouter) -> RouterFacts:
     """Return what is shown of a router."""
-    return RouterFacts(router.name, router.endpoints, router.listening(), router.enclaves)
+    return RouterFacts(
+        router.name, router.endpoints, router.listening(), router.enclaves, router.crossing
+    )
 
 
 class NetworkFacts(NamedTuple):

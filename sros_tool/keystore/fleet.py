@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
@@ -15,16 +16,18 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note
-from sros_tool.fleet.enclaves import enclaves_of, robot_of, size_problem
+from sros_tool.fleet.enclaves import enclaves_of, robot_of, router_of, size_problem
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.layout import FLEET, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import Keystore
+from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.validity import iso
 from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
     from sros_tool.keystore.transaction.transaction import Transaction
+    from sros_tool.zenoh.configuration import ZenohNetwork
 
 _COMMENT = """\
 # The robots of this keystore; sros wrote them from a fleet file, and knows by them which enclave
@@ -155,6 +158,42 @@ class EnclaveDomains(NamedTuple):
                 "file.",
             )
         return DomainSet.of((robot.domain, robot.domain))
+
+
+def with_routers_of_robots(
+    network: ZenohNetwork, before: Fleet | None, fleet: Fleet, gone: Collection[str] = ()
+) -> ZenohNetwork:
+    """Return a Zenoh network with the routers of a fleet's robots, in place of those of ``before``.
+
+    Where a router listens stays as it is.  Routers whose enclaves are ``gone`` are left out.
+    """
+    from sros_tool.zenoh.configuration import ZenohRouter  # most fleets name no routers
+
+    known = {router.name: router for router in network.routers}
+    for name in _routers(before) if before else ():
+        known.pop(name, None)
+    listening = {router.name: router.listen for router in network.routers}
+    for name, robot in _routers(fleet).items():
+        if name not in gone:
+            own = [enclave for enclave in enclaves_of(fleet, robot) if enclave != name]
+            folder = fleet.routers.rpartition("/")[0]
+            if has_placeholder(folder):
+                beside = f"{name.rpartition('/')[0]}/"
+                own = [f"{beside}*", *(e for e in own if not e.startswith(beside))]
+            known[name] = ZenohRouter(
+                name, (robot.router,), listening.get(name, ()), tuple(own), robot.crossing
+            )
+    return replace(network, routers=tuple(known.values()))
+
+
+def robot_of_router(fleet: Fleet | None, name: str) -> Robot | None:
+    """Return the robot that has the Zenoh router in the enclave ``name``; None if none has."""
+    return _routers(fleet).get(name) if fleet else None
+
+
+def _routers(fleet: Fleet) -> dict[str, Robot]:
+    """Map the enclaves of the robots' Zenoh routers to their robots."""
+    return {router_of(fleet, robot): robot for robot in fleet.robots.values() if robot.router}
 
 
 # ── writing ────────────────────────────────────────────────────────────────────────────────

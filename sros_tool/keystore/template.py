@@ -264,6 +264,7 @@ def _zenoh_routers(tables: _Table) -> Iterator[ZenohRouter]:
             tuple(table.texts("endpoints")),
             tuple(table.texts("listen", [])),
             tuple(table.texts("enclaves")),
+            tuple(_crossing(table)),
         )
         for pattern in router.enclaves:
             if not pattern.startswith("/") or set(pattern) & set("?[]"):
@@ -296,7 +297,7 @@ def _zenoh_lines(network: ZenohNetwork) -> Iterator[str]:
         yield f"crossing = [{', '.join(map(_toml, network.crossing))}]"
     for router in network.routers:
         yield f"\n[zenoh.routers.{_toml(router.name)}]"
-        for key in ("endpoints", "listen", "enclaves"):
+        for key in ("endpoints", "listen", "enclaves", "crossing"):
             if texts := getattr(router, key):
                 yield f"{key} = [{', '.join(map(_toml, texts))}]"
 

@@ -508,9 +508,10 @@ def _router_files(
         for router, of in sides.items()
         if network.routers
     }
-    if network.crossing:
-        most = crossing_rules(network.crossing, domains)
-        together = {router: narrowed(of, most, GRAPH) for router, of in together.items()}
+    for router in routers if network.routers else ():
+        for names in filter(None, (network.crossing, router.crossing)):
+            most = crossing_rules(names, domains)
+            together[router.name] = narrowed(together[router.name], most, GRAPH)
     between = RightsBetween(together.values())
     files = {}
     for router in routers:

@@ -46,18 +46,21 @@ class ZenohRouter:
 
     ``endpoints`` (``HOST:PORT``) are where these sessions and other routers connect to it, and
     ``listen`` is where it listens; without it, at these ports of all its addresses.  ``enclaves``
-    are names, in which ``*`` stands for any characters.
+    are names, in which ``*`` stands for any characters.  ``crossing`` are the names that may pass
+    between it and other routers, if not all that may pass in the network.
     """
 
     name: str
     endpoints: tuple[str, ...]
     listen: tuple[str, ...] = ()
     enclaves: tuple[str, ...] = ()
+    crossing: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Return text like ``/r1/router at r1.local:7447 for /r1/*``."""
         served = f" for {' '.join(self.enclaves)}" if self.enclaves else ""
-        return f"{self.name} at {' '.join(self.endpoints)}{served}"
+        passing = f", which passes on {' '.join(self.crossing)}" if self.crossing else ""
+        return f"{self.name} at {' '.join(self.endpoints)}{served}{passing}"
 
     def listening(self) -> tuple[str, ...]:
         """Return where it listens."""

@@ -9,7 +9,7 @@ verb determines the new state; this module does the rest.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -22,9 +22,14 @@ from cryptography import x509
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
-from sros_tool.errors import Note
+from sros_tool.errors import KeystoreError, Note
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.fleet import checked_fleet, write_fleet
+from sros_tool.keystore.fleet import (
+    checked_fleet,
+    load_fleet,
+    with_routers_of_robots,
+    write_fleet,
+)
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.authority import Authorities, Authority, load_authority
 from sros_tool.keystore.issuing.enclave import EnclaveWriter
@@ -37,7 +42,7 @@ from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
 from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore, check_domain
 from sros_tool.keystore.rights import RecordedRights, SignedRights
-from sros_tool.keystore.settings import edit_notes
+from sros_tool.keystore.settings import edit_notes, edit_remedy, found_edits
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
@@ -46,6 +51,7 @@ from sros_tool.pki.keys import PublicKey
 from sros_tool.pki.token import TokenUri
 from sros_tool.policy.model import Enclave
 from sros_tool.validity import iso
+from sros_tool.zenoh.configuration import ZenohNetwork, check_network
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
@@ -245,11 +251,56 @@ class KeystoreChange:
         check_domain(self.domains, domain, self.root)
 
     def write_fleet(self, fleet: Fleet, patterns: Collection[str]) -> Fleet:
-        """Stage ``fleet``, with ``patterns`` added, as the keystore's fleet; return it."""
+        """Stage ``fleet``, with ``patterns`` added, as the keystore's fleet; return it.
+
+        A Zenoh network gets the routers of its robots.
+        """
+        before = None if self.is_new else load_fleet(self.keystore)
         fleet, entries = write_fleet(self.transaction, self.keystore, fleet, patterns, self.now)
         self.fleet = fleet
         self.entries += entries
+        if self.template.zenoh:
+            self.set_network(self.with_routers_of_robots(self.template.zenoh, before))
+        elif any(robot.router for robot in fleet.robots.values()):
+            self.notes.append(_no_network(self.root))
         return fleet
+
+    def with_routers_of_robots(
+        self, network: ZenohNetwork, before: Fleet | None = None
+    ) -> ZenohNetwork:
+        """Return a network with the routers of the fleet's robots, except those that are revoked.
+
+        ``before`` is the fleet until now, whose routers the network has.
+        """
+        if self.fleet is None:
+            return network
+        before = before or self.fleet
+        wanted = with_routers_of_robots(network, before, self.fleet)
+        missing = {*wanted.router_names()}.difference(self.names)
+        if self.is_new or missing.isdisjoint(self.known.revoked_enclaves):
+            return wanted
+        gone = missing.intersection(self.known.revoked_enclaves)
+        return with_routers_of_robots(network, before, self.fleet, gone)
+
+    def set_network(self, network: ZenohNetwork) -> None:
+        """Stage settings with another Zenoh network, unless it is the present one.
+
+        Raises:
+            KeystoreError: the settings or other files were edited by hand.
+            UsageError: the network cannot work.
+        """
+        if network == self.template.zenoh:
+            return
+        check_network(network)
+        if not self.is_new and (edits := found_edits(self.keystore, self.governance)):
+            raise KeystoreError(
+                f"the settings of keystore '{self.root}' get other routers of Zenoh, and its files "
+                f"were edited by hand: {'; '.join(edits.clauses())}",
+                "Writing the settings would undo the edit, or apply it unnoticed.",
+                f"First apply or undo the edit: {edit_remedy(self.root)}",
+            )
+        self.template = replace(self.template, zenoh=network)
+        self.entries.append(write_settings(self.transaction, self.template, self.now))
 
     def edit_notes(self) -> tuple[Note, ...]:
         """Return a note on files that were edited by hand, which this change does not carry out."""
@@ -411,6 +462,14 @@ class KeystoreChange:
             "notes": tuple(self.notes),
         }
         return kind(**shared | more)
+
+
+def _no_network(root: Path) -> Note:
+    text = (
+        "the fleet names routers of robots, which begin with the Zenoh network of the keystore: "
+        f"`sros zenoh {quote(str(root))}`."
+    )
+    return Note("fleet.no-zenoh-network", text)
 
 
 _ADOPTED = "taken over"

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
 from shlex import quote
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -95,6 +95,7 @@ def revoke(
             lists.revocations(last, reason), change.restart, incomplete=until_retired
         )
         change.remarks += lists.remarks
+        _drop_routers(change, gone)
         change.keep_zenoh({}, gone=gone)
         change.record()
         change.finish(aim="revoke")
@@ -141,6 +142,21 @@ def _check_names(change: KeystoreChange, names: Sequence[str]) -> None:
             raise _is_router(change, name)
         if name not in existing:
             raise no_such_enclave(change.keystore, name, change.names, may_create=False)
+
+
+def _drop_routers(change: KeystoreChange, gone: Collection[str]) -> None:
+    """Take further routers whose enclaves are ``gone`` out of the Zenoh network."""
+    network = change.template.zenoh
+    dropped = [router for router in network.routers if router.name in gone] if network else []
+    if network and dropped:
+        left = tuple(router for router in network.routers if router not in dropped)
+        change.set_network(replace(network, routers=left))
+        names = ", ".join(router.name for router in dropped)
+        text = (
+            f"{names}: no router any more. Sessions that connected to it, and are not revoked, "
+            "connect to another router by their new files."
+        )
+        change.notes.append(Note("zenoh.router-revoked", text))
 
 
 def _is_router(change: KeystoreChange, router: str) -> KeystoreError:

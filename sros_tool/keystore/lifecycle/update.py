@@ -35,7 +35,7 @@ from sros_tool.keystore.expiry import (
     read_credentials,
     refuse_unreadable,
 )
-from sros_tool.keystore.fleet import EnclaveDomains
+from sros_tool.keystore.fleet import EnclaveDomains, robot_of_router
 from sros_tool.keystore.issuing.enclave import (
     Issuance,
     NewIdentity,
@@ -756,12 +756,13 @@ def set_zenoh(
         UsageError: the network cannot work, is not for the domains of the keystore, or the router's
             enclave has rights of its own.
     """
-    if network:
-        check_network(network)
     with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
         change.begin_issuing(None)
         _check_settings(change, edited=bool(change.notes))
         before = change.template.zenoh
+        if network:
+            network = _with_routers_of_robots(change, network)
+            check_network(network)
         if network and before and before.router != network.router:
             change.notes.append(_router_moved(before.router, network.router))
         template = replace(change.template, zenoh=network)
@@ -775,6 +776,29 @@ def set_zenoh(
         write_enclaves(change, {})
     change.restart = removed or change.restart
     return creation(change, ())
+
+
+def _with_routers_of_robots(change: KeystoreChange, network: ZenohNetwork) -> ZenohNetwork:
+    """Return a network with the routers of the fleet's robots.
+
+    Raises:
+        UsageError: another endpoint is asked for one of them, or none.
+    """
+    complete = change.with_routers_of_robots(network)
+    asked, before = (
+        {router.name: router for router in (of.routers if of else ())}
+        for of in (network, change.template.zenoh)
+    )
+    for router in complete.routers:
+        of_fleet = asked.get(router.name) not in (router, before.get(router.name))
+        if of_fleet and (robot := robot_of_router(change.fleet, router.name)):
+            raise UsageError(
+                f"the fleet of keystore '{change.root}' names the router of {robot.name}",
+                f"It is {router}.",
+                f"Change `router` of {robot.name} in the fleet file, and run `sros "
+                "generate_artifacts --fleet`.",
+            )
+    return complete
 
 
 def _router_moved(old: str, new: str) -> Note:
