@@ -381,8 +381,8 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
     authority = keystore.ca_certificate(PERMISSIONS)
 
     def drifted(moment: datetime | None) -> bool:
-        drifts, _ = zenoh_drift(keystore, network, keystore.domains, authority, moment)
-        return any(drift.enclave == name for drift in drifts)
+        drift = zenoh_drift(keystore, network, keystore.domains, authority, moment)
+        return any(file.enclave == name for file in drift.files)
 
     # The router starts although the permissions of another enclave have expired since.
     if drifted(now) and drifted(None):

@@ -22,7 +22,13 @@ from sros_tool.policy.model import RIGHTS as RIGHTS_OF
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import OWN_SERVICES, NodeName, Right, Rules, nodes_of_rights
 from sros_tool.translate import permissions_for
-from sros_tool.translate_zenoh.graph import example_token, graph_rules, nodes_in_rules
+from sros_tool.translate_zenoh.graph import (
+    announced_nodes,
+    example_token,
+    graph_rules,
+    nodes_in_rules,
+    shared_nodes,
+)
 from sros_tool.translate_zenoh.rights import (
     StatedRight,
     as_router,
@@ -468,7 +474,11 @@ def test_services_of_a_node_show_its_name(
     assert remote_of("/e", {0: stated}, told) == remote_of("/e", {0: stated})
 
 
-EVERY = [f"/robot/arm/{service}" for service in OWN_SERVICES]
+OWN = {
+    node: [f"{node}/{service}" for service in OWN_SERVICES]
+    for node in ("/n", "/n1", "/m", "/robot/arm")
+}
+EVERY = OWN["/robot/arm"]
 
 
 @pytest.mark.parametrize(
@@ -508,6 +518,44 @@ def test_denied_services_of_a_node_take_it_away(
         announcing = ("/e", IN, Message.LIVELINESS_TOKEN)
         passes = partial(control.allows, *announcing)
         assert passes(example_token(0, "/e", control.allowed_keys(*announcing), passes))
+
+
+OF_SEVERAL = {
+    # What each enclave may offer (-: denied), and the nodes that several may announce.
+    "other nodes": ({"/a": ["/n/*"], "/b": ["/m/*"], "/c": ["/x/n/*"]}, []),
+    "the same": ({"/a": OWN["/n"], "/b": OWN["/n"], "/c": OWN["/m"]}, [("/a /b", "", "/n")]),
+    "within": ({"/a": ["/n*"], "/b": OWN["/n1"], "/c": OWN["/m"]}, [("/a", "/b", "/n*")]),
+    "without": ({"/a": ["/*", "-/n/*"], "/b": OWN["/n"]}, []),
+    "not without": ({"/a": ["/*", "-/m/*"], "/b": OWN["/n"]}, [("/a", "/b", "/*")]),
+    "denied at the other": ({"/a": ["/n*"], "/b": [*OWN["/n"], "-/n/*"]}, []),
+    "wildcards": ({"/a": ["/n/*"], "/b": ["/n*"]}, [("/a", "/b", "/n/*")]),
+    "no common part": ({"/a": ["/n/*"], "/b": ["/n*", "-/n/*"]}, []),
+    "everything": ({"/a": ["/*"], "/b": ["/*"]}, [("/a /b", "", "/*")]),
+    "changing": ({"/a": ["/launch_ros_*"], "/b": ["/launch_ros_*"]}, []),
+}
+
+
+@pytest.mark.parametrize("case", OF_SEVERAL)
+def test_nodes_of_several_enclaves(case: str) -> None:
+    offered, expected = OF_SEVERAL[case]
+    announced = {}
+    for path, names in offered.items():
+        rights = [
+            Right(path, DENY_ if name[0] == "-" else ALLOW, "reply", name.removeprefix("-"))
+            for name in names
+        ]
+        announced[path] = announced_nodes(graph_rules(path, 0, rights, ()), path)
+    assert [tuple(map(" ".join, shared)) for shared in shared_nodes(announced)] == expected
+
+
+@pytest.mark.parametrize("policy", sorted(policies_dir().glob("*.xml")), ids=lambda p: p.stem)
+def test_no_node_of_several_enclaves_in_shipped_policies(policy: Path) -> None:
+    announced = {
+        each.path: announced_nodes(remote_rights(each, 0).rules, each.path)
+        for each in read_policy(policy).enclaves
+    }
+    assert all(nodes.allowed for nodes in announced.values())
+    assert not list(shared_nodes(announced))
 
 
 def test_many_nodes_with_many_names_announce_them_as_any_node() -> None:

@@ -353,9 +353,9 @@ class ZenohEvaluator:
             deciding = ours | {check.enforcer for check in answer.checks}
             if answer.mode is not Mode.CLIENT:
                 deciding |= self._other_ends(answer)
-            drifts, _ = zenoh_drift(
+            drifts = zenoh_drift(
                 self.keystore, network, domains, authority, self._at, only=deciding
-            )
+            ).files
         except SrosError:
             return None
         return tuple(

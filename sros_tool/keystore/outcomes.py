@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Generic, NamedTuple, TypeVar
 
 from cryptography import x509
 
@@ -18,6 +18,9 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.pki.certificates import digest, subject_text, validity_of
 from sros_tool.values import FileChange, Words
+
+if TYPE_CHECKING:
+    from sros_tool.translate_zenoh.graph import AnnouncedNodes
 
 Outcome = TypeVar("Outcome", bound=str)
 Restart = Annotated[
@@ -34,11 +37,12 @@ class KeptZenoh:
     """The Zenoh configurations after a change of a keystore.
 
     ``files`` maps the enclaves to their files in the keystore, ``written`` the paths of staged
-    files to their content.  ``restart`` are the enclaves whose processes have to be restarted,
-    because their configurations changed.
+    files to their content, ``nodes`` the enclaves to the nodes that they may announce.  ``restart``
+    are the enclaves whose processes have to be restarted, because their configurations changed.
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
+    nodes: Mapping[str, AnnouncedNodes] = field(default_factory=dict)
     written: Mapping[str, bytes] = field(default_factory=dict)
     restart: tuple[str, ...] = ()
     notes: tuple[Note, ...] = ()

@@ -44,7 +44,12 @@ from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Source
 from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import Right, Rules, nodes_from_text, parts
 from sros_tool.translate import grant_rights
-from sros_tool.translate_zenoh.graph import GRAPH, nodes_in_rules
+from sros_tool.translate_zenoh.graph import (
+    GRAPH,
+    AnnouncedNodes,
+    announced_nodes,
+    nodes_in_rules,
+)
 from sros_tool.translate_zenoh.rights import (
     ANY_TYPE,
     StatedRight,
@@ -263,12 +268,14 @@ class ZenohDocuments:
 
     ``files`` maps their paths in the keystore to their content, ``enclaves`` to their enclaves.
     ``left_out`` maps enclaves that get none, and no rights at the others, to the reason: a clause.
+    ``nodes`` maps all others to the nodes that they may announce in the graph.
     ``existing`` are the enclaves of the keystore, ``ledger`` is its ledger.
     """
 
     files: Mapping[str, bytes]
     enclaves: Mapping[str, str]
     left_out: Mapping[str, str]
+    nodes: Mapping[str, AnnouncedNodes]
     existing: tuple[str, ...]
     ledger: Ledger
 
@@ -345,6 +352,18 @@ def drifted(
     return tuple(found)
 
 
+class ZenohDrift(NamedTuple):
+    """The configurations of a keystore that are not as they shall be.
+
+    ``left_out`` maps enclaves that get none to the reason, a clause; ``nodes`` maps all others to
+    the nodes that they may announce in the graph.
+    """
+
+    files: tuple[Drifted, ...]
+    left_out: Mapping[str, str]
+    nodes: Mapping[str, AnnouncedNodes]
+
+
 def zenoh_drift(
     keystore: Keystore,
     network: ZenohNetwork,
@@ -353,7 +372,7 @@ def zenoh_drift(
     now: datetime | None,
     *,
     only: Collection[str] = (),
-) -> tuple[tuple[Drifted, ...], Mapping[str, str]]:
+) -> ZenohDrift:
     """Return the configurations that are not as they shall be, and who gets none with the reason.
 
     Without ``now``, permissions that have expired count, too.  ``only`` are the enclaves that are
@@ -363,7 +382,7 @@ def zenoh_drift(
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
     """
     wanted = zenoh_documents(keystore, network, domains, authority, now, only=only)
-    return drifted(keystore, wanted, authority), wanted.left_out
+    return ZenohDrift(drifted(keystore, wanted, authority), wanted.left_out, wanted.nodes)
 
 
 def zenoh_documents(
@@ -451,7 +470,8 @@ def zenoh_documents(
     enclaves |= {_session_path(name): name for name in chosen}
     if only:
         existing = tuple(name for name in existing if name in only)
-    return ZenohDocuments(files, enclaves, left_out, existing, reader.ledger)
+    nodes = {name: each.nodes for name, each in rules.items()}
+    return ZenohDocuments(files, enclaves, left_out, nodes, existing, reader.ledger)
 
 
 def last_revocation(entries: Iterable[Entry]) -> str:
@@ -553,11 +573,13 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
 class _RulesOfEnclave(NamedTuple):
     """What other processes allow to an enclave, and what the enclave allows to the router.
 
-    ``rights`` are the former as a value, if they are needed for more than one file.
+    ``rights`` are the former as a value, if they are needed for more than one file; ``nodes`` are
+    the nodes that they let it announce.
     """
 
     remote: RenderedRights
     router: RenderedRights
+    nodes: AnnouncedNodes
     rights: RemoteRights | None
 
 
@@ -635,6 +657,7 @@ class _RightsReader:
             else _RulesOfEnclave(
                 rendered[name],
                 render_rights(routers[name]),
+                announced_nodes(remotes[name].rules, name),
                 remotes[name] if self._network.mode is Mode.PEER or self._network.routers else None,
             )
             for name in names

@@ -294,6 +294,15 @@ OWN_SERVICES = (
     "set_parameters_atomically",
 )
 """Services that every node offers under its own name (rclcpp and rclpy of ROS 2 Jazzy)."""
+CHANGING_NODES = (
+    "transform_listener_impl_",
+    "launch_ros_",
+    "rqt_gui_py_node_",
+    "rqt_gui_cpp_node_",
+    "_ros2cli_",
+    "_sros_observer_",
+)
+"""Beginnings of node names that end in an address or a process id, and change with every start."""
 _SHOWING = frozenset(f"~/{service}" for service in OWN_SERVICES)
 
 

@@ -12,16 +12,34 @@ a process reads a token with wildcards as it is written, as the name of nobody's
 
 from __future__ import annotations
 
+import re
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from string import ascii_lowercase
+from typing import NamedTuple
 
 from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
-from sros_tool.policy.patterns import Names, overlap
-from sros_tool.policy.rights import OWN_SERVICES, NodeName, Right, denied_nodes, nodes_of_rights
+from sros_tool.policy.patterns import Names, covers, overlap
+from sros_tool.policy.rights import (
+    CHANGING_NODES,
+    OWN_SERVICES,
+    NodeName,
+    Right,
+    denied_nodes,
+    nodes_of_rights,
+)
 from sros_tool.policy.subtraction import CannotSubtract, listed
+from sros_tool.wording import first_few
 from sros_tool.zenoh.access import AccessRule, Flow, Message
-from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical
+from sros_tool.zenoh.key_expressions import (
+    ANY_CHUNKS,
+    ANY_PART,
+    KeyExpressions,
+    canonical,
+    includes,
+    names_of,
+)
 
 GRAPH = "@ros2_lv"
 _NODE = "NN"
@@ -29,6 +47,7 @@ _KINDS = {"publish": "MP", "subscribe": "MS", "reply": "SS", "request": "SC"}
 """The kind of what a right lets a node announce."""
 _MOST_TOKENS = 4096
 """Most key expressions for the tokens of one right of an enclave."""
+_EVERY_KIND = "*"
 _ANNOUNCING = (Message.LIVELINESS_TOKEN,)
 _ASKING = (Message.LIVELINESS_QUERY, Message.DECLARE_LIVELINESS_SUBSCRIBER)
 _ANY_NODE = NodeName("*", "*")
@@ -36,17 +55,39 @@ _LETTER = "[a-zA-Z0-9_]"
 """Any character of a ROS name."""
 
 
-def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName, ...]:
+class AnnouncedNodes(NamedTuple):
+    """The nodes that an enclave may announce, as ``DOMAIN/NAMESPACE/NAME`` of their tokens.
+
+    ``denied`` are exceptions from ``allowed``.
+    """
+
+    allowed: tuple[str, ...]
+    denied: tuple[str, ...]
+
+
+def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes:
     """Return the nodes that rules of `graph_rules` let an enclave announce."""
-    found: dict[NodeName, None] = {}
+    nodes: dict[bool, list[str]] = {True: [], False: []}
     for rule in rules:
-        if rule.messages == _ANNOUNCING and rule.allows:
+        if rule.messages == _ANNOUNCING:
+            own = [_NODE if rule.allows else _EVERY_KIND, _part(enclave)]
             for key in rule.key_expressions:
                 chunks = key.split("/")
-                if chunks[0] == GRAPH and chunks[5:7] == [_NODE, _part(enclave)]:
-                    names = [each.replace(ANY_PART, "*").replace("%", "/") for each in chunks[7:]]
-                    found[NodeName(*names)] = None
-    return tuple(found)
+                if chunks[0] == GRAPH and chunks[5:7] == own:
+                    nodes[rule.allows].append("/".join((chunks[1], *chunks[7:9])))
+    return AnnouncedNodes(tuple(nodes[True]), tuple(nodes[False]))
+
+
+def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName, ...]:
+    """Return the nodes that rules of `graph_rules` allow an enclave, whatever they deny of them."""
+    nodes = map(_node_of, announced_nodes(rules, enclave).allowed)
+    return tuple(dict.fromkeys(nodes))
+
+
+def _node_of(place: str) -> NodeName:
+    """Return the node of ``DOMAIN/NAMESPACE/NAME`` as tokens have them."""
+    _, ns, name = (part.replace(ANY_PART, "*").replace("%", "/") for part in place.split("/"))
+    return NodeName(ns, name)
 
 
 def graph_rules(
@@ -120,7 +161,7 @@ class _Tokens:
             else node
             for node in nodes
         )
-        return tuple(self._key("*", place, ANY_CHUNKS) for place in _places(named))
+        return tuple(self._key(_EVERY_KIND, place, ANY_CHUNKS) for place in _places(named))
 
     def _announced(self, right: str, names: Mapping[str, None]) -> list[str]:
         """Return the tokens of names, each of every node that may have it."""
@@ -175,6 +216,130 @@ def _places(nodes: Iterable[NodeName]) -> tuple[str, ...]:
 def _part(name: str) -> str:
     """Return a name as the part of a token."""
     return canonical((name.replace("/", "%").replace("*", ANY_PART) or "%",))
+
+
+# ── nodes of several enclaves ──────────────────────────────────────────────────────────────
+
+
+class SharedNodes(NamedTuple):
+    """Nodes that several enclaves may announce, so that each can take them out of the graph."""
+
+    enclaves: tuple[str, ...]
+    """The enclaves that may announce all of these nodes."""
+    others: tuple[str, ...]
+    """Enclaves that may announce some of them."""
+    nodes: tuple[str, ...]
+    """Full names of the nodes, perhaps with wildcards."""
+
+    def __str__(self) -> str:
+        """Return a clause about the first enclave: ``it may announce node /n, and so may /b``."""
+        text = f"it may announce {'nodes' if len(self.nodes) > 1 else 'node'} "
+        text += first_few(self.nodes, _MOST_SHOWN)
+        if more := self.enclaves[1:]:
+            text += f", and so may {first_few(more, _MOST_SHOWN)}"
+        if self.others:
+            text += f"; some of these are nodes of {first_few(self.others, _MOST_SHOWN)}, too"
+        return text
+
+
+_MOST_SHOWN = 6
+
+
+def shared_nodes(announced: Mapping[str, AnnouncedNodes]) -> Iterator[SharedNodes]:
+    """Yield the nodes that several enclaves may announce, by the nodes of each enclave.
+
+    Nodes with names that change with every start (`CHANGING_NODES`) do not count.
+    """
+    owners: dict[str, list[str]] = {}
+    wide: dict[AnnouncedNodes, list[str]] = {}
+    for enclave, (allowed, denied) in announced.items():
+        lasting = [node for node in allowed if not _CHANGING.search(node)]
+        never = KeyExpressions(denied)
+        for node in lasting:
+            if not _is_wide(node) and not never.include(node):
+                owners.setdefault(node, []).append(enclave)
+        if wildcards := tuple(filter(_is_wide, lasting)):
+            wide.setdefault(AnnouncedNodes(wildcards, denied), []).append(enclave)
+    together: dict[tuple[str, ...], list[str]] = {}
+    for node, enclaves in owners.items():
+        if len(enclaves) > 1:
+            together.setdefault(tuple(enclaves), []).append(node)
+    for enclaves_of_nodes, nodes in together.items():
+        yield SharedNodes(enclaves_of_nodes, (), _full_names(nodes))
+    in_order, groups = sorted(owners), list(wide.items())
+    nearby = _with_the_same_beginning([nodes for nodes, _ in groups])
+    told: dict[str, set[str]] = {}
+    for number, (nodes_of_group, group) in enumerate(groups):
+        others = {
+            owner: None
+            for node in _included(nodes_of_group, in_order)
+            for owner in owners[node]
+            if owner not in group and owner not in told.get(group[0], ())
+        }
+        for nodes_of_other, other in (groups[later] for later in sorted(nearby.get(number, ()))):
+            if _have_common(nodes_of_group, nodes_of_other):
+                others |= dict.fromkeys(other)
+        for other_enclave in others:
+            told.setdefault(other_enclave, set()).update(group)
+        if others or (len(group) > 1 and _have_common(nodes_of_group, nodes_of_group)):
+            yield SharedNodes(tuple(group), tuple(others), _full_names(nodes_of_group.allowed))
+
+
+_CHANGING = re.compile("[/%](?:" + "|".join(CHANGING_NODES) + ")[^/]*[*]")
+
+
+def _is_wide(node: str) -> bool:
+    return "*" in node
+
+
+def _included(nodes: AnnouncedNodes, in_order: Sequence[str]) -> Iterator[str]:
+    """Yield the nodes without wildcards, of those ``in_order``, that ``nodes`` include."""
+    never = KeyExpressions(nodes.denied)
+    for wide in nodes.allowed:
+        begin = _begin(wide)
+        for node in in_order[bisect_left(in_order, begin) :]:
+            if not node.startswith(begin):
+                break
+            if includes(wide, node) and not never.include(node):
+                yield node
+
+
+def _with_the_same_beginning(groups: Sequence[AnnouncedNodes]) -> Mapping[int, set[int]]:
+    """Map positions to the later ones with nodes that may begin with the same text."""
+    begins = sorted(
+        {(_begin(node), at) for at, nodes in enumerate(groups) for node in nodes.allowed}
+    )
+    nearby: dict[int, set[int]] = {}
+    for place, (begin, at) in enumerate(begins):
+        for longer, other in begins[place + 1 :]:
+            if not longer.startswith(begin):
+                break
+            if at != other:
+                nearby.setdefault(min(at, other), set()).add(max(at, other))
+    return nearby
+
+
+def _have_common(one: AnnouncedNodes, other: AnnouncedNodes) -> bool:
+    """Return whether some node is one of both."""
+    left, right = (names_of(nodes.allowed) - names_of(nodes.denied) for nodes in (one, other))
+    return not (left & right).is_empty()
+
+
+def _begin(node: str) -> str:
+    """Return what every node begins with that a wildcard includes."""
+    return node.partition("*")[0].rstrip("$")
+
+
+def _full_names(nodes: Iterable[str]) -> tuple[str, ...]:
+    """Return the full names of nodes, without those that wildcards of others cover."""
+    parts = map(_node_of, nodes)
+    names = dict.fromkeys("/".join((ns.rstrip("/").removeprefix("*"), name)) for ns, name in parts)
+    return tuple(
+        name for name in names if not any(covers(wide, name) for wide in names if wide != name)
+    )
+
+
+# ── an example ─────────────────────────────────────────────────────────────────────────────
 
 
 def example_token(

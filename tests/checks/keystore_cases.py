@@ -631,6 +631,13 @@ def _(bench: Bench) -> None:
     bench.path("enclaves/base/permissions.p7s").unlink()
 
 
+@case("zenoh.shared-node")
+def _(bench: Bench) -> None:
+    with_zenoh(bench)
+    # Without a policy, each may be any node.
+    sros("create_enclave", bench.root, "/one", "/two", env={"SROS_CA_PASSPHRASE": SECRET}).ok()
+
+
 @case("zenoh.cannot-be-made")
 def _(bench: Bench) -> None:
     with_zenoh(bench)

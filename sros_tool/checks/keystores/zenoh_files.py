@@ -72,6 +72,17 @@ LEFT_OUT = FindingKind(
     "State its rights with `sros create_permission ROOT NAME POLICY_FILE`, or revoke it if nobody "
     "needs it.",
 )
+SHARED_NODE = FindingKind(
+    "zenoh.shared-node",
+    WARNING,
+    "a node that several enclaves may announce in the graph",
+    "rmw_zenoh takes a node out of the graph without a look at its enclave: a process of one of "
+    "these enclaves can remove or imitate the node of another one, whose topics and services are "
+    "then not found, although its data pass.",
+    "rmw_zenoh (graph_cache.cpp); sros (docs/zenoh.md).",
+    "Name each node in the policy of one enclave. Where a wildcard gives an enclave the services "
+    "of all nodes, deny those of the others' nodes, such as `/camera/*`.",
+)
 _RENEW = "Renew it with `sros renew ROOT NAME`, or revoke it if nobody needs it."
 _EXPIRED = {Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED}
 CANNOT_BE_MADE = FindingKind(
@@ -133,22 +144,25 @@ def check_network(
     if network is None or not authorities:
         return
     from sros_tool.keystore.zenoh_files import zenoh_drift
+    from sros_tool.translate_zenoh.graph import shared_nodes
 
     try:
         domains = keystore.opened.domains
     except SrosError:  # a finding of each enclave
         return
     try:
-        drifts, left_out = zenoh_drift(
-            keystore.opened, network, domains, authorities[0], keystore.now
-        )
+        drift = zenoh_drift(keystore.opened, network, domains, authorities[0], keystore.now)
     except SrosError as error:
         yield CANNOT_BE_MADE.found("zenoh", str(error), keystore.shown(SETTINGS))
         return
-    for each in drifts:
-        if only is None or each.enclave in only:
-            yield from _of_drift(keystore, each)
-    for name, why in left_out.items():
+    for file in drift.files:
+        if only is None or file.enclave in only:
+            yield from _of_drift(keystore, file)
+    for shared in shared_nodes(drift.nodes):
+        if only is None or not {*shared.enclaves, *shared.others}.isdisjoint(only):
+            first = shared.enclaves[0]
+            yield SHARED_NODE.found(first, str(shared), str(keystore.opened.folder(first)))
+    for name, why in drift.left_out.items():
         if only is None or name in only:
             faults = {e.fault for e in keystore.enclave(name).problems_at_home}
             remedy = _RENEW if faults and faults <= _EXPIRED else ""

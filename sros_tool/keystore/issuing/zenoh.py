@@ -70,6 +70,7 @@ def keep_zenoh(
     names = tuple(wanted.enclaves.values())
     return KeptZenoh(
         {name: path for path, name in wanted.enclaves.items()},
+        wanted.nodes,
         written,
         tuple(sorted({each.enclave for each in drifts if each.kind is not Drift.UNSIGNED})),
         (

@@ -94,6 +94,7 @@ from sros_tool.translate import (
     permissions_for,
     protection_for,
 )
+from sros_tool.translate_zenoh.graph import shared_nodes
 from sros_tool.validity import iso
 from sros_tool.wording import counted
 from sros_tool.xml import read_bytes
@@ -774,6 +775,10 @@ def set_zenoh(
             change.entries.append(write_settings(change.transaction, template, now))
         removed = () if network else remove_zenoh(change.transaction)
         write_enclaves(change, {})
+        change.notes += (
+            Note("zenoh.shared-node", f"{shared.enclaves[0]}: {shared}. `sros check` says more.")
+            for shared in shared_nodes(change.zenoh.nodes)
+        )
     change.restart = removed or change.restart
     return creation(change, ())
 
