@@ -1,28 +1,24 @@
 """Let Cyclone DDS nodes talk in a network of their own: what was heard, refused, and readable.
 
-As a program it reads a list of nodes from standard input, plays them, and prints a `Conversation`,
-both as JSON: each node takes part in a process of its own.
+Each node takes part in a process of its own.
 """
 
 from __future__ import annotations
 
-import json
-import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from sros_tool.demo import cyclone_node
 from sros_tool.demo.wire import Capture
 from sros_tool.runtime.environment import secured_environment
-from sros_tool.runtime.events import Event, EventKind, read_events
-from sros_tool.runtime.netns import enter_isolation, try_isolation
-from tests.support.children import LATE, PATIENCE, Forked, python
+from sros_tool.runtime.events import Event, EventKind, EventReader
+from tests.support.children import LATE, PATIENCE, Forked, apart, importing
 
 Running = subprocess.Popen[bytes] | Forked
 
@@ -105,22 +101,16 @@ def listener(
 
 def converse(domain: int, *nodes: Node) -> Conversation:
     """Let the nodes talk, and tell what came of it."""
-    done = python(__file__, domain, said=json.dumps([asdict(node) for node in nodes]))
-    found = json.loads(done.stdout)
-    told = {name: Told(**each) for name, each in found["nodes"].items()}
-    return Conversation(told, found["readable"])
+    return apart(partial(_play, domain, nodes))
 
 
-def main() -> None:
-    nodes = [Node(**each) for each in json.load(sys.stdin)]
-    if try_isolation().isolated:
-        enter_isolation()
+def _play(domain: int, nodes: Sequence[Node]) -> Conversation:
     capture = open_capture([node.text for node in nodes if node.role == "talker"])
     with tempfile.TemporaryDirectory() as folder:
-        parties = [Party(node, int(sys.argv[1]), Path(folder)) for node in nodes]
+        parties = [Party(node, domain, Path(folder)) for node in nodes]
         wait_until_over(parties, capture)
-        told = {party.node.name: asdict(party.end()) for party in parties}
-    json.dump({"nodes": told, "readable": dict(capture.plain) if capture else None}, sys.stdout)
+        told = {party.node.name: party.end() for party in parties}
+    return Conversation(told, dict(capture.plain) if capture else None)
 
 
 class Party:
@@ -128,11 +118,14 @@ class Party:
 
     def __init__(self, node: Node, domain: int, folder: Path) -> None:
         self.node = node
-        self.process, self._report = start(node, domain, folder)
-        self._errors = self._report.with_suffix(".err")
+        self.process, report = start(node, domain, folder)
+        self._reader = EventReader(report)
+        self._events: list[Event] = []
+        self._errors = report.with_suffix(".err")
 
     def events(self) -> list[Event]:
-        return read_events(self._report)
+        self._events += self._reader.new_events()
+        return self._events
 
     def is_settled(self) -> bool:
         """Whether it is ready, or will never be."""
@@ -192,7 +185,7 @@ def start(node: Node, domain: int, folder: Path) -> tuple[Running, Path]:
     """The process of a node, the file that it reports to, and beside that its errors (.err)."""
     report = folder / f"{node.name}.jsonl"
     report.touch()
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("ROS_")}
+    environment = {k: v for k, v in importing().items() if not k.startswith("ROS_")}
     environment["ROS_DOMAIN_ID"] = str(domain)
     if node.keystore:
         environment |= secured_environment(Path(node.keystore), node.enclave, domain)
@@ -204,7 +197,3 @@ def start(node: Node, domain: int, folder: Path) -> tuple[Running, Path]:
     command = [*node.through, sys.executable, "-m", "sros_tool.demo.cyclone_node"]
     with report.with_suffix(".err").open("wb") as errors:
         return subprocess.Popen([*command, *arguments], env=environment, stderr=errors), report
-
-
-if __name__ == "__main__":
-    main()

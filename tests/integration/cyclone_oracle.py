@@ -1,8 +1,8 @@
 """Ask Cyclone DDS, many times, what signed documents let an identity do.
 
-Reads a JSON list of cases from standard input: {"identity", "documents", "domain", "zone",
+Cases are {"identity", "documents", "domain", "zone",
 "questions": [[verb, topic, [partition...]]...], "peer": null or [identity, documents], "seconds"},
-where identity and documents are folders.  Prints an answer for each as a line of JSON:
+where identity and documents are folders.  The answer to each is
 {"end": "refused" | "joined" | "crashed" | "hung" | "failed" | "peer refused" | "peer crashed" |
 "peer hung", "answers", "log"};
 the answers are denied, invalid (the name), created, and with a peer: matched (and heard), unmatched
@@ -19,10 +19,9 @@ import json
 import os
 import select
 import signal
-import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -36,7 +35,7 @@ from sros_tool.runtime.cyclone import (
     load_cyclone,
     security_properties,
 )
-from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+from sros_tool.runtime.netns import end_with_parent
 
 PATIENCE = 120.0
 OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x05 << 16, 0, 0)
@@ -49,18 +48,14 @@ Report = dict[str, Any]
 IGNORE_OWN_PARTICIPANT = 1  # a reader and a writer of one process would else meet each other
 
 
-def main() -> None:
-    cases: list[Case] = json.load(sys.stdin)
+def answers(cases: Sequence[Case]) -> list[Report]:
+    """The answers to cases, in their order; for a process of its own."""
     with suppress(PermissionError):
         os.setsid()  # OpenSSL asks on the terminal for the pass phrase of an encrypted part
     library = load_cyclone()
     declare(library.api)
-    if try_isolation().isolated:
-        enter_isolation()
-    answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # Cyclone DDS prints what it does not understand of XML
-    for case in cases:
-        print(json.dumps(run(library, case)), file=answers, flush=True)
+    return [run(library, case) for case in cases]
 
 
 def declare(api: Any) -> None:
@@ -307,7 +302,3 @@ def qos_of(api: Any) -> Iterator[Any]:
         yield qos
     finally:
         api.dds_delete_qos(qos)
-
-
-if __name__ == "__main__":
-    main()

@@ -7,26 +7,19 @@ import fcntl
 import os
 import re
 import shutil
-import sys
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.runtime.netns import try_isolation
-from tests.support.children import run
+from sros_tool.runtime.netns import enter_isolation
+from tests.support.children import Done, has_isolation, run
 
 HERE = Path(__file__).parent
 OWN_FASTDDS = os.environ.get("SROS_FASTDDS_PREFIX", "")
 """Where a Fast DDS with security of one's own is installed; without it, Debian's is asked."""
-
-ISOLATED = """
-import os, sys
-from sros_tool.runtime.netns import end_with_parent, enter_isolation
-enter_isolation()
-os.execv(sys.argv[1], sys.argv[1:])
-"""
 
 
 @cache
@@ -88,7 +81,6 @@ def _libraries() -> list[str]:
     return [f"-I{include}", f"-L{lib}", found, "-lfastrtps", "-lfastcdr"]
 
 
-def isolated(*command: object) -> list[str]:
-    """The command that runs another one in a network of its own, where there can be one."""
-    words = [str(each) for each in command]
-    return [sys.executable, "-c", ISOLATED, *words] if try_isolation().isolated else words
+def run_isolated_program(*command: object, **more: Any) -> Done:
+    """Run a program as `run` does, in a network of its own, where there can be one."""
+    return run(command, preexec_fn=enter_isolation if has_isolation() else None, **more)

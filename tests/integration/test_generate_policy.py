@@ -10,9 +10,11 @@ import importlib.util
 import json
 import shutil
 import signal
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,9 @@ import pytest
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY
 from sros_tool.files import policies_dir
+from sros_tool.graph import observe
 from sros_tool.graph.learn import is_tool_name
+from sros_tool.graph.observation import Observation, from_json
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
@@ -32,8 +36,10 @@ from sros_tool.policy.rights import policy_rights
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from tests.integration.converse import converse, listener, talker
+from tests.integration.cyclone_rights import Endpoint, refusals
 from tests.integration.enforcing import enforces
-from tests.support.children import python
+from tests.support.children import apart, python
+from tests.support.harness import Ended, sros
 from tests.support.long_form import some, sometimes
 
 pytestmark = [
@@ -41,11 +47,8 @@ pytestmark = [
     pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not installed"),
 ]
 
-SCRIPTS = Path(__file__).with_name("ros_nodes")
 DOMAIN = 211
 NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
-
-Endpoint = tuple[str, str]
 
 
 def node(name: str, ns: str = "/", **rights: list[str] | bool) -> dict[str, Any]:
@@ -256,13 +259,6 @@ ELSEWHERE = """\
 # ── running ────────────────────────────────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True)
-class Ended:
-    status: int
-    out: str
-    err: str
-
-
 Command = str | dict[str, Any]
 
 
@@ -278,14 +274,10 @@ def live(
         return {"words": each.split()} if isinstance(each, str) else each
 
     groups = [[each] if isinstance(each, str | dict) else each for each in commands]
-    task = {
-        "domain": domain,
-        "folder": str(folder),
-        "processes": processes,
-        "commands": [[spelled(each) for each in group] for group in groups],
-    }
-    done = python(SCRIPTS / "robot.py", said=json.dumps(task))
-    return [Ended(**each) for each in json.loads(done.stdout.splitlines()[-1])]
+    spelt = [[spelled(each) for each in group] for group in groups]
+    from tests.integration.ros_nodes import robot  # it imports rclpy, once for all that follow
+
+    return apart(partial(robot.play, domain, folder, processes, spelt))
 
 
 @dataclass(frozen=True)
@@ -295,28 +287,54 @@ class Learned:
     observed: dict[str, Any]
 
 
+class Replayed:
+    """What was observed of a robot, in place of the observer: it stays as it is."""
+
+    rmw = "rmw_fastrtps_cpp"
+
+    def __init__(self, seen: Observation) -> None:
+        self._seen: Observation | None = seen
+
+    def __enter__(self) -> Replayed:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def next(self, seconds: float) -> Observation | None:
+        seen, self._seen = self._seen, None
+        if seen is None:
+            time.sleep(seconds)
+        return seen
+
+
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
-    """Everything that is asked of one robot, as it starts only once."""
+    """Everything that is asked of one robot, which is observed by two runs at the same time.
+
+    What later runs do with what they see, they are asked with what one of the two saw.
+    """
     folder = tmp_path_factory.mktemp("robot")
     (folder / "older.xml").write_text(OLDER)
     (folder / "elsewhere.xml").write_text(ELSEWHERE)
-    at_first = {
-        "first": "generate_policy robot.xml",
-        "flat": "generate_policy flat.xml --flat --json",
-        "elsewhere": "generate_policy elsewhere.xml",
-        "dry": "generate_policy never.xml --dry-run",
+    on_the_robot = ("generate_policy robot.xml", "generate_policy flat.xml --flat --json")
+    first, flat = live(DOMAIN, folder, ROBOT, on_the_robot)
+    assert flat.status == 0, flat.err
+    observed = json.loads(flat.out)
+    ended = {"first": first, "flat": flat}
+    later = {
+        "elsewhere": "elsewhere.xml",
+        "dry": "never.xml --dry-run",
+        "second": "robot.xml --no-daemon --use-sim-time",
+        "older": "older.xml",
+        "older_again": "older.xml",
     }
-    then = {
-        "second": "generate_policy robot.xml --spin-time 5 --no-daemon --use-sim-time",
-        "older": "generate_policy older.xml",
-    }
-    at_last = {"older_again": "generate_policy older.xml"}
-    groups = (at_first, then, at_last)
-    ended = live(DOMAIN, folder, ROBOT, *(list(group.values()) for group in groups))
-    names = [name for group in groups for name in group]
-    by_name = dict(zip(names, ended, strict=True))
-    return Learned(folder, by_name, json.loads(by_name["flat"].out))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(observe, "RosGraph", lambda _: Replayed(from_json(observed)))
+        for name, words in later.items():
+            spelt = ("generate_policy", *words.split(), "--spin-time", "0.1")
+            ended[name] = sros(*spelt, cwd=folder)
+    return Learned(folder, ended, observed)
 
 
 def observed_endpoints(learned: Learned) -> dict[str, set[Endpoint]]:
@@ -475,11 +493,7 @@ def keystore_of(policy: Policy, root: Path) -> Path:
 
 
 def refused(keystore: Path, enclave: str, endpoints: Iterable[Endpoint]) -> set[Endpoint]:
-    questions = sorted(endpoints)
-    folder = enclave_path(keystore, enclave)
-    done = python(SCRIPTS / "ask_cyclone.py", folder, DOMAIN + 3, said=json.dumps(questions))
-    answers = json.loads(done.stdout.splitlines()[-1])
-    return {asked for asked, said in zip(questions, answers, strict=True) if said == "refused"}
+    return set(refusals(enclave_path(keystore, enclave), DOMAIN + 3, endpoints))
 
 
 def without(policy: Policy, path: str, name: str) -> Policy:
@@ -535,22 +549,6 @@ def test_cyclone_allows_what_was_learned_and_nothing_else(
     assert refused(keystore, path, seen[path] | others) == others
 
 
-_REFUSALS = """
-import json, sys
-from pathlib import Path
-from sros_tool.runtime.cyclone import Participant, SecurityRefusedError
-from sros_tool.runtime.netns import enter_isolation, try_isolation
-if try_isolation().isolated:
-    enter_isolation()
-with Participant(int(sys.argv[2]), Path(sys.argv[1])) as participant:
-    for direction, topic in json.load(sys.stdin):
-        try:
-            participant.writer(topic) if direction == "publish" else participant.reader(topic)
-        except SecurityRefusedError as error:
-            print(error)
-"""
-
-
 def test_what_cyclone_denied_is_proposed_and_then_allowed(tmp_path: Path) -> None:
     """Both nodes hold the wrong direction of their topic; their log sets it right."""
     path, enclave = tmp_path / "robot.xml", "/robot"
@@ -579,23 +577,13 @@ def test_what_cyclone_denied_is_proposed_and_then_allowed(tmp_path: Path) -> Non
         return root
 
     before = keystore("before")
-    assert refused(before, enclave, wrong | never) == wrong | never
-    folder = enclave_path(before, enclave)
-    asked = json.dumps(sorted(wrong | never))
-    done = python("-c", _REFUSALS, folder, DOMAIN + 3, said=asked)
-    (tmp_path / "arm.log").write_text(done.stdout)
-    words = [
-        "generate_policy",
-        "robot.xml",
-        "--enclave",
-        enclave,
-        "--from-log",
-        "arm.log",
-        "--accept",
-    ]
-    ended = python("-m", "sros_tool", *words, cwd=tmp_path)
-    assert "note [log.unclear]" in ended.stderr and "rt/never" in ended.stderr
-    assert "added 2 rights" in ended.stdout
+    said = refusals(enclave_path(before, enclave), DOMAIN + 3, wrong | never)
+    assert set(said) == wrong | never
+    (tmp_path / "arm.log").write_text("".join(f"{text}\n" for text in said.values()))
+    words = ("robot.xml", "--enclave", enclave, "--from-log", "arm.log", "--accept")
+    ended = sros("generate_policy", *words, cwd=tmp_path).ok()
+    assert "note [log.unclear]" in ended.err and "rt/never" in ended.err
+    assert "added 2 rights" in ended.out
     assert refused(keystore("after"), enclave, wrong | never) == never
 
 
@@ -654,7 +642,7 @@ STEADY = process("/steady", node("steady", publish=["beat"]))
 
 def stopped(words: str, number: signal.Signals, *once: str) -> dict[str, Any]:
     """A command that gets a signal once it has said all texts (none: once it looks around)."""
-    return {"words": words.split(), "signal": int(number), "once": once}
+    return {"words": words.split(), "signal": number, "once": once}
 
 
 def rights_of(path: Path) -> set[tuple[str, str, str]]:

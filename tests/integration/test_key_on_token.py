@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.keystore.layout import enclave_path
-from tests.integration.fastdds import build, isolated
+from tests.integration.fastdds import build, run_isolated_program
 from tests.integration.test_token import MODULE, sros, token
 from tests.support.children import LATE, run
 from tests.support.harness import policy_text, publish
@@ -39,7 +39,7 @@ def pin_file(folder: Path) -> Path:
 def asked(program: Path, env: dict[str, str], *pairs: tuple[Path, Path]) -> list[str]:
     """Ask Fast DDS which of the pairs of writer and reader communicate."""
     lines = "".join(f"{writer} {reader} rt/chatter {LATE}\n" for writer, reader in pairs)
-    return run(isolated(program, DOMAIN), said=lines, env=env).stdout.splitlines()
+    return run_isolated_program(program, DOMAIN, said=lines, env=env).stdout.splitlines()
 
 
 @pytest.mark.dds

@@ -19,7 +19,7 @@ from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.policy.document import read_policy
 from tests.integration.converse import ENOUGH, converse, listener, talker
-from tests.integration.fastdds import build, fastdds_stack, fastdds_vendor, isolated
+from tests.integration.fastdds import build, fastdds_stack, fastdds_vendor, run_isolated_program
 from tests.integration.kept.forms import form_of
 from tests.integration.kept.replies import answered
 from tests.integration.vendor_oracle import MATCH_SECONDS, cyclone_stack
@@ -120,7 +120,7 @@ def probe_all(program: Path, questions: Expected, domain: int) -> list[str]:
         f"{LATE if expected == HEARD else MATCH_SECONDS}\n"
         for question, expected in questions.items()
     ]
-    done = run(isolated(program, domain), said="".join(lines))
+    done = run_isolated_program(program, domain, said="".join(lines))
     answers = done.stdout.splitlines()
     assert len(answers) == len(questions), done
     assert not [answer for answer in answers if answer.startswith("reader")], answers

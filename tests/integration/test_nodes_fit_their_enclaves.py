@@ -38,7 +38,8 @@ from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave
 from tests.dds.decision_documents import access_of as access_of_documents
-from tests.integration.test_policies_live import all_dds_endpoints, observed_in, run_script, without
+from tests.integration.test_policies_live import all_dds_endpoints, observed_in, without
+from tests.integration.test_policies_live import observe as look
 from tests.support.children import LONG
 from tests.support.long_form import ONLY_LONG, some
 
@@ -197,7 +198,7 @@ def observe(processes: dict[str, Key], number: int) -> dict[Key, list[dict[str, 
         }
         for label, (role, names, topic) in processes.items()
     }
-    nodes = run_script("observe.py", (), {"domain": 220 + number, "processes": question})
+    nodes = look(220 + number, question)
     return {
         key: [each for each in nodes if each["enclave"] == label]
         for label, key in processes.items()
@@ -330,7 +331,7 @@ def is_of_every_node(name: str, *, managed: bool) -> bool:
 def test_the_nodes_of_a_shipped_policy_are_denied_nothing(system: str, keystore: Path) -> None:
     enclaves = read_policy(policies_dir() / f"{system}.xml").enclaves
     processes = {each.path: nodes_of(each) for each in enclaves}
-    seen = run_script("observe.py", (), {"domain": 230, "processes": processes})
+    seen = look(230, processes)
     for enclave in enclaves:
         nodes = [each for each in seen if each["enclave"] == enclave.path]
         assert len(nodes) == len(processes[enclave.path])

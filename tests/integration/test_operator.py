@@ -17,6 +17,7 @@ from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from tests.explain.test_operator import CASES, NEVER, STEPS, endpoints_of
+from tests.integration.cyclone_rights import refusals
 from tests.integration.enforcing import enforcing_backend
 from tests.support.children import PATIENCE, python
 
@@ -71,11 +72,9 @@ def test_cyclone_creates_what_commands_of_the_step_need_and_not_more(
     cases = {what: endpoints_of(node, rights) for what, node, rights, _ in CASES}
     never = {what: endpoints_of(node, rights) for what, node, rights in NEVER}
     works = {what for what, _, _, first in CASES if STEPS.index(first) <= STEPS.index(step)}
-    asked = sorted({(e.direction, e.topic) for found in (cases | never).values() for e in found})
+    asked = {(e.direction, e.topic) for found in (cases | never).values() for e in found}
     folder = enclave_path(keystore, f"/operator/{step}")
-    done = python(SCRIPTS / "ask_cyclone.py", folder, DOMAIN, said=json.dumps(asked))
-    answers = json.loads(done.stdout.splitlines()[-1])
-    refused = {each for each, said in zip(asked, answers, strict=True) if said == "refused"}
+    refused = set(refusals(folder, DOMAIN, asked))
     whole = {
         what
         for what, found in (cases | never).items()

@@ -8,12 +8,11 @@ and Cyclone DDS, which enforces them, must agree.
 from __future__ import annotations
 
 import importlib.util
-import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,8 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Group, Policy, Profile
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
-from tests.support.children import python
+from tests.integration.cyclone_rights import Endpoint, refusals
+from tests.support.children import apart
 from tests.support.long_form import some
 
 pytestmark = pytest.mark.dds
@@ -38,12 +38,9 @@ needs_rclpy = pytest.mark.skipif(
     importlib.util.find_spec("rclpy") is None, reason="rclpy is not installed"
 )
 
-SCRIPTS = Path(__file__).with_name("ros_nodes")
 DOMAINS = DomainSet.parse("200-219")
 CYCLONE_DOMAIN = 210
 
-Endpoint = tuple[str, str]
-"""A direction (publish or subscribe) and a DDS topic."""
 Nodes = list[dict[str, Any]]
 
 
@@ -127,20 +124,18 @@ ENCLAVES = [(system, path) for system, processes in SYSTEMS.items() for path in 
 # ── observing ──────────────────────────────────────────────────────────────────────────────
 
 
-def run_script(script: str, arguments: Iterable[object], question: object) -> Any:
-    """The JSON answer of a script of ``ros_nodes`` to a JSON question."""
-    done = python(SCRIPTS / script, *arguments, said=json.dumps(question))
-    return json.loads(done.stdout.splitlines()[-1])
+def observe(domain: int, processes: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What the ROS graph says of every node of processes, which are started for that."""
+    from tests.integration.ros_nodes import observe  # it imports rclpy, once for all that follow
+
+    return apart(partial(observe.observe, domain, processes))
 
 
 @cache
 def observed(system: str) -> list[dict[str, Any]]:
     """What the ROS graph says of every node of a system, each system in a domain of its own."""
     domain = 200 + list(SYSTEMS).index(system)
-    found: list[dict[str, Any]] = run_script(
-        "observe.py", (), {"domain": domain, "processes": SYSTEMS[system]}
-    )
-    return found
+    return observe(domain, SYSTEMS[system])
 
 
 def observed_in(system: str, enclave: str) -> list[dict[str, Any]]:
@@ -324,11 +319,7 @@ def keystore(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def refused_by_cyclone(keystore: Path, path: str, endpoints: Iterable[Endpoint]) -> set[Endpoint]:
-    questions = sorted(endpoints)
-    folder = enclave_path(keystore, path)
-    answers = run_script("ask_cyclone.py", (folder, CYCLONE_DOMAIN), questions)
-    assert len(answers) == len(questions)
-    return {asked for asked, said in zip(questions, answers, strict=True) if said == "refused"}
+    return set(refusals(enclave_path(keystore, path), CYCLONE_DOMAIN, endpoints))
 
 
 STRANGERS = {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.integration.fastdds import build, isolated
+from tests.integration.fastdds import build, run_isolated_program
 from tests.integration.trust.trusts import (
     IDENTITY_FILE,
     ISSUER,
@@ -79,7 +79,7 @@ wait
 exit $ended
 """)
     both.chmod(0o755)
-    done = run(isolated(both), status=None)
+    done = run_isolated_program(both, status=None)
     assert (tmp_path / "stranger.out").read_text().split() == ["joined", "unmatched"]
     why = (tmp_path / "node.err").read_text()
     assert done.returncode == ends, why

@@ -7,12 +7,11 @@ order of the cases.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from functools import cache
+from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,12 +21,11 @@ from sros_tool.pki.certificates import Issuer, common_name, issue_ca, parse_subj
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.runtime.cyclone import load_cyclone
 from sros_tool.validity import Window
-from tests.integration.fastdds import build, fastdds_stack, isolated, openssl
+from tests.integration import cyclone_oracle
+from tests.integration.fastdds import build, fastdds_stack, openssl, run_isolated_program
 from tests.integration.kept.forms import form_of, form_of_text
 from tests.integration.kept.replies import answered
-from tests.support.children import LATE, python, run
-
-HERE = Path(__file__).parent
+from tests.support.children import LATE, together
 
 MATCH_SECONDS = 2.5
 """How long a match is waited for; those that come take a tenth of a second."""
@@ -193,7 +191,7 @@ def ask_fastdds(
     def ask(places: list[int]) -> list[Reply]:
         program = build("fastdds_oracle.cpp", workshop.root)
         lines = [_line(workshop, cases[place], seconds) for place in places]
-        return _spread(lines, at_once, lambda some: _ask_one_program(program, some))
+        return _spread(lines, at_once, partial(_ask_programs, program))
 
     return _replies(fastdds_stack(), [workshop.form(case) for case in cases], ask, seconds)
 
@@ -216,12 +214,17 @@ def _line(workshop: Workshop, case: Case, seconds: float) -> str:
     return "\t".join(map(str, fields))
 
 
+def _ask_programs(program: Path, hands: Sequence[Sequence[str]]) -> list[list[Reply]]:
+    with ThreadPoolExecutor(len(hands)) as pool:
+        return list(pool.map(partial(_ask_one_program, program), hands))
+
+
 def _ask_one_program(program: Path, lines: Sequence[str]) -> list[Reply]:
-    command = isolated(program)
     replies: list[Reply] = []
     while len(replies) < len(lines):
         rest = lines[len(replies) :]
-        done = run(command, said="\n".join(rest) + "\n", status=None, patience=_PATIENCE)
+        said = "\n".join(rest) + "\n"
+        done = run_isolated_program(program, said=said, status=None, patience=_PATIENCE)
         replies += [_reply(line) for line in done.stdout.splitlines()]
         if len(replies) < len(lines):
             assert done.returncode < 0, (done.returncode, done.stderr)
@@ -253,19 +256,28 @@ def ask_cyclone(
     """What Cyclone DDS does with each case; every participant is a process of its own."""
 
     def ask(places: list[int]) -> list[Reply]:
-        records = [_record(workshop, cases[place], seconds) for place in places]
-        return _spread(records, at_once, ask_cyclone_records)
+        return ask_cyclone_records(
+            [_record(workshop, cases[place], seconds) for place in places], at_once
+        )
 
     return _replies(cyclone_stack(), [workshop.form(case) for case in cases], ask, seconds)
 
 
-def ask_cyclone_records(records: Sequence[dict[str, Any]]) -> list[Reply]:
+def ask_cyclone_records(records: Sequence[dict[str, Any]], at_once: int) -> list[Reply]:
     """What Cyclone DDS does with cases in the form of `cyclone_oracle`."""
-    script = HERE / "cyclone_oracle.py"
-    done = python(script, said=json.dumps(list(records)), patience=_PATIENCE)
-    replies = [json.loads(line) for line in done.stdout.splitlines()]
-    assert not [each for each in replies if each["end"] == "failed"], done.stderr
-    return [Reply(each["end"], tuple(each["answers"]), each["log"]) for each in replies]
+
+    def ask(hands: Sequence[Sequence[dict[str, Any]]]) -> list[list[Reply]]:
+        asked = together(
+            [partial(cyclone_oracle.answers, hand) for hand in hands], patience=_PATIENCE
+        )
+        return [[_reply_of(report) for report in reports] for reports in asked]
+
+    return _spread(records, at_once, ask)
+
+
+def _reply_of(report: dict[str, Any]) -> Reply:
+    assert report["end"] != "failed", report
+    return Reply(report["end"], tuple(report["answers"]), report["log"])
 
 
 def _record(workshop: Workshop, case: Case, seconds: float) -> dict[str, Any]:
@@ -309,7 +321,7 @@ def ask_fastdds_folders(
     def ask(places: list[int]) -> list[Reply]:
         program = build("fastdds_oracle.cpp", program_folder)
         asked = [lines[place] for place in places]
-        return _spread(asked, at_once, lambda some: _ask_one_program(program, some))
+        return _spread(asked, at_once, partial(_ask_programs, program))
 
     return _replies(fastdds_stack(), _forms_of_pairs(pairs, topic, domain), ask, seconds)
 
@@ -339,7 +351,7 @@ def ask_cyclone_folders(
     ]
 
     def ask(places: list[int]) -> list[Reply]:
-        return _spread([records[place] for place in places], at_once, ask_cyclone_records)
+        return ask_cyclone_records([records[place] for place in places], at_once)
 
     return _replies(cyclone_stack(), _forms_of_pairs(pairs, topic, domain), ask, seconds)
 
@@ -365,12 +377,14 @@ def _replies(
     return [Reply(end, tuple(answers), log) for end, log, *answers in found]
 
 
-def _spread(items: Sequence[Any], at_once: int, ask: Any) -> list[Reply]:
-    """Deal the items out, ask ``at_once`` programs, and put the replies in order again."""
+def _spread(
+    items: Sequence[Asked],
+    at_once: int,
+    ask: Callable[[Sequence[Sequence[Asked]]], list[list[Reply]]],
+) -> list[Reply]:
+    """Deal the items out to ``at_once`` processes, and put the replies in order again."""
     hands = [items[start::at_once] for start in range(at_once) if items[start::at_once]]
-    with ThreadPoolExecutor(at_once) as pool:
-        answered: Iterable[list[Reply]] = list(pool.map(ask, hands))
     replies: list[Reply] = [Reply("")] * len(items)
-    for start, found in enumerate(answered):
+    for start, found in enumerate(ask(hands)):
         replies[start::at_once] = found
     return replies

@@ -14,7 +14,8 @@ from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NoReturn
+from tempfile import TemporaryFile
+from typing import IO, NoReturn
 
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
@@ -23,6 +24,7 @@ from sros_tool.cli import main
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.keystore.layout import LOCK, REQUIRED_FILES
 from sros_tool.pki import smime
+from tests.support.children import Forked
 
 STAGES = (".sros-transaction", ".sros-")
 
@@ -103,6 +105,54 @@ def forked(
     reader.join()
     _, status = os.waitpid(child, 0)
     return Ended(os.waitstatus_to_exitcode(status), text, *said)
+
+
+class Running(Forked):
+    """A forked run of the program, at which a test can look and which it can send signals.
+
+    It leads a session of its own, and calls ``first`` before the program.
+    """
+
+    def __init__(
+        self,
+        *arguments: object,
+        env: Mapping[str, str] | None = None,
+        cwd: Path | None = None,
+        first: Callable[[], object] | None = None,
+    ) -> None:
+        words = [str(argument) for argument in arguments]
+        self._out, self._err = TemporaryFile(), TemporaryFile()  # noqa: SIM115 - live as long
+
+        def begin() -> None:
+            os.setsid()
+            if first:
+                first()
+
+        def work() -> int:
+            _become_program(words, None, cwd, begin, self._out.fileno(), self._err.fileno())
+
+        super().__init__(work, env=dict(env or os.environ), errors=Path(os.devnull))
+
+    @property
+    def out(self) -> str:
+        """What it has written to standard output so far."""
+        return _content(self._out)
+
+    @property
+    def err(self) -> str:
+        """What it has written to standard error so far."""
+        return _content(self._err)
+
+    def end(self) -> Ended:
+        """Wait until it ends by itself; return its exit status and its output."""
+        status = self.wait()
+        return Ended(status, self.out, self.err)
+
+
+def _content(file: IO[bytes]) -> str:
+    """The content of a file of which another process moves the position."""
+    descriptor = file.fileno()
+    return os.pread(descriptor, os.fstat(descriptor).st_size, 0).decode(errors="replace")
 
 
 def _become_program(

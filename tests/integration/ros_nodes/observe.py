@@ -1,25 +1,23 @@
-"""Starts processes of nodes, and prints as JSON what the ROS graph says of each node.
+"""Start processes of nodes, and tell what the ROS graph says of each node.
 
-Reads from stdin ``{"domain": N, "processes": {enclave: [node, ...]}}``, nodes as in
-``run_nodes.py``, or ``{enclave: {"command": [word, ...], "nodes": count, "topics": {name: []}}}``
-with DDS topics that its nodes must have.  Runs in a network of its own where the kernel allows it.
-Every node is described by its enclave, its endpoints in ROS terms, and the DDS topics that it
-writes and reads (``raw``), both as the graph tells them.
+Processes are ``{enclave: [node, ...]}``, nodes as in ``run_nodes.py``, or
+``{enclave: {"command": [word, ...], "nodes": count, "topics": {name: []}}}`` with DDS topics that
+its nodes must have.  Every node is described by its enclave, its endpoints in ROS terms, and the
+DDS topics that it writes and reads (``raw``), both as the graph tells them.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
-import sys
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from sros_tool.names import NODE_SERVICES, dds_names, expand
-from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+from sros_tool.runtime.netns import end_with_parent
 from tests.integration.ros_nodes.run_nodes import Nodes
+from tests.support.children import importing
 
 Process = list[dict[str, Any]] | dict[str, Any]
 PATIENCE_S = 240.0
@@ -32,8 +30,12 @@ def start(enclave: str, process: Process) -> subprocess.Popen[bytes] | Nodes:
     words = ("--ros-args", "--enclave", enclave, "-p", "use_sim_time:=true")
     if isinstance(process, list):
         return Nodes(process, *words)
-    return subprocess.Popen([*process["command"], *words], stdout=subprocess.DEVNULL,
-                            preexec_fn=end_with_parent)  # fmt: skip
+    return subprocess.Popen(
+        [*process["command"], *words],
+        env=importing(),
+        stdout=subprocess.DEVNULL,
+        preexec_fn=end_with_parent,
+    )
 
 
 def describe(observer: Any, name: str, ns: str) -> dict[str, Any]:
@@ -74,7 +76,7 @@ def snapshot(observer: Any, enclaves: Collection[str]) -> list[dict[str, Any]]:
     return sorted(found, key=lambda each: (each["enclave"], each["ns"], each["name"]))
 
 
-def observe(processes: dict[str, Process]) -> list[dict[str, Any]]:
+def _watch(processes: Mapping[str, Process]) -> list[dict[str, Any]]:
     """The graph, once it shows the nodes of all ``processes`` and has come to rest."""
     import rclpy
 
@@ -94,10 +96,10 @@ def observe(processes: dict[str, Process]) -> list[dict[str, Any]]:
         if still and len(seen) >= wanted and not any(lacks(each, processes) for each in seen):
             return seen
         time.sleep(0.1)
-    raise SystemExit(f"the graph did not come to rest with {wanted} nodes: {seen}")
+    raise AssertionError(f"the graph did not come to rest with {wanted} nodes: {seen}")
 
 
-def lacks(seen: dict[str, Any], processes: dict[str, Process]) -> bool:
+def lacks(seen: dict[str, Any], processes: Mapping[str, Process]) -> bool:
     """Whether a node is not yet seen with something that it is known to have."""
     process = processes[seen["enclave"]]
     topics = {
@@ -131,22 +133,19 @@ def services(node: str, spec: dict[str, Any]) -> set[str]:
     }
 
 
-def main() -> None:
-    task = json.load(sys.stdin)
-    if try_isolation().isolated:
-        enter_isolation()
-    os.environ["ROS_DOMAIN_ID"] = str(task["domain"])
-    processes = [start(enclave, process) for enclave, process in task["processes"].items()]
+def observe(domain: int, processes: Mapping[str, Process]) -> list[dict[str, Any]]:
+    """Start processes in a domain, and describe all of their nodes.
+
+    It changes the environment, so it is for a process of its own.
+    """
+    os.environ["ROS_DOMAIN_ID"] = str(domain)
+    running = [start(enclave, process) for enclave, process in processes.items()]
     try:
-        for process in processes:
-            if isinstance(process, Nodes):  # others are seen in the graph when they are ready
-                process.wait_until_ready()
-        print(json.dumps(observe(task["processes"])))
+        for each in running:
+            if isinstance(each, Nodes):  # others are seen in the graph when they are ready
+                each.wait_until_ready()
+        return _watch(processes)
     finally:
-        for process in processes:
-            process.kill()
-            process.wait()
-
-
-if __name__ == "__main__":
-    main()
+        for each in running:
+            each.kill()
+            each.wait()
