@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime, tzinfo
+from functools import lru_cache
 
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.decision.vendors import DocumentReader, Vendor
+from sros_tool.dds.governance import Governance
+from sros_tool.dds.permissions import Permissions
 
 NOW = datetime(2026, 6, 15, 12, 0, tzinfo=UTC)
 SUBJECT = "CN=/t"
@@ -87,6 +90,17 @@ def permissions(*grants: str) -> bytes:
 <dds><permissions>{"".join(grants)}</permissions></dds>""".encode()
 
 
+@lru_cache(1000)
+def _governance(vendor: Vendor, _: DocumentReader, xml: bytes) -> Governance | Refusal:
+    """What a vendor reads: the same texts are asked about again and again."""
+    return read_governance_as(vendor, xml)
+
+
+@lru_cache(1000)
+def _permissions(vendor: Vendor, _: DocumentReader, xml: bytes) -> Permissions | Refusal:
+    return read_permissions_as(vendor, xml)
+
+
 def access_of(
     vendor: Vendor,
     governance_xml: bytes,
@@ -98,10 +112,11 @@ def access_of(
     zone: tzinfo = UTC,
 ) -> Access | Refusal:
     """Return the access control by two documents as ``vendor`` reads them, or its refusal."""
-    read = read_governance_as(vendor, governance_xml)
+    reader = vendor.traits.reader
+    read = _governance(vendor, reader, governance_xml)
     if isinstance(read, Refusal):
         return read
-    permissions_read = read_permissions_as(vendor, permissions_xml)
+    permissions_read = _permissions(vendor, reader, permissions_xml)
     if isinstance(permissions_read, Refusal):
         return permissions_read
     governed = GovernedDomain(vendor, read, domain)

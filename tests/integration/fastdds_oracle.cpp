@@ -15,6 +15,10 @@
 // With a peer, "created" becomes "matched" if the counterpart of the peer is found within WAIT_MS,
 // else "unmatched"; "peer denied" if the peer may not open it.  The line that lacks when the process
 // ends is that of the case at which it crashed.
+//
+// With a domain as argument, it is the program of fastdds_probe.hpp.
+
+#include "fastdds_probe.hpp"
 
 #include <fastdds/dds/domain/DomainParticipant.hpp>
 #include <fastdds/dds/domain/DomainParticipantFactory.hpp>
@@ -46,9 +50,6 @@
 #include <string>
 #include <thread>
 #include <vector>
-
-namespace fast = eprosima::fastdds::dds;
-namespace rtps = eprosima::fastrtps::rtps;
 
 // A type of which nothing is ever written.
 class EmptyType : public fast::TopicDataType
@@ -117,14 +118,6 @@ std::vector<std::string> split(const std::string& text, char mark)
         }
     }
     return parts;
-}
-
-// The key as rmw_fastrtps of ROS 2 Jazzy finds it: the PKCS#11 URI in key.p11, or else key.pem.
-std::string private_key(const std::string& folder)
-{
-    std::string uri;
-    std::ifstream named(folder + "/key.p11");
-    return named >> uri && uri.rfind("pkcs11:", 0) == 0 ? uri : "file://" + folder + "/key.pem";
 }
 
 struct Party
@@ -308,13 +301,17 @@ std::string answer(const std::vector<std::string>& fields)
     return said;
 }
 
-int main()
+int main(int count, char** arguments)
 {
     fast::Log::ClearConsumers();  // it writes to standard output
-    fast::Log::RegisterConsumer(std::make_unique<Lines>());
     eprosima::fastrtps::LibrarySettingsAttributes settings;
     settings.intraprocess_delivery = eprosima::fastrtps::INTRAPROCESS_OFF;
     eprosima::fastrtps::xmlparser::XMLProfileManager::library_settings(settings);
+    if (count > 1)
+    {
+        return probing::probe(static_cast<std::uint32_t>(std::stoul(arguments[1])));
+    }
+    fast::Log::RegisterConsumer(std::make_unique<Lines>());
     // OpenSSL asks for the pass phrase of an encrypted part on the terminal or from standard input,
     // which is neither a question's answer nor a question: nobody is there to type one.
     FILE* questions = fdopen(dup(0), "r");

@@ -24,7 +24,7 @@ from tests.integration.enforcing import BACKENDS, enforcing_backend
 from tests.integration.test_demo_run import processes_with, start
 from tests.integration.weak_keystores import WEAKNESSES, make_weak
 from tests.support.children import LONG, PATIENCE
-from tests.support.harness import snapshot, sros
+from tests.support.harness import Running, snapshot, sros
 from tests.support.long_form import ONLY_LONG, some
 
 pytestmark = pytest.mark.dds
@@ -41,7 +41,7 @@ def backend(request: pytest.FixtureRequest) -> Backend:
     return enforcing_backend(request.param)
 
 
-def demo(backend: Backend, *arguments: str, folder: Path) -> subprocess.Popen[str]:
+def demo(backend: Backend, *arguments: str, folder: Path) -> Running:
     chosen = ("--backend", backend.name, "--scenario", "attacks")
     return start("demo", *chosen, *arguments, folder=folder)
 
@@ -70,11 +70,10 @@ def shown(
     temporary = folder / "tmp"
     temporary.mkdir()
     words = [word for name in some_attacks() for word in ("--only", name)]
-    process = demo(backend, "--json", "--summary", str(summary), *words, folder=temporary)
-    output, errors = process.communicate(timeout=PATIENCE)
-    assert not errors
+    ended = demo(backend, "--json", "--summary", str(summary), *words, folder=temporary).end()
+    assert not ended.err
     assert not list(temporary.iterdir())
-    return json.loads(output), process.returncode, summary
+    return json.loads(ended.out), ended.status, summary
 
 
 def test_every_attack_ends_as_expected(
@@ -126,11 +125,10 @@ def test_a_weakness_makes_its_rows_fail_and_no_others(
     before = snapshot(root)
     words = [word for row in {*tried, *broken} for word in ("--only", row)]
     chosen = ("--template", "production", "--keystore", str(root), "--json", *words)
-    process = demo(backend, *chosen, folder=tmp_path)
-    output, errors = process.communicate(timeout=PATIENCE)
+    ended = demo(backend, *chosen, folder=tmp_path).end()
     assert snapshot(root) == before
-    assert not errors
-    rows = {row["name"]: row for row in json.loads(output)["rows"]}
+    assert not ended.err
+    rows = {row["name"]: row for row in json.loads(ended.out)["rows"]}
     assert set(tried) <= set(rows)
     skipped = {each for each, row in rows.items() if row["observed"] == "skipped"}
     wrong = {each: row["observed"] for each, row in rows.items() if not row["as_expected"]}
@@ -138,7 +136,7 @@ def test_a_weakness_makes_its_rows_fail_and_no_others(
         assert skipped == weakness.untried & set(tried)
     assert skipped <= NEEDS_ROOT | weakness.untried
     assert set(wrong) == broken - skipped, rows
-    assert process.returncode == bool(wrong)
+    assert ended.status == bool(wrong)
     assert set(wrong.values()) <= {"heard", "answered", "readable"}
 
 
@@ -153,9 +151,9 @@ def test_interrupted_attacks_leave_nothing(backend: Backend, tmp_path: Path) -> 
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 130
-    assert "Traceback" not in errors
+    ended = process.end()
+    assert ended.status == 130
+    assert "Traceback" not in ended.err
     assert list(tmp_path.iterdir()) == []
     assert not processes_with(str(tmp_path))
 

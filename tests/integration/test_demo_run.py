@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -24,11 +24,11 @@ from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.runtime.cyclone import load_cyclone
 from sros_tool.runtime.netns import run_isolated, try_isolation
 from tests.support.children import PATIENCE
+from tests.support.harness import Running
 from tests.support.long_form import some
 
 pytestmark = pytest.mark.dds
 
-SROS = [sys.executable, "-c", "from sros_tool.cli import main; main()"]
 SHORT = Limits(window=1.0, longest_window=8.0)
 
 
@@ -41,16 +41,13 @@ def _needs_cyclone() -> None:
         pytest.skip(str(error))
 
 
-def start(*arguments: str, folder: Path, **more: str) -> subprocess.Popen[str]:
-    environment = {**os.environ, "TMPDIR": str(folder), **more}
-    return subprocess.Popen(
-        [*SROS, *arguments],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+def start(*arguments: str, folder: Path, **more: str) -> Running:
+    """Start a run of the program that makes its temporary files in ``folder``."""
+
+    def first() -> None:
+        tempfile.tempdir = str(folder)
+
+    return Running(*arguments, env={**os.environ, **more}, first=first)
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +55,9 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], int
     folder = tmp_path_factory.mktemp("demo")
     keep = folder / "kept"
     arguments = ["--backend", "cyclone", "--json", "--domain", "140", "--keep", str(keep)]
-    process = start("demo", *arguments, folder=folder)
-    output, errors = process.communicate(timeout=PATIENCE)
-    assert not errors
-    return json.loads(output), process.returncode, keep
+    ended = start("demo", *arguments, folder=folder).end()
+    assert not ended.err
+    return json.loads(ended.out), ended.status, keep
 
 
 def test_every_row_is_as_expected(shown: tuple[dict[str, Any], int, Path]) -> None:
@@ -89,6 +85,12 @@ def test_what_is_kept(shown: tuple[dict[str, Any], int, Path]) -> None:
         assert key.stat().st_mode & 0o777 == 0o600
 
 
+ONE_ROW = (
+    *("--backend", "cyclone", "--domain", "160"),
+    *("--only", "secured talker to secured listener"),
+)
+
+
 @pytest.mark.parametrize(
     ("number", "after"),
     some([(signal.SIGINT, "at once"), (signal.SIGTERM, "while rows run")], 1),
@@ -96,29 +98,29 @@ def test_what_is_kept(shown: tuple[dict[str, Any], int, Path]) -> None:
 def test_an_interrupted_demo_leaves_nothing(
     number: signal.Signals, after: str, tmp_path: Path
 ) -> None:
-    process = start("demo", "--backend", "cyclone", "--domain", "160", folder=tmp_path)
+    process = start("demo", *ONE_ROW, folder=tmp_path)
     deadline = time.monotonic() + PATIENCE
     wanted = "sros-demo-*/rows/row_*/*.jsonl" if after == "while rows run" else "sros-demo-*"
     while not list(tmp_path.glob(wanted)):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143}[number]
-    assert "Traceback" not in errors
+    ended = process.end()
+    assert ended.status == {signal.SIGINT: 130, signal.SIGTERM: 143}[number]
+    assert "Traceback" not in ended.err
     assert list(tmp_path.iterdir()) == []
     assert not processes_with(str(tmp_path))
 
 
 def test_no_node_outlives_a_killed_demo(tmp_path: Path) -> None:
-    process = start("demo", "--backend", "cyclone", "--domain", "160", folder=tmp_path)
+    process = start("demo", *ONE_ROW, folder=tmp_path)
     deadline = time.monotonic() + PATIENCE
     while not list(tmp_path.glob("sros-demo-*/rows/row_*/*.jsonl")):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     assert processes_with(str(tmp_path))
     process.kill()
-    process.communicate(timeout=PATIENCE)
+    process.wait()
     while processes_with(str(tmp_path)):
         assert time.monotonic() < deadline
         time.sleep(0.02)
@@ -214,27 +216,30 @@ def test_an_error_of_the_runner_is_an_error_of_the_demo() -> None:
 
 
 def test_doctor_finds_what_enforces(tmp_path: Path) -> None:
-    process = start("doctor", "--json", folder=tmp_path, ROS_SECURITY_ENABLE="True")
-    output, _ = process.communicate(timeout=PATIENCE)
-    found = json.loads(output)
+    ended = start("doctor", "--json", folder=tmp_path, ROS_SECURITY_ENABLE="True").end()
+    found = json.loads(ended.out)
     stacks = {stack["kind"]: stack for stack in found["stacks"]}
     assert stacks["cyclone"]["enforces"] is True
-    assert process.returncode == 1, "a misspelt variable switches security off"
+    assert ended.status == 1, "a misspelt variable switches security off"
     assert "runtime.enable-misspelt" in {each["id"] for each in found["findings"]}
     assert list(tmp_path.iterdir()) == []
 
 
 def test_doctor_says_what_to_install(tmp_path: Path) -> None:
-    process = start("doctor", "--json", folder=tmp_path, SROS_CYCLONEDDS_DIR=str(tmp_path))
-    output, _ = process.communicate(timeout=PATIENCE)
-    answer = json.loads(output)
+    def first() -> None:
+        tempfile.tempdir = str(tmp_path)
+        load_cyclone.cache_clear()
+
+    environment = {**os.environ, "SROS_CYCLONEDDS_DIR": str(tmp_path)}
+    ended = Running("doctor", "--json", env=environment, first=first).end()
+    answer = json.loads(ended.out)
     cyclone = next(each for each in answer["stacks"] if each["kind"] == "cyclone")
     assert not cyclone["present"]
     assert "libddsc0debian" in cyclone["advice"]
     # Processes of other tests may be misconfigured on purpose, and doctor looks at all of them.
     misconfigured = any(each["severity"] == "error" for each in answer["findings"])
     sound = answer["enforces"] and answer["ros_enforces"] is not False
-    assert process.returncode == (misconfigured or not sound)
+    assert ended.status == (misconfigured or not sound)
 
 
 FAST_DDS_NODE = """

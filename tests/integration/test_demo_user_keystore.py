@@ -53,6 +53,7 @@ def test_who_plays_which_part_in_a_robot(robot: Path, tmp_path: Path) -> None:
         open_user_keystore(robot, "/no_such_topic", ATTACKS, datetime.now(UTC))
 
 
+@sometimes("a robot under attack")
 @needs_isolation
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_robot_under_attack(backend: str, robot: Path) -> None:

@@ -48,7 +48,7 @@ def test_a_copy_of_the_folder_without_the_token_cannot_talk(
     token: dict[str, str], tmp_path: Path
 ) -> None:
     """The key is made on the token; the listener hears it, and hears another one at all times."""
-    program = build("fastdds_probe.cpp", tmp_path)
+    program = build("fastdds_oracle.cpp", tmp_path)
     home, robot, answer = (tmp_path / name for name in ("home", "robot", "answer.tgz"))
     hears = publish("/chatter").replace("publish", "subscribe")
     (at_home := tmp_path / "home.xml").write_text(

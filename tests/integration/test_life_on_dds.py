@@ -103,7 +103,7 @@ def converse_all(questions: Expected) -> list[str]:
 @pytest.fixture(scope="session")
 def probe(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The program that asks Fast DDS."""
-    return build("fastdds_probe.cpp", tmp_path_factory.mktemp("probe"))
+    return build("fastdds_oracle.cpp", tmp_path_factory.mktemp("probe"))
 
 
 def ask_fast(program: Path, questions: Expected, domain: int = DOMAIN) -> list[str]:

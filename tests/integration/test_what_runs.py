@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import pytest
 
-from sros_tool.runtime.netns import try_isolation
 from tests.integration import what_runs
-from tests.support.children import python
+from tests.support.children import apart, has_isolation
 
 pytestmark = pytest.mark.dds
 
@@ -29,9 +27,9 @@ EXPECTED = {
 
 @pytest.fixture(scope="module")
 def said() -> Any:
-    if not try_isolation().isolated:
+    if not has_isolation():
         pytest.skip("needs a network of its own")
-    return json.loads(python("-m", "tests.integration.what_runs").stdout)
+    return apart(what_runs.play)
 
 
 def test_each_state_is_named_and_nothing_else(said: Any) -> None:

@@ -1,7 +1,6 @@
-"""Bring about processes in every state, and print what `sros check runtime` says of each.
+"""Bring about processes in every state, and tell what `sros check runtime` says of each.
 
-All run in a network of their own, most of them from the export of one keystore.  Prints as JSON,
-for each process by its name, the ids of the findings about it with their texts.
+Most of them run from the export of one keystore.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from sros_tool.files import templates_dir
 from sros_tool.runtime.environment import secured_environment
@@ -26,7 +26,7 @@ from sros_tool.runtime.events import EventKind, read_events
 from sros_tool.runtime.netns import end_with_parent, enter_isolation
 from sros_tool.runtime.rmw import RMW
 from tests.support.children import LONG, importing, wait_for
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import Running, policy_text, publish, sros
 
 DOMAIN = 0
 FILES = {
@@ -174,41 +174,33 @@ def by_process(
 class Watching:
     """`sros check runtime --watch --json`, and what it has said so far."""
 
-    def __init__(self, folder: Path) -> None:
-        self._out, self._err = folder / "watch.jsonl", folder / "watch.err"
-        words = ("-m", "sros_tool", "check", "runtime", "--watch", "--json")
-        with self._out.open("wb") as out, self._err.open("wb") as err:
-            self._process = subprocess.Popen(
-                [sys.executable, *words],
-                env=importing(),
-                stdout=out,
-                stderr=err,
-                preexec_fn=end_with_parent,
-            )
+    def __init__(self) -> None:
+        self._running = Running("check", "runtime", "--watch", "--json")
 
     def changes(self, names: Mapping[int, str]) -> list[tuple[str, str, str]]:
         """What became of which process with which finding."""
         found = []
-        for line in self._out.read_text().split("\n")[:-1]:
+        for line in self._running.out.split("\n")[:-1]:
             change = json.loads(line)
             for name in by_process([change["finding"]], names):
                 found.append((change["change"], name, change["finding"]["id"]))
         return found
 
     def end(self) -> tuple[int, str]:
-        self._process.terminate()
-        return self._process.wait(), self._err.read_text()
+        self._running.terminate()
+        ended = self._running.end()
+        return ended.status, ended.err
 
 
-def main() -> None:
-    enter_isolation()
+def play() -> dict[str, Any]:
+    """Return the ids of the findings about each process, with their texts; for a network apart."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         home, robot, strange = make_keystores(folder)
         started = Started(folder)
         try:
             start_all(started, home, robot, strange)
-            watching = Watching(folder)
+            watching = Watching()
             wait_for(lambda: watching.changes(started.pids()), "the first changes")
             change_files(home, robot)
             said = sros("check", "runtime", "--at", "2d", "--json", "--severity", "note")
@@ -226,11 +218,6 @@ def main() -> None:
             over = ("over", "open", "runtime.process-unsecured")
             wait_for(lambda: over in watching.changes(names), "the end of a process")
             watched = [list(each) for each in watching.changes(names)]
-            told = {"found": found, "running": running, "watched": watched, "end": watching.end()}
-            json.dump(told, sys.stdout)
+            return {"found": found, "running": running, "watched": watched, "end": watching.end()}
         finally:
             started.end()
-
-
-if __name__ == "__main__":
-    main()

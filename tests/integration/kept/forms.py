@@ -12,6 +12,7 @@ import re
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
+from functools import lru_cache
 from hashlib import sha1
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,8 @@ class _Writer:
         self._names: dict[bytes, str] = {}
         self._words: dict[str, str] = {}
         self._texts: tuple[bytes, ...] = ()
+        self._signer = b""
+        """The key of the last signature, which is tried first for the next one."""
 
     # ── keys ───────────────────────────────────────────────────────────────────────────────
 
@@ -213,8 +216,9 @@ class _Writer:
         digest = _HASHES.get(der.decode_oid(parts[0].content)) if parts else None
         if digest is None:
             return signature.hex()
-        for info, key in self._keys.items():
-            if any(_fits(key, signature, each, digest) for each in signed):
+        for info, key in sorted(self._keys.items(), key=lambda each: each[0] != self._signer):
+            if any(_fits(info, key, signature, each, digest.name) for each in signed):
+                self._signer = info
                 return f"<signature {self._word(signature.hex())} by {self._names[info]}>"
         return f"<signature {self._word(signature.hex())} by none of these keys>"
 
@@ -301,6 +305,7 @@ def _printable(content: bytes) -> str:
     return text if all(each.isprintable() or each in "\r\n\t" for each in text) else ""
 
 
+@lru_cache(1000)
 def _private_key(data: bytes) -> Any:
     try:
         return load_der_private_key(data, None, unsafe_skip_rsa_key_validation=True)
@@ -319,7 +324,19 @@ def _signed_texts(content: bytes) -> Iterator[bytes]:
         yield re.sub(rb"\r?\n", b"\r\n", parts[1])
 
 
-def _fits(key: Any, signature: bytes, signed: bytes, digest: hashes.HashAlgorithm) -> bool:
+def _fits(info: bytes, key: Any, signature: bytes, signed: bytes, digest: str) -> bool:
+    """Whether a key, whose encoding is ``info``, made a signature; each is verified once."""
+    asked = info, signature, sha1(signed).digest(), digest
+    if asked not in _FITTING:
+        _FITTING[asked] = _verifies(key, signature, signed, _BY_NAME[digest])
+    return _FITTING[asked]
+
+
+_FITTING: dict[tuple[bytes, bytes, bytes, str], bool] = {}
+_BY_NAME = {digest.name: digest for digest in _HASHES.values()}
+
+
+def _verifies(key: Any, signature: bytes, signed: bytes, digest: hashes.HashAlgorithm) -> bool:
     try:
         if isinstance(key, ec.EllipticCurvePublicKey):
             key.verify(signature, signed, ec.ECDSA(digest))

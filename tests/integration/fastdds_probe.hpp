@@ -1,12 +1,15 @@
-// Asks Fast DDS whether one enclave hears another.
+// Asks Fast DDS whether one enclave hears another; a part of fastdds_oracle, with which it is compiled
+// once.
 //
-//   fastdds_probe DOMAIN
+//   fastdds_oracle DOMAIN
 //
 // Reads questions from standard input, a line each: WRITER_FOLDER READER_FOLDER TOPIC SECONDS.
 // Answers each with a line: heard, silent (never matched, or nothing arrived within SECONDS), or what
 // was refused: "writer joins", "reader joins", "writer opens", "reader opens".
 //
 // A crl.pem in a folder is used as the RMWs of ROS 2 use it.
+
+#pragma once
 
 #include <fastdds/dds/domain/DomainParticipant.hpp>
 #include <fastdds/dds/domain/DomainParticipantFactory.hpp>
@@ -35,6 +38,17 @@
 
 namespace fast = eprosima::fastdds::dds;
 namespace rtps = eprosima::fastrtps::rtps;
+
+// The key as rmw_fastrtps of ROS 2 Jazzy finds it: the PKCS#11 URI in key.p11, or else key.pem.
+std::string private_key(const std::string& folder)
+{
+    std::string uri;
+    std::ifstream named(folder + "/key.p11");
+    return named >> uri && uri.rfind("pkcs11:", 0) == 0 ? uri : "file://" + folder + "/key.pem";
+}
+
+namespace probing
+{
 
 // One number, in little-endian CDR.
 class NumberType : public fast::TopicDataType
@@ -89,14 +103,6 @@ public:
         return false;
     }
 };
-
-// The key as rmw_fastrtps of ROS 2 Jazzy finds it: the PKCS#11 URI in key.p11, or else key.pem.
-std::string private_key(const std::string& folder)
-{
-    std::string uri;
-    std::ifstream named(folder + "/key.p11");
-    return named >> uri && uri.rfind("pkcs11:", 0) == 0 ? uri : "file://" + folder + "/key.pem";
-}
 
 fast::DomainParticipant* join(std::uint32_t domain, const std::string& folder)
 {
@@ -190,18 +196,8 @@ std::string ask(std::uint32_t domain, double seconds, const std::string& from,
     return "silent";
 }
 
-int main(int count, char** arguments)
+int probe(std::uint32_t domain)
 {
-    if (count < 2)
-    {
-        std::cerr << "usage: fastdds_probe DOMAIN" << std::endl;
-        return 2;
-    }
-    const auto domain = static_cast<std::uint32_t>(std::stoul(arguments[1]));
-    fast::Log::ClearConsumers();  // it writes to standard output
-    eprosima::fastrtps::LibrarySettingsAttributes settings;
-    settings.intraprocess_delivery = eprosima::fastrtps::INTRAPROCESS_OFF;
-    eprosima::fastrtps::xmlparser::XMLProfileManager::library_settings(settings);
     std::string line, from, to, topic;
     double seconds;
     while (std::getline(std::cin, line))
@@ -209,4 +205,7 @@ int main(int count, char** arguments)
         std::istringstream(line) >> from >> to >> topic >> seconds;
         std::cout << ask(domain, seconds, from, to, topic) << std::endl;
     }
+    return 0;
 }
+
+}  // namespace probing
