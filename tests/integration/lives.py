@@ -1,22 +1,20 @@
 """Keystores that are drawn, and changed by verbs, with what live Cyclone DDS nodes then hear.
 
 A life begins with CAs of its own or given ones, of many kinds, and ends after some verbs.  After a
-verb that succeeded, nodes are to be started with a copy of the keystore (`Scene`).  As a program
-it reads scenes from standard input, plays them, each in a domain of its own and each node in a
-process of its own, and prints what was heard, both as JSON.
+verb that succeeded, nodes are to be started with a copy of the keystore (`Scene`).  Scenes are
+played at once, each in a domain of its own and each node in a process of its own.
 """
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from random import Random
 
@@ -29,9 +27,8 @@ from sros_tool.files import templates_dir
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import PrivateKey, key_pem
 from sros_tool.runtime.events import EventKind
-from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.integration.converse import SILENCE, Node, Party
-from tests.support.children import LATE, PATIENCE, python
+from tests.support.children import LATE, PATIENCE, apart
 from tests.support.harness import Ended, sros
 
 LOST, A, B = "/lost", "/a", "/b"
@@ -320,9 +317,7 @@ class Life:
 
 def play(scenes: Sequence[Scene]) -> list[dict[str, str]]:
     """Play scenes at once: map the enclaves that talk to "heard", "silent" or "refused ..."."""
-    said = json.dumps([asdict(each) for each in scenes])
-    found: list[dict[str, str]] = json.loads(python(__file__, said=said).stdout)
-    return found
+    return apart(partial(_play, scenes))
 
 
 class _Played:
@@ -360,18 +355,7 @@ class _Played:
         return answers
 
 
-def main() -> None:
-    scenes = [
-        Scene(
-            each["title"],
-            tuple(Node(**node) for node in each["nodes"]),
-            tuple(each["heard"]),
-            tuple(each["silent"]),
-        )
-        for each in json.load(sys.stdin)
-    ]
-    if try_isolation().isolated:
-        enter_isolation()
+def _play(scenes: Sequence[Scene]) -> list[dict[str, str]]:
     with tempfile.TemporaryDirectory() as folder:
         played = [
             _Played(number, scene, Path(folder, str(number)))
@@ -386,9 +370,4 @@ def main() -> None:
         if any(each.scene.silent for each in played):
             needed = time.monotonic() - begin
             time.sleep(max(SILENCE - needed, min(needed, BUSY / 4)))
-        answers = [each.end() for each in played]
-    json.dump(answers, sys.stdout)
-
-
-if __name__ == "__main__":
-    main()
+        return [each.end() for each in played]

@@ -1,16 +1,14 @@
 """Change a keystore under Cyclone DDS nodes that run, restart these one by one: who hears whom?
 
-Arguments: a keystore with the enclaves /talker and /listener, perhaps also /server and /client, and
-a domain.  Reads as JSON the steps (stages of `rotate_ca`, "finish", "same-key", or a template and a
-stage of `update_keystore`, as in "production governance") with what is expected after each, and
-prints in the same form what came: "running" (nobody was restarted), "listener" (it alone was),
-"talker", and "both", each true or false.  A client counts as listener, and its server as talker.
+The keystore has the enclaves /talker and /listener, perhaps also /server and /client.  Steps are
+stages of `rotate_ca`, "finish", "same-key", or a template and a stage of `update_keystore`, as in
+"production governance", with what is expected after each: "running" (nobody was restarted),
+"listener" (it alone was), "talker", and "both", each true or false.  A client counts as listener,
+and its server as talker.
 """
 
 from __future__ import annotations
 
-import json
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -23,8 +21,7 @@ from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.rotation import RotationStage
 from sros_tool.keystore.lifecycle.update import UpdateStage, update_keystore
 from sros_tool.keystore.template import load_template
-from sros_tool.runtime.events import EventKind, read_events
-from sros_tool.runtime.netns import enter_isolation, try_isolation
+from sros_tool.runtime.events import Event, EventKind, EventReader
 from tests.integration.converse import SETTLED, SILENCE, Node, Running, start
 from tests.support.children import LATE, PATIENCE, wait_for
 
@@ -38,18 +35,22 @@ class Nodes:
         self._root = root
         self._domain = domain
         self._folder = folder
-        self._processes: dict[str, tuple[Running, Path]] = {}
+        self._processes: dict[str, Running] = {}
+        self._readers: dict[str, EventReader] = {}
+        self._events: dict[str, list[Event]] = {}
 
     def start(self, role: str, number: int) -> str:
         node = Node(role, f"{role} {number}", self._root, f"/{role}", text=f"from {role} {number};")
-        process, report = self._processes[node.name] = start(node, self._domain, self._folder)
+        process, report = start(node, self._domain, self._folder)
+        self._processes[node.name] = process
+        self._readers[node.name], self._events[node.name] = EventReader(report), []
         wait_for(lambda: self._kinds(node.name) & SETTLED or process.poll() is not None, node.name)
         errors = report.with_suffix(".err").read_text()
-        assert EventKind.READY in self._kinds(node.name), (read_events(report), errors)
+        assert EventKind.READY in self._kinds(node.name), (self._events[node.name], errors)
         return node.name
 
     def stop(self, name: str) -> None:
-        process, _ = self._processes.pop(name)
+        process = self._processes.pop(name)
         process.terminate()
         process.wait(PATIENCE)
 
@@ -64,12 +65,16 @@ class Nodes:
         return True
 
     def _kinds(self, name: str) -> set[EventKind]:
-        return {event.kind for event in read_events(self._processes[name][1])}
+        return {event.kind for event in self._look(name)}
 
     def _heard(self, name: str) -> Counter[str]:
-        events = read_events(self._processes[name][1])
-        texts = [event.text for event in events if event.kind is EventKind.HEARD]
+        texts = [event.text for event in self._look(name) if event.kind is EventKind.HEARD]
         return Counter(text.partition("from ")[2].partition(";")[0] for text in texts)
+
+    def _look(self, name: str) -> list[Event]:
+        """All that a node has reported so far."""
+        self._events[name] += self._readers[name].new_events()
+        return self._events[name]
 
 
 def go(root: Path, step: str) -> None:
@@ -87,11 +92,10 @@ def go(root: Path, step: str) -> None:
         assert rotate_ca(root, RotationStage(step), now=now).changes
 
 
-def main() -> None:
-    root, domain = Path(sys.argv[1]), int(sys.argv[2])
-    steps: dict[str, dict[str, bool]] = json.load(sys.stdin)
-    if try_isolation().isolated:
-        enter_isolation()
+def play(
+    root: Path, domain: int, steps: Mapping[str, Mapping[str, bool]]
+) -> dict[str, dict[str, bool]]:
+    """Take the steps, and tell who heard whom after each, in the form of ``steps``."""
     pairs = [("listener", "talker")]
     pairs += [("client", "server")] if "/client" in list_enclaves(root) else []
     answers = {}
@@ -121,12 +125,8 @@ def main() -> None:
             old = new
         for name in old.values():
             nodes.stop(name)
-    json.dump(answers, sys.stdout)
+    return answers
 
 
 def roles(pairs: Sequence[tuple[str, str]], side: int) -> list[str]:
     return [pair[side] for pair in pairs]
-
-
-if __name__ == "__main__":
-    main()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,8 +16,9 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.template import load_template
+from tests.integration.restarts import play
 from tests.integration.test_life_on_dds import HEARD, SILENT, Question, ask_fast, compare, probe
-from tests.support.children import python
+from tests.support.children import apart
 from tests.support.long_form import ONLY_LONG
 
 __all__ = ["probe"]
@@ -25,7 +26,6 @@ __all__ = ["probe"]
 pytestmark = pytest.mark.dds
 
 DOMAIN = 141
-HERE = Path(__file__).parent
 ALL = {"running": True, "listener": True, "talker": True, "both": True}
 TOGETHER = {"running": True, "listener": False, "talker": False, "both": True}
 
@@ -44,8 +44,7 @@ def make(root: Path, template: str, *, revoked: bool = False) -> None:
 
 def restarts(root: Path, steps: dict[str, dict[str, bool]]) -> None:
     """Assert who hears whom after each step; who is to be heard is waited for."""
-    done = python(HERE / "restarts.py", root, DOMAIN, said=json.dumps(steps))
-    assert json.loads(done.stdout) == steps
+    assert apart(partial(play, root, DOMAIN, steps)) == steps
 
 
 @pytest.mark.parametrize(
