@@ -30,7 +30,7 @@ from sros_tool.cli.common import (
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.terminal import echo
 from sros_tool.values import FileChange, file_change
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
     from sros_tool.keystore.template import Template
@@ -49,8 +49,9 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     "routers",
     multiple=True,
     metavar="NAME[=HOST:PORT]",
-    help="Enclave of the router; usually /router. With an endpoint: another router, for the "
-    "enclaves beside it; /r1/router=r1.local:7447 is for /r1/*. NAME= drops it.",
+    help="NAME: the enclave of the router, /router by default. NAME=HOST:PORT: add a router for "
+    "another robot or host; /r1/router=r1.local:7447 is the router of the enclaves /r1/*. NAME=: "
+    "remove that router. May be repeated.",
 )
 @click.option(
     "--endpoint",
@@ -80,9 +81,18 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     "host.",
 )
 @click.option("--domain", metavar="IDS", help="ROS domains; usually those of the keystore.")
-@click.option("--off", is_flag=True, help="Remove the files, and keep none in step any more.")
 @click.option(
-    "--check", "only_check", is_flag=True, help="Write nothing; say what is missing or out of date."
+    "--off",
+    is_flag=True,
+    help="Remove the Zenoh files, and the network from the keystore's settings, so that no verb "
+    "writes such files any more.",
+)
+@click.option(
+    "--check",
+    "only_check",
+    is_flag=True,
+    help="Write nothing; say which files are missing or out of date, and which enclaves have none, "
+    "and why.",
 )
 @click.option(
     "--from",
@@ -128,9 +138,10 @@ def zenoh(
       $ sros zenoh keystore --check
       $ sros zenoh --from session.json5 -o policy.xml
 
-    Exit status: 0 written, or up to date; with --check 1 if a file is missing or out of date; with
-    --from 1 if the configuration lets anybody in or does not work; 2 if it could not be done, such
-    as for rights that Zenoh cannot enforce.
+    Exit status: 0 written, or up to date; with --check 1 if a file is missing or out of date, or an
+    enclave has none, such as one without permissions; with --from 1 if the configuration lets
+    anybody in or does not work; 2 if it could not be done, such as for rights that Zenoh cannot
+    enforce.
     """
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
     from sros_tool.keystore.lifecycle.update import set_zenoh
@@ -183,10 +194,17 @@ def zenoh(
             action = actions.get(path, "replace")
             word = f"{_FOUND[action]}:" if only_check else _DONE[action]
             echo(f"{word} {root / path}")
+    left_out = result.zenoh.left_out
+    if only_check and not as_json:
+        for name, why in left_out.items():
+            echo(f"no file: enclave {name}: {why}")
+        notes = tuple(note for note in result.notes if note.id != "zenoh.left-out")
+        result = replace(result, notes=notes)
     if not result.changes:
-        echo("the files of Zenoh are up to date", err=True)
+        without = f", and {counted(len(left_out), 'enclave')} without a file" if left_out else ""
+        echo(f"the files of Zenoh are up to date{without}", err=True)
     print_follow_up(result, restart=not (dry_run or only_check))
-    if only_check and result.changes:
+    if only_check and (result.changes or left_out):
         raise SystemExit(1)
 
 
@@ -409,6 +427,8 @@ def _left_out(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
         )
     yield Note(
         "zenoh.node-names",
-        "the rules name no nodes: each profile has the last part of its enclave's name, and "
-        "absolute names",
+        "rules of Zenoh name no nodes: in the policy, each node has the last part of its enclave's "
+        "name, and all names of topics and services are absolute. Write the real namespaces and "
+        "names of the nodes into it: on Zenoh, others do not see a node that the policy does not "
+        "name.",
     )

@@ -37,12 +37,14 @@ class KeptZenoh:
     """The Zenoh configurations after a change of a keystore.
 
     ``files`` maps the enclaves to their files in the keystore, ``written`` the paths of staged
-    files to their content, ``nodes`` the enclaves to the nodes that they may announce.  ``restart``
-    are the enclaves whose processes have to be restarted, because their configurations changed.
+    files to their content, ``nodes`` the enclaves to the nodes that they may announce.
+    ``left_out`` maps enclaves that get no file to the reason, a clause.  ``restart`` are the
+    enclaves whose processes have to be restarted, because their configurations changed.
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
     nodes: Mapping[str, AnnouncedNodes] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
     written: Mapping[str, bytes] = field(default_factory=dict)
     restart: tuple[str, ...] = ()
     notes: tuple[Note, ...] = ()

@@ -434,10 +434,12 @@ def zenoh_documents(
         files = _router_files(network, of_network, rules, revoked)
     except TooManyExpressions:
         raise PolicyError(
-            "what enclaves of two routers may send each other cannot be said to Zenoh",
-            "A router allows another one what the enclaves at both ends may do, and with the "
-            "wildcards of these that takes too many key expressions.",
-            "Use fewer wildcards, or name what may pass with `sros zenoh --cross`.",
+            "the rules of a Zenoh router for another router would have too many key expressions",
+            "Between routers passes what an enclave on one side may send and an enclave on the "
+            "other side may get. The wildcards in the rights of these enclaves combine in too many "
+            "ways.",
+            "Use fewer wildcards in the policies, or list what may pass between routers: `sros "
+            "zenoh --cross NAME`.",
         ) from None
     direct = network.mode is Mode.PEER
     listen = (_ANY_PORT_HERE,) if direct else ()

@@ -94,6 +94,8 @@ def make_folder(folder: Path) -> None:
     (folder / "partial/enclaves/a/permissions.p7s").unlink()
     shutil.copytree(folder / "zenoh", folder / "closed", symlinks=True)
     sros("zenoh", "closed", cwd=folder).ok()
+    shutil.copytree(folder / "zenoh", folder / "lacking", symlinks=True)
+    (folder / "lacking/enclaves/b/permissions.p7s").unlink()
     (folder / "closed/enclaves/b/session.json5").unlink()
     (folder / "open.json5").write_text("{mode: 'router'}")
     repository = folder / "git"
@@ -205,6 +207,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("zenoh --endpoint a:7447 --router /r1/router=r1.local:7447 --cross /x"),
         Case("zenoh --check", 1),
         Case("zenoh --check", before=("zenoh zenoh",)),
+        Case("lacking --check", 1),
         Case("--from closed/enclaves/router/router.json5 -o found.xml"),
         Case("--from closed/enclaves/a/session.json5 -o found.xml --dry-run"),
         Case("--from self_limiting.json5", 1),

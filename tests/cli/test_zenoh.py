@@ -201,6 +201,22 @@ def test_a_revoked_certificate_that_zenoh_still_accepts_is_noted(folder: Path) -
     assert "a revoked certificate of /a has not expired" in notes
 
 
+def test_an_enclave_without_a_file_is_told_and_not_up_to_date(folder: Path) -> None:
+    sros("zenoh", "ks", cwd=folder).ok()
+    (folder / "ks/enclaves/b/permissions.p7s").unlink()
+    written = sros("zenoh", "ks", cwd=folder).ok()
+    assert "note [zenoh.left-out]: /b gets no configuration" in written.err
+    checked = sros("zenoh", "ks", "--check", cwd=folder)
+    assert (checked.status, checked.out) == (1, "no file: enclave /b: it has no permissions\n")
+    assert checked.err == "the files of Zenoh are up to date, and 1 enclave without a file\n"
+    told = sros("zenoh", "ks", "--check", "--json", cwd=folder)
+    assert (told.status, json.loads(told.out)["left_out"]) == (
+        1, [{"enclave": "/b", "why": "it has no permissions"}],
+    )  # fmt: skip
+    sros("revoke", "ks", "/b", cwd=folder).ok()
+    sros("zenoh", "ks", "--check", cwd=folder).ok()
+
+
 def test_the_router_is_moved_before_its_enclave_is_revoked(folder: Path) -> None:
     sros("zenoh", "ks", cwd=folder).ok()
     refused = sros("revoke", "ks", "/router", cwd=folder)

@@ -71,6 +71,7 @@ def keep_zenoh(
     return KeptZenoh(
         {name: path for path, name in wanted.enclaves.items()},
         wanted.nodes,
+        {name: why.rstrip(".") for name, why in wanted.left_out.items()},
         written,
         tuple(sorted({each.enclave for each in drifts if each.kind is not Drift.UNSIGNED})),
         (

@@ -213,6 +213,15 @@ class ZenohFileState(NamedTuple):
     """Whether the file already had this content and a valid signature."""
 
 
+class EnclaveWithoutZenoh(NamedTuple):
+    """An enclave that has no configuration of Zenoh, and no rights there."""
+
+    enclave: str
+    """The enclave."""
+    why: str
+    """Why it has none, as a clause."""
+
+
 class KeystoreZenoh(NamedTuple):
     """The configurations of Zenoh of a keystore's enclaves."""
 
@@ -222,6 +231,8 @@ class KeystoreZenoh(NamedTuple):
     """The network, as the keystore's settings have it afterwards; null after ``--off``."""
     files: Sequence[ZenohFileState]
     """The file of the router, and a file for each other enclave with rights."""
+    left_out: Sequence[EnclaveWithoutZenoh]
+    """The enclaves that have no file; with ``--check`` they make the exit status 1."""
     created: Sequence[str]
     """Enclaves that were created: the router's enclave, if it did not exist."""
     restart: Sequence[str]
@@ -250,7 +261,8 @@ def shown_zenoh(
         ZenohFileState(name, result.root / path, path not in changed)
         for name, path in result.zenoh.files.items()
     ]
-    return shown(result, KeystoreZenoh, network=settings, files=files)
+    left_out = [EnclaveWithoutZenoh(name, why) for name, why in result.zenoh.left_out.items()]
+    return shown(result, KeystoreZenoh, network=settings, files=files, left_out=left_out)
 
 
 # ── renew, revoke, update_keystore ──────────────────────────────────────────────────────────
