@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from itertools import permutations
 from typing import Any
 
 import pytest
@@ -72,6 +74,20 @@ def test_decision(
     decision = found.decide(TALKER, Flow.INGRESS, Message.PUT, key)
     assert (decision.allowed, decision.rules) == (allowed, rules)
     assert decision.why
+
+
+def test_the_order_in_which_a_file_lists_its_rules_decides_nothing() -> None:
+    """Policies name rules by their ids, and DENY wins wherever it stands."""
+
+    def allowed(names: Sequence[str]) -> tuple[bool, ...]:
+        rules = {name: RULES[name] for name in names}
+        found = enforcement(rules, {"t": NAMED}, {"t": "yes no"})
+        return tuple(
+            found.decide(TALKER, Flow.EGRESS, Message.PUT, key).allowed
+            for key in ("a/b", "a/c", "b")
+        )
+
+    assert {allowed(names) for names in permutations(RULES)} == {(False, True, False)}
 
 
 def test_no_common_name_matches_no_named_subject() -> None:
