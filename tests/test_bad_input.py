@@ -193,6 +193,7 @@ POLICIES: dict[str, tuple[str, str]] = {
     ),
     "loose text": (GOOD.replace("<topics", "chatter<topics"), "loose text"),
     "loose text at the end": (GOOD.replace("</profile>", "x</profile>"), "loose text"),
+    "slash": (_groups('<topics publish="ALLOW"><topic>/</topic></topics>'), "ends with '/'"),
     "no rights": (_groups("<topics><topic>x</topic></topics>"), "allows nor denies"),
     "no names": (_groups('<topics publish="ALLOW"></topics>'), "no topic"),
     "empty name": (_topic(""), "empty"),

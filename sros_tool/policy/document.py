@@ -617,8 +617,6 @@ class _Reader:
         problem = expression_problem(sampled)
         if not problem and name.startswith("~") and not node:
             problem = "A name with ~ is private to a node, and the profile has an empty node name."
-        if not problem and name == "/":
-            problem = "It is a namespace, not a name."
         if not problem and any(isinstance(child.tag, str) for child in element):
             problem = "It contains other elements."
         if problem:
