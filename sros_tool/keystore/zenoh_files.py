@@ -58,6 +58,7 @@ from sros_tool.translate_zenoh.rights import (
     domains_of,
     remote_of,
     remote_rights,
+    stated_names,
 )
 from sros_tool.validity import iso
 from sros_tool.zenoh.access import (
@@ -243,6 +244,16 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
     if not any(remote.rules == mirrored for remote in control.remotes) or not all(
         is_within(remote, own) for remote in control.remotes
     ):
+        names = stated_names(own.rules)
+        if any(
+            stated_names(rule.mirrored() for rule in remote.rules) == names
+            for remote in control.remotes
+        ):
+            # Refused all the same: the earlier rules may let others do more.
+            return (
+                f"it has the topics and services of {PERMISSIONS_FILE}, and not the rules that "
+                "this version of sros writes for them: an earlier version wrote it"
+            )
         return f"it does not state the rights of {PERMISSIONS_FILE}"
     return ""
 

@@ -16,7 +16,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
 from sros_tool.policy.rights import NodeName
 from sros_tool.translate_zenoh.rights import StatedRight, remote_of
-from sros_tool.zenoh.access import AccessRule, Flow, Message, RemoteRights
+from sros_tool.zenoh.access import AccessRule, Flow, Message, RemoteRights, in_order
 from tests.support.harness import policy_text, publish, snapshot, sros
 
 TOKEN = (Message.LIVELINESS_TOKEN,)
@@ -246,6 +246,42 @@ def test_a_file_of_before_a_revocation_is_refused_where_the_list_is_newer(folder
     assert "it is from before the last revocation in crl.pem" in checked.out
     refused = sros("env", "robot", "/a", "--rmw", "rmw_zenoh_cpp", cwd=folder)
     assert (refused.status, "before the last revocation" in refused.err) == (2, True)
+
+
+def test_a_file_of_an_earlier_version_is_refused_with_what_to_do(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def as_before(*rights: Any) -> RemoteRights:
+        """Return rights whose graph tokens are bound to the enclave alone."""
+        remote = remote_of(*rights)
+        others = [
+            rule for rule in remote.rules if (rule.flow, rule.messages) != (Flow.INGRESS, TOKEN)
+        ]
+        key = f"@ros2_lv/0/*/*/*/*/%{remote.common_name[1:]}/**"
+        every = AccessRule(Flow.INGRESS, TOKEN, (key,))
+        return replace(remote, rules=in_order([*others, every]))
+
+    with monkeypatch.context() as earlier:
+        earlier.setattr(zenoh_files, "remote_of", as_before)
+        earlier.setattr(zenoh_files, "_prove", lambda *_: None)
+        sros("zenoh", "ks", cwd=folder).ok()
+        sros("distribute_key", "ks", "/a", "robot", cwd=folder).ok()
+        sros("verify", "robot", cwd=folder).ok()
+    checked = sros("verify", "robot", cwd=folder)
+    assert (checked.status, "zenoh.out-of-date" in checked.out) == (1, True)
+    assert "an earlier version wrote it" in checked.out
+    refused = sros("env", "robot", "/a", "--rmw", "rmw_zenoh_cpp", cwd=folder)
+    assert (refused.status, "an earlier version wrote it" in refused.err) == (2, True)
+    assert "`sros zenoh KEYSTORE` where the CA keys are, and export the enclave" in refused.err
+    # Other permissions are told as that.
+    (folder / "wider.xml").write_text(policy_text({"/a": publish("/x", "/y")}))
+    sros("create_permission", "ks", "/a", "wider.xml", cwd=folder).ok()
+    sros("distribute_key", "ks", "/a", "robot2", cwd=folder).ok()
+    for name in ("session.json5", "session.p7s"):
+        shutil.copy(folder / "robot/enclaves/a" / name, folder / "robot2/enclaves/a" / name)
+    assert (
+        "does not state the rights of permissions.p7s" in sros("verify", "robot2", cwd=folder).out
+    )
 
 
 def test_an_export_has_the_file_of_its_enclave_alone(folder: Path) -> None:
