@@ -294,10 +294,13 @@ class ZenohEvaluator:
         """Return the answer for one enclave; ``reach`` says whether to look at all others.
 
         A ``brief`` answer says neither which files are unsigned, nor asks peers: for these the
-        router's file has the same rights.
+        router's file has the same rights.  If the router drops the message, it reads no more of the
+        enclave than how its file begins.
         """
         if enclave not in self.names:
             raise no_such_enclave(self.keystore, enclave, self.names)
+        if brief and (dropped := self._dropped_by_router(enclave, question)):
+            return dropped
         own = self._file(enclave, self._file_of(enclave))
         answer = ZenohAnswer(
             enclave,
@@ -323,10 +326,7 @@ class ZenohEvaluator:
         wanted = self._rights(enclave, question)
         checks = self._deciding(own.process, router.process, wanted, brief=brief)
         answer = replace(answer, checks=checks)
-        assert answer.deciding
-        by = answer.deciding.enforcer
-        why = answer.deciding.decision.why
-        text = f"{answer.deciding}: {why}, in {self._file_of(by)} of {by}"
+        text = self._why(answer.deciding)
         if answer.dropped:
             return replace(answer, outcome=_Outcome.DROPPED, text=text)
         reached = tuple(self._reached(own, wanted)) if reach else ()
@@ -337,6 +337,35 @@ class ZenohEvaluator:
             reached=reached,
             wildcards=tuple(self._wildcards(own.process, wanted, checks, reached)),
         )
+
+    def _dropped_by_router(self, enclave: str, question: Question) -> ZenohAnswer | None:
+        """Return the answer if the router drops the message itself, whatever the enclave's files.
+
+        Return None if it does not, or if the enclave's file does not begin as sros writes it.
+        """
+        router = self._router_of(enclave)
+        path = enclave_path(self.root, enclave) / SESSION_FILE
+        if router.process is None or enclave in self.routers or not path.exists():
+            return None
+        try:
+            begun = self._rendered.beginning(self.keystore.read(path, "Zenoh configuration"))
+        except SrosError:
+            return None
+        if begun is None or not _meet(tuple(map(ZenohEndpoint, begun.connect)), router.endpoints):
+            return None
+        session = _unrestricted(enclave, begun.mode)
+        checks = tuple(self._decided(session, router.process, self._rights(enclave, question)))
+        dropping = _first((check for check in checks if not check.allowed), enclave)
+        if dropping is None or dropping.message not in _DATA:
+            return None
+        outcome, text = _Outcome.DROPPED, self._why(dropping)
+        return ZenohAnswer(enclave, question, begun.mode, outcome, text, checks)
+
+    def _why(self, check: Check | None) -> str:
+        """Return the check that decides, its reason, and the file that has it, as a clause."""
+        assert check
+        file = self._file_of(check.enforcer)
+        return f"{check}: {check.decision.why}, in {file} of {check.enforcer}"
 
     def out_of_date(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
         """Return the files that decide an answer and are not what the permissions ask for.

@@ -434,7 +434,7 @@ def zenoh_documents(
                 "Give the node an enclave of its own.",
             )
         names.remove(router)
-    reader = _RightsReader(keystore, authority, of_network, network, now, change)
+    reader = _RightsReader(keystore, authority, of_network, network, now, change, only)
     read: dict[str, _RulesOfEnclave | str] = {}
     for _, each in map_slices(names, reader.read):
         read |= each
@@ -456,17 +456,19 @@ def zenoh_documents(
     listen = (_ANY_PORT_HERE,) if direct else ()
     between = RightsBetween(each.rights for each in rules.values() if each.rights and direct)
 
+    def session(name: str) -> bytes:
+        router = rules[name].router
+        assert router
+        return render_configuration(
+            network.mode,
+            listen,
+            _tls(network.router_of(name).endpoints),
+            _peers(name, router, between) if direct else (router,),
+            revoked if direct else "",
+        )
+
     def sessions(some: Sequence[str]) -> dict[str, bytes]:
-        return {
-            _session_path(name): render_configuration(
-                network.mode,
-                listen,
-                _tls(network.router_of(name).endpoints),
-                _peers(name, rules[name].router, between) if direct else (rules[name].router,),
-                revoked if direct else "",
-            )
-            for name in some
-        }
+        return {_session_path(name): session(name) for name in some}
 
     size = 0
     chosen = [name for name in rules if not only or name in only]
@@ -586,12 +588,13 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
 class _RulesOfEnclave(NamedTuple):
     """What other processes allow to an enclave, and what the enclave allows to the router.
 
-    ``rights`` are the former as a value, if they are needed for more than one file; ``nodes`` are
-    the nodes that they let it announce.
+    The latter is None if the enclave's own file is not asked for.  ``rights`` are the former as a
+    value, if they are needed for more than one file; ``nodes`` are the nodes that they let it
+    announce.
     """
 
     remote: RenderedRights
-    router: RenderedRights
+    router: RenderedRights | None
     nodes: AnnouncedNodes
     rights: RemoteRights | None
 
@@ -611,6 +614,7 @@ class _RightsReader:
         network: ZenohNetwork,
         now: datetime | None,
         change: ZenohChange,
+        only: Collection[str],
     ) -> None:
         self._keystore = keystore
         self._authority = authority
@@ -618,6 +622,7 @@ class _RightsReader:
         self._network = network
         self._now = now
         self._change = change
+        self._only = only
         self.ledger = keystore.ledger
         self._recorded = RecordedRights(keystore, self.ledger)
         self._revoked = {one.serial for each in keystore.revocation_lists for one in each.revoked}
@@ -657,11 +662,12 @@ class _RightsReader:
             for name, domains in joined.items()
         }
         remotes = {name: self._remote(name, each) for name, each in stated.items()}
-        for name, remote in remotes.items():
-            _prove(name, remote, stated[name])
+        asked = [name for name in remotes if not self._only or name in self._only]
+        for name in asked:
+            _prove(name, remotes[name], stated[name])
         routers = {
-            name: as_router(self._network.router_of(name).name, rights)
-            for name, rights in remotes.items()
+            name: render_rights(as_router(self._network.router_of(name).name, remotes[name]))
+            for name in asked
         }
         rendered = {name: render_rights(each) for name, each in remotes.items()}
         return {
@@ -669,7 +675,7 @@ class _RightsReader:
             if name in left_out
             else _RulesOfEnclave(
                 rendered[name],
-                render_rights(routers[name]),
+                routers.get(name),
                 announced_nodes(remotes[name].rules, name),
                 remotes[name] if self._network.mode is Mode.PEER or self._network.routers else None,
             )

@@ -369,6 +369,14 @@ class RenderedReader:
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):
             return None
 
+    def beginning(self, data: bytes) -> Configuration | None:
+        """Return a configuration without the rules, which are not read; None if others wrote it."""
+        try:
+            text, mark, _ = data.decode().partition(_CONTROL)
+            return self._beginning(text) if mark else None
+        except (ValueError, KeyError, IndexError, TypeError, RecursionError):
+            return None
+
     def _beginning(self, text: str) -> Configuration:
         """Return the mode, and where a process listens and connects; raise if others wrote it."""
         if text not in self._beginnings:

@@ -65,11 +65,12 @@ class KeyExpressions:
         self.all = frozenset(expressions)
 
     @cached_property
-    def _by_begin(self) -> Mapping[str, list[str]]:
-        found: dict[str, list[str]] = {}
+    def _by_begin(self) -> Mapping[str, Mapping[str, list[str]]]:
+        """The expressions with wildcards by what they begin with, and there by their form."""
+        found: dict[str, dict[str, list[str]]] = {}
         for each in self.all:
             if (begin := _fixed_begin(each)) != each:
-                found.setdefault(begin, []).append(each)
+                found.setdefault(begin, {}).setdefault(_form(each), []).append(each)
         return found
 
     @cached_property
@@ -80,32 +81,50 @@ class KeyExpressions:
         """Return whether one of the expressions includes all of ``narrow``."""
         if narrow in self.all:
             return True
-        return any(_includes(wide, narrow) for wide in self._wider(narrow))
+        return any(
+            _includes(wide, narrow)
+            for by_form in self._beginning_as(narrow)
+            for some in by_form.values()
+            for wide in some
+        )
 
     def needed(self) -> list[str]:
         """Return the expressions that no other one includes, sorted; all if they are too alike."""
-        # With the same wildcards at the same places, none includes another.
-        forms = {each: _LITERAL.sub("", each) for each in self.all}
+        forms = {each: _form(each) for each in self.all}
         if len(set(forms.values())) == 1:
             return sorted(self.all)
-        compared = sum(len(self._wider(each)) for each in self.all)
+        wider = {each: self._beginning_as(each) for each in self.all}
+        compared = sum(len(some) for of in wider.values() for each in of for some in each.values())
         if compared > _MOST_COMPARED:
             return sorted(self.all)
         return sorted(
             each
-            for each, form in forms.items()
-            if not any(form != forms[wide] and _includes(wide, each) for wide in self._wider(each))
+            for each, own in forms.items()
+            if not any(
+                _includes(wide, each)
+                for by_form in wider[each]
+                for form, some in by_form.items()
+                # With the same wildcards at the same places, none includes another.
+                if form != own
+                for wide in some
+            )
         )
 
-    def _wider(self, narrow: str) -> list[str]:
-        """Return the expressions with wildcards that begin as ``narrow`` does."""
+    def _beginning_as(self, narrow: str) -> list[Mapping[str, list[str]]]:
+        """Return the expressions with wildcards that begin as ``narrow`` does, by their form."""
         by_begin, found = self._by_begin, []
         for size in self._sizes:
             if size > len(narrow):
                 break
             if some := by_begin.get(narrow[:size]):
-                found += some
+                found.append(some)
         return found
+
+
+@lru_cache(maxsize=_MANY)
+def _form(expression: str) -> str:
+    """Return the wildcards of an expression and their places."""
+    return _LITERAL.sub("", expression)
 
 
 def _without_wildcards(expression: str) -> str:

@@ -148,6 +148,32 @@ def test_who_may(made: Path, mode: str) -> None:
     assert explain(made / mode, "--who", "call", "/nope", "--vendor", "zenoh").status == 1
 
 
+def test_who_may_says_what_each_enclave_is_told(made: Path) -> None:
+    """What the router drops is decided without the enclave's own files, with the same answer."""
+    evaluator = ZenohEvaluator(Keystore(made / "client"), at=now(), domain=0)
+    outcomes = set()
+    for enclave, words in product(evaluator.names, ("publish /chatter", "call /add", "join")):
+        question = ask(*words.split())
+        brief = evaluator.answer(enclave, question, reach=False, brief=True)
+        whole = evaluator.answer(enclave, question)
+        assert brief.in_brief == whole.in_brief, (enclave, words)
+        outcomes.add(whole.outcome)
+    assert outcomes == {"allowed", "dropped"}
+
+
+def test_who_may_reads_the_identity_of_those_that_the_router_lets(keystore: Path) -> None:
+    (keystore / "enclaves/listener/cert.pem").write_text("no certificate")
+    outcome = {}
+    for right in ("subscribe", "publish"):
+        asked = zenoh(keystore, "--who", right, "/chatter")
+        outcome[right] = {e["enclave"]: e["outcome"] for e in asked["enclaves"]}["/listener"]
+    assert outcome == {"subscribe": "refused", "publish": "dropped"}
+    missing = keystore / "enclaves/wide/session.json5"
+    missing.unlink()
+    asked = zenoh(keystore, "--who", "publish", "/chatter")
+    assert {e["enclave"]: e["outcome"] for e in asked["enclaves"]}["/wide"] == "refused"
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_reach_follows_the_rules_of_zenoh(made: Path, tmp_path: Path, mode: str) -> None:
     asked = ("--reach", "/client", "--vendor", "zenoh", "--json")
