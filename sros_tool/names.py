@@ -68,7 +68,7 @@ Sources: rcl_interfaces, lifecycle_msgs, composition_interfaces and type_descrip
 
 DISTRIBUTIONS = (
     "ardent", "bouncy", "crystal", "dashing", "eloquent", "foxy", "galactic", "humble", "iron",
-    "jazzy", "kilted", "rolling",
+    "jazzy", "kilted", "lyrical", "rolling",
 )  # fmt: skip
 """The distributions of ROS 2, in the order of their release; rolling is always the latest."""
 

@@ -26,7 +26,7 @@ from sros_tool.checks.kind import (
     by_cause,
     some_names,
 )
-from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import (
     MAX_SIGNED_BYTES,
@@ -572,9 +572,9 @@ DENY_BLOCKS = FindingKind(
     "portable.deny-blocks-topic",
     WARNING,
     "a topic that is denied in one direction and allowed in the other",
-    "Cyclone DDS checks whether the topic may be created at all, and a denial of either direction "
-    "forbids it; Fast DDS allows it.",
-    "Cyclone DDS 0.10.2 (access_control.c), Fast DDS 2.9.1 and 2.14.5; measured.",
+    "Cyclone DDS 0.10 checks whether the topic may be created at all, and a denial of either "
+    "direction forbids it; Fast DDS and Cyclone DDS 11 allow it.",
+    "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c), Fast DDS 2.9.1 and 2.14.5; measured.",
     "Remove the denial: everything that no rule allows is denied anyway.",
     vendors=(Vendor.CYCLONE,),
 )
@@ -592,10 +592,11 @@ ENCLAVE_NAMES = FindingKind(
     "an enclave whose name consists of parts of another enclave's name",
     "Cyclone DDS checks only that every part of a certificate's subject occurs in the grant's "
     "subject. So /robot can join with the (public) permissions of /robot/admin.",
-    "Cyclone DDS 0.10.2 (access_control.c); reproduced: readers received data of such an enclave.",
+    "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c); reproduced: readers received data of such "
+    "an enclave.",
     "Choose names that do not consist of parts of another name, such as /robot_admin, or unique "
     "subjects (template production).",
-    vendors=(Vendor.CYCLONE,),
+    vendors=CYCLONE_DDS,
 )
 SEVERAL_PROFILES = FindingKind(
     "policy.several-profiles",

@@ -49,7 +49,9 @@ if TYPE_CHECKING:
 @click.option(
     "--vendor",
     type=click.Choice([vendor.value for vendor in Vendor]),
-    help="Decide as this DDS vendor does. [default: the vendor of this machine's RMW]",
+    metavar="VENDOR",
+    help=f"Decide as this DDS vendor does: {', '.join(vendor.value for vendor in Vendor)}. "
+    "[default: the vendor of this machine's RMW]",
 )
 @click.option(
     "--patch",

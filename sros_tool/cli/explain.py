@@ -59,6 +59,7 @@ _KINDS = {
 _ZENOH = "zenoh"
 """The word of --vendor for Zenoh, which is not DDS."""
 _ZENOH_TITLE = "Zenoh"
+_VENDORS = (*(vendor.value for vendor in Vendor), _ZENOH)
 
 
 # ── options ────────────────────────────────────────────────────────────────────────────────
@@ -162,9 +163,10 @@ def _refuse_ignored(mode: str) -> None:
 @fleet_option("The robots that placeholders of --policy stand for. [default: the keystore's]")
 @click.option(
     "--vendor",
-    type=click.Choice([*(each.value for each in Vendor), _ZENOH]),
+    type=click.Choice(_VENDORS),
+    metavar="VENDOR",
     help="Decide as this DDS vendor does; zenoh: as Zenoh does with the files of `sros "
-    "zenoh`. [default: the vendor of this machine's RMW]",
+    f"zenoh`. One of: {', '.join(_VENDORS)}. [default: the vendor of this machine's RMW]",
 )
 @click.option("--all-vendors", is_flag=True, help="Compare the decisions of all vendors.")
 @click.option(

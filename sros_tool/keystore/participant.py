@@ -221,6 +221,7 @@ def _expiries(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetim
 
 _ONLY_PEERS_NOTICE = {
     (Vendor.CYCLONE, Fault.KEY_MISMATCH),
+    (Vendor.CYCLONE_11, Fault.KEY_MISMATCH),
     (Vendor.FAST, Fault.KEY_ALGORITHM),
     (Vendor.FAST_2_9, Fault.KEY_ALGORITHM),
     (Vendor.FAST_2_9, Fault.DOCUMENT_SIZE),

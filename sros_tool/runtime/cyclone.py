@@ -11,6 +11,7 @@ that sros calls are declared here as in ``dds/dds.h`` of Cyclone DDS 0.10 and 11
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import functools
 import os
 import re
@@ -367,10 +368,17 @@ class CycloneLog:
 
     def __init__(self) -> None:
         """Redirect the stream.  libddsc keeps the stream that it sees at its first participant."""
-        self._file = os.memfd_create("cyclonedds")
+        self._file = _memory_file()
         libc = ctypes.CDLL(None)
         libc.fdopen.restype = ctypes.c_void_p
         ctypes.c_void_p.in_dll(libc, "stderr").value = libc.fdopen(self._file, b"a")
+        os.register_at_fork(after_in_child=self._leave_parent)
+
+    def _leave_parent(self) -> None:
+        """Write into a file of this process, which is a copy of the one that made the log."""
+        file = _memory_file()
+        os.dup2(file, self._file)
+        os.close(file)
 
     def clear(self) -> None:
         """Forget the messages."""
@@ -381,6 +389,13 @@ class CycloneLog:
         written = os.pread(self._file, os.fstat(self._file).st_size, 0).decode("utf-8", "replace")
         messages = (message.rstrip() for message in _LOG_HEADER.split(written))
         return tuple(filter(None, messages))[-_KEPT_LOG_MESSAGES:]
+
+
+def _memory_file() -> int:
+    """Return a file in memory to which every write is appended."""
+    file = os.memfd_create("cyclonedds")
+    fcntl.fcntl(file, fcntl.F_SETFL, os.O_APPEND)
+    return file
 
 
 def _describe_return(library: CycloneLibrary, code: int) -> str:

@@ -151,16 +151,27 @@ _MOST_BYTES = 16 * 1024 * 1024
 def vendor_here(environment: Mapping[str, str]) -> tuple[Vendor, str]:
     """Return the DDS vendor of this machine, and the reason as a short text.
 
-    It is the vendor of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS.  The text says
+    It is the vendor of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS; the release is
+    that of $ROS_DISTRO.  The text says
     so if that RMW was built without DDS Security.
     """
     named = environment.get(RMW, "")
-    if vendor := vendor_of(named):
+    if vendor := _shipped(named, environment):
         return vendor, f"{RMW} is {named}{_without_security(named, environment)}"
     for rmw in rmw_implementations(environment):
-        if vendor := vendor_of(rmw):
+        if vendor := _shipped(rmw, environment):
             return vendor, f"{rmw} is installed here{_without_security(rmw, environment)}"
     return Vendor.FAST, "the default of ROS 2 Jazzy"
+
+
+_SHIPPED = {("lyrical", Vendor.CYCLONE): Vendor.CYCLONE_11}
+"""The release of a vendor in a ROS 2 distribution that has not the one of Jazzy (ros2.repos)."""
+
+
+def _shipped(rmw: str, environment: Mapping[str, str]) -> Vendor | None:
+    """Return the vendor of an RMW in the release that the sourced distribution has, or None."""
+    vendor = vendor_of(rmw)
+    return _SHIPPED.get((environment.get("ROS_DISTRO", ""), vendor), vendor) if vendor else None
 
 
 def _without_security(rmw: str, environment: Mapping[str, str]) -> str:

@@ -107,7 +107,7 @@ ROWS = (
         ),
         "enclave.refused",
         "enclave.refused",
-        "Cyclone DDS 0.10.2 refuses it (governance.p7s: ",
+        "Cyclone DDS 0.10 and Cyclone DDS 11.0 refuse it (governance.p7s: ",
     ),
     Row(
         "an open domain",
@@ -126,14 +126,14 @@ ROWS = (
         code_signing,
         "portable.ca-purpose",
         "portable.refused",
-        "Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse it (governance.p7s: ",
+        "Fast DDS 2.9.1 and Cyclone DDS 0.10 refuse it (governance.p7s: ",
     ),
     Row(
         "an identity CA of P-384",
         large_key,
         "portable.key-algorithm",
         "portable.refused",
-        "Cyclone DDS 0.10.2 refuses it (identity_ca.cert.pem: it has a key of ",
+        "Cyclone DDS 0.10 and Cyclone DDS 11.0 refuse it (identity_ca.cert.pem: it has a key of ",
     ),
     Row(
         "an identity CA without basicConstraints",
@@ -148,7 +148,7 @@ ROWS = (
         without_constraints("permissions"),
         "portable.refused",
         "portable.refused",
-        "Fast DDS 2.9.1 and Cyclone DDS 0.10.2 accept it",
+        "Fast DDS 2.9.1, Cyclone DDS 0.10 and Cyclone DDS 11.0 accept it",
         Fault.CA_CHAIN.remedy,
     ),
     Row(
@@ -230,8 +230,8 @@ def test_what_some_vendors_accept_is_no_error(bench: Bench) -> None:
     bench.export()
     (found,) = (each for each in worst(bench) if each.file.endswith(".p7s"))
     assert (found.id, found.severity) == ("portable.refused", WARNING)
-    assert "Fast DDS 2.14 refuses it (governance.p7s: " in found.text
-    assert "Fast DDS 2.9.1 and Cyclone DDS 0.10.2 accept it" in found.text
+    assert "Fast DDS 2.14 and Cyclone DDS 11.0 refuse it (governance.p7s: " in found.text
+    assert "Fast DDS 2.9.1 and Cyclone DDS 0.10 accept it" in found.text
     assert {each.id for each in worst(bench, vendor="cyclonedds")} == set()
     assert {each.id for each in worst(bench, vendor="fastdds")} == {"enclave.signature"}
     base = bench.checked / "enclaves/base"
@@ -308,7 +308,7 @@ def test_every_verb_starts_what_the_vendor_starts(
     [
         (lambda _: None, ""),
         (lambda b: b.permissions(("<default>DENY</default>", "")), ""),
-        (_bad_kind, "Cyclone DDS 0.10.2 refuses it: governance.p7s: "),
+        (_bad_kind, "Cyclone DDS 0.10 refuses it: governance.p7s: "),
         (lambda b: b.governance(("</dds>", "")), "governance.p7s: "),
     ],
     ids=("sound", "taken by Cyclone DDS alone", "refused by all", "malformed"),

@@ -1,7 +1,7 @@
 """Who may sign, and which CA files are taken: enclaves made each in one way, and what vendors do.
 
 ``YES`` is started and matched with an enclave made in the same way, ``REFUSED`` not started.  Runs
-of Fast DDS 2.9.1, Fast DDS 2.14.5 and Cyclone DDS 0.10.2.
+of Fast DDS 2.9.1, Fast DDS 2.14.5, Cyclone DDS 0.10.2 and 11.0.1.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.name import _ASN1Type
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, parse_subject, pem
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
@@ -158,13 +159,44 @@ class Made:
 
 @dataclass(frozen=True)
 class Row:
-    """What Fast DDS 2.9.1, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 do with one."""
+    """What Fast DDS 2.9.1, Fast DDS 2.14.5 and Cyclone DDS 0.10 do with one."""
 
     name: str
     made: Made
     fast: str
     later: str
     cyclone: str
+
+    def answer(self, vendor: Vendor) -> str:
+        """Return what a vendor does."""
+        answers = {
+            Vendor.FAST_2_9: self.fast,
+            Vendor.FAST: self.later,
+            Vendor.CYCLONE: self.cyclone,
+            Vendor.CYCLONE_11: ON_CYCLONE_11.get(self.name, self.cyclone),
+        }
+        return answers[vendor]
+
+
+ON_CYCLONE_11 = {
+    "-nocerts": YES,
+    "a CA for clientAuth": YES,
+    "a CA for serverAuth": YES,
+    "a CA that only certifies": YES,
+    "a leaf below the CA signs": REFUSED,
+    "a renewed CA of the same key and serial number": YES,
+    "an expired CA": YES,
+    "an intermediate that may sign signs, the CA alone in the file": REFUSED,
+    "an intermediate without keyUsage signs, the CA alone in the file": REFUSED,
+    "intermediate (may sign) and root": YES,
+    "intermediate (no keyUsage) and root": YES,
+    "intermediate (only certifies) and root": YES,
+    "intermediate alone": YES,
+    "one CA for both jobs, the enclave signs for itself": REFUSED,
+    "root and intermediate that may sign, which signs": REFUSED,
+    "two signers, the CA and a leaf below": REFUSED,
+}
+"""What Cyclone DDS 11.0.1 does otherwise than 0.10."""
 
 
 def write_enclave(

@@ -21,6 +21,9 @@ from tests.dds.decision_documents import allow, governance, grant, permissions, 
 # ── subjects ───────────────────────────────────────────────────────────────────────────────
 
 
+SUBSETS = {Subjects.SUBSET, Subjects.TRIMMED_SUBSET}
+
+
 @pytest.mark.parametrize(
     ("granted", "certified", "accepted_by"),
     [
@@ -28,12 +31,12 @@ from tests.dds.decision_documents import allow, governance, grant, permissions, 
         ("CN=/t", "CN=/u", set()),
         ("CN=/t,O=x", "CN=/t,O=x", set(Subjects)),
         ("CN=/t, O=x", "CN=/t,O=x", set(Subjects) - {Subjects.SUBSET}),
-        ("O=x,CN=/t", "CN=/t,O=x", {Subjects.ANY_ORDER, Subjects.SUBSET}),
-        ("CN = /t", "CN=/t", {Subjects.EXACT, Subjects.ANY_ORDER}),
+        ("O=x,CN=/t", "CN=/t,O=x", {Subjects.ANY_ORDER, *SUBSETS}),
+        ("CN = /t", "CN=/t", {Subjects.EXACT, Subjects.ANY_ORDER, Subjects.TRIMMED_SUBSET}),
         ("OU=a,OU=b", "OU=a,OU=b", {Subjects.EXACT, Subjects.WHOLE_ATTRIBUTES}),
-        ("CN=/robot/admin", "CN=/robot", {Subjects.SUBSET}),
+        ("CN=/robot/admin", "CN=/robot", SUBSETS),
         ("CN=/robot", "CN=/robot/admin", set()),
-        ("CN=/b/a", "CN=/a/b", {Subjects.SUBSET}),
+        ("CN=/b/a", "CN=/a/b", SUBSETS),
         ('CN="/t"', "CN=/t", {Subjects.EXACT, Subjects.ANY_ORDER}),
         (r"CN=a\,b", r"CN=a\,b", set(Subjects)),
         (r'CN="a,b"', r"CN=a\,b", {Subjects.EXACT, Subjects.ANY_ORDER}),

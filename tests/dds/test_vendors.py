@@ -2,13 +2,14 @@
 
 import pytest
 
-from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, NEWEST, Vendor
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, MEASURED, NEWEST, Vendor
 
 
 def test_the_measured_vendors() -> None:
-    assert MEASURED == (Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE)
+    assert MEASURED == (Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE, Vendor.CYCLONE_11)
     assert NEWEST == (Vendor.FAST, Vendor.CYCLONE)
     assert FAST_DDS == (Vendor.FAST, Vendor.FAST_2_9)
+    assert CYCLONE_DDS == (Vendor.CYCLONE, Vendor.CYCLONE_11)
 
 
 @pytest.mark.parametrize("vendor", [each for each in Vendor if each not in MEASURED])

@@ -3,8 +3,8 @@
 The enclave /base publishes /chatter and is broken, /arm hears it and is sound.  ``cyclone`` and
 ``fast`` tell what becomes of /base: refused (it does not start), denied (it cannot publish),
 unmatched (it starts, and nobody hears it), matched, crashed; ``..._says`` is a part of what the
-vendor logs.  Runs of Cyclone DDS 0.10.2 and Fast DDS 2.9.1; ``later`` is what Fast DDS 2.14.5 does,
-where that differs.
+vendor logs.  Runs of Cyclone DDS 0.10.2 and 11.0.1, and Fast DDS 2.9.1; ``later`` is what Fast DDS
+2.14.5 does, where that differs.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.keystore.layout import REQUIRED_FILES
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem
@@ -53,6 +54,11 @@ class Breakage:
     later: str = ""
     shared: bool = False
     """Whether the other enclave has its part of what is broken; else it is that of a sound one."""
+
+    def on_cyclone(self, vendor: Vendor) -> tuple[str, str | tuple[str, ...]]:
+        """Return what a release of Cyclone DDS does, and a part of what it logs."""
+        known = (self.cyclone, self.cyclone_says)
+        return ON_CYCLONE_11.get(self.name, known) if vendor is Vendor.CYCLONE_11 else known
 
 
 # ── the ways ───────────────────────────────────────────────────────────────────────────────
@@ -480,6 +486,18 @@ MORE = (
     ),
 )  # fmt: skip
 """What the table does not know."""
+
+NOT_FOUND = "signer certificate not found"
+ON_CYCLONE_11 = {
+    "permissions CA expired": (UNMATCHED, ""),
+    "governance signed by another CA": (REFUSED, NOT_FOUND),
+    "permissions signed by another CA": (REFUSED, NOT_FOUND),
+    "denial of the other direction": (MATCHED, ""),
+    "permissions CA below a root": (UNMATCHED, ""),
+    "permissions CA that only certifies": (MATCHED, ""),
+    "blanks in the subject": (MATCHED, ""),
+}
+"""What Cyclone DDS 11.0.1 does otherwise than 0.10, and a part of what it logs."""
 
 HARMLESS = (
     Breakage(

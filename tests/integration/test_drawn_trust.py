@@ -19,6 +19,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from tests.integration.fastdds import fastdds_vendor
 from tests.integration.trust.drawing import FAMILIES, Case, controls, draw, make
 from tests.integration.trust.replies import Compared, compare, engine_says, kept_replies, same
+from tests.integration.vendor_oracle import cyclone_vendor
 from tests.support.children import LONG
 from tests.support.openssl import takes_changes_for_lists
 
@@ -51,7 +52,7 @@ def test_the_engine_says_what_vendors_were_observed_to_do(tmp_path: Path) -> Non
 @pytest.mark.dds
 @pytest.mark.parametrize("asked", ["Fast DDS", "Cyclone DDS"])
 def test_drawn_enclaves(asked: str, tmp_path: Path) -> None:
-    vendor = Vendor.CYCLONE if asked == "Cyclone DDS" else fastdds_vendor()
+    vendor = cyclone_vendor() if asked == "Cyclone DDS" else fastdds_vendor()
     cases = draw(SEED, COUNT) if COUNT else list(kept_replies())[:: len(kept_replies()) // FEW]
     cases += list(controls())[:: 1 if COUNT else 5]
     if takes_changes_for_lists():

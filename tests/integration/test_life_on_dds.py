@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.vendors import Signers, Vendor
+from sros_tool.dds.decision.vendors import Signers
 from sros_tool.dds.domains import DomainSet
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
@@ -22,7 +22,7 @@ from tests.integration.converse import ENOUGH, converse, listener, talker
 from tests.integration.fastdds import build, fastdds_stack, fastdds_vendor, run_isolated_program
 from tests.integration.kept.forms import form_of
 from tests.integration.kept.replies import answered
-from tests.integration.vendor_oracle import MATCH_SECONDS, cyclone_stack
+from tests.integration.vendor_oracle import MATCH_SECONDS, cyclone_stack, cyclone_vendor
 from tests.support.children import LATE, run
 from tests.support.harness import policy_text, publish
 from tests.support.long_form import ONLY_LONG
@@ -276,7 +276,7 @@ def test_permissions_signed_by_the_enclave_itself(
     With one CA for both jobs that is every enclave.  Fast DDS 2.14 accepts the CA itself only.
     """
     cyclone = request.node.callspec.params["ask"] == "Cyclone DDS"
-    vendor = Vendor.CYCLONE if cyclone else fastdds_vendor()
+    vendor = cyclone_vendor() if cyclone else fastdds_vendor()
     any_signer = vendor.traits.signers is Signers.CHAIN
     expected = HEARD if template == "sros2" and any_signer else REFUSED
     root = tmp_path / "ks"

@@ -40,6 +40,7 @@ from tests.integration.vendor_oracle import (
     Workshop,
     ask_cyclone,
     ask_fastdds,
+    cyclone_vendor,
     with_patience,
 )
 from tests.proof.test_against_brute_force import ENCLAVES, draw_policy, draw_requirement
@@ -49,7 +50,7 @@ from tests.support.harness import policy_text, sros
 COUNT = int(os.environ.get("SROS_WITNESSES", "200" if LONG else "12"))
 DOMAIN = 42
 OPPOSITE = {True: "publish", False: "subscribe"}
-ASK = {fastdds_vendor(): ask_fastdds, Vendor.CYCLONE: ask_cyclone}
+ASK = {fastdds_vendor(): ask_fastdds, cyclone_vendor(): ask_cyclone}
 
 
 def witnesses(world: str, domain: int = DOMAIN) -> Iterator[tuple[Policy, Use, bool]]:

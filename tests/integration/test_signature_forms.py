@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.errors import PkiError
 from sros_tool.keystore.participant import load_enclave
 from sros_tool.pki import smime
@@ -25,6 +25,7 @@ from tests.integration.vendor_oracle import (
     Workshop,
     ask_cyclone_folders,
     ask_fastdds_folders,
+    cyclone_vendor,
     with_patience,
 )
 from tests.integration.vendor_rows import OPEN
@@ -45,7 +46,7 @@ FORMS = {
 """By a name: how openssl signs, and whether Fast DDS 2.9.1 and Cyclone DDS 0.10.2 take it."""
 
 TAKEN_LATER = {"-text -nocerts"}
-"""What Fast DDS 2.14.5 takes as well."""
+"""What Fast DDS 2.14.5 and Cyclone DDS 11.0 take as well."""
 
 READ_BY_SROS = {"-text", "-text, opaque", "cms -text", "-text, SHA-1", "-text, SHA-512"}
 
@@ -80,6 +81,11 @@ def enclave(workshop: Workshop, name: str, subject: str, document: bytes) -> Pat
     return folder
 
 
+def takes(vendor: Vendor, form: str) -> bool:
+    later = vendor in (Vendor.FAST, Vendor.CYCLONE_11)
+    return FORMS[form][1] or (later and form in TAKEN_LATER)
+
+
 @pytest.mark.parametrize("vendor", ["Cyclone DDS", "Fast DDS"])
 def test_what_the_vendors_take(vendor: str, workshop: Workshop, enclaves: dict[str, Path]) -> None:
     peer = enclave(workshop, f"peer for {vendor}", PEER, PEER_PERMISSIONS)
@@ -89,11 +95,8 @@ def test_what_the_vendors_take(vendor: str, workshop: Workshop, enclaves: dict[s
             return ask_cyclone_folders(some, "rt/a", peer, seconds=seconds)
         return ask_fastdds_folders(some, "rt/a", workshop.root, seconds=seconds)
 
-    expected = [taken for _, taken in FORMS.values()]
-    if vendor == "Fast DDS" and fastdds_vendor() is Vendor.FAST:
-        expected = [
-            taken or name in TAKEN_LATER for name, taken in zip(FORMS, expected, strict=True)
-        ]
+    asked = cyclone_vendor() if vendor == "Cyclone DDS" else fastdds_vendor()
+    expected = [takes(asked, name) for name in FORMS]
     pairs = [(enclaves[name], peer, "UTC") for name in FORMS]
     replies = with_patience(ask, pairs, lambda place, _: expected[place])
     assert [reply.answers == ("matched",) for reply in replies] == expected, replies
@@ -102,11 +105,7 @@ def test_what_the_vendors_take(vendor: str, workshop: Workshop, enclaves: dict[s
 @pytest.mark.parametrize("name", FORMS)
 def test_sros_explains_what_the_vendors_do(name: str, enclaves: dict[str, Path]) -> None:
     material = load_enclave("/t", enclaves[name], at=datetime.now(UTC))
-    taken = {
-        Vendor.FAST: FORMS[name][1] or name in TAKEN_LATER,
-        Vendor.FAST_2_9: FORMS[name][1],
-        Vendor.CYCLONE: FORMS[name][1],
-    }
+    taken = {vendor: takes(vendor, name) for vendor in MEASURED}
     found = {vendor: not material.problems(vendor.traits) for vendor in taken}
     assert found == taken
 

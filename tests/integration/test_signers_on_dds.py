@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import allow, grant, permissions, publish, subscribe
 from tests.dds.signer_rows import SIGNER, YES, Made, Row, authority, rows, write_enclave
 from tests.integration.fastdds import fastdds_vendor
@@ -18,6 +17,7 @@ from tests.integration.vendor_oracle import (
     Reply,
     ask_cyclone_folders,
     ask_fastdds_folders,
+    cyclone_vendor,
     with_patience,
 )
 from tests.integration.vendor_rows import OPEN
@@ -53,7 +53,7 @@ def test_the_next_permissions_ca_needs_the_name_of_the_old_one(
 
 @pytest.mark.parametrize("asked", ["Fast DDS", "Cyclone DDS"])
 def test_every_row(asked: str, tmp_path: Path) -> None:
-    vendor = Vendor.CYCLONE if asked == "Cyclone DDS" else fastdds_vendor()
+    vendor = cyclone_vendor() if asked == "Cyclone DDS" else fastdds_vendor()
     taken = "a list that has only changes" if takes_changes_for_lists() else ""
     table = [row for row in rows() if row.name != taken]
     granted = permissions(
@@ -67,12 +67,11 @@ def test_every_row(asked: str, tmp_path: Path) -> None:
         pairs.append((own, peer, "UTC"))
 
     def ask(some: Sequence[Pair], seconds: float) -> list[Reply]:
-        if vendor is Vendor.CYCLONE:
+        if asked == "Cyclone DDS":
             return ask_cyclone_folders(some, TOPIC, pairs[0][0], seconds=seconds)
         return ask_fastdds_folders(some, TOPIC, tmp_path, seconds=seconds)
 
-    columns = {Vendor.FAST_2_9: "fast", Vendor.FAST: "later", Vendor.CYCLONE: "cyclone"}
-    expected = [getattr(row, columns[vendor]) for row in table]
+    expected = [row.answer(vendor) for row in table]
     replies = with_patience(ask, pairs, lambda place, _: expected[place] == YES)
     wrong = [
         f"{row.name}: {vendor.title} answers {reply}, not {answer}"

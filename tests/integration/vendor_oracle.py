@@ -16,6 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, common_name, issue_ca, parse_subject, pem
 from sros_tool.pki.keys import generate_key, key_pem
@@ -238,6 +239,12 @@ def _reply(line: str) -> Reply:
 
 
 # ── Cyclone DDS ────────────────────────────────────────────────────────────────────────────
+
+
+@cache
+def cyclone_vendor() -> Vendor:
+    """Which of the releases that sros knows the Cyclone DDS is that is asked."""
+    return Vendor.CYCLONE if load_cyclone().version.startswith("0.") else Vendor.CYCLONE_11
 
 
 @cache

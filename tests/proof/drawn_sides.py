@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.matching import matches
-from sros_tool.dds.decision.vendors import Style, Subjects, Vendor
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import (
     DomainRule,
@@ -452,7 +452,7 @@ class Side:
 
     def _lenders(self, vendor: Vendor, enclave: str) -> Iterator[str]:
         """The enclaves whose permissions Cyclone DDS takes for those of another one."""
-        if vendor.traits.subjects is Subjects.SUBSET and not self._is_unique(enclave):
+        if vendor in CYCLONE_DDS and not self._is_unique(enclave):
             parts = set(enclave.split("/"))
             yield from (e for e in self._stated if e != enclave and parts < {*e.split("/")})
 

@@ -79,10 +79,11 @@ CA_PURPOSE = FindingKind(
     "portable.ca-purpose",
     WARNING,
     "a permissions CA whose certificate does not allow signing documents",
-    "Fast DDS 2.9 and Cyclone DDS verify the S/MIME purpose, and refuse every document "
+    "Fast DDS 2.9 and Cyclone DDS 0.10 verify the S/MIME purpose, and refuse every document "
     '("unsuitable certificate purpose"): keyUsage must have digitalSignature, extendedKeyUsage '
-    "emailProtection, if present. Fast DDS 2.14 checks neither.",
-    "RFC 8550, 4.4.2; Fast DDS 2.9.1 and 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
+    "emailProtection, if present. Fast DDS 2.14 and Cyclone DDS 11 check neither.",
+    "RFC 8550, 4.4.2; Fast DDS 2.9.1 and 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2 and 11.0.1; "
+    "measured.",
     "Replace it with `sros rotate_ca ROOT`, or issue its certificate again with digitalSignature.",
     vendors=(Vendor.FAST_2_9, Vendor.CYCLONE),
 )

@@ -19,7 +19,7 @@ from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import check_topic_names
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.dds.decision.grants import read_moment
-from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, Moments, Vendor
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, MEASURED, Moments, Vendor
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Rule, outside
@@ -679,7 +679,7 @@ def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
     Cyclone DDS 0.10.2 does not check the rights of these participants, but hides from them all
     topics with enable_discovery_protection, whatever discovery_protection_kind is.
     """
-    on_cyclone = vendor is Vendor.CYCLONE
+    on_cyclone = vendor in CYCLONE_DDS
     hides = on_cyclone or rule.discovery_protection_kind is not ProtectionKind.NONE
     opened = [
         topic_rule.topic_expression

@@ -7,7 +7,6 @@ control that the governance requires (`GovernedDomain`, `_decide_join`, `Access`
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime, tzinfo
 from enum import Enum, auto
@@ -24,6 +23,7 @@ from sros_tool.dds.decision.vendors import (
     Moments,
     OpenRange,
     Style,
+    TopicNames,
     Vendor,
     VendorTraits,
 )
@@ -243,6 +243,33 @@ class _GrantRules:
             return self._otherwise
         return self._entries[position].verdict(fits=True)
 
+    def crash(self, topic: str) -> RuleVerdict | None:
+        """Return the verdict that ends a process which reads all criteria for a topic, or None."""
+        passed = 0
+        for position in self._index.matching(topic):
+            entry = self._entries[position]
+            if entry.criteria != passed and not entry.expression:
+                return entry.verdict(fits=True)
+            passed = entry.criteria
+        return None
+
+    def safe_names(self) -> NameSet:
+        """Return the topics over which there is no `crash`."""
+        from sros_tool.automata import NameSet
+
+        groups = groupby(self._entries, key=lambda entry: entry.criteria)
+        crashing = [self._crashing(list(group)) for _, group in groups]
+        return _every_topic() - NameSet.union(filter(None, crashing))
+
+    def _crashing(self, group: Sequence[_Entry]) -> NameSet | None:
+        """Return the topics over which a criteria crashes the process; None if it never does.
+
+        Only the first matching topic of a criteria counts: one without text crashes the process if
+        no other one of the criteria stands before it and matches.
+        """
+        before = list(takewhile(lambda entry: entry.expression, group))
+        return _every_topic() - self._names_of(before) if len(before) < len(group) else None
+
     def names(self) -> NameSet:
         """Return the topics that `ask` allows in the default partition."""
         from sros_tool.automata import NameSet
@@ -254,12 +281,8 @@ class _GrantRules:
             if fits or self._traits.topic_decides:
                 rules += [(names, allowed and fits) for names, allowed in self._deciding(group)]
                 continue
-            # Only the first matching topic of a criteria counts: one without text crashes the
-            # process if no other one of the criteria stands before it and matches.
-            before = list(takewhile(lambda entry: entry.expression, group))
-            if len(before) < len(group):
-                passed = self._names_of(before)
-                rules.append((_every_topic() - passed, False))
+            if crashing := self._crashing(group):
+                rules.append((crashing, False))
         return NameSet.first(rules, self._otherwise.allowed)
 
     def topic_names(self) -> NameSet:
@@ -465,19 +488,31 @@ def _every_topic() -> NameSet:
     return ~NameSet()
 
 
+_TOPIC_NAMES = {
+    TopicNames.WORDS: (f"{ascii_letters}_/", f"{ascii_letters}{digits}_/"),
+    TopicNames.PRINTABLE: ("".join(sorted({*map(chr, range(33, 127))} - {*"*?[]\"'#$"})),) * 2,
+}
+"""The characters that a topic's name may begin with, and those that may follow."""
+
+
+def _is_topic_name(rule: TopicNames, text: str) -> bool:
+    if rule is TopicNames.ANY:
+        return True
+    first, following = _TOPIC_NAMES[rule]
+    return text[:1] in first and bool(text) and not text.strip(following)
+
+
 @cache
-def _usable_topics(*, created: bool) -> NameSet:
-    """Return the topics without wildcards, or those that `_is_topic_name` accepts (``created``)."""
+def _usable_topics(rule: TopicNames) -> NameSet:
+    """Return the topics without wildcards that `_is_topic_name` accepts."""
     from sros_tool.automata import Automaton, Letters, NameSet
 
-    if not created:
+    if rule is TopicNames.ANY:
         return NameSet((), [Automaton(((0, ~Letters.of("*?["), 0),), frozenset((0,)))])
-    first = Letters.of(f"{ascii_letters}_/")
-    edges = ((0, first, 1), (1, first | Letters.of(digits), 1))
-    return NameSet((), [Automaton(edges, frozenset((1,)))])
+    first, following = map(Letters.of, _TOPIC_NAMES[rule])
+    return NameSet((), [Automaton(((0, first, 1), (1, following, 1)), frozenset((1,)))])
 
 
-_TOPIC_NAME = re.compile(r"[A-Za-z_/][A-Za-z0-9_/]*\Z")
 _ENDPOINTS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
 
@@ -557,7 +592,7 @@ class Access:
             for kind in dict.fromkeys(kinds)
             if kind is not _Kind.NOTHING
         )
-        return NameSet.union(topics) & _usable_topics(created=self._traits.creates_topics)
+        return NameSet.union(topics) & _usable_topics(self._traits.topic_names)
 
     def protection(self) -> tuple[tuple[NameSet, DomainRule, TopicRule], ...]:
         """Return the topic rules of the domain, each with its topics: the first match counts."""
@@ -584,7 +619,7 @@ class Access:
         allowed = self._own[verb].names()
         if self._peers is not self._own:
             allowed &= self._peers[verb].names()
-        return allowed & self._either.topic_names() if kind is _Kind.BOTH_WAYS else allowed
+        return allowed & self._creatable_names() if kind is _Kind.BOTH_WAYS else allowed
 
     def _prepare(self, grant: Grant) -> None:
         traits = self._traits
@@ -614,8 +649,26 @@ class Access:
 
     @cached_property
     def _either(self) -> _GrantRules:
-        """The grant's rules for creating a topic: a right in either direction is enough."""
+        """The grant's rules for creating a topic if one list of both directions decides."""
         return self._deciding(self._rules, *_ENDPOINTS)
+
+    def _creation(self, verb: AccessVerb, topic: str) -> RuleVerdict:
+        """Return the verdict on creating a topic, which opening it for ``verb`` needs first."""
+        if not self._traits.asks_both_directions:
+            return self._either.ask_topic(topic)
+        directions = sorted(_ENDPOINTS, key=lambda endpoint: endpoint is not verb)
+        crashes = (self._own[direction].crash(topic) for direction in directions)
+        verdicts = [self._own[direction].ask_topic(topic) for direction in directions]
+        allowed = (verdict for verdict in verdicts if verdict.allowed)
+        return next(filter(None, crashes), None) or next(allowed, verdicts[0])
+
+    def _creatable_names(self) -> NameSet:
+        """Return the topics whose `_creation` is allowed."""
+        if not self._traits.asks_both_directions:
+            return self._either.topic_names()
+        publish, subscribe = (self._own[direction] for direction in _ENDPOINTS)
+        either = publish.topic_names() | subscribe.topic_names()
+        return either & publish.safe_names() & subscribe.safe_names()
 
     def _deciding(self, rules: Sequence[NumberedRule], *verbs: str) -> _GrantRules:
         return _GrantRules(self._traits, rules, self._otherwise, *verbs)
@@ -627,7 +680,7 @@ class Access:
         if join.outcome in (Outcome.REFUSED, Outcome.CRASHES) and not join.hits_peers:
             return join
         traits = self._traits
-        if traits.creates_topics and not _is_topic_name(topic):
+        if not _is_topic_name(traits.topic_names, topic):
             return self._answer(
                 Outcome.DENIED, "invalid-name", f"{topic!r} is not a valid topic name"
             )
@@ -652,7 +705,7 @@ class Access:
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
         asked = f"{verb} {topic}"
         if traits.creates_topics and writes and reads:
-            verdict = self._either.ask_topic(topic)
+            verdict = self._creation(verb, topic)
             if not verdict.allowed:
                 return self._verdict(verdict, asked, rule)
         if not (writes if verb is AccessVerb.PUBLISH else reads):
@@ -736,8 +789,3 @@ class Access:
             verdict.expression if verdict else None,
             topic_rule,
         )
-
-
-def _is_topic_name(name: str) -> bool:
-
-    return bool(_TOPIC_NAME.match(name))

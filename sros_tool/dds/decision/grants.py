@@ -10,14 +10,14 @@ import re
 from calendar import timegm
 from collections.abc import Callable, Collection, Mapping
 from datetime import datetime, timedelta, tzinfo
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import inf
 
 from sros_tool.dds.decision.vendors import Moments, Subjects, VendorTraits
 from sros_tool.validity import parse_iso
 
 _BLANK = ord(" ")
-_MOST_PARTS = 20  # Cyclone DDS 0.10 refuses a grant's subject of more
+_MOST_PARTS = 20  # Cyclone DDS refuses a grant's subject of more
 
 
 class ComparisonCrash(Exception):  # noqa: N818
@@ -40,18 +40,21 @@ def also_fitting(
 
     ``certified`` are the subjects of certificates, ``granted`` those of the grants.
     """
-    if traits.subjects is not Subjects.SUBSET:  # all others compare the whole subject
+    plain = _PLAIN_PARTS.get(traits.subjects)
+    if plain is None:  # all others compare the whole subject
         return {}
     having: dict[str, set[str]] = {}
     for name, subjects in granted.items():
         for part in {
-            attribute for subject in subjects for attribute in _SEPARATORS.split(subject.strip())
+            plain(attribute)
+            for subject in subjects
+            for attribute in _SEPARATORS.split(subject.strip())
         }:
             having.setdefault(part, set()).add(name)
     lenders = {}
     for name, subject in certified.items():
         own = certified_text(traits, subject)
-        several = [having.get(part, set()) for part in _SEPARATORS.split(own) if part]
+        several = [having.get(plain(part), set()) for part in _SEPARATORS.split(own) if part]
         fitting = set.intersection(*sorted(several, key=len)) if several else set()
         others = tuple(
             each
@@ -187,8 +190,8 @@ def _plain(text: str) -> str:
 _SEPARATORS = re.compile(r"[,/|]")
 
 
-def _subset(granted: str, certified: str) -> bool:
-    parts = [part for part in _SEPARATORS.split(granted) if part]
+def _subset(granted: str, certified: str, *, plain: Callable[[str], str] = str) -> bool:
+    parts = [plain(part) for part in _SEPARATORS.split(granted) if part]
     if len(parts) > _MOST_PARTS:
         return False
     values: dict[str, str] = {}
@@ -199,17 +202,29 @@ def _subset(granted: str, certified: str) -> bool:
     if wanted and not wanted[-1]:  # no empty part after a last separator
         wanted.pop()
     for part in wanted:
-        kind, _, value = part.partition("=")
+        kind, _, value = plain(part).partition("=")
         if not part or values.get(kind) != value:
             return False
     return True
 
+
+def _without_blanks(part: str) -> str:
+    """Return a part of a subject without the blanks around its name and its value."""
+    return "=".join(text.strip(" ") for text in part.split("=", 1))
+
+
+_PLAIN_PARTS: dict[Subjects, Callable[[str], str]] = {
+    Subjects.SUBSET: str,
+    Subjects.TRIMMED_SUBSET: _without_blanks,
+}
+"""How rules that split subjects read each part."""
 
 _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
     Subjects.EXACT: _exact,
     Subjects.WHOLE_ATTRIBUTES: _whole_attributes,
     Subjects.ANY_ORDER: _any_order,
     Subjects.SUBSET: _subset,
+    Subjects.TRIMMED_SUBSET: partial(_subset, plain=_without_blanks),
 }
 
 

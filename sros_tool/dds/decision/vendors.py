@@ -1,8 +1,8 @@
 """The vendors of DDS Security, and the differences of their decisions, as data.
 
-Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2 were measured on the real libraries.  Vendors that
-were never measured, such as OpenDDS and Connext, are taken to follow the standard, as their manuals
-say.
+Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2, 0.10.5 and 11.0.1 were measured on the real
+libraries; Cyclone DDS 0.10.2 and 0.10.5 decide alike.  Vendors that were never measured, such as
+OpenDDS and Connext, are taken to follow the standard, as their manuals say.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ class Subjects(Enum):
     """The same attributes in any order (Fast DDS 2.14)."""
     SUBSET = auto()
     """Each part of the certificate's subject, split at ``, / |``, is in the grant's (Cyclone)."""
+    TRIMMED_SUBSET = auto()
+    """As SUBSET, but blanks around names and values do not count (Cyclone DDS 11)."""
 
 
 class Moments(Enum):
@@ -53,6 +55,16 @@ class OpenRange(Enum):
     """``min N`` alone means only N; ``max N`` alone means 0 to N (Fast DDS)."""
     CRASHES = auto()
     """``min N`` alone means only N; ``max N`` alone is a crash (Cyclone DDS)."""
+
+
+class TopicNames(Enum):
+    """The names that a topic may have."""
+
+    ANY = auto()
+    WORDS = auto()
+    """Letters, digits, ``_`` and ``/``, beginning with no digit (Cyclone DDS 0.10)."""
+    PRINTABLE = auto()
+    """Printable ASCII characters but blanks, quotes and ``* ? [ ] # $`` (Cyclone DDS 11)."""
 
 
 class DenyPartitions(Enum):
@@ -145,10 +157,16 @@ class VendorTraits:
     honours_default: bool = True
     crashes_on_empty_texts: bool = False
     """An expression or a default without text crashes the process when a decision reaches it."""
+    topic_names: TopicNames = TopicNames.ANY
     longest_topic_name: int | None = None
     """Length of a name, in bytes, above which a topic is created but never matched."""
     creates_topics: bool = False
-    """A topic is created before its endpoint, and needs a right in either direction."""
+    """A topic is created before its endpoint, and needs a right in either direction.
+
+    The first rule that names the topic, for either direction, decides.
+    """
+    asks_both_directions: bool = False
+    """A topic that is created has a right if one direction has it, each by its own first rule."""
     always_needs_allow_rule: bool = False
     """Without any allow rule the participant does not start, even without join control."""
     needs_domain_rule: bool = True
@@ -214,6 +232,28 @@ _FAST_2_14 = VendorTraits(
     hashes=Hashes.SHA256,
     keys=Keys.EC_AND_RSA,
 )
+_CYCLONE_0_10 = VendorTraits(
+    "Cyclone DDS 0.10",
+    product="Cyclone DDS",
+    measured=True,
+    reader=DocumentReader.CYCLONE,
+    style=Style.CYCLONE,
+    trims_texts=True,
+    subjects=Subjects.SUBSET,
+    escapes_subjects=True,
+    moments=Moments.CYCLONE,
+    open_range=OpenRange.CRASHES,
+    deny_partitions=DenyPartitions.ANY_OR_DEFAULT,
+    crashes_on_empty_texts=True,
+    topic_names=TopicNames.WORDS,
+    creates_topics=True,
+    shares_open_topics=True,
+    signers=Signers.CHAIN,
+    reads_first_authority=True,
+    keys=Keys.SMALL,
+    reads_tokens=False,
+    reads_trusted_certificates=False,
+)
 
 
 class Vendor(StrEnum):
@@ -247,28 +287,16 @@ class Vendor(StrEnum):
             largest_document=60 * 1024 - 1,
         ),
     )
-    CYCLONE = (
-        "cyclonedds",
-        VendorTraits(
-            "Cyclone DDS 0.10.2",
-            product="Cyclone DDS",
-            measured=True,
-            reader=DocumentReader.CYCLONE,
-            style=Style.CYCLONE,
-            trims_texts=True,
-            subjects=Subjects.SUBSET,
-            escapes_subjects=True,
-            moments=Moments.CYCLONE,
-            open_range=OpenRange.CRASHES,
-            deny_partitions=DenyPartitions.ANY_OR_DEFAULT,
-            crashes_on_empty_texts=True,
-            creates_topics=True,
-            shares_open_topics=True,
-            signers=Signers.CHAIN,
-            reads_first_authority=True,
-            keys=Keys.SMALL,
-            reads_tokens=False,
-            reads_trusted_certificates=False,
+    CYCLONE = "cyclonedds", _CYCLONE_0_10
+    CYCLONE_11 = (
+        "cyclonedds-11",
+        replace(
+            _CYCLONE_0_10,
+            title="Cyclone DDS 11.0",
+            subjects=Subjects.TRIMMED_SUBSET,
+            topic_names=TopicNames.PRINTABLE,
+            asks_both_directions=True,
+            signers=Signers.LISTED,
         ),
     )
     OPENDDS = "opendds", VendorTraits("OpenDDS", product="OpenDDS", reads_tokens=False)
@@ -294,5 +322,13 @@ MEASURED = tuple(vendor for vendor in Vendor if vendor.traits.measured)
 NEWEST = tuple({vendor.traits.product: vendor for vendor in reversed(MEASURED)}.values())[::-1]
 """The newest measured release of each implementation."""
 
-FAST_DDS = tuple(vendor for vendor in Vendor if vendor.traits.product == Vendor.FAST.traits.product)
+
+def _releases(product: str) -> tuple[Vendor, ...]:
+    return tuple(vendor for vendor in Vendor if vendor.traits.product == product)
+
+
+FAST_DDS = _releases("Fast DDS")
 """All releases of Fast DDS."""
+
+CYCLONE_DDS = _releases("Cyclone DDS")
+"""All releases of Cyclone DDS."""

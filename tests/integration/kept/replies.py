@@ -43,7 +43,7 @@ def answered(
     ``ask`` is given the places of the forms that the stack itself has to answer: those that are
     new, that were drawn, and those whose kept reply ``believe`` does not accept.
     """
-    hashes = [sha256(form.encode()).hexdigest()[:24] for form in forms]
+    hashes = list(map(_hash, forms))
     kept = {} if KEEP else _kept(HERE / f"{stack}.txt")
     replies = {
         place: kept[name]
@@ -66,6 +66,16 @@ def _assert_told_apart(forms: Sequence[str], replies: dict[int, Reply]) -> None:
     for place, (_, *answers) in replies.items():
         earlier = known.setdefault(forms[place], tuple(answers))
         assert earlier == tuple(answers), f"{earlier} and {answers} to {forms[place]}"
+
+
+def kept_replies(stack: str, forms: Sequence[str]) -> list[Reply | None]:
+    """Return the kept replies of a stack that is not at hand; None where there is none."""
+    kept = _kept(HERE / f"{stack}.txt")
+    return [kept.get(_hash(form)) for form in forms]
+
+
+def _hash(form: str) -> str:
+    return sha256(form.encode()).hexdigest()[:24]
 
 
 @cache

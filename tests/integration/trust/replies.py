@@ -29,6 +29,7 @@ from tests.integration.vendor_oracle import (
     Reply,
     ask_cyclone_folders,
     ask_fastdds_folders,
+    cyclone_vendor,
 )
 from tests.support.children import run
 from tests.support.raw_pki import pem, private_der
@@ -146,7 +147,7 @@ def ask(
 ) -> list[Reply]:
     """Ask a library about folders with own/ and peer/; ``whole`` is an enclave without oddity."""
     pairs = [(each / "own", each / "peer", "UTC") for each in folders]
-    if vendor is Vendor.CYCLONE:
+    if vendor.traits.product == Vendor.CYCLONE.traits.product:
         return ask_cyclone_folders(
             pairs, TOPIC, whole, domain=DOMAIN, seconds=seconds, at_once=at_once
         )
@@ -208,7 +209,7 @@ def main() -> None:
         folder = Path(sys.argv[2] if len(sys.argv) > 2 else temporary)
         folder.mkdir(parents=True, exist_ok=True)
         print(make(case)[1] or "no oddity")
-        for vendor in (fastdds_vendor(), Vendor.CYCLONE):
+        for vendor in (fastdds_vendor(), cyclone_vendor()):
             place = folder / vendor.value
             place.mkdir()
             (made,) = compare(vendor, [case], place, program_folder=folder)
