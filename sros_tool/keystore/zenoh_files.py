@@ -232,10 +232,10 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
         return ""
     control = configuration.access_control
     domains = _joined_domains(state.grant, domains_of(control))
-    stated = {each: _recorded_rights(name, state.grant, each) for each in domains}
     # Only the keystore knows which nodes a policy names: here it is what the permissions CA signed.
     nodes = nodes_in_rules((rule for each in control.remotes for rule in each.rules), name)
     try:
+        stated = {domain: _recorded_rights(name, state.grant, domain) for domain in domains}
         own = remote_of(name, stated, nodes)
     except SrosError as error:
         return f"Zenoh cannot state the permissions of the enclave: {error.what}"
@@ -917,9 +917,16 @@ def _recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
     on Zenoh.
 
     Raises:
-        PolicyError: it is uncertain which ROS names a right or a denial is about.
+        PolicyError: it is uncertain which ROS names a right or a denial is about, or what no rule
+            names is allowed.
     """
     source = Source(f"the permissions of {enclave}", 0)
+    if grant.default_allow:
+        raise PolicyError(
+            f"{source}: <default>ALLOW</default> cannot be said to Zenoh",
+            "It allows what no rule names, on some vendors of DDS and not on others.",
+            "State the rights of the enclave in a policy, with `sros create_permission`.",
+        )
     rules = tuple(each for each in grant.rules if domain in each.domains.closed())
     rights = grant_rights(enclave, grant._replace(rules=rules))
     raw = {each for each in rights if not each.name.startswith("/")}

@@ -264,6 +264,15 @@ def test_a_wildcard_of_dds_is_said_exactly_or_refused(
         ]
 
 
+def test_what_permissions_allow_by_default_is_refused() -> None:
+    domain = DomainSet.of((0, 0))
+    rules = (Rule(allow=True, domains=domain, publish=(Criteria(("rt/a",)),)),)
+    grant = Grant("/n", "CN=/n", "", "", rules)
+    assert [each.right.name for each in _recorded_rights("/n", grant, 0)] == ["/a"]
+    with pytest.raises(PolicyError, match="the permissions of /n: <default>ALLOW</default> cannot"):
+        _recorded_rights("/n", grant._replace(default_allow=True), 0)
+
+
 @pytest.mark.parametrize(
     ("words", "why"),
     [
